@@ -22,9 +22,9 @@ from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
 from reskin.models.train import train
 from reskin.seeds import rng_for
-from reskin.universal.map import NOMINAL, OF_NOMINAL
-from reskin.universal.population import POKES_N, Population
-from reskin.universal.training import Syllabus
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
+from reskin.universal.population import PRESSES_N, Population
+from reskin.universal.training import SkinPrior
 from reskin.universal.training import train as train_universal
 from tests.models.jobs import some_job, some_rows
 from tests.universal.skins import SETUP
@@ -57,10 +57,11 @@ def adversarial_network() -> str:
 def universal_network() -> str:
     rng = rng_for(0, "population")
     skins = Population(
-        rng.normal(0, 300, (20, POKES_N, 15)).astype(np.float32), rng.normal(0, 1000, (20, 15)).astype(np.float32),
-        rng.uniform(-8, 8, (20, POKES_N, 2)).astype(np.float32), rng.uniform(0.1, 8, (20, POKES_N)).astype(np.float32),
+        rng.normal(0, 300, (20, PRESSES_N, 15)).astype(np.float32), rng.normal(0, 1000, (20, 15)).astype(np.float32),
+        rng.uniform(-8, 8, (20, PRESSES_N, 2)).astype(np.float32),
+        rng.uniform(0.1, 8, (20, PRESSES_N)).astype(np.float32),
     )  # fmt: skip
-    weights, _ = train_universal(skins, Syllabus("made up", NOMINAL, OF_NOMINAL, SETUP), STEPS_N, rng)
+    weights = train_universal(skins, SkinPrior("made up", NOMINAL, NOMINAL_SPREADS, SETUP), STEPS_N, rng)
     return digest(weights[name] for name in sorted(weights))
 
 

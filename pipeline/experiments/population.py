@@ -1,12 +1,16 @@
-"""Experts taught simulated skins only, on skins of a simulated scene: unlabelled pokes, one weight, a few labels."""
+"""The universal model of simulated skins alone, on held-out skins of a simulated scene.
+
+It is calibrated to each skin by its no-load field, by unlabelled presses and by labels; forces also with one known
+weight. Networks of more and more simulated skins give the error against their number.
+"""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,76 +28,99 @@ from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import summarise
 from pipeline.training.jobs import SceneData, read_data
-from pipeline.training.population import (
-    WEIGHT_N,
-    WEIGHT_SD,
-    Case,
-    Experts,
-    Told,
-    Weight,
-    cases_of,
-    fewer,
-    scores_of,
-    trust,
-    weight_of,
-)
-from pipeline.training.universal import Frame, Pokes
+from pipeline.training.universal import BOARD_POWERS, Frame, coverage
 from reskin import io
 from reskin.code import digest, imported
 from reskin.config import Strict
 from reskin.data.grid import CENTRE_MM
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError, SchemaError
+from reskin.metrics import score
 from reskin.physics.skin import SkinDesign
 from reskin.physics.slide import force_at
 from reskin.seeds import rng_for
 from reskin.simulation.settings import BoardKind
+from reskin.universal.calibration import CalibrationData, LabelledPresses
 from reskin.universal.law import Law, Setup
-from reskin.universal.map import OF_RIG, Tables, new_map
+from reskin.universal.map import RIG_SPREADS, Estimate, Tables, new_map
 from reskin.universal.map import tabulate as tabulate_map
+from reskin.universal.model import Evaluation, PriorModel
 from reskin.universal.network import Weights
-from reskin.universal.population import Forces, Population, draw_population
-from reskin.universal.training import Syllabus, draw_weights, train
+from reskin.universal.population import PLACES_N, Forces, Population, draw_population
+from reskin.universal.training import NOISE_uT, SkinPrior, draw_weights, train
+
+EXPERIMENT = "lobo"  # whose folds are used: their pools are those of adaptation
+POOL_MAX_N = 65  # presses: one at each place of the paper's grid, under any of its depths
+TESTED_MAX_N = 2000  # rows of a skin, drawn at random
+CALIBRATION_SKINS_N = 16  # simulated, for likelihood powers and weight shares
+FRESH_N = 32  # further simulated skins, for the coverage of intervals
+BY = ("way", "pokes_n", "labels_n")
+WAYS = ("map", "universal", "network")  # the map alone, map and networks, the networks alone
+WEIGHT_N = 5.0  # of the known weight, 500 g in the middle, which tells forces at all places best
+WEIGHT_SD = 0.02  # of the log of its assumed force: friction of the guide, and its mass
+LOG_FORCE_MIN_N = 0.2  # smaller forces do not count in errors of log F: the skin hardly feels them
 
 PACKAGE = Path(reskin.universal.__file__).parent
 TRAINS = "reskin.universal.training"
-PART_N = 100  # skins that are kept together
-STEPS_OF_FORCE = 0.6  # at most, of log F between two tabulated forces
-FORCE_SHARES = (0.7, 1.5)  # of the least and of the largest force of the skin as designed: skins differ
+PART_N = 100  # skins that are cached together
+LOG_FORCE_STEP = 0.6  # at most, between two tabulated forces
+FORCE_SHARES = (0.7, 1.5)  # of the least and the largest force of the designed skin, as skins differ
 
 
-class Taught(Strict):
-    """How many skins there are, of which networks are taught the first so many, each for as many steps."""
+class CalibrationSize(NamedTuple):
+    """Numbers of unlabelled presses and of labels that the model is calibrated with."""
+
+    presses_n: int
+    labels_n: int
+
+
+class PopulationSettings(Strict):
+    """Section population.
+
+    skins_n: simulated skins of each network, the first of one population. steps_n: of each training. unlabelled_n,
+    labels_n: presses that the model is calibrated with.
+    """
 
     skins_n: Annotated[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], Field(min_length=1)]
     steps_n: Annotated[int, Field(ge=2, le=1_000_000)]
+    unlabelled_n: Annotated[tuple[Annotated[int, Field(ge=0, le=POOL_MAX_N)], ...], Field(min_length=1)]
+    labels_n: tuple[Annotated[int, Field(ge=1, le=POOL_MAX_N)], ...]
+
+    def sizes(self) -> list[CalibrationSize]:
+        """List more and more unlabelled presses, then all of them with more and more labels."""
+        most_n = max(self.unlabelled_n)
+        return [CalibrationSize(n, 0) for n in self.unlabelled_n] + [CalibrationSize(most_n, n) for n in self.labels_n]
+
+
+def read(settings: Settings) -> PopulationSettings:
+    """Read section population."""
+    return settings.section(PopulationSettings, "population")
 
 
 @dataclass(frozen=True)
-class Lesson:
-    """A syllabus of skins as a scene's are designed, with forces as its depths ask for."""
+class DesignedSkins:
+    """Simulated skins about the design of a scene's skins, with the forces of its depths."""
 
-    syllabus: Syllabus
+    prior: SkinPrior
     forces_N: tuple[float, float]
     seed: int
 
-    def skins(self, name: str, which: slice, weight_N: float | None = None) -> Population:
-        """Draw some skins of the population that bears this name; where a weight is given, its press comes last."""
-        centre, spreads, setup = self.syllabus.centre, self.syllabus.spreads, self.syllabus.setup
-        rng = rng_for(self.seed, "population", name)
-        return draw_population(centre, spreads, setup, which, rng, Forces(*self.forces_N, weight_N))
+    def draw(self, name: str, which: slice, weight_N: float | None = None) -> Population:
+        """Draw some skins of the population of this name; the press of a weight, if given, is the last of each."""
+        prior, rng = self.prior, rng_for(self.seed, "population", name)
+        return draw_population(prior.centre, prior.spreads, prior.setup, which, rng, Forces(*self.forces_N, weight_N))
 
     def tables(self) -> Tables:
-        """Tabulate the skin as designed, for the map."""
+        """Tabulate the designed skin, for the map."""
         first, last = np.log(self.forces_N)
-        forces_N = np.exp(np.linspace(first, last, 1 + int(np.ceil((last - first) / STEPS_OF_FORCE))))
-        return tabulate_map(self.syllabus.centre, self.syllabus.spreads, self.syllabus.setup, forces_N)
+        forces_N = np.exp(np.linspace(first, last, 1 + int(np.ceil((last - first) / LOG_FORCE_STEP))))
+        return tabulate_map(self.prior.centre, self.prior.spreads, self.prior.setup, forces_N)
 
 
-def lesson_of(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> Lesson:
-    """Put a designed skin over designed boards: the law's numbers as the design has them, its slide included."""
+def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> DesignedSkins:
+    """Return skins about a design, on boards as designed, with the law's parameters and the slide of the design."""
     if design.hold is None:
-        remedy = "Ask this experiment of a scene whose skin has hold."
+        remedy = "Run this experiment in a scene whose skin has hold."
         raise ParamsError("params.yaml: skin", "hold", "that of a skin that slides, as the law's", "null", remedy)
     modulus_MPa = design.modulus_kPa * 1e-3
     law = Law(
@@ -108,44 +135,47 @@ def lesson_of(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...],
     ends_N = FORCE_SHARES * force_at(
         deep_m, modulus_Pa=mega * modulus_MPa, thickness_m=setup.thickness_m, tip_radius_m=tip_m
     )
-    syllabus = Syllabus("as designed", law, OF_RIG, setup, follows_law=True)
-    return Lesson(syllabus, (float(ends_N[0]), float(ends_N[1])), seed)
+    prior = SkinPrior("as designed", law, RIG_SPREADS, setup, follows_law=True)
+    return DesignedSkins(prior, (float(ends_N[0]), float(ends_N[1])), seed)
 
 
-def draw(lesson: Lesson, skins_n: int, tell: Callable[[str], None]) -> Population:
-    """Draw a population part by part."""
+def draw(designed: DesignedSkins, skins_n: int, report: Callable[[str], None]) -> Population:
+    """Draw a population part by part; parts are cached."""
     parts = []
     for first in range(0, skins_n, PART_N):
         which = slice(first, min(first + PART_N, skins_n))
-        parts.append(_once(lesson, f"skins {which}", partial(_stack_of, lesson, which)))
-        tell(f"{which.stop} of {skins_n} skins are drawn")
-    return _unstack(np.concatenate(parts))
+        parts.append(_cached(designed, f"skins {which}", partial(_drawn, designed, which)))
+        report(f"{which.stop} of {skins_n} skins are drawn")
+    channels_n = (parts[0].shape[2] - 3) // 2
+    stacked = np.split(np.concatenate(parts), (channels_n, 2 * channels_n, -1), axis=2)
+    db_uT, rest_uT, place_mm, force_N = stacked
+    return Population(db_uT, rest_uT[:, 0], place_mm, force_N[..., 0])
 
 
-def network(lesson: Lesson, skins: Population, skins_n: int, steps_n: int) -> Weights:
-    """Train a network on the first skins of a population."""
+def train_network(designed: DesignedSkins, skins: Population, skins_n: int, steps_n: int) -> Weights:
+    """Train a network on the first skins of a population, or take it from the cache."""
     first = Population(*(getattr(skins, name)[:skins_n] for name in Population.__annotations__))
-    rng_name = (lesson.seed, "population", "network")  # without the number: equal first weights
+    rng_name = (designed.seed, "population", "network")  # without skins_n: equal initial weights
     empty = draw_weights(skins.rest_uT.shape[1], rng_for(*rng_name))
 
-    def teach() -> Float[np.ndarray, " w"]:
-        weights, _ = train(first, lesson.syllabus, steps_n, rng_for(*rng_name))
+    def make() -> Float[np.ndarray, " w"]:
+        weights = train(first, designed.prior, steps_n, rng_for(*rng_name))
         return np.concatenate([weights[name].ravel() for name in empty])
 
-    flat, found, start = _once(lesson, f"network of {skins_n} skins, {steps_n} steps", teach), {}, 0
+    flat, found, start = _cached(designed, f"network of {skins_n} skins, {steps_n} steps", make), {}, 0
     for name, value in empty.items():
         found[name] = flat[start : start + value.size].reshape(value.shape)
         start += value.size
     return found
 
 
-def _once(lesson: Lesson, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
-    """Give what is kept under this name and these lessons; the first skin's fields stand for all physics below."""
-    seen = hashlib.sha256(_stack_of(lesson, slice(1)).tobytes()).hexdigest()
-    spreads = sorted(lesson.syllabus.spreads.items())
+def _cached(designed: DesignedSkins, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return an array from the cache, or make it. Its key: name, prior, code, and the first skin's fields (physics)."""
+    first_skin = hashlib.sha256(_drawn(designed, slice(1)).tobytes()).hexdigest()
+    spreads = sorted(designed.prior.spreads.items())
     code = [digest(module) for module in imported(TRAINS)]
-    of = f"torch {version('torch')}; {code}; {seen}"
-    name = f"{what}; {of}; {lesson.syllabus.centre}; {spreads}; {lesson.forces_N}; seed {lesson.seed}"
+    of = f"torch {version('torch')}; {code}; {first_skin}"
+    name = f"{what}; {of}; {designed.prior.centre}; {spreads}; {designed.forces_N}; seed {designed.seed}"
     found = io.load(PACKAGE, name)
     if found is None:
         found = make()
@@ -153,42 +183,35 @@ def _once(lesson: Lesson, what: str, make: Callable[[], np.ndarray]) -> np.ndarr
     return found
 
 
-def _stack_of(lesson: Lesson, which: slice) -> np.ndarray:
-    return _stack(lesson.skins("taught", which))
-
-
-def _stack(skins: Population) -> np.ndarray:
+def _drawn(designed: DesignedSkins, which: slice) -> np.ndarray:
+    """Draw skins for training, as one array for the cache."""
+    skins = designed.draw("taught", which)
     rest_uT = np.repeat(skins.rest_uT[:, None], skins.db_uT.shape[1], axis=1)
     return np.concatenate([skins.db_uT, rest_uT, skins.place_mm, skins.force_N[..., None]], axis=2)
 
 
-def _unstack(stacked: np.ndarray) -> Population:
-    channels_n = (stacked.shape[2] - 3) // 2
-    db_uT, rest_uT, place_mm, force_N = np.split(stacked, (channels_n, 2 * channels_n, -1), axis=2)
-    return Population(db_uT, rest_uT[:, 0], place_mm, force_N[..., 0])
+@dataclass(frozen=True)
+class KnownWeight:
+    """A press of the skin's middle by a weight: its change of field, and the force that is assumed."""
+
+    db_uT: Float[np.ndarray, " ch"]
+    force_N: float
 
 
-EXPERIMENT = "lobo"  # whose folds these are: their pools are those of adaptation
-POOL_MAX_N = 65  # pokes: one at each place of the paper's grid, under any of its depths
-TESTED_MAX_N = 2000  # rows of a skin that are read, drawn
-ASKED_FURTHER_N = 16  # skins of the population that tell how sure experts are
-FRESH_N = 32  # and others, on which is counted what their intervals hold
-BY = ("way", "pokes_n", "labels_n")
+@dataclass(frozen=True)
+class TestSkin:
+    """A skin to score the model on, in its board's frame and axes."""
+
+    board: str
+    rest_uT: Float[np.ndarray, " ch"]
+    pool: LabelledPresses  # the first are used for calibration
+    weight: KnownWeight
+    test_uT: Float[np.ndarray, "n ch"]
+    true: Float[np.ndarray, "n 3"]  # x, y in mm from the board's middle, F in N
 
 
-class Asked(Taught):
-    """Section population: what experts are taught, and what they are told of each skin."""
-
-    unlabelled_n: Annotated[tuple[Annotated[int, Field(ge=0, le=POOL_MAX_N)], ...], Field(min_length=1)]
-    labels_n: tuple[Annotated[int, Field(ge=1, le=POOL_MAX_N)], ...]
-
-    def told(self) -> list[Told]:
-        """List what experts are told: ever more pokes, then all of them and ever more labels."""
-        return [(n, 0) for n in self.unlabelled_n] + [(max(self.unlabelled_n), n) for n in self.labels_n]
-
-
-def cases(data: SceneData, fold: Fold, frame: Frame, rest_uT: dict[str, np.ndarray]) -> list[Case]:
-    """Take the skins of a held-out board: a poke at each place of their first passes, and rows of later ones."""
+def scene_skins(data: SceneData, fold: Fold, frame: Frame, rest_uT: Mapping[str, np.ndarray]) -> list[TestSkin]:
+    """Return the skins of a held-out board: a press at each place of their first passes, and rows of later ones."""
     rows, found = data.rows, []
     for skin in np.unique(rows.skin[fold.test]):
         rng = rng_for(data.settings.seed, "population", "asked", str(skin))
@@ -199,30 +222,13 @@ def cases(data: SceneData, fold: Fold, frame: Frame, rest_uT: dict[str, np.ndarr
         place_mm = frame.place(rows.target[test, :2].astype(float))
         true = np.column_stack([place_mm, rows.target[test, 2]])
         noload_uT = frame.field(rest_uT[str(skin)][None])[0]
-        weight = _weight(data, pooled, frame, rng_for(data.settings.seed, "population", "weight", str(skin)))
-        found.append(Case(str(rows.board[test[0]]), noload_uT, pool, weight, frame.field(rows.db_uT[test]), true))
+        weight = find_weight(data, pooled, frame, rng_for(data.settings.seed, "population", "weight", str(skin)))
+        found.append(TestSkin(str(rows.board[test[0]]), noload_uT, pool, weight, frame.field(rows.db_uT[test]), true))
     return found
 
 
-def _weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> Weight:
-    # Of the presses of the place next to the middle, that whose force comes next to the weight's.
-    rows = data.rows
-    off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
-    middle = own[off_mm == off_mm.min()]
-    press_i, first = np.unique(rows.indentation[middle], return_index=True)
-    ratio = rows.target[middle[first], 2] / WEIGHT_N
-    off = np.full(len(ratio), np.inf)  # a gauge may read 0 N and less, which no logarithm knows
-    off[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
-    if np.isinf(off).all():
-        rule, got = "of a press with a force above 0 N", f"{len(ratio)} without"
-        raise SchemaError(f"skin {rows.skin[own[0]]}", "the known weight", rule, got, "Check the sign of its forces.")
-    next_i = press_i[off.argmin()]
-    press = middle[rows.indentation[middle] == next_i]
-    return weight_of(frame.field(rows.db_uT[press]).mean(axis=0), float(rows.target[press, 2].mean()), rng)
-
-
-def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> Pokes:
-    # Of each place one indentation, the mean of its readings.
+def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> LabelledPresses:
+    """Draw one indentation at each place, as the mean of its readings."""
     rows = data.rows
     first = np.unique(rows.indentation[own], return_index=True)[1]
     _, place_i = np.unique(rows.target[own[first], :2].round(2), axis=0, return_inverse=True)
@@ -231,44 +237,165 @@ def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generat
     taken = [own[rows.indentation[own] == rows.indentation[own[first[i]]]] for i in rng.permutation(order[chosen])]
     target = np.array([rows.target[one].mean(axis=0) for one in taken], float)
     db_uT = np.array([rows.db_uT[one].mean(axis=0) for one in taken], float)
-    return Pokes(frame.place(target[:, :2]), target[:, 2], frame.field(db_uT))
+    return LabelledPresses(frame.place(target[:, :2]), target[:, 2], frame.field(db_uT))
+
+
+def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> KnownWeight:
+    """Take as the weight the press nearest to the middle whose force is nearest to the weight's."""
+    rows = data.rows
+    off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
+    middle = own[off_mm == off_mm.min()]
+    press_i, first = np.unique(rows.indentation[middle], return_index=True)
+    ratio = rows.target[middle[first], 2] / WEIGHT_N
+    off = np.full(len(ratio), np.inf)  # a gauge may read 0 N and less, which have no logarithm
+    off[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
+    if np.isinf(off).all():
+        rule, got = "of a press with a force above 0 N", f"{len(ratio)} without"
+        raise SchemaError(f"skin {rows.skin[own[0]]}", "the known weight", rule, got, "Check the sign of its forces.")
+    press = middle[rows.indentation[middle] == press_i[off.argmin()]]
+    return known_weight(frame.field(rows.db_uT[press]).mean(axis=0), float(rows.target[press, 2].mean()), rng)
+
+
+def known_weight(db_uT: Float[np.ndarray, " ch"], force_N: float, rng: np.random.Generator) -> KnownWeight:
+    """Take a press as that of a weight, whose assumed force is drawn about the true one."""
+    return KnownWeight(db_uT, force_N * float(np.exp(WEIGHT_SD * rng.standard_normal())))
 
 
 def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
-    """Give the mean no-load field of each skin's first pass, in the chips' axes."""
+    """Return the mean no-load field of each skin's first pass, in the chips' axes."""
     return {
         one.skin: one.noload_uT[one.pass_i == one.pass_i.min()].mean(axis=0, dtype=float)
         for one in read_captures(indentations)
     }
 
 
+def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSkin]:
+    """Return simulated skins with noise: presses on the grid are the pool, the last is the weight's, others test."""
+    found = []
+    for i in range(len(skins)):
+        db_uT = skins.db_uT[i] + np.tile(NOISE_uT, 5) * rng.standard_normal(skins.db_uT[i].shape)
+        order, place_mm, force_N = rng.permutation(PLACES_N), skins.place_mm[i], skins.force_N[i]
+        pool = LabelledPresses(place_mm[order].astype(float), force_N[order].astype(float), db_uT[order])
+        true = np.column_stack([place_mm, force_N])[PLACES_N:-1].astype(float)
+        weight = known_weight(db_uT[-1], float(force_N[-1]), rng)
+        rest_uT = skins.rest_uT[i].astype(float)
+        found.append(TestSkin(f"population {i}", rest_uT, pool, weight, db_uT[PLACES_N:-1], true))
+    return found
+
+
+def estimate(
+    model: PriorModel, skin: TestSkin, size: CalibrationSize, powers: Sequence[Mapping[str, float]]
+) -> list[dict[str, Estimate]]:
+    """Calibrate a model to a skin; estimate its test presses, and at last the weight's, in each way and power."""
+    labels = skin.pool[: size.labels_n]
+    labels = replace(labels, force_N=np.maximum(labels.force_N, model.skin.tables.force_N[0]))
+    data = CalibrationData(skin.rest_uT, skin.pool.db_uT[: size.presses_n])
+    read_uT = np.concatenate([skin.test_uT, skin.weight.db_uT[None]])
+
+    def in_each_way(evaluation: Evaluation) -> list[Estimate]:
+        way = {"map": evaluation.by_map, "universal": evaluation.combined, "network": evaluation.by_network}
+        return [way[name](one[name]) for one in powers for name in WAYS]
+
+    found = iter(model.calibrate(data).with_labels(labels).estimate_by(in_each_way, read_uT))
+    return [{name: next(found) for name in WAYS} for _ in powers]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """For each way, the likelihood power, and the share of the weight's error in log F that corrects all forces."""
+
+    power: Mapping[str, float]
+    weight_share: Mapping[str, float]
+
+
+def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: CalibrationSize) -> Calibration:
+    """Choose likelihood powers and weight shares on simulated skins that are not scored."""
+    covered = {way: np.zeros((len(BOARD_POWERS), len(skins))) for way in WAYS}
+    # Errors of log F, by power: of the weight, and the mean of all other presses.
+    off = {way: np.zeros((len(BOARD_POWERS), 2, len(skins))) for way in WAYS}
+    candidates = [dict.fromkeys(WAYS, power) for power in BOARD_POWERS]
+    for j, skin in enumerate(skins):
+        for i, by_way in enumerate(estimate(model, skin, size, candidates)):
+            for way, found in by_way.items():
+                covered[way][i, j] = _coverage(found, skin)
+                off[way][i, :, j] = _off_log_N(found, skin)
+    chosen_i = {way: int(np.abs(covered[way].mean(axis=1) - 0.9).argmin()) for way in WAYS}
+    shares = {way: weight_share(*off[way][i]) for way, i in chosen_i.items()}
+    return Calibration({way: BOARD_POWERS[i] for way, i in chosen_i.items()}, shares)
+
+
+def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
+    """Return by least squares the share of the weight's error in log F that other presses have too."""
+    return float(weight_off @ others_off / (weight_off @ weight_off))
+
+
+def score_skin(
+    model: PriorModel, skin: TestSkin, size: CalibrationSize, calibration: Calibration
+) -> list[dict[str, Any]]:
+    """Score each way on a skin; forces also with one known weight, and after the best factor (a diagnosis)."""
+    rows = []
+    (by_way,) = estimate(model, skin, size, [calibration.power])
+    for way, found in by_way.items():
+        force_N, true_N = found.force_N[:-1], skin.true[:, 2]
+        weight_off, _ = _off_log_N(found, skin)
+        weighed_N = force_N * np.exp(calibration.weight_share[way] * weight_off)
+        scaled_N = force_N * (force_N @ true_N) / (force_N @ force_N)
+        rows.append(
+            {"way": way, "pokes_n": size.presses_n, "labels_n": size.labels_n, "board": skin.board}
+            | score(skin.true, np.column_stack([found.place_mm[:-1], force_N]))
+            | {"mse_f_weight_N2": float(((weighed_N - true_N) ** 2).mean())}
+            | {"mse_f_factor_N2": float(((scaled_N - true_N) ** 2).mean())}
+            | {"coverage_pct": 100 * _coverage(found, skin)}
+        )
+    return rows
+
+
+def _off_log_N(found: Estimate, skin: TestSkin) -> tuple[float, float]:
+    """Return the error of log F for the weight, and its mean over test presses."""
+    felt = skin.true[:, 2] > LOG_FORCE_MIN_N
+    weight = np.log(skin.weight.force_N / found.force_N[-1])
+    return float(weight), float(np.log(skin.true[felt, 2] / found.force_N[:-1][felt]).mean())
+
+
+def _coverage(found: Estimate, skin: TestSkin) -> float:
+    tested = Estimate(*(getattr(found, name)[:-1] for name in Estimate.__annotations__))
+    return coverage(tested, skin.true[:, :2])
+
+
 def score_all(
-    lesson: Lesson, section: Asked, asked: Sequence[Case], scene: str
+    designed: DesignedSkins, section: PopulationSettings, tested: Sequence[TestSkin], scene: str
 ) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
-    """Score the experts of the whole population on every skin, and networks of smaller ones; and say what they are."""
-    skins = draw(lesson, max(section.skins_n), lambda line: say(f"{scene} population: {line}"))
+    """Score the model on every skin: by calibration data, with networks of fewer skins, and on fresh simulated skins.
+
+    Returns rows by calibration data, rows by number of simulated skins, and further numbers.
+    """
+    skins = draw(designed, max(section.skins_n), lambda line: say(f"{scene} population: {line}"))
     networks: dict[int, Weights] = {}
     for n in section.skins_n:
-        networks[n] = network(lesson, skins, n, section.steps_n)
+        networks[n] = train_network(designed, skins, n, section.steps_n)
         say(f"{scene} population: network of {n} skins is trained")
-    whole = Experts(new_map(lesson.tables()), [networks[max(section.skins_n)]])
-    further = lesson.skins("further", slice(ASKED_FURTHER_N), WEIGHT_N)
-    held = cases_of(further, rng_for(lesson.seed, "population", "noise"))
-    fresh = cases_of(lesson.skins("fresh", slice(FRESH_N), WEIGHT_N), rng_for(lesson.seed, "population", "fresh noise"))
-    rows, sizes, untaught, full, trusted = [], [], [], (max(section.unlabelled_n), 0), {}
-    for told in section.told():
-        trusted[told] = trust(whole, held, told)
-        rows += [row for case in asked for row in scores_of(whole, case, told, trusted[told])]
-        untaught += [row for case in fresh for row in scores_of(whole, case, told, trusted[told])]
-        say(f"{scene} population: told {told[0]} pokes and {told[1]} labels")
+    model = PriorModel(new_map(designed.tables()), [networks[max(section.skins_n)]])
+    further = designed.draw("further", slice(CALIBRATION_SKINS_N), WEIGHT_N)
+    further_skins = simulated_skins(further, rng_for(designed.seed, "population", "noise"))
+    fresh = designed.draw("fresh", slice(FRESH_N), WEIGHT_N)
+    fresh_skins = simulated_skins(fresh, rng_for(designed.seed, "population", "fresh noise"))
+    full, calibrations = CalibrationSize(max(section.unlabelled_n), 0), {}
+    rows, sizes, fresh_rows = [], [], []
+    for size in section.sizes():
+        calibrations[size] = calibrate_ways(model, further_skins, size)
+        rows += [row for skin in tested for row in score_skin(model, skin, size, calibrations[size])]
+        fresh_rows += [row for skin in fresh_skins for row in score_skin(model, skin, size, calibrations[size])]
+        say(f"{scene} population: {size.presses_n} unlabelled presses and {size.labels_n} labels done")
     for n, weights in networks.items():
-        of_n = [row for case in asked for row in scores_of(fewer(whole, [weights]), case, full, trusted[full])]
+        smaller = replace(model, networks=[weights])
+        of_n = [row for skin in tested for row in score_skin(smaller, skin, full, calibrations[full])]
         sizes += [row | {"skins_n": n} for row in of_n]
-    within = [row for case in held for row in scores_of(whole, case, full, trusted[full])]
-    coverage = pd.DataFrame(within).groupby("way")["coverage_pct"].mean().to_dict()
-    share = trusted[full].weight_share
-    words = {"coverage_further_pct": coverage, "weight_share": share, "fresh": over_boards(pd.DataFrame(untaught), *BY)}
-    return pd.DataFrame(rows), pd.DataFrame(sizes), words
+    within = [row for skin in further_skins for row in score_skin(model, skin, full, calibrations[full])]
+    numbers = {
+        "coverage_further_pct": pd.DataFrame(within).groupby("way")["coverage_pct"].mean().to_dict(),
+        "weight_share": calibrations[full].weight_share, "fresh": over_boards(pd.DataFrame(fresh_rows), *BY),
+    }  # fmt: skip
+    return pd.DataFrame(rows), pd.DataFrame(sizes), numbers
 
 
 def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
@@ -280,26 +407,21 @@ def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
     return found
 
 
-def read(settings: Settings) -> Asked:
-    """Read section population."""
-    return settings.section(Asked, "population")
-
-
 def population(settings: Settings, folds: Path, indentations: Path, results: Path) -> None:
-    """Ask experts of simulated skins about every held-out skin of a simulated scene."""
+    """Score the universal model of simulated skins on every held-out skin of a simulated scene."""
     data, section, simulation = read_data(settings, indentations, folds), read(settings), simulation_settings(settings)
     kind, design = simulation.main_boards, settings.shared_section(SkinDesign, "skin")
-    lesson = lesson_of(design, kind, simulation.main.depths_mm, settings.seed)
+    designed = designed_skins(design, kind, simulation.main.depths_mm, settings.seed)
     turn = Rotation.from_euler("z", np.array(kind.design.turns_deg)[:, None], degrees=True).as_matrix()
     frame, rest_uT = Frame(turn, (CENTRE_MM, CENTRE_MM), mirrored=False), rest_by_skin(indentations)
-    asked = [case for fold in data.folds_of(EXPERIMENT) for case in cases(data, fold, frame, rest_uT)]
-    rows, sizes, words = score_all(lesson, section, asked, settings.scene)
+    tested = [skin for fold in data.folds_of(EXPERIMENT) for skin in scene_skins(data, fold, frame, rest_uT)]
+    rows, sizes, further = score_all(designed, section, tested, settings.scene)
     numbers = {
         "told": over_boards(rows, *BY),
         "scaling": over_boards(sizes, *BY, "skins_n"),
-        "skins_asked_n": len(asked), "rows_asked_n": sum(len(case.true) for case in asked),
-        "pool_n": min(len(case.pool.force_N) for case in asked), "steps_n": section.steps_n,
-        "weight_N": WEIGHT_N, "weight_sd": WEIGHT_SD, **words,
+        "skins_asked_n": len(tested), "rows_asked_n": sum(len(skin.true) for skin in tested),
+        "pool_n": min(len(skin.pool) for skin in tested), "steps_n": section.steps_n,
+        "weight_N": WEIGHT_N, "weight_sd": WEIGHT_SD, **further,
     }  # fmt: skip
     write_results(results, numbers, {})
 
@@ -309,27 +431,39 @@ NAMES = {
     "universal": "universal, skin as designed",
     "network": "universal network alone, skin as designed",
 }
-WAYS = {"map": "map", "network": "network", "universal": "both"}
-WEIGHED, FACTOR = "MSE_F with one known weight / N²", "MSE_F after one factor a skin (diagnosis) / N²"
+SHORT_NAMES = {"map": "map", "network": "network", "universal": "both"}
 COVERAGE = "in 90 % intervals / %"
-FURTHER = {"mse_f_weight_N2": WEIGHED, "mse_f_factor_N2": FACTOR, "coverage_pct": COVERAGE}
+FURTHER = {
+    "mse_f_weight_N2": "MSE_F with one known weight / N²",
+    "mse_f_factor_N2": "MSE_F after one factor a skin (diagnosis) / N²",
+    "coverage_pct": COVERAGE,
+}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show errors by what is told of a skin, and by how many skins a network was taught."""
-    told = [_line(row, source) for row in numbers["told"]]
-    scaling = [_line(row, source, taught=row["skins_n"]) for row in numbers["scaling"]]
+    """Tabulate errors by calibration data, and by number of simulated skins."""
+    scaling = [{"method": NAMES[row["way"]], "skins taught": str(row["skins_n"])} for row in numbers["scaling"]]
     shown = {
-        "population": tabulate(told, meaning=_meaning(numbers)),
-        "population_scaling": tabulate(scaling, meaning=_scaling(numbers)),
+        "population": tabulate([_line(row, source) for row in numbers["told"]], meaning=_meaning(numbers)),
+        "population_scaling": tabulate(
+            [first | _line(row, source) for first, row in zip(scaling, numbers["scaling"], strict=True)],
+            meaning=f"Networks of {numbers['steps_n']} steps each, from equal initial weights, on the first so many "
+            "skins of one population. The map beside them is the same, and so are the likelihood powers, chosen with "
+            "the network of most skins.",
+        ),
     }
-    if "fresh" in numbers:  # committed results may be of before it was counted
-        shown["population_fresh"] = tabulate(_fresh(numbers["fresh"], source), meaning=_of_fresh(numbers))
+    if "fresh" in numbers:  # absent from results of earlier versions
+        meaning = (
+            "Fresh skins of the population: neither those of the training nor those that likelihood powers were chosen "
+            "on. [low, high]: 95 % interval over n skins. The population is drawn wider than the scene's "
+            f"{numbers['skins_asked_n']} skins."
+        )
+        shown["population_fresh"] = tabulate(_fresh(numbers["fresh"], source), meaning=meaning)
     return shown
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the error against the number of skins that a network was taught."""
+    """Draw the error against the number of simulated skins."""
     rows = pd.DataFrame(numbers["scaling"])
     with drawing(6.0, 3.8) as figure:
         axes = figure.subplots()
@@ -339,7 +473,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             sd = [one.get("sd", 0.0) for one in own["accuracy_pct"]]
             style = {"color": COLOURS[i], "marker": MARKERS[i], "capsize": 3}
             axes.errorbar(own["skins_n"], wrong_pct, sd, label=NAMES[way], **style)
-        axes.set(xscale="log", xlabel="simulated skins that the network was taught", ylim=(0, None))
+        axes.set(xscale="log", xlabel="simulated skins that the network was trained on", ylim=(0, None))
         axes.set_ylabel("error above 1 mm / %")
         axes.legend(frameon=False)
         boards_n = rows["accuracy_pct"].iloc[0]["n"]
@@ -347,47 +481,30 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         return {"population_scaling.svg": svg(figure)}
 
 
-def _line(row: Mapping[str, Any], source: str, taught: int | None = None) -> dict[str, str]:
-    line = {"method": NAMES[row["way"]]} | ({} if taught is None else {"skins taught": str(taught)})
-    line |= {"unlabelled pokes": str(row["pokes_n"]), "labels": str(row["labels_n"]), "source": source}
-    return line | scores(row) | scores(row, FURTHER) | {"n": n_of(row)}
+def _line(row: Mapping[str, Any], source: str) -> dict[str, str]:
+    line = {"method": NAMES[row["way"]], "unlabelled pokes": str(row["pokes_n"]), "labels": str(row["labels_n"])}
+    return line | {"source": source} | scores(row) | scores(row, FURTHER) | {"n": n_of(row)}
 
 
 def _fresh(rows: Sequence[Mapping[str, Any]], source: str) -> list[dict[str, str]]:
     lines: dict[tuple[int, int], dict[str, str]] = {}
     for row in rows:
-        told = row["pokes_n"], row["labels_n"]
-        first = {"unlabelled pokes": str(told[0]), "labels": str(told[1]), "source": source}
-        line = lines.setdefault(told, first)
-        line |= scores(row, {"coverage_pct": f"{WAYS[row['way']]}: {COVERAGE}"})
+        size = row["pokes_n"], row["labels_n"]
+        first = {"unlabelled pokes": str(size[0]), "labels": str(size[1]), "source": source}
+        line = lines.setdefault(size, first)
+        line |= scores(row, {"coverage_pct": f"{SHORT_NAMES[row['way']]}: {COVERAGE}"})
     skins_n = n_of(rows[0])
     return [line | {"n": skins_n} for line in lines.values()]
-
-
-def _of_fresh(numbers: Mapping[str, Any]) -> str:
-    return (
-        "Fresh skins of the population: neither those that networks were taught nor those that tell how sure experts "
-        "are. [low, high]: 95 % interval over n skins. The population is drawn wider than the scene's "
-        f"{numbers['skins_asked_n']} skins."
-    )
 
 
 def _meaning(numbers: Mapping[str, Any]) -> str:
     coverage = ", ".join(f"{NAMES[way]} {pct:.3g} %" for way, pct in numbers["coverage_further_pct"].items())
     return (
-        f"Experts that were taught simulated skins about the skin as designed, and none of the scene's "
-        f"{numbers['skins_asked_n']}, of which {numbers['rows_asked_n']:,} rows of later passes are read. Unlabelled "
-        f"pokes: one at each of the {numbers['pool_n']} places of the grid under any depth, or the first of these; "
-        f"labels are among them. The weight: of one press in the middle, {numbers['weight_N']:g} N or what of the "
-        f"first passes comes next to it, the force is known to {100 * numbers['weight_sd']:g} %; the factor uses all "
-        "forces: no weight that moves them alike goes below it. How sure each "
-        "way is, and how far a weight moves its forces, was told on further skins of the population; there 90 % "
-        f"intervals hold {coverage}."
-    )
-
-
-def _scaling(numbers: Mapping[str, Any]) -> str:
-    return (
-        f"Networks of {numbers['steps_n']} steps each, from equal first weights, on the first so many skins of one "
-        "population; the map beside them is the same, and so is how sure they are, told with the network of most skins."
+        f"Models of simulated skins about the skin as designed, of none of the scene's {numbers['skins_asked_n']}; "
+        f"tested on {numbers['rows_asked_n']:,} rows of later passes. Unlabelled pokes: one at each of the "
+        f"{numbers['pool_n']} places of the grid under any depth, or the first of these; labels are among them. Known "
+        f"weight: of one press in the middle, the first passes' nearest to {numbers['weight_N']:g} N, the force is "
+        f"known to {100 * numbers['weight_sd']:g} %. The factor uses all forces: no weight that scales them alike does "
+        "better. Likelihood powers, and the share of the weight's error that corrects all forces, were chosen on "
+        f"further skins of the population; there 90 % intervals cover {coverage}."
     )

@@ -28,21 +28,19 @@ from pipeline.stage import say
 from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy
 from pipeline.training.jobs import SceneData, read_data, score_test
 from pipeline.training.universal import (
-    ASSUMED_TEMPER,
+    ASSUMED_POWER,
     EXPERIMENT,
     METHODS,
     WAYS,
-    Bench,
-    Experts,
+    Benchmark,
     Frame,
-    Known,
-    Pokes,
-    Told,
+    KnownBoards,
+    Powers,
+    Variant,
+    calibrate,
+    estimate,
     pool_of,
-    read_both,
-    read_experts,
-    ready,
-    tell,
+    read_variants,
 )
 from reskin import io
 from reskin.config import Strict, parse
@@ -60,9 +58,10 @@ from reskin.models.recipe import Name, Recipe
 from reskin.models.runner import MAX_ATTEMPTS_N
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
+from reskin.universal.calibration import LabelledPresses
 from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
 from reskin.universal.law import Seen, Setup
-from reskin.universal.map import new_map, see_rest
+from reskin.universal.model import PriorModel
 
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method receives
 Key = tuple[str, str, int]  # method, unlabelled pokes, number of labels
@@ -112,8 +111,8 @@ def reference_methods(settings: Settings, indentations: Path, folds: Path, model
         unpaired_n += int(np.isnan(paired_uT).any(axis=1).sum())
         say(f"{data.scene} reference_methods: methods with aligned inputs on {fold.name} done")
 
-    nominal, rig = read_experts(Known(data, frame, setup, seen), models)
-    bench = Bench(data, frame, seen, nominal, {}, {})
+    nominal, rig = read_variants(KnownBoards(data, frame, setup, seen), models)
+    bench = Benchmark(data, frame, seen, nominal, {}, {})
     seconds: list[Seconds] = []
     for fold in of_labels:
         unlabelled_points, took = score_unlabelled(bench, setup, of_labels, fold, rig)
@@ -323,7 +322,7 @@ def alignment_controls(methods: Mapping[str, Classical], labels_n: Sequence[int]
 INVERSION = "physics inversion"
 CENTRED = f"{INVERSION}, centred"
 UNIVERSAL = ("universal map, ", "universal network, ", "universal, ")  # the map, the network, both
-NOWHERE_MM = np.zeros((1, 2))  # of no poke: nothing is centred
+ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 
 @dataclass(frozen=True)
@@ -339,19 +338,18 @@ Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Second
 
 
 def score_unlabelled(
-    bench: Bench, setup: Setup, folds: Sequence[Fold], fold: Fold, rig: Mapping[str, Experts]
+    bench: Benchmark, setup: Setup, folds: Sequence[Fold], fold: Fold, rig: Mapping[str, Variant]
 ) -> tuple[list[Point], list[Seconds]]:
     """Score the universal models and the inversion with a skin's own pokes, with none and with another skin's."""
     points, took = [], []
     frame, db_uT = bench.frame, bench.data.rows.db_uT
-    test_uT, rest_uT = frame.field(db_uT[fold.test]), bench.seen[board_of(fold)].rest_uT.ravel()
+    test_uT, rest_uT = frame.field(db_uT[fold.test]), bench.presses[board_of(fold)].rest_uT.ravel()
     own = pool_of(bench, fold)
-    none = Pokes(own.place_mm[:0], own.force_N[:0], own.db_uT[:0])
-    pools = {OWN: own, NONE: none, FOREIGN: pool_of(bench, next_board(fold, folds))}
+    pools = {OWN: own, NONE: own[:0], FOREIGN: pool_of(bench, next_board(fold, folds))}
     for given, pool in pools.items():
         for method, place_mm, force_N, seconds in [
-            *estimate_universal(bench.nominal, rest_uT, pool, test_uT, WAYS["nominal"]),
-            *estimate_universal(rig[board_of(fold)], rest_uT, pool, test_uT, WAYS["rig"]),
+            *estimate_universal(bench.nominal.model, rest_uT, pool, test_uT, WAYS["nominal"]),
+            *estimate_universal(rig[board_of(fold)].model, rest_uT, pool, test_uT, WAYS["rig"]),
             *estimate_inversion(setup, rest_uT, pool, test_uT),
         ]:
             predicted = np.column_stack([frame.label(place_mm), force_N])
@@ -361,31 +359,27 @@ def score_unlabelled(
 
 
 def estimate_universal(
-    experts: Experts, rest_uT: Float[np.ndarray, " ch"], pool: Pokes, test_uT: Float[np.ndarray, "b ch"], way: str
-) -> Iterator[Estimated]:
+    model: PriorModel, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses, test_uT: Float[np.ndarray, "b ch"],
+    way: str,
+) -> Iterator[Estimated]:  # fmt: skip
     """Estimate by a map, a network and both, calibrated with a skin's field at rest and some pokes."""
     start_s = time.process_time()
-    if len(pool.force_N):
-        told = tell(experts, rest_uT, pool)
-    else:
-        skin = see_rest(new_map(experts.tables, experts.residual), rest_uT)
-        told = Told(skin, experts.networks, rest_uT, pool, NOWHERE_MM, misfit=1.0)
-    experts_ready = ready(told, 0)
+    calibrated = calibrate(model, rest_uT, pool).with_labels(0)
     ready_s = time.process_time()
-    ((alone, both),) = read_both(experts_ready, test_uT, [(ASSUMED_TEMPER, ASSUMED_TEMPER)])
+    ((by_map, combined),) = estimate(calibrated, test_uT, ASSUMED)
     both_s = time.process_time()
-    opinion = told.opinion(test_uT, 0)
+    by_network = calibrated.evaluate_networks(test_uT)
     network_s = time.process_time()
     map_seconds = Seconds("", ready_s - start_s, (both_s - ready_s) / len(test_uT))
-    network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))  # it receives its pokes while it reads
-    places = alone.place_mm, opinion.place_mm, both.place_mm
-    forces = alone.force_N, np.exp(opinion.log_N), both.force_N
+    network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))  # calibrated together with the map
+    places = by_map.place_mm, by_network.place_mm, combined.place_mm
+    forces = by_map.force_N, np.exp(by_network.log_N), combined.force_N
     names = [f"{name}{way}" for name in UNIVERSAL]
     yield from zip(names, places, forces, (map_seconds, network_seconds, map_seconds), strict=True)
 
 
 def estimate_inversion(
-    setup: Setup, rest_uT: Float[np.ndarray, " ch"], pool: Pokes, test_uT: Float[np.ndarray, "b ch"]
+    setup: Setup, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses, test_uT: Float[np.ndarray, "b ch"]
 ) -> Iterator[Estimated]:
     """Invert a physical model that was fitted to some pokes; also with places shifted to centre these pokes."""
     start_s = time.process_time()
@@ -514,13 +508,13 @@ def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]]
     return {name: statistic(values, boards=True) for name, values in found.items()}
 
 
-def flag_by_universal(bench: Bench, folds: Sequence[Fold], fraction: float) -> list[dict[str, Any]]:
+def flag_by_universal(bench: Benchmark, folds: Sequence[Fold], fraction: float) -> list[dict[str, Any]]:
     """Flag readings of the universal model by the standard deviation of the place, and by the misfit of the map."""
     sd_mm, misfit, off_mm = {}, {}, {}
     for board, fold in first_folds(folds).items():
         rows, test = bench.data.rows, fold.test[::TESTED_EVERY_N]
-        told = ready(tell(bench.nominal, bench.seen[board].rest_uT.ravel(), pool_of(bench, fold)), 0)
-        ((_, both),) = read_both(told, bench.frame.field(rows.db_uT[test]), [(ASSUMED_TEMPER, ASSUMED_TEMPER)])
+        calibration = calibrate(bench.nominal.model, bench.presses[board].rest_uT.ravel(), pool_of(bench, fold))
+        ((_, both),) = estimate(calibration.with_labels(0), bench.frame.field(rows.db_uT[test]), ASSUMED)
         off_mm[board] = both.place_mm - bench.frame.place(rows.target[test, :2].astype(float))
         sd_mm[board], misfit[board] = both.sd_mm.max(axis=1), both.misfit
     method = METHODS[1] + WAYS["nominal"]

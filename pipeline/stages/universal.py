@@ -17,20 +17,20 @@ from pipeline.training.few_labels import FewLabels
 from pipeline.training.jobs import SceneData, collapse_record, read_data, score_test, train_jobs, training_data
 from pipeline.training.universal import (
     EXPERIMENT,
-    Bench,
+    Benchmark,
     Frame,
-    Known,
-    make_experts,
+    KnownBoards,
+    calibrate_on_boards,
+    calibrate_on_simulated,
+    make_variants,
     score_fold,
-    tell_sureness,
-    tell_tempers,
     write_networks,
 )
 from reskin import io
 from reskin.errors import ParamsError
 from reskin.models.classical import run_classical_jobs
 from reskin.physics.skin import SkinDesign
-from reskin.universal.training import Lessons
+from reskin.universal.training import TrainingSettings
 
 
 def read_few_labels(settings: Settings) -> FewLabels:
@@ -66,8 +66,8 @@ def _point(data: SceneData, tried: few.Tried, predicted: np.ndarray) -> dict[str
     return point | {"seed_i": int(draw), "scores": score_test(data, tried.fold.test, predicted)}
 
 
-class UniversalSection(Lessons):
-    """Section universal: settings of its training; numbers of labelled pokes of the held-out board."""
+class UniversalSection(TrainingSettings):
+    """Section universal: training settings, and numbers of labelled presses of the held-out board."""
 
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
@@ -78,9 +78,9 @@ def read_universal(settings: Settings) -> UniversalSection:
 
 
 def universal(settings: Settings, indentations: Path, folds: Path, models: Path, scores: Path) -> None:
-    """Score the universal model on every held-out board, with every number of its labels, on the rows of few_labels.
+    """Score the universal model on every held-out board, with every number of labels, on the rows of few_labels.
 
-    A map, and a network with it; calibrated with recorded boards of the rig, and with simulated skins alone.
+    The map alone, and with networks; knowing the other boards of the rig, and simulated skins alone.
     """
     data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
@@ -88,14 +88,14 @@ def universal(settings: Settings, indentations: Path, folds: Path, models: Path,
         raise ParamsError(f"scene {data.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
     setup = make_setup(section, settings.shared_section(SkinDesign, "skin"))
     frame = Frame(chip_rotations(section), section.labels_middle_mm, section.labels_mirrored)
-    seen = {board: to_board_axes(pokes, section) for board, pokes in skins.items()}
-    lessons = read_universal(settings)
-    nominal, rig = make_experts(Known(data, frame, setup, seen), lessons)
-    write_networks(models, [nominal, *rig.values()], lessons, settings.seed)
-    sureness = tell_sureness(nominal, lessons.labels_n, settings.seed)
-    bench, points = Bench(data, frame, seen, nominal, {}, sureness), []
-    bench = replace(bench, tempers=tell_tempers(bench, lessons.labels_n))
+    presses = {board: to_board_axes(pokes, section) for board, pokes in skins.items()}
+    training = read_universal(settings)
+    variants = make_variants(KnownBoards(data, frame, setup, presses), training)
+    write_networks(models, variants, training, settings.seed)
+    nominal_powers = calibrate_on_simulated(variants.nominal, training.labels_n, settings.seed)
+    benchmark, points = Benchmark(data, frame, presses, variants.nominal, {}, nominal_powers), []
+    benchmark = replace(benchmark, board_powers=calibrate_on_boards(benchmark, training.labels_n))
     for fold in data.folds_of(EXPERIMENT):
-        points += score_fold(bench, fold, rig, lessons.labels_n)
+        points += score_fold(benchmark, fold, variants.rig, training.labels_n)
         say(f"{data.scene} universal: {fold.name} done")
     io.write_json(scores, points)

@@ -13,16 +13,15 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.training.universal import (
-    AS_TAUGHT,
+    AS_TRAINED,
+    CALIBRATION_SKINS_N,
     FORCE_MIN_N,
-    FURTHER_N,
-    MISSES,
-    SURENESS,
-    Experts,
-    best,
-    covered,
-    pool_of_prior,
-    skins_of_prior,
+    LAW_ERRORS,
+    NOMINAL_POWERS,
+    best_powers,
+    coverage,
+    draw_prior_skins,
+    split_presses,
 )
 from reskin.config import parse, read_yaml
 from reskin.data.grid import CENTRE_MM
@@ -30,15 +29,15 @@ from reskin.physics.skin import SkinDesign
 from reskin.simulation import defaults
 from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
 from reskin.universal.law import CHIPS_MM, Setup, to_chips
-from reskin.universal.map import NOMINAL, OF_NOMINAL, tabulate
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, tabulate
 from reskin.universal.model import SKIN_MM, Universal, write
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
-from reskin.universal.training import NAMELESS, Lessons, Syllabus, teach
+from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
 
-POKES_N = (0, 12, FULL_SET_N)  # unlabelled ones; `reskin live` asks for a dozen
-WAYS = (*((n, False) for n in POKES_N), (FULL_SET_N, True))  # so many, and whether they are said to lie evenly
-UNKNOWN = LikelihoodPowers({n: {0: 1.0} for n in POKES_N}, {0: 1.0})
+PRESSES_N = (0, 12, FULL_SET_N)  # unlabelled; `reskin live` asks for a dozen
+WAYS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses, and whether they lie evenly
+NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "name": "universal, simulated alone",
     "source": "simulated",
@@ -58,57 +57,56 @@ CARD = {
 }
 
 
-def tell_sureness(experts: Experts, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
-    """Find, on simulated skins, tempers at a misfit of 1 of the model as it is used, by pokes and by labels."""
-    model = Universal(experts.tables, experts.networks, UNKNOWN)
-    held: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
-    for name, miss in MISSES.items():
-        skins = skins_of_prior(experts, FURTHER_N, seed, name, miss)
+def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
+    """Choose likelihood powers at a misfit of 1 on simulated skins, by number of unlabelled presses and of labels."""
+    found: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
+    for name, error in LAW_ERRORS.items():
+        skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
         for i in range(len(skins)):
-            for pokes_n, even in WAYS:
-                for n in labels_n if name == AS_TAUGHT else [n for n in labels_n if n]:
-                    asked = shown(model, skins, i, (pokes_n, n), even=even, seed=seed)
-                    held.setdefault((pokes_n, even, n), []).append(_coverage(model, asked))
-    told = {key: best(SURENESS, of)[1] for key, of in held.items()}
-    anywhere = {pokes_n: {n: told[pokes_n, False, n] for n in labels_n} for pokes_n in POKES_N}
-    return LikelihoodPowers(anywhere, {n: told[FULL_SET_N, True, n] for n in labels_n})
+            for presses_n, even in WAYS:
+                for n in labels_n if name == AS_TRAINED else [n for n in labels_n if n]:
+                    tested = calibrate(model, skins, i, (presses_n, n), even=even, seed=seed)
+                    found.setdefault((presses_n, even, n), []).append(_coverages(model, *tested))
+    best = {key: best_powers(NOMINAL_POWERS, of).combined for key, of in found.items()}
+    anywhere = {presses_n: {n: best[presses_n, False, n] for n in labels_n} for presses_n in PRESSES_N}
+    return LikelihoodPowers(anywhere, {n: best[FULL_SET_N, True, n] for n in labels_n})
 
 
-def shown(
+def calibrate(
     model: Universal, skins: Population, i: int, counts: tuple[int, int], *, even: bool, seed: int
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]:
-    """Show a model a simulated skin, so many pokes and so many labels of its pool; give what is asked, as boards do.
+    """Calibrate a model to a simulated skin by so many presses and labels of its pool.
 
-    Readings in the chips' axes and places as labels, in mm.
+    Returns readings to test it on, along the chips' axes, and their places as labels.
     """
-    (pokes_n, labels_n), (pool, asked) = counts, pool_of_prior(skins, i, seed)
-    rest_uT, pool_uT, asked_uT = (to_chips(db_uT) for db_uT in (skins.rest_uT[i][None], pool.db_uT, asked.db_uT))
+    (presses_n, labels_n), (pool, tested) = counts, split_presses(skins, i, seed)
+    rest_uT, pool_uT, tested_uT = (to_chips(db_uT) for db_uT in (skins.rest_uT[i][None], pool.db_uT, tested.db_uT))
     model.zero(rest_uT)
-    if pokes_n:
-        model.see(rest_uT + pool_uT[:pokes_n], even=even)
+    if presses_n:
+        model.see(rest_uT + pool_uT[:presses_n], even=even)
     if labels_n:
         first = slice(labels_n)
         force_N = np.maximum(pool.force_N[first], FORCE_MIN_N)
         model.label(pool.place_mm[first] + CENTRE_MM, force_N, rest_uT + pool_uT[first])
-    return rest_uT + asked_uT, asked.place_mm + CENTRE_MM
+    return rest_uT + tested_uT, tested.place_mm + CENTRE_MM
 
 
-def _coverage(
-    model: Universal, asked: tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]
+def _coverages(
+    model: Universal, b_uT: Float[np.ndarray, "m ch"], place_mm: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, "t 2"]:
-    # Of the map with networks, twice: as others are given with the map alone.
-    told = [lower_by_misfit(one, model.misfit) for one in SURENESS]
-    tempers = [lower_by_residuals(*one) for one in zip(told, model.variance_inflations(told), strict=True)]
-    held = [covered(found, asked[1]) for found in model.estimates(asked[0], tempers)]
-    return np.column_stack([held, held])
+    """Return the coverage of 90 % intervals for each power, twice: `best_powers` takes pairs."""
+    by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
+    powers = [lower_by_residuals(*one) for one in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
+    found = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
+    return np.column_stack([found, found])
 
 
 @dataclass(frozen=True)
 class Inputs:
     """What the shipped model is made from."""
 
-    setup: Setup
-    lessons: Lessons
+    prior: SkinPrior
+    training: TrainingSettings
     labels_n: tuple[int, ...]
     seed: int
 
@@ -118,25 +116,29 @@ def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
     design = parse(SkinDesign, defaults.nominal("skin"), f"{defaults.NOMINAL}: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
     settings = read_yaml(scene)
-    training = {name: settings["universal"][name] for name in Lessons.model_fields}
-    lessons = parse(Lessons, training, f"{scene}: universal")
-    return Inputs(setup, lessons, tuple(settings["universal"]["labels_n"]), settings["seed"])
+    training = {name: settings["universal"][name] for name in TrainingSettings.model_fields}
+    return Inputs(
+        SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup),
+        parse(TrainingSettings, training, f"{scene}: universal"),
+        tuple(settings["universal"]["labels_n"]),
+        settings["seed"],
+    )
 
 
 def make() -> None:
     """Make the model anew and overwrite its file and card."""
     inputs = read_inputs()
     times_s = [time.process_time()]
-    tables = tabulate(NOMINAL, OF_NOMINAL, inputs.setup)
+    tables = tabulate(NOMINAL, NOMINAL_SPREADS, inputs.prior.setup)
     times_s.append(time.process_time())
-    syllabus = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, inputs.setup)
-    networks = teach(syllabus, inputs.lessons, inputs.seed)
+    networks = train_networks(inputs.prior, inputs.training, inputs.seed)
     times_s.append(time.process_time())
-    sureness = tell_sureness(Experts(tables, networks, None, syllabus), inputs.labels_n, inputs.seed)
+    model = Universal(tables, networks, NO_POWERS)
+    powers = calibrate_powers(model, inputs.prior, inputs.labels_n, inputs.seed)
     times_s.append(time.process_time())
     took_s = dict(zip(("map", "network", "sureness"), np.diff(times_s).round().tolist(), strict=True))
-    lessons = inputs.lessons.model_dump() | {"seed": inputs.seed}
-    write(tables, networks, sureness, CARD | {"lessons": lessons, "made_in_s": took_s})
+    training = inputs.training.model_dump() | {"seed": inputs.seed}
+    write(tables, networks, powers, CARD | {"lessons": training, "made_in_s": took_s})
 
 
 if __name__ == "__main__":

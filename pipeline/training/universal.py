@@ -1,10 +1,13 @@
-"""The universal model on held-out boards: its training on other boards and simulated skins, its calibration, scores."""
+"""The universal model on held-out boards: train it on other boards and simulated skins, calibrate it, score it.
+
+Two variants: `rig` knows the recorded boards that are not held out, `nominal` simulated skins alone.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int64
@@ -16,43 +19,44 @@ from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from reskin.universal.calibration import folds_of_labels, lower_by_misfit, lower_by_residuals, variance_inflations
-from reskin.universal.combine import Labels, centre, multiply, off_middle_mm, shift
+from reskin.universal.calibration import (
+    CalibrationData,
+    HeldOut,
+    LabelledPresses,
+    folds_of_labels,
+    lower_by_misfit,
+    lower_by_residuals,
+    variance_inflations,
+)
 from reskin.universal.law import TEN, Law, Seen, Setup, fit, simulate_uT
 from reskin.universal.map import (
     FORCES_N,
     NOMINAL,
-    OF_NOMINAL,
-    OF_RIG,
+    NOMINAL_SPREADS,
+    RIG_SPREADS,
     Estimate,
-    Reader,
     Residual,
-    SkinMap,
-    Tables,
-    carry,
-    joined,
-    middle,
+    condition_on_labels,
+    fit_residual,
+    mean_law,
     new_map,
-    see_even,
-    see_labelled,
-    see_pokes,
-    see_rest,
     tabulate,
 )
-from reskin.universal.network import Opinion, Weights, of_tensors, predict, to_tensors
+from reskin.universal.model import CalibratedModel, Evaluation, PressCalibration, PriorModel, network_offsets_mm
+from reskin.universal.network import Weights, from_tensors, to_tensors
 from reskin.universal.population import PLACES_N, Population, draw_population
 from reskin.universal.training import (
     ERROR_OF_NOMINAL,
-    NAMELESS,
-    Lessons,
+    NOMINAL_NAME,
     NOISE_uT,
-    Recorded,
-    Syllabus,
+    RecordedBoard,
+    SkinPrior,
+    TrainingSettings,
     add_error,
-    teach,
+    train_networks,
 )
 
-READINGS_N = 100  # of a poke that a network is taught
+READINGS_N = 100  # of each press of a recorded board, for training
 FORMAT = "reskin-universal-1"
 
 
@@ -79,387 +83,396 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Known:
-    """What is known before a board is held out."""
+class KnownBoards:
+    """The scene's recorded boards, before one is held out: `presses` by board, in the board's frame."""
 
     data: SceneData
     frame: Frame
     setup: Setup
-    seen: Mapping[str, Seen]
+    presses: Mapping[str, Seen]
 
 
 @dataclass(frozen=True)
-class Experts:
-    """What is ready for a further board: tables, networks, and what the law misses on known boards."""
+class Variant:
+    """The model before calibration to a board, and the skins that it was made from."""
 
-    tables: Tables
-    networks: Sequence[Weights]
-    residual: Residual | None
-    syllabus: Syllabus
+    prior: SkinPrior
+    model: PriorModel
 
 
-def make_experts(known: Known, lessons: Lessons) -> tuple[Experts, dict[str, Experts]]:
-    """Fit known boards; make experts that know none, and for each board those that know the others."""
+class Variants(NamedTuple):
+    """The variant that knows no board, and by held-out board the variant that knows the others."""
+
+    nominal: Variant
+    rig: Mapping[str, Variant]
+
+
+def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
+    """Fit laws to the known boards, tabulate maps and train networks."""
     with make_executor(imports="reskin.universal.training") as executor:
-        syllabuses = _syllabuses(known, executor)
-        tables = [executor.submit(tabulate, each.centre, each.spreads, known.setup) for each in syllabuses]
-        networks = [executor.submit(teach, each, lessons, known.data.settings.seed) for each in syllabuses]
-        found = [
-            Experts(of_map.result(), of_networks.result(), each.residual, each)
-            for each, of_map, of_networks in zip(syllabuses, tables, networks, strict=True)
+        priors = _priors(known, executor)
+        tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
+        networks = [executor.submit(train_networks, prior, settings, known.data.settings.seed) for prior in priors]
+        variants = [
+            Variant(prior, PriorModel(new_map(of_map.result(), prior.residual), of_networks.result()))
+            for prior, of_map, of_networks in zip(priors, tables, networks, strict=True)
         ]
-    return found[0], dict(zip(known.seen, found[1:], strict=True))
+    return Variants(variants[0], dict(zip(known.presses, variants[1:], strict=True)))
 
 
-def read_experts(known: Known, models: Path) -> tuple[Experts, dict[str, Experts]]:
-    """Make the same again with networks that were written; laws and tables, which are no files, are found anew."""
+def read_variants(known: KnownBoards, models: Path) -> Variants:
+    """Read the networks that `write_networks` wrote; fit laws and tabulate maps anew."""
     with make_executor(imports="reskin.universal.map") as executor:
-        syllabuses = _syllabuses(known, executor)
-        tables = [executor.submit(tabulate, each.centre, each.spreads, known.setup) for each in syllabuses]
-        found = [
-            Experts(of_map.result(), read_networks(models, each.name), each.residual, each)
-            for each, of_map in zip(syllabuses, tables, strict=True)
+        priors = _priors(known, executor)
+        tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
+        variants = [
+            Variant(prior, PriorModel(new_map(of_map.result(), prior.residual), read_networks(models, prior.name)))
+            for prior, of_map in zip(priors, tables, strict=True)
         ]
-    return found[0], dict(zip(known.seen, found[1:], strict=True))
+    return Variants(variants[0], dict(zip(known.presses, variants[1:], strict=True)))
 
 
-def _syllabuses(known: Known, executor: Executor) -> list[Syllabus]:
-    """Say what may be known where no board is, and where each is held out."""
-    seen, setup = known.seen, known.setup
-    laws = dict(zip(seen, executor.map(fit, seen.values(), [setup] * len(seen), [TEN] * len(seen)), strict=True))
-    nominal = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)
-    return [nominal, *(syllabus_without(known, laws, board) for board in seen)]
+def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
+    """Return the nominal prior, and for each board the prior when it is held out."""
+    boards, setup = known.presses, known.setup
+    laws = dict(
+        zip(boards, executor.map(fit, boards.values(), [setup] * len(boards), [TEN] * len(boards)), strict=True)
+    )
+    nominal = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup)
+    return [nominal, *(prior_without(known, laws, board) for board in boards)]
 
 
-def syllabus_without(known: Known, laws: Mapping[str, Law], board: str) -> Syllabus:
-    """Put together what may be known where a board is held out: laws, errors and readings of the others."""
-    others = {other: own for other, own in known.seen.items() if other != board}
+def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
+    """Return the prior that knows all boards but one: their laws, the laws' errors, and their readings."""
+    others = {other: own for other, own in known.presses.items() if other != board}
     rows, frame = known.data.rows, known.frame
-    taught = [recorded(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
-    centre, residual = middle([laws[other] for other in others]), carried(others, laws, known.setup)
-    return Syllabus(f"without {board}", centre, OF_RIG, known.setup, taught, residual)
+    recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
+    centre, residual = mean_law([laws[other] for other in others]), residual_of(others, laws, known.setup)
+    return SkinPrior(f"without {board}", centre, RIG_SPREADS, known.setup, recorded, residual)
 
 
-def carried(seen: Mapping[str, Seen], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Carry what laws miss on the boards that they were fitted on."""
-    missed = []
-    for board, own in seen.items():
+def residual_of(presses: Mapping[str, Seen], laws: Mapping[str, Law], setup: Setup) -> Residual:
+    """Fit the residual to the laws' errors on the boards that they were fitted to."""
+    errors = []
+    for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.pokes.force_N).reshape(len(own.pokes), -1)
         off_uT = own.db_uT.reshape(simulated_uT.shape) - simulated_uT
-        missed.append(off_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
-    boards = list(seen.values())
-    return carry([own.place_mm for own in boards], [own.pokes.force_N for own in boards], missed)
+        errors.append(off_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
+    boards = list(presses.values())
+    return fit_residual([own.place_mm for own in boards], [own.pokes.force_N for own in boards], errors)
 
 
-def recorded(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> Recorded:
-    """Take a known board's readings for teaching: as many of each poke, of those with a force."""
+def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
+    """Select a board's readings for training: equally many of each press with a force."""
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
-    each = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]  # an indentation's readings lie together
+    each = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]  # the readings of a press are adjacent
     db_uT = frame.field(rows.db_uT[each.ravel()]).reshape(*each.shape, -1)
     place_mm = frame.place(rows.target[each[:, 0], :2].astype(float))
     parts = db_uT, rest_uT, place_mm, rows.target[each, 2]
-    return Recorded(*(part.astype(np.float32) for part in parts))
+    return RecordedBoard(*(part.astype(np.float32) for part in parts))
 
 
-def write_networks(models: Path, experts: Sequence[Experts], lessons: Lessons, seed: int) -> None:
-    """Write the networks of each, and beside them what they were taught."""
+def write_networks(models: Path, variants: Variants, settings: TrainingSettings, seed: int) -> None:
+    """Write the networks of each variant, with a card."""
     with io.replacing(models) as folder:
         folder.mkdir()
-        for each in experts:
-            name = _file_name(each.syllabus.name)
-            io.write_tensors(folder / f"{name}.safetensors", to_tensors(each.networks), {"format": FORMAT})
-            io.write_json(folder / f"{name}.json", card_of(each, lessons, seed))
+        for variant in (variants.nominal, *variants.rig.values()):
+            name = _file_name(variant.prior.name)
+            io.write_tensors(folder / f"{name}.safetensors", to_tensors(variant.model.networks), {"format": FORMAT})
+            io.write_json(folder / f"{name}.json", card_of(variant, settings, seed))
 
 
 def read_networks(models: Path, name: str) -> list[Weights]:
-    """Read the networks of what is known, by its name, in their order."""
-    return of_tensors(io.read_tensors(models / f"{_file_name(name)}.safetensors")[0])
+    """Read the networks of a prior, by its name."""
+    return from_tensors(io.read_tensors(models / f"{_file_name(name)}.safetensors")[0])
 
 
 def _file_name(name: str) -> str:
     return name.replace(" ", "-")
 
 
-def card_of(experts: Experts, lessons: Lessons, seed: int) -> dict[str, object]:
-    """Describe networks: what skins they were taught, and what they are not for."""
-    taught = experts.syllabus
+def card_of(variant: Variant, settings: TrainingSettings, seed: int) -> dict[str, object]:
+    """Describe networks: the skins they were trained on, and what they are not for."""
+    prior = variant.prior
     return {
-        "format": FORMAT, "method": f"universal, {taught.name}", "seed": seed,
-        "skins_n": lessons.skins_n, "steps_n": lessons.steps_n, "networks_n": len(experts.networks),
-        "centre": asdict(taught.centre), "spreads": dict(taught.spreads), "recorded_boards_n": len(taught.recorded),
+        "format": FORMAT, "method": f"universal, {prior.name}", "seed": seed,
+        "skins_n": settings.skins_n, "steps_n": settings.steps_n, "networks_n": len(variant.model.networks),
+        "centre": asdict(prior.centre), "spreads": dict(prior.spreads), "recorded_boards_n": len(prior.recorded),
         "inputs": "change of field (uT, board's axes), field at rest, any number of unlabelled pokes",
         "outputs": "x, y over 8 mm; log F over 3; log sd of each",
         "not_for": "other boards' layouts, skins of another polarity, two contacts at once, shear",
     }  # fmt: skip
 
 
-EXPERIMENT = "labels"  # whose folds these are
-METHODS = ("universal map, ", "universal, ")  # the map alone; with networks
+EXPERIMENT = "labels"  # whose folds are scored
+METHODS = ("universal map, ", "universal, ")  # the map alone; map and networks
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
 REACH = 1.645  # standard deviations to either side of a 90 % interval
-TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)
-ASSUMED_TEMPER = 0.5  # of the map's places, and where nothing tells how sure it is: as if channels erred in pairs
-BLOCK_N = 200  # readings at a time, to bound memory
-FORCE_MIN_N = float(FORCES_N[0])  # of a labelled poke: below, the map is not tabulated
+BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidates, calibrated on other boards
+NOMINAL_POWERS = tuple(
+    np.geomspace(0.1, 1.6, 13).tolist()
+)  # candidates at a misfit of 1, calibrated on simulated skins
+ASSUMED_POWER = 0.5  # of the map's estimates, and where none is calibrated: as if channels erred in pairs
+FORCE_MIN_N = float(FORCES_N[0])  # of a labelled press: the map is not tabulated below
 
-Tempers = tuple[float, float]  # of the map alone, and of the map with networks
+
+class Powers(NamedTuple):
+    """Likelihood powers of the map alone, and of map and networks."""
+
+    map: float
+    combined: float
+
+
+class Estimates(NamedTuple):
+    """Estimates of the same readings by the map alone, and by map and networks."""
+
+    map: Estimate
+    combined: Estimate
 
 
 @dataclass(frozen=True)
-class Bench:
-    """All that folds share: rows, how boards lie under labels, what is known of each board, experts that know none."""
+class Benchmark:
+    """What all folds share.
+
+    board_powers: by board and number of labels. nominal_powers: by number of labels, at a misfit of 1.
+    """
 
     data: SceneData
     frame: Frame
-    seen: Mapping[str, Seen]
-    nominal: Experts
-    tempers: Mapping[str, Mapping[int, Tempers]]
-    sureness: Mapping[int, Tempers]  # of experts that know no board, at a misfit of 1
+    presses: Mapping[str, Seen]
+    nominal: Variant
+    board_powers: Mapping[str, Mapping[int, Powers]]
+    nominal_powers: Mapping[int, Powers]
 
 
 @dataclass(frozen=True)
-class Pokes:
-    """Pokes of one board, the mean of their readings each, in the board's frame and axes; in the order of labelling."""
+class PoolCalibration:
+    """A model calibrated to a board's no-load field and to its pool of presses, of which the first may be labelled."""
 
-    place_mm: Float[np.ndarray, "m 2"]
-    force_N: Float[np.ndarray, " m"]
-    db_uT: Float[np.ndarray, "m ch"]
+    presses: PressCalibration
+    pool: LabelledPresses
+    pool_mm: Float[np.ndarray, "m 2"]  # the pool's places as the networks estimate them
+    misfit: float  # median over the pool
 
-    def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "Pokes":
-        """Take some of them."""
-        return Pokes(self.place_mm[which], self.force_N[which], self.db_uT[which])
+    def with_labels(self, labels_n: int) -> CalibratedModel:
+        """Condition on the first presses of the pool as labels."""
+        labels = self.pool[:labels_n]
+        force_N = np.maximum(labels.force_N, FORCE_MIN_N)
+        skin = condition_on_labels(self.presses.skin, labels.place_mm, force_N, labels.db_uT)
+        offsets_mm = network_offsets_mm(self.pool_mm, self.pool_mm[:labels_n], labels.place_mm)
+        return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
+    def nominal_powers(self, powers: Powers) -> Powers:
+        """Lower the powers of a model that knows no board by the misfit."""
+        return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
-@dataclass(frozen=True)
-class Told:
-    """Experts that have seen a board's field at rest and its unlabelled pokes."""
-
-    skin: SkinMap
-    networks: Sequence[Weights]
-    rest_uT: Float[np.ndarray, " ch"]
-    pool: Pokes
-    pool_mm: Float[np.ndarray, "m 2"]  # where the networks say that these are
-    misfit: float  # of these, the median: chi^2 a channel, about 1 where the law errs as the map expects
-
-    def opinion(self, db_uT: Float[np.ndarray, "n ch"], labels_n: int) -> Opinion:
-        """Ask the networks, centred by the pool and shifted by its first labels."""
-        said = predict(self.networks, db_uT, self.rest_uT, self.pool.db_uT)
-        said_mm = self.pool_mm[:labels_n] - off_middle_mm(self.pool_mm, labels_n)
-        return shift(centre(said, self.pool_mm, labels_n), Labels(said_mm, self.pool.place_mm[:labels_n]))
-
-    def tempers(self, sureness: Tempers) -> Tempers:
-        """Believe experts that know no board the less the worse the pokes fit."""
-        of_map, of_both = (lower_by_misfit(one, self.misfit) for one in sureness)
-        return of_map, of_both
-
-    def first(self, which: Int64[np.ndarray, " k"]) -> "Told":
-        """Put some of the pool's pokes first: they are labelled next."""
-        order = np.concatenate([which, np.setdiff1d(np.arange(len(self.pool.force_N)), which)])
-        return replace(self, pool=self.pool[order], pool_mm=self.pool_mm[order])
+    def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":
+        """Put some of the pool's presses first."""
+        order = np.concatenate([first, np.setdiff1d(np.arange(len(self.pool)), first)])
+        pool = self.pool[order]
+        # The networks are conditioned again: their sums run in the order of the pool, which moves the last bits.
+        presses = replace(self.presses, data=CalibrationData(self.presses.data.rest_uT, pool.db_uT, pool.db_uT))
+        return replace(self, presses=presses, pool=pool, pool_mm=self.pool_mm[order])
 
 
-def score_fold(bench: Bench, fold: Fold, rig: Mapping[str, Experts], labels_n: Sequence[int]) -> list[dict[str, Any]]:
-    """Score the map alone and both experts on one fold: how sure they are is told on boards that are not held out."""
-    board = str(bench.data.rows.board[fold.test[0]])
-    if board not in bench.seen:  # they are named by board and skin where a board has several
-        rule = "boards of one skin each"
-        raise ParamsError(f"fold {fold.name}", "the boards", rule, ", ".join(bench.seen), "Do not ask it.")
-    pool, rest_uT = pool_of(bench, fold), bench.seen[board].rest_uT.ravel()
-    test_uT = bench.frame.field(bench.data.rows.db_uT[fold.test])
-    points = []
-    for way, experts in {"rig": rig[board], "nominal": bench.nominal}.items():
-        told = tell(experts, rest_uT, pool)
-        for n in labels_n:
-            tempers = bench.tempers[board][n] if way == "rig" else told.tempers(bench.sureness[n])
-            (tempers,) = by_own_labels(told, n, [tempers]) if way == "nominal" else [tempers]
-            ((alone, both),) = read_both(ready(told, n), test_uT, [tempers])
-            for name, temper, found in zip(METHODS, tempers, (alone, both), strict=True):
-                words = {"method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.name.rsplit("-draw", 1)[0]}
-                words |= {"inputs": "map" if "map" in name else "map and network", "temper": temper}
-                words |= {"seed_i": int(fold.name.rsplit("-draw", 1)[1]), "misfit": told.misfit}
-                points.append(words | {"scores": scored(bench, fold.test, found)})
-    return points
+def calibrate(model: PriorModel, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses) -> PoolCalibration:
+    """Calibrate a model to what a board gives without labels: its no-load field, and presses evenly over the skin."""
+    presses = model.calibrate(CalibrationData(rest_uT, pool.db_uT, pool.db_uT))
+    misfit = float(np.median(presses.skin.evaluator.evaluate(pool.db_uT).misfit())) if len(pool) else 1.0
+    return PoolCalibration(presses, pool, presses.even_mm, misfit)
 
 
-def tell(experts: Experts, rest_uT: Float[np.ndarray, " ch"], pool: Pokes) -> Told:
-    """Tell experts what a new board gives without a label: its field at rest, and pokes all over it."""
-    skin = see_pokes(see_rest(new_map(experts.tables, experts.residual), rest_uT), pool.db_uT)
-    pool_mm = predict(experts.networks, pool.db_uT, rest_uT, pool.db_uT).place_mm
-    skin = see_even(skin, pool.db_uT)
-    misfit = float(np.median(Reader(skin).weigh(pool.db_uT).misfit()))
-    return Told(skin, experts.networks, rest_uT, pool, pool_mm, misfit)
+def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[Powers]) -> list[Estimates]:
+    """Estimate places and forces, once for each pair of powers: only standard deviations depend on them."""
+
+    def by_powers(evaluation: Evaluation) -> list[Estimate]:
+        assumed = evaluation.by_map(ASSUMED_POWER)
+        by_map = [about(assumed, evaluation.by_map(power)) for power, _ in powers]
+        return [*by_map, *(evaluation.combined(power) for _, power in powers)]
+
+    found = model.estimate_by(by_powers, db_uT)
+    return [Estimates(*pair) for pair in zip(found[: len(powers)], found[len(powers) :], strict=True)]
 
 
-@dataclass(frozen=True)
-class Ready:
-    """Experts with so many labels, ready to read."""
-
-    reader: Reader
-    told: Told
-    labels_n: int
+def about(estimate: Estimate, other: Estimate) -> Estimate:
+    """Return an estimate with the standard deviations of another one about its places."""
+    return replace(estimate, sd_mm=np.hypot(other.sd_mm, other.place_mm - estimate.place_mm))
 
 
-def ready(told: Told, labels_n: int) -> Ready:
-    """Tell a map the first labels."""
-    first = slice(labels_n)
-    force_N = np.maximum(told.pool.force_N[first], FORCE_MIN_N)
-    skin = see_labelled(told.skin, told.pool.place_mm[first], force_N, told.pool.db_uT[first])
-    return Ready(Reader(skin), told, labels_n)
-
-
-def read_both(
-    ready: Ready, db_uT: Float[np.ndarray, "n ch"], tempers: Sequence[Tempers]
-) -> list[tuple[Estimate, Estimate]]:
-    """Read places by the map alone, and by it and the networks; under other tempers intervals alone differ."""
-    opinion, alone, both = ready.told.opinion(db_uT, ready.labels_n), [], []
-    for first in range(0, len(db_uT), BLOCK_N):
-        here = slice(first, first + BLOCK_N)
-        weighed = ready.reader.weigh(db_uT[here])
-        answer = ready.reader.answer(weighed, ASSUMED_TEMPER)
-        alone.append([about(answer, ready.reader.answer(weighed, of_map)) for of_map, _ in tempers])
-        both.append([multiply(ready.reader, weighed, opinion[here], of_both) for _, of_both in tempers])
-    by_temper = zip(zip(*alone, strict=True), zip(*both, strict=True), strict=True)
-    return [(joined(of_map), joined(of_both)) for of_map, of_both in by_temper]
-
-
-def by_own_labels(told: Told, labels_n: int, tempers: Sequence[Tempers]) -> list[Tempers]:
-    """Believe experts by how far labelled pokes are off that they were not told, under each temper."""
-    of_map: list[tuple[list[Estimate], Any]] = []
-    of_both: list[tuple[list[Estimate], Any]] = []
-    for kept, left in folds_of_labels(min(labels_n, len(told.pool.force_N))):
-        found = read_both(ready(told.first(kept), len(kept)), told.pool.db_uT[left], tempers)
-        for parts, of_way in zip((of_map, of_both), zip(*found, strict=True), strict=True):
-            parts.append((list(of_way), told.pool.place_mm[left]))
-    of_ways = zip(tempers, *(variance_inflations(len(tempers), parts) for parts in (of_map, of_both)), strict=True)
+def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequence[Powers]) -> list[Powers]:
+    """Lower powers by the variance inflation of cross-validated labels."""
+    by_map: list[HeldOut] = []
+    combined: list[HeldOut] = []
+    for kept, held_out in folds_of_labels(min(labels_n, len(calibration.pool))):
+        model = calibration.reordered(kept).with_labels(len(kept))
+        found, true_mm = estimate(model, calibration.pool.db_uT[held_out], powers), calibration.pool.place_mm[held_out]
+        by_map.append(([one.map for one in found], true_mm))
+        combined.append(([one.combined for one in found], true_mm))
+    inflations = [variance_inflations(len(powers), folds) for folds in (by_map, combined)]
     return [
-        (lower_by_residuals(alone, of_alone), lower_by_residuals(both, of)) for (alone, both), of_alone, of in of_ways
+        Powers(lower_by_residuals(power.map, of_map), lower_by_residuals(power.combined, of_both))
+        for power, of_map, of_both in zip(powers, *inflations, strict=True)
     ]
 
 
-def about(answer: Estimate, likely: Estimate) -> Estimate:
-    """Give an answer how far what is likely spreads about it."""
-    return replace(answer, sd_mm=np.hypot(likely.sd_mm, likely.place_mm - answer.place_mm))
+def score_fold(
+    benchmark: Benchmark, fold: Fold, rig: Mapping[str, Variant], labels_n: Sequence[int]
+) -> list[dict[str, Any]]:
+    """Score both variants on one fold, by the map alone and with networks, for every number of labels."""
+    board = str(benchmark.data.rows.board[fold.test[0]])
+    if board not in benchmark.presses:  # they are named by board and skin if a board has several
+        rule = "boards of one skin each"
+        names = ", ".join(benchmark.presses)
+        raise ParamsError(f"fold {fold.name}", "the boards", rule, names, "Do not run this experiment.")
+    pool, rest_uT = pool_of(benchmark, fold), benchmark.presses[board].rest_uT.ravel()
+    test_uT = benchmark.frame.field(benchmark.data.rows.db_uT[fold.test])
+    points = []
+    for way, variant in {"rig": rig[board], "nominal": benchmark.nominal}.items():
+        calibration = calibrate(variant.model, rest_uT, pool)
+        for n in labels_n:
+            if way == "rig":
+                powers = benchmark.board_powers[board][n]
+            else:
+                (powers,) = lower_by_labels(calibration, n, [calibration.nominal_powers(benchmark.nominal_powers[n])])
+            (found,) = estimate(calibration.with_labels(n), test_uT, [powers])
+            for name, power, estimates in zip(METHODS, powers, found, strict=True):
+                draw = fold.name.rsplit("-draw", 1)
+                points.append({
+                    "method": f"{name}{WAYS[way]}", "labels_n": n, "fold": draw[0],
+                    "inputs": "map" if "map" in name else "map and network", "temper": power, "seed_i": int(draw[1]),
+                    "misfit": calibration.misfit, "scores": scored(benchmark, fold.test, estimates),
+                })  # fmt: skip
+    return points
 
 
-def coverages(told: Told, asked: Pokes, labels_n: int, tempers: Sequence[Tempers]) -> Float[np.ndarray, "t 2"]:
-    """Give what 90 % intervals of pokes hold under each temper, of the map alone and with networks."""
-    both = read_both(ready(told, labels_n), asked.db_uT, tempers)
-    return np.array([[covered(found, asked.place_mm) for found in pair] for pair in both])
-
-
-def covered(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
-    """Give the part of coordinates that lie in their 90 % intervals."""
+def coverage(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
+    """Return the share of coordinates that lie in their 90 % intervals."""
     return float((np.abs(estimate.place_mm - place_mm) <= REACH * estimate.sd_mm).mean())
 
 
-def scored(bench: Bench, test: Int64[np.ndarray, " b"], estimate: Estimate) -> dict[str, Any]:
-    """Score estimates as every method's, and count what their 90 % intervals hold."""
-    label_mm = bench.frame.label(estimate.place_mm)
+def coverages(
+    calibration: PoolCalibration, tested: LabelledPresses, labels_n: int, powers: Sequence[Powers]
+) -> Float[np.ndarray, "t 2"]:
+    """Return the coverage of 90 % intervals for each pair of powers, of the map alone and with networks."""
+    found = estimate(calibration.with_labels(labels_n), tested.db_uT, powers)
+    return np.array([[coverage(one, tested.place_mm) for one in pair] for pair in found])
+
+
+def scored(benchmark: Benchmark, test: Int64[np.ndarray, " b"], estimate: Estimate) -> dict[str, Any]:
+    """Score estimates as every method's, and the coverage of their 90 % intervals."""
+    label_mm = benchmark.frame.label(estimate.place_mm)
     predicted = np.column_stack([label_mm, estimate.force_N]).astype(np.float32)
-    scores = score_test(bench.data, test, predicted)
-    true_mm = bench.frame.place(bench.data.rows.target[test, :2].astype(float))
+    scores = score_test(benchmark.data, test, predicted)
+    true_mm = benchmark.frame.place(benchmark.data.rows.target[test, :2].astype(float))
     half_width_mm = REACH * float(np.median(estimate.sd_mm))
-    coverage = {"coverage_pct": 100 * covered(estimate, true_mm), "half_width_mm": half_width_mm}
-    skins = {name: own | coverage for name, own in scores["by_skin"].items()} if len(scores["by_skin"]) == 1 else {}
-    return scores | {"all": scores["all"] | coverage} | ({"by_skin": skins} if skins else {})
+    intervals = {"coverage_pct": 100 * coverage(estimate, true_mm), "half_width_mm": half_width_mm}
+    skins = {name: own | intervals for name, own in scores["by_skin"].items()} if len(scores["by_skin"]) == 1 else {}
+    return scores | {"all": scores["all"] | intervals} | ({"by_skin": skins} if skins else {})
 
 
-def pool_of(bench: Bench, fold: Fold) -> Pokes:
-    """Give the means of the pool's pokes, in the order in which experiment labels hands out labels."""
-    rows, indentation = bench.data.rows, bench.data.rows.indentation[fold.pool]
-    order = rng_for(bench.data.settings.seed, "labelled", fold.name).permutation(np.unique(indentation))
+def pool_of(benchmark: Benchmark, fold: Fold) -> LabelledPresses:
+    """Return the mean readings of the pool's presses, in the order in which experiment labels takes them as labels."""
+    rows, indentation = benchmark.data.rows, benchmark.data.rows.indentation[fold.pool]
+    order = rng_for(benchmark.data.settings.seed, "labelled", fold.name).permutation(np.unique(indentation))
     own = [fold.pool[indentation == one] for one in order]
     target = np.array([rows.target[one].mean(axis=0) for one in own], float)
     db_uT = np.array([rows.db_uT[one].mean(axis=0) for one in own], float)
-    return Pokes(bench.frame.place(target[:, :2]), target[:, 2], bench.frame.field(db_uT))
+    return LabelledPresses(benchmark.frame.place(target[:, :2]), target[:, 2], benchmark.frame.field(db_uT))
 
 
-FURTHER_N = 24  # simulated skins of each kind that tell how sure experts are that know no board
-SURENESS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # tempers at a misfit of 1
+CALIBRATION_SKINS_N = 24  # simulated, with each error of the law, for the powers of the nominal variant
 
-Coverage = Float[np.ndarray, "t 2"]  # by temper, of the map alone and with networks
-Miss = Callable[[Population, np.random.Generator], np.ndarray]  # changes of field of skins that a law misses
+Coverages = Float[np.ndarray, "t 2"]  # by power; of the map alone, and with networks
+LawError = Callable[[Population, np.random.Generator], np.ndarray]  # changes of field with errors of the law
 
 
-def missed(times: float = 1.0) -> Miss:
-    """Say that a law misses as much as networks are taught, times so much."""
+def law_error(times: float = 1.0) -> LawError:
+    """Return errors of the law that are as large as in training, or so many times larger."""
     least, most = ERROR_OF_NOMINAL
 
-    def miss(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
+    def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
         return add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), (times * least, times * most), rng)
 
-    return miss
+    return add
 
 
-AS_TAUGHT = "further"  # names stand in seeds
-MISSES = {AS_TAUGHT: missed(), "further, missed twice": missed(2.0)}
+AS_TRAINED = "further"  # names are part of seeds
+LAW_ERRORS = {AS_TRAINED: law_error(), "further, missed twice": law_error(2.0)}
 
 
-def tell_tempers(bench: Bench, labels_n: Sequence[int]) -> dict[str, dict[int, Tempers]]:
-    """Find, for each board that is held out, how much experts are to be believed: as was best on the other boards."""
-    held = {board: _of_board(bench, board, labels_n) for board in bench.seen}
+def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[str, dict[int, Powers]]:
+    """Choose powers for each held-out board, as is best on the other boards."""
+    by_board = {board: _board_coverages(benchmark, board, labels_n) for board in benchmark.presses}
     return {
-        board: {n: best(TEMPERS, [own[n] for other, own in held.items() if other != board]) for n in labels_n}
-        for board in held
+        board: {
+            n: best_powers(BOARD_POWERS, [own[n] for other, own in by_board.items() if other != board])
+            for n in labels_n
+        }
+        for board in by_board
     }
 
 
-def tell_sureness(nominal: Experts, labels_n: Sequence[int], seed: int) -> dict[int, Tempers]:
-    """Find, on simulated skins, tempers at a misfit of 1; a board's is this over its own misfit and labels' residuals.
+def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
+    """Choose powers at a misfit of 1, by number of labels, on simulated skins.
 
-    What the law misses on a skin is as large as its unlabelled pokes say: covariances are taken to be larger by that
-    factor (Birge's ratio). On these skins it misses as much as on those that networks are taught. With labels, also on
-    as many on which it misses twice that: residuals are to tell how much, so that skins of more than one kind must fit.
+    A board's powers are these over its misfit (Birge's ratio) and over the variance inflation of its labels. The law's
+    errors on these skins are as in training; with labels, skins with errors twice as large count too, as residuals of
+    labels are to tell the size of the errors.
     """
-    held: dict[int, list[Coverage]] = {n: [] for n in labels_n}
-    for name, miss in MISSES.items():
-        skins = skins_of_prior(nominal, FURTHER_N, seed, name, miss)
-        told = [told_of(nominal, skins, i, seed) for i in range(len(skins))]
+    found: dict[int, list[Coverages]] = {n: [] for n in labels_n}
+    for name, error in LAW_ERRORS.items():
+        skins = draw_prior_skins(nominal.prior, CALIBRATION_SKINS_N, seed, name, error)
+        calibrated = [calibrate_to_simulated(nominal.model, skins, i, seed) for i in range(len(skins))]
         for n in labels_n:
-            held[n] += [_of_skin(*one, n) for one in told] if n or name == AS_TAUGHT else []
-    return {n: best(SURENESS, held[n]) for n in labels_n}
+            if n or name == AS_TRAINED:
+                found[n] += [_simulated_coverages(*one, n) for one in calibrated]
+    return {n: best_powers(NOMINAL_POWERS, found[n]) for n in labels_n}
 
 
-def best(candidates: Sequence[float], held: Sequence[Coverage]) -> Tempers:
-    """Choose the candidates under which 90 % intervals hold 90 %, on the mean."""
-    of_map, of_both = np.abs(np.mean(held, axis=0) - 0.9).argmin(axis=0)
-    return candidates[of_map], candidates[of_both]
+def best_powers(candidates: Sequence[float], found: Sequence[Coverages]) -> Powers:
+    """Choose the powers whose 90 % intervals cover 90 %, on the mean over skins."""
+    of_map, combined = np.abs(np.mean(found, axis=0) - 0.9).argmin(axis=0)
+    return Powers(candidates[of_map], candidates[combined])
 
 
-def skins_of_prior(nominal: Experts, skins_n: int, seed: int, name: str, miss: Miss) -> Population:
-    """Draw skins of the prior, noisy, and with what the law misses."""
-    taught, rng = nominal.syllabus, rng_for(seed, "universal", nominal.syllabus.name, name)
-    skins = draw_population(taught.centre, taught.spreads, taught.setup, skins_n, rng)
-    db_uT = miss(skins, rng).reshape(skins.db_uT.shape)
+def draw_prior_skins(prior: SkinPrior, skins_n: int, seed: int, name: str, error: LawError) -> Population:
+    """Draw skins of the prior, with noise and errors of the law."""
+    rng = rng_for(seed, "universal", prior.name, name)
+    skins = draw_population(prior.centre, prior.spreads, prior.setup, skins_n, rng)
+    db_uT = error(skins, rng).reshape(skins.db_uT.shape)
     sd_uT = np.tile(np.array(NOISE_uT), skins.rest_uT.shape[1] // len(NOISE_uT))
     return replace(skins, db_uT=(db_uT + sd_uT * rng.standard_normal(skins.db_uT.shape)).astype(np.float32))
 
 
-def told_of(nominal: Experts, skins: Population, i: int, seed: int) -> tuple[Told, Pokes]:
-    """Tell experts of a simulated skin its pool, and give the pokes that are asked."""
-    pool, asked = pool_of_prior(skins, i, seed)
-    return tell(nominal, skins.rest_uT[i].astype(float), pool), asked
+def calibrate_to_simulated(
+    model: PriorModel, skins: Population, i: int, seed: int
+) -> tuple[PoolCalibration, LabelledPresses]:
+    """Calibrate a model to a simulated skin; return it with the presses to test it on."""
+    pool, tested = split_presses(skins, i, seed)
+    return calibrate(model, skins.rest_uT[i].astype(float), pool), tested
 
 
-def pool_of_prior(skins: Population, i: int, seed: int) -> tuple[Pokes, Pokes]:
-    """Take a random half of a simulated skin's pokes as its pool; the others are asked."""
+def split_presses(skins: Population, i: int, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
+    """Split the presses of a simulated skin at random into a pool and those to test on."""
     order = rng_for(seed, "universal", "pool", i).permutation(skins.db_uT.shape[1])
-    pokes = Pokes(*(part[i][order].astype(float) for part in (skins.place_mm, skins.force_N, skins.db_uT)))
-    return pokes[:PLACES_N], pokes[PLACES_N:]
+    parts = (skins.place_mm, skins.force_N, skins.db_uT)
+    presses = LabelledPresses(*(part[i][order].astype(float) for part in parts))
+    return presses[:PLACES_N], presses[PLACES_N:]
 
 
-def _of_skin(told: Told, asked: Pokes, labels_n: int) -> Coverage:
-    tempers = by_own_labels(told, labels_n, [told.tempers((one, one)) for one in SURENESS])
-    return coverages(told, asked, labels_n, tempers)
+def _simulated_coverages(calibration: PoolCalibration, tested: LabelledPresses, labels_n: int) -> Coverages:
+    candidates = [calibration.nominal_powers(Powers(power, power)) for power in NOMINAL_POWERS]
+    return coverages(calibration, tested, labels_n, lower_by_labels(calibration, labels_n, candidates))
 
 
-def _of_board(bench: Bench, board: str, labels_n: Sequence[int]) -> dict[int, Coverage]:
-    # The board is read by the nominal experts, which know no board, with labels of its own, on its other pokes.
-    seen = bench.seen[board]
-    order = rng_for(bench.data.settings.seed, "universal", board).permutation(len(seen.pokes))
-    pokes = Pokes(seen.place_mm[order], seen.pokes.force_N[order], seen.db_uT.reshape(len(order), -1)[order])
+def _board_coverages(benchmark: Benchmark, board: str, labels_n: Sequence[int]) -> dict[int, Coverages]:
+    """Return coverages of the nominal variant on a board, with a third of its presses as pool, on the others."""
+    own = benchmark.presses[board]
+    order = rng_for(benchmark.data.settings.seed, "universal", board).permutation(len(own.pokes))
+    db_uT = own.db_uT.reshape(len(order), -1)
+    presses = LabelledPresses(own.place_mm[order], own.pokes.force_N[order], db_uT[order])
     pool_n = len(order) // 3
-    told = tell(bench.nominal, seen.rest_uT.ravel(), pokes[:pool_n])
-    tempers = [(one, one) for one in TEMPERS]
-    return {n: coverages(told, pokes[pool_n:], min(n, pool_n), tempers) for n in labels_n}
+    calibration = calibrate(benchmark.nominal.model, own.rest_uT.ravel(), presses[:pool_n])
+    powers = [Powers(power, power) for power in BOARD_POWERS]
+    return {n: coverages(calibration, presses[pool_n:], min(n, pool_n), powers) for n in labels_n}

@@ -1,26 +1,26 @@
-"""Calibration data of one skin, checks of it, the likelihood powers, and which press to label next."""
+"""Calibration data of one skin: checks and file format; likelihood powers and their cross-validation."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from reskin import io
 from reskin.errors import SchemaError
-from reskin.universal.map import Estimate, NOISE_uT, SkinMap, between, kernel
+from reskin.universal.map import Estimate
 from reskin.universal.network import FULL_SET_N
 
 CHANNELS_N = 15  # of five chips, three axes each
-FIELD_MAX_uT = 1e6  # 20 times what a chip can measure: no poke, and single precision holds its square
-LABELS_MAX_N = 2000  # pokes at once: memory grows with their square, time faster
+FIELD_MAX_uT = 1e6  # 20 times the range of a chip: no press, and its square fits single precision
+LABELS_MAX_N = 2000  # memory grows with their square, time faster
 
 
 def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Take one reading or several; raise SchemaError on those of another board."""
+    """Return one reading or several as rows; raise SchemaError on those of another board."""
     rows_uT = np.atleast_2d(np.asarray(b_uT, float))
     if rows_uT.ndim != 2 or rows_uT.shape[1] != CHANNELS_N:
         rule, remedy = f"the {CHANNELS_N} of five chips", "Load a model of such boards."
@@ -29,7 +29,7 @@ def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
 
 
 def check_readings(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Take readings to learn from; raise SchemaError on one that is no number, or that no chip measures."""
+    """Return calibration readings as rows; raise SchemaError on values that are not finite or out of range."""
     rows_uT = check_shape(b_uT)
     _need("fields", "readings to learn from", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
     rule = f"at most {FIELD_MAX_uT:,.0f} uT in size"
@@ -43,11 +43,14 @@ def check_labels(
     rows_n: int,
     reach_mm: Float[np.ndarray, "2 2"],
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Take one label or several, as many as readings: places within `reach_mm` (least, most), forces above 0 N."""
+    """Return labels as arrays; raise SchemaError on places outside `reach_mm` or forces of 0 N or less.
+
+    There are as many as readings, at most LABELS_MAX_N.
+    """
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n}, {CHANNELS_N})"
     if places_mm.shape != (rows_n, 2) or forces_N.shape != (rows_n,):
-        rule, remedy = "x and y, a force and a reading of each poke", "Give arrays [m, 2], [m] and [m, 15]."
+        rule, remedy = "x and y, a force and a reading of each press", "Give arrays [m, 2], [m] and [m, 15]."
         raise SchemaError("labels", "shapes", rule, got, remedy)
     if rows_n > LABELS_MAX_N:
         raise SchemaError("labels", "their number", f"at most {LABELS_MAX_N}", rows_n, "Take some of them.")
@@ -66,23 +69,31 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, holds: Bool[np.ndar
 
 
 FORMAT = "reskin-skin-1"
-SHAPES: Mapping[str, tuple[int, ...]] = {  # behind the number of pokes
+SHAPES: Mapping[str, tuple[int, ...]] = {  # of the arrays, after the number of presses
     "pokes_uT": (CHANNELS_N,),
     "even_uT": (CHANNELS_N,),
     "labelled_mm": (2,),
     "labelled_N": (),
     "labelled_uT": (CHANNELS_N,),
 }
-FILE_BYTES_MAX_N = 2**20  # a full set of pokes and LABELS_MAX_N labels take a third of it
+FILE_BYTES_MAX_N = 2**20  # a full set of presses and LABELS_MAX_N labels take a third of it
 REMEDY = "Take a file that `save` wrote."
 
 
-class LabelledPresses(NamedTuple):
+@dataclass(frozen=True)
+class LabelledPresses:
     """Presses at known places (from the board's middle) under known forces, and their changes of field."""
 
     place_mm: Float[np.ndarray, "m 2"]
     force_N: Float[np.ndarray, " m"]
     db_uT: Float[np.ndarray, "m ch"]
+
+    def __len__(self) -> int:
+        return len(self.force_N)
+
+    def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "LabelledPresses":
+        """Select presses."""
+        return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which])
 
 
 def no_presses() -> Float[np.ndarray, "0 ch"]:
@@ -109,7 +120,8 @@ class CalibrationData:
 
 def write_calibration(data: CalibrationData, file: Path) -> None:
     """Write calibration data as safetensors; the model is not in the file."""
-    values = (data.presses_uT, data.even_uT, *data.labels)
+    labels = data.labels
+    values = (data.presses_uT, data.even_uT, labels.place_mm, labels.force_N, labels.db_uT)
     io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
 
 
@@ -122,14 +134,14 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
     """Read calibration data; raise SchemaError on places that are not within `reach_mm` of the middle."""
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(file, "a saved skin", f"at most {FILE_BYTES_MAX_N:,} bytes", f"{bytes_n:,}", REMEDY)
-    found, words = io.read_tensors(file, digest_needed=True)
-    if words.get("format") != FORMAT:
-        raise SchemaError(file, "format", FORMAT, words.get("format"), REMEDY)
+    found, metadata = io.read_tensors(file, digest_needed=True)
+    if metadata.get("format") != FORMAT:
+        raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
     got = {name: values.shape for name, values in sorted(found.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
-    of_skin = {"rest_uT": (CHANNELS_N,)} | {name: (counts_n.get(name, 0), *shape) for name, shape in SHAPES.items()}
-    if got != of_skin or max(counts_n["pokes_uT"], counts_n["even_uT"]) > FULL_SET_N:
-        rule = f"rest_uT, {', '.join(SHAPES)} of {CHANNELS_N} channels and at most {FULL_SET_N} unlabelled pokes"
+    expected = {"rest_uT": (CHANNELS_N,)} | {name: (counts_n.get(name, 0), *shape) for name, shape in SHAPES.items()}
+    if got != expected or max(counts_n["pokes_uT"], counts_n["even_uT"]) > FULL_SET_N:
+        rule = f"rest_uT, {', '.join(SHAPES)} of {CHANNELS_N} channels and at most {FULL_SET_N} unlabelled presses"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
     fields_uT = {name: check_readings(values) for name, values in found.items() if values.shape[1:] == (CHANNELS_N,)}
     labels_n = len(fields_uT["labelled_uT"])
@@ -141,48 +153,11 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
     return CalibrationData(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], labels)
 
 
-Pokes = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, " _"]]  # places in mm from the board's middle, log F
-
-
-def expected_gain(skin: SkinMap, place_mm: Float[np.ndarray, "c 2"], force_N: Float[np.ndarray, " c"]) -> np.ndarray:
-    """Return by how much a labelled press at each place is expected to reduce the variance of fields over the skin.
-
-    Relative to |dB|, all channels together, the mean over places under the middle one of the map's forces. Errors of
-    the law that earlier labels have shown are known.
-    """
-    of, error_cov, known = skin.hypotheses, skin.error_cov, []
-    every = slice(len(of.log_N) // 2, None, len(of.log_N))
-    mean_uT, slope_uT = (part[every].astype(float) for part in (of.mean_uT, of.slope_uT))
-    of_all = slope_uT / np.linalg.norm(mean_uT, axis=1)[:, None, None] @ skin.cov
-    at_mm, at_log_N = (part[every] for part in of.at)
-    poke_uT, poke_slope_uT, _ = between(skin, place_mm, force_N)
-    poke_log_N = np.log(force_N)
-    shared = open_errors(skin, (at_mm, at_log_N), (place_mm, poke_log_N))
-    for i, length_uT in enumerate(np.linalg.norm(poke_uT, axis=1)):
-        one = slice(i, i + 1)
-        slope = poke_slope_uT[i] / length_uT
-        own = open_errors(skin, (place_mm[one], poke_log_N[one]), (place_mm[one], poke_log_N[one]))[0, 0]
-        cov = slope @ skin.cov @ slope.T + (own + skin.residual.noise) * error_cov
-        cov += (NOISE_uT / length_uT) ** 2 * np.eye(len(cov))
-        with_all = (of_all @ slope.T + shared[:, i, None, None] * error_cov).reshape(-1, len(cov))
-        known.append(float(((with_all @ np.linalg.inv(cov)) * with_all).sum() / len(at_mm)))
-    return np.array(known)
-
-
-def open_errors(skin: SkinMap, a: Pokes, b: Pokes) -> Float[np.ndarray, "n m"]:
-    """Return the covariance of the law's errors at two sets of presses, given the errors that labels have shown."""
-    alike, shown = kernel(a[0], b[0], a[1], b[1]), skin.labelled
-    if shown is None:
-        return alike
-    to_a, to_b = (kernel(one[0], shown.place_mm, one[1], shown.log_N) for one in (a, b))
-    return alike - to_a @ shown.inverse @ to_b.T
-
-
-PARTS_N = 5  # of the labelled pokes: each is left out in its turn
-PRIOR_N = 40.0  # coordinates as far off as is said, beside those of labels: told on simulated skins (docs/learning.md)
+FOLDS_N = 5  # of the cross-validation over labels
+PRIOR_N = 40.0  # coordinates with a variance inflation of 1 that labels are weighed against (docs/learning.md)
 NORMAL_MEAN = math.sqrt(2 / math.pi)  # of |z|
 
-Parts = Sequence[tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]]  # under each temper, and where pokes were, in mm
+HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]  # estimates for each power, and true places in mm
 
 
 @dataclass(frozen=True)
@@ -196,34 +171,34 @@ class LikelihoodPowers:
     anywhere: Mapping[int, Mapping[int, float]]
     even: Mapping[int, float]
 
-    def of(self, pokes_n: int, labels_n: int, *, even: bool) -> float:
+    def of(self, presses_n: int, labels_n: int, *, even: bool) -> float:
         """Return the power for these numbers of presses and labels."""
-        told = self.even if even else self.anywhere[max(n for n in self.anywhere if n <= pokes_n)]
-        labels_told_n = sorted(told)
-        return float(np.exp(np.interp(labels_n, labels_told_n, np.log([told[n] for n in labels_told_n]))))
+        known = self.even if even else self.anywhere[max(n for n in self.anywhere if n <= presses_n)]
+        known_n = sorted(known)
+        return float(np.exp(np.interp(labels_n, known_n, np.log([known[n] for n in known_n]))))
 
-    def are_enough(self, pokes_n: int) -> bool:
+    def are_enough(self, presses_n: int) -> bool:
         """Tell whether so many presses are enough for their misfit to count."""
-        return any(0 < n <= pokes_n for n in self.anywhere)
+        return any(0 < n <= presses_n for n in self.anywhere)
 
     def to_card(self) -> dict[str, dict[str, Any]]:
         """Return the entry of the model's card."""
-        anywhere = {str(pokes_n): _named(of) for pokes_n, of in self.anywhere.items()}
+        anywhere = {str(presses_n): _named(of) for presses_n, of in self.anywhere.items()}
         return {"anywhere": anywhere, "even": _named(self.even)}
 
     @classmethod
     def from_card(cls, card: Mapping[str, Mapping[str, Any]]) -> "LikelihoodPowers":
         """Read the entry of a model's card."""
-        anywhere = {int(pokes_n): _numbered(of) for pokes_n, of in card["anywhere"].items()}
+        anywhere = {int(presses_n): _numbered(of) for presses_n, of in card["anywhere"].items()}
         return cls(anywhere, _numbered(card["even"]))
 
 
-def _named(told: Mapping[int, float]) -> dict[str, float]:
-    return {str(n): temper for n, temper in told.items()}
+def _named(powers: Mapping[int, float]) -> dict[str, float]:
+    return {str(n): power for n, power in powers.items()}
 
 
-def _numbered(told: Mapping[str, float]) -> dict[int, float]:
-    return {int(n): temper for n, temper in told.items()}
+def _numbered(powers: Mapping[str, float]) -> dict[int, float]:
+    return {int(n): power for n, power in powers.items()}
 
 
 def lower_by_misfit(power: float, misfit: float) -> float:
@@ -238,22 +213,19 @@ def lower_by_residuals(power: float, inflation: float) -> float:
 
 def folds_of_labels(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " l"]]]:
     """Split labels for cross-validation, every fifth into one fold: indices kept, indices held out."""
-    part = np.arange(labels_n) % PARTS_N
-    return [(np.flatnonzero(part != i), np.flatnonzero(part == i)) for i in range(min(PARTS_N, labels_n))]
+    fold = np.arange(labels_n) % FOLDS_N
+    return [(np.flatnonzero(fold != i), np.flatnonzero(fold == i)) for i in range(min(FOLDS_N, labels_n))]
 
 
-def variance_inflations(powers_n: int, parts: Parts) -> list[float]:
-    """Return by what factor errors of held-out labels exceed the variances given, for each likelihood power."""
+def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
+    """Return by what factor squared errors of held-out labels exceed the estimated variances, for each power."""
     found = []
     for i in range(powers_n):
-        off = [np.abs(of_part[i].place_mm - at_mm) / of_part[i].sd_mm for of_part, at_mm in parts]
+        off = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
         found.append(variance_inflation(np.concatenate([np.zeros((0, 2)), *off])))
     return found
 
 
 def variance_inflation(off: Float[np.ndarray, "m 2"]) -> float:
-    """Return the factor from coordinates' absolute residuals in standard deviations, by their mean.
-
-    So one press that is far off counts once, not squared.
-    """
+    """Return the factor from absolute errors in standard deviations, by their mean (an outlier is not squared)."""
     return ((PRIOR_N + float(off.sum()) / NORMAL_MEAN) / (PRIOR_N + off.size)) ** 2

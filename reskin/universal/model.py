@@ -1,13 +1,15 @@
-"""The universal model: places and forces on a skin of the paper's board, without training.
+"""The universal model: estimates places and forces on a skin without training.
 
-A map (a Gaussian process over skins) and networks, both made from nominal simulated skins, come with the project. A
-new skin calibrates them: by its no-load field, by presses at unknown places and by presses at known ones. The board
-has five chips, turned as on recorded boards. Places are labels: along the board's axes, its middle at (8, 8) mm.
+`PriorModel` is a map and networks made from simulated skins. Calibration conditions both on the data of one skin:
+`PressCalibration` on its no-load field and on presses at unknown places, `CalibratedModel` on labelled presses too.
+These work in the board's frame and axes, for any board. `Universal` is the model that comes with the project, of the
+paper's board with five chips turned as on recorded boards. Its readings are along the chips' axes; its places are
+labels, with the board's middle at (8, 8) mm.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from jaxtyping import Float
 from reskin import io
 from reskin.data.grid import CENTRE_MM
 from reskin.errors import SchemaError
+from reskin.universal import network
 from reskin.universal.calibration import (
     CHANNELS_N,
     CalibrationData,
@@ -25,7 +28,6 @@ from reskin.universal.calibration import (
     check_labels,
     check_readings,
     check_shape,
-    expected_gain,
     folds_of_labels,
     lower_by_misfit,
     lower_by_residuals,
@@ -33,88 +35,219 @@ from reskin.universal.calibration import (
     variance_inflations,
     write_calibration,
 )
-from reskin.universal.combine import Labels, multiply, off_middle_mm, told_mm
+from reskin.universal.kernels import products
 from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import (
     ROUNDS_N,
     Estimate,
-    Reader,
+    Likelihoods,
+    MapEvaluator,
     SkinMap,
     Tables,
-    joined,
+    concatenate,
+    condition_on_even_presses,
+    condition_on_labels,
+    condition_on_noload,
+    condition_on_presses,
+    expected_gain,
     new_map,
-    see_even,
-    see_labelled,
-    see_pokes,
-    see_rest,
 )
-from reskin.universal.network import FULL_SET_N, Layers, Weights, ask, moved, of_tensors, tell, to_tensors
+from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weights, shift_places
+
+MAP_POWER = 0.6  # of the map's likelihoods beside the networks', as errors of channels correlate; not fitted to a board
+SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of a network's estimates
+FADES_PER_LABEL = 0.15  # of the centring of the networks' places: labels tell the middle better
+OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # of a constant error of the networks' places; of single errors about it
+BLOCK_N = 200  # readings at a time, to bound memory
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card beside it, .json
 FORMAT = "reskin-universal-3"
 SKIN_MM = (20.0, 20.0)
 REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # of places, about the middle
-CHOICE_EVERY_N = 3  # of the lattice's places, one may be the next to press
-BLOCK_N = 200  # readings at a time, to bound memory
+CHOICE_EVERY_N = 3  # of the lattice's places, one is a candidate for the next press
 
 
 @dataclass(frozen=True)
-class Calibrated:
-    """A map and networks, calibrated to one skin."""
+class Evaluation:
+    """Readings evaluated by map and networks: estimates follow for any likelihood power.
 
-    reader: Reader
+    The power changes standard deviations; places and forces of `by_map` too.
+    """
+
+    evaluator: MapEvaluator
+    likelihoods: Likelihoods
+    network: NetworkEstimate
+
+    def by_map(self, power: float) -> Estimate:
+        """Estimate by the map alone: means over its hypotheses."""
+        return self.evaluator.mean(self.likelihoods, power)
+
+    def by_network(self, power: float) -> Estimate:
+        """Estimate by the networks alone; they have no misfit (NaN)."""
+        nothing = np.full(len(self.network.log_N), np.nan)
+        of = self.network
+        return Estimate(of.place_mm, of.sd_mm / np.sqrt(power), np.exp(of.log_N), nothing)
+
+    def combined(self, power: float) -> Estimate:
+        """Multiply the map's probabilities of places and of forces with the networks' normal distributions.
+
+        Both read the same field, so their errors correlate: standard deviations are those of a power of the product.
+        """
+        normals = np.empty((len(self.network.log_N), 6))
+        normals[:, :2], normals[:, 4] = self.network.place_mm, self.network.log_N
+        np.maximum(self.network.sd_mm, SD_MIN_MM, out=normals[:, 2:4])
+        np.maximum(self.network.sd_log_N, SD_MIN_LOG_N, out=normals[:, 5])
+        of = self.likelihoods
+        moments = products(of.deviance, of.best, self.evaluator.lattice, normals, MAP_POWER, power)
+        return Estimate(*moments, of.misfit())
+
+
+@dataclass(frozen=True)
+class CalibratedModel:
+    """Map and networks, calibrated to one skin. `offsets_mm` are added to the networks' places, one after the other."""
+
+    skin: SkinMap
     networks: Sequence[Layers]
+    offsets_mm: Sequence[Float[np.ndarray, "2"]]
+
+    def with_offsets_in_biases(self) -> "CalibratedModel":
+        """Add the offsets to the networks' last biases instead: faster, in single precision."""
+        by_mm = sum(self.offsets_mm, np.zeros(2))
+        return CalibratedModel(self.skin, [shift_places(layers, by_mm) for layers in self.networks], ())
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Estimate places and forces, once for each likelihood power: only standard deviations depend on it."""
-        weighed, opinion = self.reader.weigh(db_uT), ask(self.networks, db_uT)
-        return [multiply(self.reader, weighed, opinion, power) for power in powers]
+        """Estimate places and forces by map and networks, once for each likelihood power."""
+        return self.estimate_by(lambda evaluation: [evaluation.combined(power) for power in powers], db_uT)
+
+    def estimate_by(
+        self, method: Callable[[Evaluation], Sequence[Estimate]], db_uT: Float[np.ndarray, "n ch"]
+    ) -> list[Estimate]:
+        """Estimate places and forces in one or several ways, block by block."""
+        starts = range(0, max(len(db_uT), 1), BLOCK_N)
+        by_block = [method(self.evaluate(db_uT[i : i + BLOCK_N])) for i in starts]
+        return [concatenate(parts) for parts in zip(*by_block, strict=True)]
+
+    def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
+        """Evaluate map and networks on a block of readings."""
+        evaluator = self.skin.evaluator
+        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT))
+
+    def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
+        """Estimate by the networks alone."""
+        found = network.evaluate(self.networks, db_uT)
+        for offset_mm in self.offsets_mm:
+            found = replace(found, place_mm=found.place_mm + offset_mm)
+        return found
+
+
+@dataclass(frozen=True)
+class PressCalibration:
+    """Map and networks, conditioned on a skin's no-load field and its presses at unknown places."""
+
+    skin: SkinMap
+    networks: Sequence[Weights]
+    data: CalibrationData
+
+    @cached_property
+    def layers(self) -> list[Layers]:
+        """The networks, conditioned."""
+        return [network.condition(weights, self.data.rest_uT, self.data.presses_uT) for weights in self.networks]
+
+    @cached_property
+    def even_mm(self) -> Float[np.ndarray, "e 2"]:
+        """Where the networks place the presses that lie evenly over the skin."""
+        return network.evaluate(self.layers, self.data.even_uT).place_mm
+
+    def with_labels(self, labels: LabelledPresses) -> CalibratedModel:
+        """Condition on labelled presses."""
+        skin = condition_on_labels(self.skin, labels.place_mm, labels.force_N, labels.db_uT)
+        estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
+        return CalibratedModel(skin, self.layers, network_offsets_mm(self.even_mm, estimated_mm, labels.place_mm))
+
+
+@dataclass(frozen=True)
+class PriorModel:
+    """Map and networks before they are calibrated to a skin."""
+
+    skin: SkinMap
+    networks: Sequence[Weights]
+
+    def calibrate(self, data: CalibrationData) -> PressCalibration:
+        """Calibrate to a skin; labels of the data are not used (see `PressCalibration.with_labels`)."""
+        noload_map = condition_on_noload(self.skin, data.rest_uT)
+        return PressCalibration(condition_on_unlabelled(noload_map, data), self.networks, data)
+
+
+def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinMap:
+    """Condition a map on presses at unknown places, then on those that lie evenly over the skin."""
+    skin = noload_map
+    if len(data.presses_uT):
+        skin = condition_on_presses(skin, data.presses_uT)
+    if len(data.even_uT):
+        skin = condition_on_even_presses(skin, data.even_uT)
+    return skin
+
+
+def network_offsets_mm(
+    even_mm: Float[np.ndarray, "e 2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return two corrections of the networks' places, to be added one after the other.
+
+    The first centres presses that lie evenly over the skin (`even_mm`) on the middle; it fades with labels. The second
+    is the mean error of labelled presses, estimated at `estimated_mm`, with a Gaussian prior about zero.
+    """
+    centre_mm = -even_mm.mean(axis=0) / (1 + FADES_PER_LABEL * len(place_mm)) if len(even_mm) else np.zeros(2)
+    off_mm = place_mm - (estimated_mm + centre_mm)
+    return centre_mm, off_mm.sum(axis=0) / (len(off_mm) + (LABEL_SD_MM / OFFSET_SD_MM) ** 2)
 
 
 @dataclass
 class Universal:
-    """A model of the paper's board that is calibrated while it is used.
+    """The model of the paper's board that comes with the project; it is calibrated while it is used.
 
     Call `zero` with readings without contact, `see` with presses at unknown places, `label` with presses at known
     ones, in any order and as often as wanted; `predict` at any time. Fields are in uT along the chips' axes.
 
-    tables: the map's prior. networks: their weights. powers: how far likelihoods are believed.
-    skin: the map, calibrated by all that is known of the skin.
+    Parameters
+    ----------
+    tables : the map's prior
+    networks : weights of the networks
+    powers : likelihood powers by number of presses and labels
     """
 
     tables: Tables
     networks: Sequence[Weights]
     powers: LikelihoodPowers
-    skin: SkinMap = field(init=False)
 
     def __post_init__(self) -> None:
         """Start from nominal skins."""
         self._noload_uT: np.ndarray | None = None
-        self._press_reader: Reader | None = None
-        self._calibrated: Calibrated | None = None
-        self._power: float | None = None
-        self._nominal_map = new_map(self.tables)
-        self._restart(self._nominal_map, CalibrationData(self.tables.rest_uT))
+        self._prior_map = new_map(self.tables)
+        self._restart(self._prior_map, CalibrationData(self.tables.rest_uT))
 
     @property
     def card(self) -> dict[str, Any]:
-        """What the model was made of, and what it must not be used for (its JSON card)."""
+        """The model's JSON card: what it was made from, and what it must not be used for."""
         return io.read_json(FILE.with_suffix(".json"))
 
     @property
+    def skin(self) -> SkinMap:
+        """The map, conditioned on all data of the skin."""
+        return self._model.skin
+
+    @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
-        """The no-load field that changes are taken from, along the chips' axes; zeros before it was zeroed."""
+        """The no-load field that changes are taken from, along the chips' axes; zeros before `zero`."""
         return np.zeros(CHANNELS_N) if self._noload_uT is None else self._noload_uT
 
     @property
     def presses_n(self) -> int:
         """Number of presses that it is calibrated by, labelled or not."""
-        return len(self._data.presses_uT) + len(self._data.labels.place_mm)
+        return len(self._data.presses_uT) + len(self._data.labels)
 
     @property
     def misfit(self) -> float:
-        """Median over unlabelled presses of chi^2 a channel: about 1 on a skin of the prior; 1 if they are too few."""
-        self._read_press_map()
+        """Median chi^2 per channel of unlabelled presses: about 1 on a skin of the prior; 1 if they are too few."""
         return float(np.median(self._misfits)) if self.powers.are_enough(len(self._misfits)) else 1.0
 
     @property
@@ -123,11 +256,11 @@ class Universal:
 
         1: both are trusted fully. Smaller: standard deviations are larger.
         """
-        if self._power is None:
+        if self._power is None:  # cross-validation takes long: once for each set of data, where it is needed
             data = self._data
-            believed = self.powers.of(len(data.presses_uT), len(data.labels.place_mm), even=len(data.even_uT) > 0)
-            power = lower_by_misfit(believed, self.misfit)
-            if len(data.labels.place_mm):
+            tabulated = self.powers.of(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
+            power = lower_by_misfit(tabulated, self.misfit)
+            if len(data.labels):
                 power = lower_by_residuals(power, *self.variance_inflations([power]))
             self._power = power
         return self._power
@@ -135,7 +268,11 @@ class Universal:
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
         """Take the mean of readings without contact as the no-load field, which also tells the skin's seat and gap.
 
-        Earlier presses are forgotten; with `keep` they stay, where the same skin has drifted.
+        Earlier presses are forgotten; with `keep` they stay, for the same skin after drift.
+
+        Raises
+        ------
+        SchemaError : no reading, or one that is not finite, out of range or of another board
         """
         noload_uT = check_readings(b_uT)
         if not len(noload_uT):
@@ -143,23 +280,22 @@ class Universal:
         self._noload_uT = noload_uT.mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
         data = replace(self._data, rest_uT=rest_uT) if keep else CalibrationData(rest_uT)
-        return self._restart(see_rest(self._nominal_map, rest_uT), data)
+        return self._restart(condition_on_noload(self._prior_map, rest_uT), data)
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
-        """Calibrate by presses at unknown places, a reading each: some dozens all over the skin, or more as they come.
+        """Calibrate by presses at unknown places, one reading each: dozens all over the skin, or more as they come.
 
-        The first set is passed over several times, later ones once: by then the skin is known. If these and all
-        before lie evenly over the skin (a grid, each place once), say `even`: their mean place is then its middle.
+        The first set is passed over several times, later ones once. Say `even` if these and all before lie evenly over
+        the skin (a grid, each place once): their mean place is then the skin's middle.
         """
         db_uT, data = self._change(check_readings(b_uT)), self._data
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
         if even:
-            self._misfits = np.full(len(presses_uT), np.nan)
-            return self._fit_presses(replace(data, presses_uT=presses_uT, even_uT=presses_uT))
+            return self._restart(self._noload_map, replace(data, presses_uT=presses_uT, even_uT=presses_uT))
         rounds_n = 1 if len(data.presses_uT) else ROUNDS_N
-        press_map = see_pokes(self._press_map, db_uT, rounds_n=rounds_n, reader=self._read_press_map())
+        press_map = condition_on_presses(self._calibration.skin, db_uT, rounds_n)
         self._misfits = np.concatenate([self._misfits, np.full(len(db_uT), np.nan)])[-FULL_SET_N:]
-        return self._set_press_map(press_map, replace(data, presses_uT=presses_uT))
+        return self._set(press_map, replace(data, presses_uT=presses_uT))
 
     def label(
         self,
@@ -169,23 +305,29 @@ class Universal:
         *,
         keep: bool = False,
     ) -> "Universal":
-        """Calibrate by presses at known places under known forces; `keep` earlier ones, or forget them.
+        """Calibrate by one or several presses at known places under known forces.
 
-        One press, or several; raise SchemaError, with nothing changed, on a place off the skin or a force of 0 N or
-        less.
+        Earlier labels are forgotten; with `keep` they stay.
+
+        Raises
+        ------
+        SchemaError : a place off the skin, a force of 0 N or less, too many labels; the model is unchanged
         """
         readings_uT = check_readings(b_uT)
         places_mm, forces_N = check_labels(
             np.asarray(place_mm, float), np.asarray(force_N, float), len(readings_uT), CENTRE_MM + REACH_MM
         )
-        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, self._change(readings_uT))
+        labels, before = LabelledPresses(places_mm - CENTRE_MM, forces_N, self._change(readings_uT)), self._data.labels
         if keep:
-            labels = LabelledPresses(*map(np.concatenate, zip(self._data.labels, labels, strict=True)))
-            check_labels(labels.place_mm, labels.force_N, len(labels.db_uT), REACH_MM)  # together they may be too many
-        data = replace(self._data, labels=labels)
-        if len(self._data.labels.place_mm):  # the order in which presses came must not count: from the start
-            return self._fit_presses(data)
-        return self._set_press_map(self._press_map, data)
+            labels = LabelledPresses(
+                np.concatenate([before.place_mm, labels.place_mm]), np.concatenate([before.force_N, labels.force_N]),
+                np.concatenate([before.db_uT, labels.db_uT]),
+            )  # fmt: skip
+            check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # together they may be too many
+        data, press_map = replace(self._data, labels=labels), self._calibration.skin
+        if len(before):  # fit unlabelled presses anew, so that the result does not depend on the order of calls
+            press_map = condition_on_unlabelled(self._noload_map, data)
+        return self._set(press_map, data)
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
         """Return the place, in mm, where a labelled press of about this force would tell most about the skin."""
@@ -199,26 +341,21 @@ class Universal:
         return np.column_stack([found.place_mm, found.force_N])
 
     def estimate(self, b_uT: Float[np.ndarray, "*f ch"]) -> Estimate:
-        """Return the same with the place's standard deviation, and the misfit: far above 1, this is no known skin."""
+        """Return places with standard deviations, forces and misfits: far above 1, this is no known skin."""
         return self.estimates(b_uT, [self.power])[0]
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Return the same for several likelihood powers: only standard deviations differ."""
-        db_uT, calibrated = self._change(b_uT), self._calibrate()
-        blocks = [db_uT[i : i + BLOCK_N] for i in range(0, max(len(db_uT), 1), BLOCK_N)]
-        by_block = [calibrated.estimate(block_uT, powers) for block_uT in blocks]
-        by_power = [joined(parts) for parts in zip(*by_block, strict=True)]
-        return [replace(one, place_mm=one.place_mm + CENTRE_MM) for one in by_power]
+        """Return `estimate` for several likelihood powers: only standard deviations differ."""
+        found = self._model.estimate(self._change(b_uT), powers)
+        return [replace(one, place_mm=one.place_mm + CENTRE_MM) for one in found]
 
     def variance_inflations(self, powers: Sequence[float]) -> list[float]:
         """Estimate the variance inflation for each likelihood power by cross-validation over the labelled presses."""
-        labels, networks, parts = self._data.labels, self._condition_networks(), []
-        for kept, held_out in folds_of_labels(len(labels.place_mm)):
-            skin = see_labelled(self._press_map, labels.place_mm[kept], labels.force_N[kept], labels.db_uT[kept])
-            shifted = self._shift_networks(networks, labels.place_mm[kept], labels.db_uT[kept])
-            found = Calibrated(Reader(skin), shifted).estimate(labels.db_uT[held_out], powers)
-            parts.append((found, labels.place_mm[held_out]))
-        return variance_inflations(len(powers), parts)
+        labels, folds = self._data.labels, []
+        for kept, held_out in folds_of_labels(len(labels)):
+            model = self._calibration.with_labels(labels[kept]).with_offsets_in_biases()
+            folds.append((model.estimate(labels.db_uT[held_out], powers), labels.place_mm[held_out]))
+        return variance_inflations(len(powers), folds)
 
     def save(self, file: Path | str) -> None:
         """Write the calibration data of this skin, for `load_universal(file)`; raise SchemaError before `zero`."""
@@ -227,71 +364,38 @@ class Universal:
         write_calibration(self._data, Path(file))
 
     def remember(self, file: Path | str) -> "Universal":
-        """Read what `save` wrote, in place of all that is known of a skin; then call `zero(b_uT, keep=True)`."""
+        """Replace all data of the skin by those that `save` wrote; then call `zero(b_uT, keep=True)`."""
         data = read_calibration(Path(file), REACH_MM)
         self._noload_uT = to_chips(data.rest_uT[None])[0]
-        return self._restart(see_rest(self._nominal_map, data.rest_uT), data)
+        return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
-        """Predict from changes of field, as a network does."""
+        """Predict from changes of field, as a trained network does."""
         return self.predict(check_shape(db_uT) + self.noload_uT).astype(np.float32)
 
+    @property
+    def _data(self) -> CalibrationData:
+        return self._calibration.data
+
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
+        """Return changes of field along the board's axes."""
         return to_board(check_shape(b_uT) - self.noload_uT)
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Calibrate by all data, starting from a map that knows the no-load field and nothing else of the skin."""
+        """Calibrate by all data, starting from a map that is conditioned on the no-load field alone."""
         self._noload_map = noload_map
-        self._misfits = np.full(len(data.presses_uT), np.nan)  # of each unlabelled press; NaN: not yet computed
-        return self._fit_presses(data)
+        self._misfits = np.full(len(data.presses_uT), np.nan)
+        return self._set(condition_on_unlabelled(noload_map, data), data)
 
-    def _fit_presses(self, data: CalibrationData) -> "Universal":
-        """Calibrate by all presses again: unlabelled ones, then the labels."""
-        press_map = self._noload_map
-        if len(data.presses_uT):
-            press_map = see_pokes(press_map, data.presses_uT)
-        if len(data.even_uT):
-            press_map = see_even(press_map, data.even_uT)
-        return self._set_press_map(press_map, data)
-
-    def _set_press_map(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Take a map that knows the unlabelled presses, and add the labels."""
-        self._press_map, self._data, labels = press_map, data, data.labels
-        self._press_reader, self._calibrated, self._power = None, None, None
-        self.skin = press_map
-        if len(labels.place_mm):
-            self._read_press_map()  # misfits are those of a map without labels
-            self.skin = see_labelled(press_map, labels.place_mm, labels.force_N, labels.db_uT)
-        return self
-
-    def _read_press_map(self) -> Reader:
-        """Return the reader of the map without labels, and compute the misfit of presses that have none yet."""
-        if self._press_reader is None:
-            self._press_reader = Reader(self._press_map)
+    def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
+        """Take a map that is conditioned on the unlabelled presses of the data, and condition on the labels."""
         new = np.isnan(self._misfits)
-        if new.any():  # a press misfits the map that has first learnt from it
-            self._misfits[new] = self._press_reader.weigh(self._data.presses_uT[new]).misfit()
-        return self._press_reader
-
-    def _calibrate(self) -> Calibrated:
-        """Return map and networks, ready to read; kept until the calibration data change."""
-        if self._calibrated is None:
-            labels, reader = self._data.labels, self._read_press_map()
-            networks = self._shift_networks(self._condition_networks(), labels.place_mm, labels.db_uT)
-            self._calibrated = Calibrated(Reader(self.skin) if len(labels.place_mm) else reader, networks)
-        return self._calibrated
-
-    def _condition_networks(self) -> list[Layers]:
-        return [tell(weights, self._data.rest_uT, self._data.presses_uT) for weights in self.networks]
-
-    def _shift_networks(
-        self, networks: Sequence[Layers], place_mm: Float[np.ndarray, "m 2"], db_uT: Float[np.ndarray, "m ch"]
-    ) -> list[Layers]:
-        """Shift the networks' places towards the middle, if presses lie evenly, then by the labels' mean error."""
-        even_uT, estimated_mm = self._data.even_uT, ask(networks, db_uT).place_mm
-        by_mm = -off_middle_mm(ask(networks, even_uT).place_mm, len(place_mm)) if len(even_uT) else np.zeros(2)
-        by_mm = by_mm + told_mm(Labels(estimated_mm + by_mm, place_mm))
-        return [moved(layers, by_mm) for layers in networks]
+        if new.any():  # presses keep the misfit to the map that was first conditioned on them
+            self._misfits[new] = press_map.evaluator.evaluate(data.presses_uT[new]).misfit()
+        self._calibration = PressCalibration(press_map, self.networks, data)
+        self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
+        self._power: float | None = None
+        return self
 
 
 def load_universal(calibration: Path | str | None = None, *, file: Path = FILE) -> Universal:
@@ -311,7 +415,7 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
     parts, _ = io.read_tensors(file, digest_needed=True)
     of_map = {one.name: parts.pop(one.name).astype(float) for one in fields(Tables) if one.name != "names"}
     tables = Tables(names=tuple(card["spreads"]), **of_map)
-    return tables, of_tensors(parts), LikelihoodPowers.from_card(card["sureness"])
+    return tables, network.from_tensors(parts), LikelihoodPowers.from_card(card["sureness"])
 
 
 def write(
@@ -320,7 +424,7 @@ def write(
     """Write the map's prior in single precision, the networks, and a card: how they were made, powers, spreads."""
     parts = [one.name for one in fields(tables) if one.name != "names"]
     of_map = {name: getattr(tables, name).astype(np.float32) for name in parts}
-    io.write_tensors(file, of_map | to_tensors(networks), {})
+    io.write_tensors(file, of_map | network.to_tensors(networks), {})
     spreads = dict(zip(tables.names, tables.spreads.tolist(), strict=True))
     card = {"format": FORMAT, **about, "sureness": powers.to_card(), "spreads": spreads}
     io.write_json(file.with_suffix(".json"), card)

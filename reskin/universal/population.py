@@ -1,7 +1,7 @@
-"""Skins by the hundred, drawn from a law's centre and spreads: generator -> pokes, fields and places of each skin.
+"""Draw simulated skins about a law's centre: fields, places and forces of presses on each.
 
-Each skin has its own numbers, thickness, tip, filler and chips. What the law itself misses is not drawn here but at
-every step of a training, so that no skin comes twice. Refuses to know networks and recordings.
+Each skin has its own parameters, thickness, tip, filler and chips. Errors of the law are not drawn here but at every
+step of a training, so that no skin comes twice.
 """
 
 from collections.abc import Mapping
@@ -14,28 +14,36 @@ from scipy.spatial.transform import Rotation
 from reskin.physics.deformation import RestingDipoles
 from reskin.physics.magnet import Quadrature
 from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT
-from reskin.universal.map import OF_LOG, spread_by
+from reskin.universal.map import LOGARITHMIC, perturb
 
 COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # coarser than of a fit: the law itself is off by more
-PLACES_N = 65  # of the paper's grid: so many pokes tell a network which skin it is on
-POKES_N = 2 * PLACES_N  # and as many are asked for
-PITCH_MM, JITTER_MM = 2.0, 0.05  # of that grid; of a poke about its place
-SPREAD_OUT = 0.5  # of the pokes asked for lie anywhere on the skin, the others on the grid
+PLACES_N = 65  # of the paper's grid: as many presses condition a network
+PRESSES_N = 2 * PLACES_N  # of a skin: those, and as many that the network reads
+PITCH_MM, JITTER_MM = 2.0, 0.05  # of that grid; standard deviation of a press about its place
+ANYWHERE = 0.5  # share of the presses read that lie anywhere on the skin, the others lie on the grid
 
-# What boards and skins differ in beside the spreads of the law's numbers. Assumed, as those.
+# Differences between boards and skins beside the law's parameters. Assumed, as the spreads of those.
 THICKNESSES_MM = {1.8: 0.07, 1.9: 0.24, 2.0: 0.38, 2.1: 0.24, 2.2: 0.07}  # mm: probability
 TIPS_MM = {1.75: 0.25, 2.0: 0.5, 2.5: 0.25}  # radius, mm: probability
-STRONGER_PER_MM = 0.95  # log amplitude: a skin farther from its chips was found stronger, as the two trade in a fit
-FILLER_SD, FILLER_MM, FILLER_WAVES_N = 0.15, 3.0, 64  # of the magnetisation; over which it varies
+STRONGER_PER_MM = 0.95  # log amplitude per mm of gap: the two trade off in a fit
+FILLER_SD, FILLER_MM, FILLER_WAVES_N = (
+    0.15,
+    3.0,
+    64,
+)  # of the log magnetisation; its length scale; cosines it is made from
 GAIN_SD, CROSS_SD, CHIP_TURN_DEG, CHIP_OFFSET_uT = 0.025, 0.01, 2.0, 200.0
-LEAST = {"gap_mm": 0.8, "away_um_mm": 0.0, "lets_go_N": 2.0}  # chips lie in no skin; a skin is not pulled inwards
+LEAST = {
+    "gap_mm": 0.8,
+    "away_um_mm": 0.0,
+    "lets_go_N": 2.0,
+}  # chips are not inside the skin; a skin is not pulled inwards
 
 
 @dataclass(frozen=True)
 class Forces:
-    """Under which forces skins are pressed, log-uniform; and with which weight at last, in the middle.
+    """Forces of presses: log-uniform from `least_N` to `largest_N`, a share of them from `light_N` to `least_N`.
 
-    A share of the presses are light touches, log-uniform from `light_N` to `least_N`.
+    weight_N: force of one more press in the middle, if any.
     """
 
     least_N: float = 0.5
@@ -58,10 +66,7 @@ PLAIN = Forces(light_share=0.2)
 
 @dataclass(frozen=True)
 class Population:
-    """Skins one after the other, each with pokes: the first `PLACES_N` on the grid, then those that are asked for.
-
-    Places in the board's frame, fields in its axes.
-    """
+    """Simulated skins with presses, the first `PLACES_N` of each on the grid; in the board's frame and axes."""
 
     db_uT: Float32[np.ndarray, "s m ch"]
     rest_uT: Float32[np.ndarray, "s ch"]
@@ -76,7 +81,7 @@ def draw_population(
     centre: Law, spreads: Mapping[str, float], setup: Setup, skins: int | slice, rng: np.random.Generator,
     forces: Forces = PLAIN,
 ) -> Population:  # fmt: skip
-    """Simulate skins about a centre, 130 pokes each: some 40 ms a skin; the first so many, or some of them."""
+    """Simulate the first `skins` skins about a centre, or a slice of them, with 130 presses each: some 40 ms a skin."""
     setups = {
         (thickness_mm, tip_mm): replace(
             setup, design=setup.design.model_copy(update={"thickness_mm": thickness_mm}), tip_radius_mm=tip_mm,
@@ -94,21 +99,21 @@ def draw_population(
 
 
 def draw_law(centre: Law, spreads: Mapping[str, float], rng: np.random.Generator) -> Law:
-    """Draw a skin's numbers about a centre; its amplitude follows its gap."""
+    """Draw a skin's parameters about a centre; its amplitude follows its gap."""
     law = centre
     for name, spread in spreads.items():
-        law = spread_by(law, name, spread * rng.standard_normal())
-        if name in LEAST and name not in OF_LOG:
+        law = perturb(law, name, spread * rng.standard_normal())
+        if name in LEAST and name not in LOGARITHMIC:
             law = replace(law, **{name: max(getattr(law, name), LEAST[name])})
-    return spread_by(law, "amplitude", STRONGER_PER_MM * (law.gap_mm - centre.gap_mm))
+    return perturb(law, "amplitude", STRONGER_PER_MM * (law.gap_mm - centre.gap_mm))
 
 
 def draw_skin(
     law: Law, setup: Setup, rng: np.random.Generator, forces: Forces = PLAIN
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, " ch"], Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Simulate one skin on chips that err: changes of field and the field at rest, in uT, places and forces."""
+    """Simulate one skin on imperfect chips: changes of field, no-load field, places and forces."""
     place_mm = draw_places(rng)
-    force_N = forces.draw(POKES_N, rng)
+    force_N = forces.draw(PRESSES_N, rng)
     if forces.weight_N is not None:
         place_mm, force_N = np.vstack([place_mm, np.zeros(2)]), np.append(force_N, forces.weight_N)
     filled = fill(setup.rest, rng)
@@ -121,9 +126,9 @@ def draw_skin(
 
 
 def draw_places(rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:
-    """Draw a skin's pokes in mm from the board's middle: each place of the grid, then some of these and any."""
+    """Draw places of presses, in mm from the board's middle: each of the grid, then some of these and some anywhere."""
     grid_mm = grid()
-    anywhere_n = int(PLACES_N * SPREAD_OUT)
+    anywhere_n = int(PLACES_N * ANYWHERE)
     again_mm = grid_mm[rng.permutation(PLACES_N)[anywhere_n:]]
     near_mm = np.concatenate([grid_mm, again_mm])
     near_mm = near_mm + JITTER_MM * rng.standard_normal(near_mm.shape)
@@ -133,14 +138,14 @@ def draw_places(rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:
 
 
 def grid() -> Float[np.ndarray, "65 2"]:
-    """Give the paper's grid in mm from its middle: 9 x 9 places less the corners."""
+    """Return the paper's grid in mm from its middle: 9 x 9 places less the corners."""
     step = np.arange(-4, 5)
     steps = np.stack(np.meshgrid(step, step), axis=-1).reshape(-1, 2)
     return PITCH_MM * steps[np.abs(steps).min(axis=1) <= 2].astype(float)
 
 
 def fill(rest: RestingDipoles, rng: np.random.Generator) -> RestingDipoles:
-    """Make a skin's filler uneven: its moments grow and shrink smoothly over x and y, log-normally."""
+    """Make a skin's filler uneven: its moments vary smoothly over x and y, log-normally."""
     waves_per_m = rng.standard_normal((2, FILLER_WAVES_N)) / (FILLER_MM * 1e-3)
     phase = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     waves = np.cos(rest.nodes_m[:, :2] @ waves_per_m + phase).sum(axis=1) * np.sqrt(2 / FILLER_WAVES_N)
@@ -148,7 +153,7 @@ def fill(rest: RestingDipoles, rng: np.random.Generator) -> RestingDipoles:
 
 
 def draw_gains(chips_n: int, rng: np.random.Generator) -> Float[np.ndarray, "k 3 3"]:
-    """Draw how chips read a field: the gain of each axis, cross-talk, and how the chip is turned on its board."""
+    """Draw how chips read a field: gains of the axes, cross-talk, and the chip's turn on its board."""
     gain = np.exp(GAIN_SD * rng.standard_normal((chips_n, 3)))[:, :, None] * np.eye(3)
     gain = gain + CROSS_SD * rng.standard_normal((chips_n, 3, 3))
     return gain @ Rotation.from_rotvec(CHIP_TURN_DEG * rng.standard_normal((chips_n, 3)), degrees=True).as_matrix()

@@ -1,7 +1,6 @@
-"""Teaches a network simulated skins, and recorded ones beside them: population -> weights; the same from the same seed.
+"""Train the networks of the universal model on simulated skins, and on recorded boards beside them.
 
-Every step draws some skins, what the law misses on each, and which of its pokes are shown. Refuses to know recordings'
-files, folds and scores.
+Every step draws some skins, an error of the law for each, and how many of its presses the network is conditioned on.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,14 +34,14 @@ from reskin.universal.network import (
     REST_uT,
     Weights,
 )
-from reskin.universal.population import PLACES_N, POKES_N, Population, draw_population
+from reskin.universal.population import PLACES_N, PRESSES_N, Population, draw_population
 
-FILM_SD = 0.02  # of first weights: a code changes little at first
-ANSWERS_N = 6  # x, y, log F, and the log sd of each
+FILM_SD = 0.02  # of initial weights: a code changes little at first
+OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
 
 
 class Network(nn.Module):
-    """Set encoder and regressor of weights as `draw_weights` names them."""
+    """Set encoder and regressor in PyTorch, with weights named as by `draw_weights`."""
 
     def __init__(self, weights: Weights) -> None:
         super().__init__()
@@ -52,7 +51,7 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b c ch"], rest_uT: Float[torch.Tensor, "b ch"],
         kept: Float[torch.Tensor, "b c"],
     ) -> Float[torch.Tensor, "b 64"]:  # fmt: skip
-        """Give the code of each skin from the pokes that are kept (1, else 0); with none, zeros are pooled."""
+        """Return the code of each skin from its kept presses (`kept` is 1 or 0); without any, zeros are pooled."""
         each = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
         each = torch.relu(self._linear("set2", each)) * kept[..., None]
         kept_n = kept.sum(1, keepdim=True)
@@ -63,20 +62,20 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"],
         code: Float[torch.Tensor, "b 64"],
     ) -> tuple[Float[torch.Tensor, "b n 3"], Float[torch.Tensor, "b n 3"]]:  # fmt: skip
-        """Give scaled x, y, log F, and the log sd of each."""
+        """Return scaled x, y, log F, and the log standard deviation of each."""
         values = inputs(db_uT, rest_uT)
         for i in range(LAYERS_N):
             gain, shift = self._linear(f"film{i}", code)[:, None].chunk(2, -1)
             values = torch.relu(self._linear(f"layer{i}", values) * (1 + gain) + shift)
-        answer, log_sd = self._linear("answer", values).chunk(2, -1)
-        return answer, log_sd.clamp(*LOG_SD)
+        mean, log_sd = self._linear("answer", values).chunk(2, -1)
+        return mean, log_sd.clamp(*LOG_SD)
 
     def _linear(self, name: str, values: torch.Tensor) -> torch.Tensor:
         return affine(values, self.weights[f"{name}_weight"].mT, self.weights[f"{name}_bias"][None])
 
 
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
-    """Return direction and log length of each change of field, and the skin's field at rest; scaled to about 1.
+    """Return direction and log length of each change of field, and the skin's no-load field; scaled to about 1.
 
     Computed in NumPy, as `torch.log` differs between processors; gradients do not reach the readings.
     """
@@ -88,11 +87,11 @@ def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b
 
 
 def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw first weights as PyTorch does for linear layers: uniform within 1/sqrt(fan in); of FiLM, near zero."""
+    """Draw initial weights as PyTorch does for linear layers: uniform within 1/sqrt(fan in); FiLM starts near zero."""
     inputs_n = 2 * channels_n + 1
     shapes = {"set1": (SET_WIDTH, inputs_n), "set2": (SET_WIDTH, SET_WIDTH), "code": (CODE_WIDTH, SET_WIDTH + 1)}
     shapes |= {f"layer{i}": (WIDTH, WIDTH if i else inputs_n) for i in range(LAYERS_N)}
-    shapes["answer"] = (ANSWERS_N, WIDTH)
+    shapes["answer"] = (OUTPUTS_N, WIDTH)
     weights = {}
     for name, (out_n, in_n) in shapes.items():
         limit = in_n**-0.5
@@ -104,21 +103,20 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
     return weights
 
 
-SKINS_A_STEP_N, RECORDED_A_STEP_N = 10, 2  # of these, where boards are known
+SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # skins in all; of these recorded, where boards are known
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
-HUBER_DELTA, HUBER_WEIGHT, SPREAD_WEIGHT = 0.1, 4.0, 0.02
-UNTOLD = 0.25  # of the skins come without a poke, the others with 1 to 65
-NOISE_uT = (3.3, 3.3, 5.0)  # of one reading, by axis
-CARRIED_MAX = 2.0  # times what is expected of known boards' errors: none to nearly all of them
-# How far the law is off, rms of |dB|, where boards are known and where none is; on recorded ones what else may differ.
+HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
+NO_PRESSES = 0.25  # share of skins without a press to condition on; the others have 1 to 65
+NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading, by axis
+RESIDUAL_SCALE_MAX = 2.0  # of the residual of known boards, drawn from 0
+# Relative rms error of the law, where boards are known and where none is; of recorded boards, what else may differ.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
-ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # over which such errors are alike; cosines that make them
-NAMELESS = "nominal"  # of the syllabus that knows no board
-BLOCK_STEPS_N = 100  # over which the loss is averaged in a curve
+ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # length scales of these errors; cosines they are made from
+NOMINAL_NAME = "nominal"  # of the prior without a known board
 
 
-class Lessons(Strict):
-    """How much a network is taught."""
+class TrainingSettings(Strict):
+    """Simulated skins, steps of training and networks."""
 
     skins_n: Annotated[int, Field(ge=1, le=100_000)]
     steps_n: Annotated[int, Field(ge=2, le=1_000_000)]
@@ -126,8 +124,8 @@ class Lessons(Strict):
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """Readings of a known board's pokes, in its frame and axes; as many of each poke."""
+class RecordedBoard:
+    """Readings of the presses of a known board, equally many of each, in the board's frame and axes."""
 
     db_uT: Float32[np.ndarray, "m r ch"]
     rest_uT: Float32[np.ndarray, " ch"]
@@ -136,21 +134,25 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class Syllabus:
-    """What networks are taught: skins about a centre; where boards of the rig are known, these and their errors."""
+class SkinPrior:
+    """Distribution of the skins that networks are trained on.
+
+    Simulated skins about a centre; where boards of the rig are known, these and the law's errors on them (`residual`).
+    follows_law: skins follow the law exactly, as those of a simulated scene.
+    """
 
     name: str
     centre: Law
     spreads: Mapping[str, float]
     setup: Setup
-    recorded: Sequence[Recorded] = ()
+    recorded: Sequence[RecordedBoard] = ()
     residual: Residual | None = None
-    follows_law: bool = False  # skins of a simulated scene: no law misses anything
+    follows_law: bool = False
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Skins of one step: the first `PLACES_N` pokes of each may be shown, the others are asked for."""
+    """Skins of one step: the first `PLACES_N` presses of each condition the network (if `kept`), others are read."""
 
     db_uT: Float32[np.ndarray, "b m ch"]
     rest_uT: Float32[np.ndarray, "b ch"]
@@ -158,67 +160,58 @@ class Batch:
     kept: Float32[np.ndarray, "b c"]
 
 
-def teach(syllabus: Syllabus, lessons: Lessons, seed: int) -> list[dict[str, np.ndarray]]:
-    """Draw a population and train networks on it, one after the other; give their weights."""
-    rng = rng_for(seed, "universal", syllabus.name, "skins")
-    skins = draw_population(syllabus.centre, syllabus.spreads, syllabus.setup, lessons.skins_n, rng)
-    names = ("universal", syllabus.name, "network")
-    return [
-        train(skins, syllabus, lessons.steps_n, rng_for(seed, *names, seed_i))[0] for seed_i in range(lessons.seeds_n)
-    ]
+def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> list[dict[str, np.ndarray]]:
+    """Draw skins and train networks on them, one after the other; return their weights."""
+    rng = rng_for(seed, "universal", prior.name, "skins")
+    skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng)
+    names = ("universal", prior.name, "network")
+    return [train(skins, prior, settings.steps_n, rng_for(seed, *names, i)) for i in range(settings.seeds_n)]
 
 
-def train(
-    skins: Population, syllabus: Syllabus, steps_n: int, rng: np.random.Generator
-) -> tuple[dict[str, np.ndarray], list[float]]:
-    """Train one network; give its weights, and the mean loss of its places and forces by block of steps."""
-    torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
+def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Train one network; return its weights."""
+    torch.set_num_threads(1)  # sums in the same order, however many processes run beside this one
     network = Network(draw_weights(skins.rest_uT.shape[1], rng))
     optimizer = torch.optim.AdamW(network.parameters(), RATE_MAX, weight_decay=WEIGHT_DECAY, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE_MAX, total_steps=steps_n, pct_start=WARM_UP)
-    feed, losses = Feed(skins, syllabus), []
+    batches = Batches(skins, prior)
     for _ in range(steps_n):
-        batch = feed.draw(rng)
-        loss, error = loss_of(network, batch)
+        loss = loss_of(network, batches.draw(rng))
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_NORM_MAX)
         optimizer.step()
         rate.step()
-        losses.append(float(error.detach()))
-    blocks = np.array_split(losses, -(-steps_n // BLOCK_STEPS_N))
-    weights = {name: value.detach().numpy().copy() for name, value in network.weights.items()}
-    return weights, [float(block.mean()) for block in blocks]
+    return {name: value.detach().numpy().copy() for name, value in network.weights.items()}
 
 
-def loss_of(network: Network, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
-    """Give what is descended, and the part of it that is of answers, not of how sure they are."""
+def loss_of(network: Network, batch: Batch) -> torch.Tensor:
+    """Return the loss: Huber loss of the estimates, and the Gaussian likelihood of their standard deviations."""
     db_uT, rest_uT = torch.from_numpy(batch.db_uT), torch.from_numpy(batch.rest_uT)
     target, kept = torch.from_numpy(batch.target), torch.from_numpy(batch.kept)
-    shown_n = kept.shape[1]
-    answer, log_sd = network(db_uT[:, shown_n:], rest_uT, network.encode(db_uT[:, :shown_n], rest_uT, kept))
-    error = HUBER_WEIGHT * huber_loss(answer, target, delta=HUBER_DELTA)
-    # The spread learns from errors, not errors from the spread: Gaussian likelihood alone gives hard pokes up.
-    off = (answer - target).detach()
-    surprise = (log_sd + 0.5 * off**2 * exp(-2 * log_sd)).mean()
-    return error + SPREAD_WEIGHT * surprise, error
+    set_n = kept.shape[1]
+    mean, log_sd = network(db_uT[:, set_n:], rest_uT, network.encode(db_uT[:, :set_n], rest_uT, kept))
+    error = HUBER_WEIGHT * huber_loss(mean, target, delta=HUBER_DELTA)
+    # Standard deviations learn from errors, not the reverse: the Gaussian likelihood alone gives up hard presses.
+    off = (mean - target).detach()
+    return error + SD_WEIGHT * (log_sd + 0.5 * off**2 * exp(-2 * log_sd)).mean()
 
 
-class Feed:
+class Batches:
     """Draws the batches of a training."""
 
-    def __init__(self, skins: Population, syllabus: Syllabus) -> None:
-        self.skins, self.recorded = skins, syllabus.recorded
+    def __init__(self, skins: Population, prior: SkinPrior) -> None:
+        self.skins, self.recorded = skins, prior.recorded
         self.log_N = np.log(skins.force_N)
-        self.carried_uT = None if syllabus.residual is None else carried_uT(skins, syllabus.residual)
-        self.error = ERROR_OF_NOMINAL if syllabus.residual is None else ERROR_OF_RIG
-        if syllabus.follows_law:
+        self.residual_uT = None if prior.residual is None else residual_uT(skins, prior.residual)
+        self.error = ERROR_OF_NOMINAL if prior.residual is None else ERROR_OF_RIG
+        if prior.follows_law:
             self.error = 0.0, 0.0
 
     def draw(self, rng: np.random.Generator) -> Batch:
-        """Draw simulated skins, and recorded ones where there are any; with noise, and with the law's errors."""
-        recorded_n = RECORDED_A_STEP_N if self.recorded else 0
-        parts = [self._simulated(SKINS_A_STEP_N - recorded_n, rng)]
+        """Draw simulated skins, and recorded ones where there are any, with noise and errors of the law."""
+        recorded_n = RECORDED_PER_STEP_N if self.recorded else 0
+        parts = [self._simulated(SKINS_PER_STEP_N - recorded_n, rng)]
         if recorded_n:
             parts.append(self._recorded(recorded_n, rng))
         db_uT, rest_uT, place_mm, log_N = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -230,8 +223,8 @@ class Feed:
     def _simulated(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
         i = rng.integers(len(self.skins), size=n)
         db_uT, place_mm, log_N = self.skins.db_uT[i], self.skins.place_mm[i], self.log_N[i]
-        if self.carried_uT is not None:
-            db_uT = db_uT + CARRIED_MAX * rng.random((n, 1, 1), np.float32) * self.carried_uT[i]
+        if self.residual_uT is not None:
+            db_uT = db_uT + RESIDUAL_SCALE_MAX * rng.random((n, 1, 1), np.float32) * self.residual_uT[i]
         return add_error(db_uT, place_mm, log_N, self.error, rng), self.skins.rest_uT[i], place_mm, log_N
 
     def _recorded(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
@@ -240,18 +233,18 @@ class Feed:
         return add_error(db_uT, place_mm, log_N, ERROR_OF_RECORDED, rng), rest_uT, place_mm, log_N
 
 
-def draw_recorded(board: Recorded, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw a reading of each of 130 pokes of a known board; of fewer, some come again."""
-    poke = np.resize(rng.permutation(len(board.db_uT)), POKES_N)
-    reading = rng.integers(board.db_uT.shape[1], size=POKES_N)
-    return board.db_uT[poke, reading], board.rest_uT, board.place_mm[poke], np.log(board.force_N[poke, reading])
+def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Draw one reading of each of 130 presses of a known board; if there are fewer, some repeat."""
+    press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
+    reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
+    return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
 
 
 def draw_kept(n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n c"]:
-    """Draw which pokes of each skin are shown: none of some skins, 1 to 65 of others."""
-    shown_n = np.where(rng.random(n) < UNTOLD, 0, rng.integers(1, PLACES_N + 1, n))
+    """Draw which presses of each skin the network is conditioned on: none of some skins, 1 to 65 of others."""
+    kept_n = np.where(rng.random(n) < NO_PRESSES, 0, rng.integers(1, PLACES_N + 1, n))
     rank = rng.random((n, PLACES_N)).argsort(axis=1).argsort(axis=1)
-    return (rank < shown_n[:, None]).astype(np.float32)
+    return (rank < kept_n[:, None]).astype(np.float32)
 
 
 def add_error(
@@ -261,7 +254,10 @@ def add_error(
     size: tuple[float, float],
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "b m ch"]:
-    """Add what a law misses: smooth over place and log F, half as large as |dB| of the chip, half as of all chips."""
+    """Add an error of the law, smooth over place and log F, half in proportion to |dB| of the chip, half of all chips.
+
+    size: bounds of its relative rms, drawn for each skin.
+    """
     skins_n, _, channels_n = db_uT.shape
     part = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)
     wave = rng.standard_normal((skins_n, 3, ERROR_WAVES_N), np.float32)
@@ -277,8 +273,8 @@ def add_error(
     return db_uT + part * unit * 0.5 * (of_chip + of_all)
 
 
-def carried_uT(skins: Population, residual: Residual) -> Float32[np.ndarray, "s m ch"]:
-    """Give what known boards' errors add to every poke of a population."""
+def residual_uT(skins: Population, residual: Residual) -> Float32[np.ndarray, "s m ch"]:
+    """Return what the expected errors of the law add to every press of a population."""
     added = np.empty_like(skins.db_uT)
     for i in range(len(skins)):
         relative: Float[np.ndarray, "m ch"] = residual.at(skins.place_mm[i], np.log(skins.force_N[i]))

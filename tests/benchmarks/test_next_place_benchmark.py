@@ -1,9 +1,8 @@
-"""Places chosen by the map's own uncertainty beside fixed and random ones: errors after as many labels.
+"""Errors after labels at places chosen by the map's uncertainty, beside fixed and random places.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`:
-a minute. Simulated skins about the nominal one,
-with errors of the law as training draws them, that the shipped model has not seen; of each, 65 pokes on the grid may be
-labelled, 65 others are read. Nothing is asserted but that readings were answered.
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`, a minute. Simulated skins about the
+nominal one, with errors of the law as in training, that the shipped model has not seen. Of each, 65 presses on the grid
+may be labelled; 65 others are read.
 """
 
 from collections.abc import Callable
@@ -16,12 +15,11 @@ from reskin.live.session import GUIDED_MM
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
-from reskin.universal.calibration import expected_gain
 from reskin.universal.law import CHIPS_MM, Setup, to_board
-from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, expected_gain
 from reskin.universal.model import SKIN_MM, Universal, load_universal
 from reskin.universal.population import PLACES_N, draw_population
-from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
+from reskin.universal.training import ERROR_NOMINAL_SPREADS, NOISE_uT, add_error
 from tests.benchmarks import size
 
 SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0
@@ -32,8 +30,8 @@ def test_errors_after_labels_at_fixed_random_and_chosen_places():
     rng, errors = rng_for(0, "next place"), {}
     design = parse(SkinDesign, nominal("skin"), "params.yaml: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
-    skins = draw_population(NOMINAL, OF_NOMINAL, setup, SKINS_N, rng)
-    db_uT = add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), ERROR_OF_NOMINAL, rng)
+    skins = draw_population(NOMINAL, NOMINAL_SPREADS, setup, SKINS_N, rng)
+    db_uT = add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), ERROR_NOMINAL_SPREADS, rng)
     db_uT = db_uT + np.tile(NOISE_uT, 5) * rng.standard_normal(db_uT.shape)
     to_chips = np.linalg.inv(to_board(np.eye(db_uT.shape[2])))
     for rest_uT, own_uT, place_mm, force_N in zip(
@@ -58,9 +56,9 @@ def test_errors_after_labels_at_fixed_random_and_chosen_places():
 
 
 def ways(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
-    """Fixed: of the places that `reskin live` shows, in random order, each the next poke to it that there is."""
-    shown_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
-    fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(shown_mm)]
+    """Fixed places are those that `reskin live` shows, in random order, each by the press nearest to it."""
+    live_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
+    fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(live_mm)]
     anywhere = rng.permutation(len(pool_mm)).tolist()
 
     def chosen(skin: Universal, taken: list[int]) -> int:

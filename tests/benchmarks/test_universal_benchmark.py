@@ -1,7 +1,8 @@
 """Error of the universal model against what it takes: lattice pitch, forces, training skins and steps.
 
 `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints a table, docs/learning.md holds
-one. Skins that nobody was taught, with errors of the law as in training, told 65 pokes. Processor time of one thread.
+one. Skins that no network was trained on, with errors of the law as in training, 65 presses each. Processor time of
+one thread.
 """
 
 import os
@@ -12,31 +13,31 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.training.shipping import UNKNOWN, shown
-from pipeline.training.universal import AS_TAUGHT, MISSES, Experts, pool_of_prior, skins_of_prior
+from pipeline.training.shipping import NO_POWERS, calibrate
+from pipeline.training.universal import AS_TRAINED, LAW_ERRORS, draw_prior_skins, split_presses
 from reskin.config import parse
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import nominal
 from reskin.universal import map
 from reskin.universal.law import CHIPS_MM, Setup
-from reskin.universal.map import NOMINAL, OF_NOMINAL, Tables, tabulate
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, Tables, tabulate
 from reskin.universal.model import SKIN_MM, Universal
 from reskin.universal.network import FULL_SET_N, Weights
-from reskin.universal.training import NAMELESS, Lessons, Syllabus, teach
+from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
 from tests.benchmarks import FULL, size
 
 ROOT = Path(__file__).resolve().parents[2]
 SIDE_MM = map.PITCH_MM * map.STEPS_N
 PITCHES_MM, FORCES_N = size((1.6, 0.8, 0.6), (3.2,)), size((4, 9, 17), (3,))
 SKINS_N, STEPS_N = size((125, 500, 2000), (8,)), size((300, 1200), (5,))
-ASKED_N, SEED = size(24, 2), 2021
+TESTED_N, SEED = size(24, 2), 2021
 
 
 @dataclass(frozen=True)
 class Row:
-    """A setting, what it scored and what it took."""
+    """A setting with its errors and costs."""
 
-    words: str
+    setting: str
     accuracy_pct: float
     mse_xy_mm2: float
     force_factor: float
@@ -45,7 +46,7 @@ class Row:
 
     def __str__(self) -> str:
         return (
-            f"| {self.words} | {self.accuracy_pct:.1f} | {self.mse_xy_mm2:.2f} | {self.force_factor:.2f} | "
+            f"| {self.setting} | {self.accuracy_pct:.1f} | {self.mse_xy_mm2:.2f} | {self.force_factor:.2f} | "
             f"{self.made_s:.0f} | {self.reading_us:.0f} |"
         )
 
@@ -53,26 +54,26 @@ class Row:
 def test_error_against_time_of_map_and_network(monkeypatch):
     design = parse(SkinDesign, nominal("skin"), "skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
-    syllabus = Syllabus(NAMELESS, NOMINAL, OF_NOMINAL, setup)
+    prior = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup)
     networks: dict[tuple[int, int], tuple[Sequence[Weights], float]] = {}
     for skins_n in SKINS_N:
         for steps_n in STEPS_N:
             start_s = time.process_time()
-            taught = teach(syllabus, Lessons(skins_n=skins_n, steps_n=steps_n, seeds_n=1), SEED)
-            networks[skins_n, steps_n] = taught, time.process_time() - start_s
+            trained = train_networks(prior, TrainingSettings(skins_n=skins_n, steps_n=steps_n, seeds_n=1), SEED)
+            networks[skins_n, steps_n] = trained, time.process_time() - start_s
     used = networks[SKINS_N[len(SKINS_N) // 2], STEPS_N[-1]][0]
-    print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {ASKED_N} skins asked")
+    print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {TESTED_N} skins")
     print("| setting | within 1 mm, % | MSE_xy, mm² | force off by a factor of | made in, s | a reading, µs |")
     print("|---|---|---|---|---|---|")
     rows = []
     for pitch_mm in PITCHES_MM:
         for forces_n in FORCES_N if pitch_mm == 0.8 or not FULL else (9,):
             made, made_s = lattice(monkeypatch, pitch_mm, forces_n, setup)
-            rows.append(asked(f"pitch {pitch_mm} mm, {forces_n} forces", made, used, syllabus, made_s))
+            rows.append(evaluated(f"pitch {pitch_mm} mm, {forces_n} forces", made, used, prior, made_s))
             print(rows[-1])
     whole, _ = lattice(monkeypatch, 0.8 if FULL else 3.2, 9 if FULL else 3, setup)
-    for (skins_n, steps_n), (taught, taught_s) in networks.items():
-        rows.append(asked(f"network of {skins_n} skins, {steps_n} steps", whole, taught, syllabus, taught_s))
+    for (skins_n, steps_n), (trained, trained_s) in networks.items():
+        rows.append(evaluated(f"network of {skins_n} skins, {steps_n} steps", whole, trained, prior, trained_s))
         print(rows[-1])
     assert all(np.isfinite([row.accuracy_pct, row.mse_xy_mm2, row.force_factor]).all() for row in rows)
     if FULL:
@@ -80,29 +81,29 @@ def test_error_against_time_of_map_and_network(monkeypatch):
 
 
 def lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[Tables, float]:
-    """Tabulate a lattice of this pitch and so many forces; give what that took."""
+    """Tabulate a lattice of this pitch and number of forces; return it with the seconds it took."""
     monkeypatch.setattr(map, "PITCH_MM", pitch_mm)
     monkeypatch.setattr(map, "STEPS_N", 2 * round(SIDE_MM / pitch_mm / 2))
     forces_N = np.geomspace(map.FORCES_N[0], map.FORCES_N[-1], forces_n)
     start_s = time.process_time()
-    return tabulate(NOMINAL, OF_NOMINAL, setup, forces_N), time.process_time() - start_s
+    return tabulate(NOMINAL, NOMINAL_SPREADS, setup, forces_N), time.process_time() - start_s
 
 
-def asked(words: str, made: Tables, networks: Sequence[Weights], syllabus: Syllabus, made_s: float) -> Row:
-    """Ask a model about skins that nobody was taught, told 65 pokes of each."""
-    model = Universal(made, networks, UNKNOWN)
-    skins = skins_of_prior(Experts(made, networks, None, syllabus), ASKED_N, SEED, AS_TAUGHT, MISSES[AS_TAUGHT])
+def evaluated(setting: str, made: Tables, networks: Sequence[Weights], prior: SkinPrior, made_s: float) -> Row:
+    """Score a model on fresh skins, calibrated to 65 presses of each."""
+    model = Universal(made, networks, NO_POWERS)
+    skins = draw_prior_skins(prior, TESTED_N, SEED, AS_TRAINED, LAW_ERRORS[AS_TRAINED])
     off_mm, off_log, took_s, read_n = [], [], 0.0, 0
     for i in range(len(skins)):
-        b_uT, place_mm = shown(model, skins, i, (FULL_SET_N, 0), even=True, seed=SEED)
-        model.estimate(b_uT[:1])  # made ready
+        b_uT, place_mm = calibrate(model, skins, i, (FULL_SET_N, 0), even=True, seed=SEED)
+        model.estimate(b_uT[:1])  # prepares the map
         start_s = time.process_time()
         found = model.estimate(b_uT)
         took_s, read_n = took_s + time.process_time() - start_s, read_n + len(b_uT)
         off_mm.append(found.place_mm - place_mm)
-        off_log.append(np.log(found.force_N / pool_of_prior(skins, i, SEED)[1].force_N))
+        off_log.append(np.log(found.force_N / split_presses(skins, i, SEED)[1].force_N))
     off = np.concatenate(off_mm)
     return Row(
-        words, 100 * float((np.abs(off) <= 1).all(axis=1).mean()), float((off**2).mean()),
+        setting, 100 * float((np.abs(off) <= 1).all(axis=1).mean()), float((off**2).mean()),
         float(np.exp(np.sqrt(np.mean(np.concatenate(off_log) ** 2)))), made_s, 1e6 * took_s / read_n,
     )  # fmt: skip

@@ -1,5 +1,6 @@
-"""A scene's experts are taught the skin as designed; what is killed goes on; a pool is one poke at each place."""
+"""The prior is the skin as designed; a killed run continues; no press is used for calibration and scored."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,15 +8,32 @@ import pandas as pd
 import pytest
 
 from pipeline.experiments import population
-from pipeline.experiments.population import _weight, cases, over_boards
-from pipeline.training.universal import Frame
+from pipeline.experiments.population import (
+    WAYS,
+    WEIGHT_N,
+    WEIGHT_SD,
+    CalibrationSize,
+    DesignedSkins,
+    calibrate_ways,
+    designed_skins,
+    estimate,
+    find_weight,
+    over_boards,
+    scene_skins,
+    score_skin,
+    simulated_skins,
+)
+from pipeline.training.universal import BOARD_POWERS, Frame
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
 from reskin.simulation.settings import BoardKind
+from reskin.universal.map import Estimate, new_map
+from reskin.universal.model import PriorModel
 from reskin.universal.population import Population
-from tests.universal.skins import DESIGN, made_population
+from reskin.universal.training import draw_weights
+from tests.universal.skins import DESIGN, made_population, made_tables
 
 KIND = BoardKind(
     letter="b", boards_n=1, skins_per_board_n=1, skin_mm=(20.0, 20.0), quadrature={"cell_mm": 0.8, "layers_n": 5},
@@ -25,84 +43,94 @@ STAT = {"mean": 90.0, "sd": 2.0, "n": 6}
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "mse_f_weight_N2", "mse_f_factor_N2", "coverage_pct")
 
 
-def test_the_designed_skin_is_the_law_that_its_scene_simulates():
-    lesson = population.lesson_of(DESIGN, KIND, (0.2, 1.2), seed=0)
-    law = lesson.syllabus.centre
+@pytest.fixture(scope="module")
+def model() -> PriorModel:
+    return PriorModel(new_map(made_tables()), [draw_weights(15, rng_for(0, "population"))])
+
+
+@pytest.fixture(scope="module")
+def skins():
+    return simulated_skins(made_population(3, rng_for(1, "population"), WEIGHT_N), rng_for(2, "population"))
+
+
+def test_the_prior_is_centred_on_the_law_that_its_scene_simulates():
+    designed = designed_skins(DESIGN, KIND, (0.2, 1.2), seed=0)
+    law = designed.prior.centre
     assert (law.gap_mm, law.amplitude, law.away_um_mm) == (1.1, 1.0, DESIGN.hold.away_um_mm)
     assert (law.modulus_MPa, law.grip_N_mm) == (pytest.approx(1e-3 * DESIGN.modulus_kPa), pytest.approx(8.75))
-    assert lesson.forces_N[0] < 0.05 < 5 < lesson.forces_N[1]  # of 0.2 and 1.2 mm
+    assert designed.forces_N[0] < 0.05 < 5 < designed.forces_N[1]  # of 0.2 and 1.2 mm
     with pytest.raises(ValueError, match="hold must be"):
-        population.lesson_of(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)
+        designed_skins(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)
 
 
 def test_a_killed_run_draws_no_part_again(monkeypatch):
     drawn, shelf = [], {}
     whole = made_population(7, rng_for(0, "skins"))
 
-    def skins(_: str, which: slice) -> Population:
+    def draw(_: DesignedSkins, name: str, which: slice) -> Population:
         drawn.append(which)
         return Population(*(getattr(whole, name)[which] for name in Population.__annotations__))
 
-    syllabus = SimpleNamespace(spreads={}, centre=None)
-    lesson = SimpleNamespace(skins=skins, syllabus=syllabus, forces_N=(1.0, 2.0), seed=0)
+    monkeypatch.setattr(DesignedSkins, "draw", draw)
     monkeypatch.setattr(population, "PART_N", 3)
     monkeypatch.setattr(population.io, "load", lambda _, name: shelf.get(name))
     monkeypatch.setattr(population.io, "save", lambda _, name, part: shelf.update({name: part}))
-    population.draw(lesson, 6, lambda line: None)
+    designed = designed_skins(DESIGN, KIND, (0.2, 1.2), seed=0)
+    population.draw(designed, 6, lambda line: None)
     drawn.clear()
-    found = population.draw(lesson, 7, lambda line: None)
-    assert [which for which in drawn if which != slice(1)] == [slice(6, 7)]  # the first skin is a part of the names
+    found = population.draw(designed, 7, lambda line: None)
+    assert [which for which in drawn if which != slice(1)] == [slice(6, 7)]  # the first skin is part of the key
     for name in Population.__annotations__:
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
 
 
-def test_a_skins_pool_is_one_poke_at_each_place_and_none_of_it_is_tested():
+def test_a_pool_is_one_press_at_each_place_and_none_of_it_is_tested():
     places_n, depths_n, readings_n = 4, 3, 2
-    poke = np.repeat(np.arange(2 * places_n * depths_n), readings_n)  # two passes
-    target = np.stack([poke % places_n, poke % places_n, 1 + poke], axis=1).astype(np.float32)
-    names = (np.full(len(poke), name) for name in ("c", "b0", "b0_s0"))
-    pass_i = (poke // (places_n * depths_n)).astype(np.int32)
-    rows = Rows(*names, np.tile(poke[:, None], (1, 3)).astype(np.float32), target, pass_i, poke, {})
+    press = np.repeat(np.arange(2 * places_n * depths_n), readings_n)  # two passes
+    target = np.stack([press % places_n, press % places_n, 1 + press], axis=1).astype(np.float32)
+    names = (np.full(len(press), name) for name in ("c", "b0", "b0_s0"))
+    pass_i = (press // (places_n * depths_n)).astype(np.int32)
+    rows = Rows(*names, np.tile(press[:, None], (1, 3)).astype(np.float32), target, pass_i, press, {})
     fold = Fold("lobo", "b0", np.zeros(0, np.int64), np.flatnonzero(pass_i == 1), np.flatnonzero(pass_i == 0))
     data = SimpleNamespace(rows=rows, settings=SimpleNamespace(seed=0))
-    (case,) = cases(data, fold, Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), {"b0_s0": np.zeros(3)})
-    assert sorted((case.pool.place_mm[:, 0] + 8).tolist()) == [0, 1, 2, 3]
-    np.testing.assert_array_equal(case.pool.db_uT[:, 0] + 1, case.pool.force_N)  # the readings of that poke
-    assert not set(case.pool.force_N) & set(case.true[:, 2])
-    assert len(case.true) == len(fold.test)
+    (skin,) = scene_skins(data, fold, Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), {"b0_s0": np.zeros(3)})
+    assert sorted((skin.pool.place_mm[:, 0] + 8).tolist()) == [0, 1, 2, 3]
+    np.testing.assert_array_equal(skin.pool.db_uT[:, 0] + 1, skin.pool.force_N)  # the readings of that press
+    assert not set(skin.pool.force_N) & set(skin.true[:, 2])
+    assert len(skin.true) == len(fold.test)
 
 
-def test_the_weight_is_the_press_of_the_middle_that_comes_next_to_its_force():
+def test_the_weight_is_the_press_of_the_middle_nearest_to_its_force():
     force_N = np.repeat([1.0, 4.0, 8.0, 1.0, 4.5], 2).astype(np.float32)  # two readings of each of five presses
     x_mm = np.repeat([8.0, 8.0, 8.0, 10.0, 10.0], 2).astype(np.float32)
-    target, poke = np.stack([x_mm, np.full(10, 8.0, np.float32), force_N], axis=1), np.repeat(np.arange(5), 2)
+    target, press = np.stack([x_mm, np.full(10, 8.0, np.float32), force_N], axis=1), np.repeat(np.arange(5), 2)
     names = (np.full(10, name) for name in ("c", "b0", "b0_s0"))
     db_uT = np.stack([force_N, x_mm, force_N], axis=1)
-    data = SimpleNamespace(rows=Rows(*names, db_uT, target, np.zeros(10, np.int32), poke, {}))
-    weight = _weight(data, np.arange(10), Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), rng_for(0, "weight"))
+    data = SimpleNamespace(rows=Rows(*names, db_uT, target, np.zeros(10, np.int32), press, {}))
+    weight = find_weight(data, np.arange(10), Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), rng_for(0, "weight"))
     np.testing.assert_array_equal(weight.db_uT, [4, 8, 4])
     assert 3.5 < weight.force_N < 4.5  # of 4 N, known to 2 %
     assert weight.force_N != 4.0
 
 
 def weight_of_middle(force_N: list[float]):
-    """Take the weight from presses of the middle, one reading each."""
+    """The weight among presses of the middle, one reading each."""
     force = np.array(force_N, np.float32)
     names = (np.full(len(force), name) for name in ("c", "b0", "b0_s0"))
     target, db_uT = np.full((len(force), 3), 8, np.float32), np.repeat(force[:, None], 3, axis=1)
     target[:, 2] = force
     rows = Rows(*names, db_uT, target, np.zeros(len(force), np.int32), np.arange(len(force)), {})
     frame, rng = Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), rng_for(0, "weight")
-    return _weight(SimpleNamespace(rows=rows), np.arange(len(force)), frame, rng)
+    return find_weight(SimpleNamespace(rows=rows), np.arange(len(force)), frame, rng)
 
 
-@pytest.mark.parametrize("nothing_N", [0.0, -0.01, -5.0, np.nan])
-def test_a_press_without_a_force_above_nothing_is_no_known_weight(nothing_N):
-    assert weight_of_middle([nothing_N, 4.0, 1.0]).db_uT[0] == 4
+@pytest.mark.parametrize("zero_N", [0.0, -0.01, -5.0, np.nan])
+def test_a_press_without_a_positive_force_is_no_known_weight(zero_N):
+    assert weight_of_middle([zero_N, 4.0, 1.0]).db_uT[0] == 4
     with pytest.raises(
         SchemaError, match="skin b0_s0: the known weight must be of a press with a force above 0 N; got 2"
     ):
-        weight_of_middle([nothing_N, nothing_N])
+        weight_of_middle([zero_N, zero_N])
 
 
 def test_tables_and_figure_show_every_way():
@@ -118,11 +146,14 @@ def test_tables_and_figure_show_every_way():
     assert [*tables["population_fresh"]["labels"]] == ["0", "5"]
     held = [column for column in tables["population_fresh"] if "90 %" in column]
     assert [*tables["population_fresh"]][-4:] == [*held, "n"]  # the map, both, the network
-    before = {name: value for name, value in numbers.items() if name != "fresh"}
-    assert set(tables) - set(population.tables(before, "simulated")) == {"population_fresh"}
+    earlier = {name: value for name, value in numbers.items() if name != "fresh"}
+    assert set(tables) - set(population.tables(earlier, "simulated")) == {"population_fresh"}
     assert set(tables["population_scaling"]["skins taught"]) == {"30", "3000"}
     assert all("universal" in method for method in tables["population"]["method"])
-    assert "skins that the network was taught" in population.figures(numbers, {}, "simulated")["population_scaling.svg"]
+    assert (
+        "simulated skins that the network was trained on"
+        in population.figures(numbers, {}, "simulated")["population_scaling.svg"]
+    )
 
 
 def test_boards_are_the_unit():
@@ -130,3 +161,56 @@ def test_boards_are_the_unit():
     rows = pd.DataFrame(told | {"board": ["b0", "b0", "b1"], "accuracy_pct": [1.0, 3.0, 6.0]})
     (found,) = over_boards(rows, "way", "pokes_n", "labels_n")
     assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (4.0, 2)
+
+
+def test_no_press_is_used_for_calibration_and_scored(skins):
+    for skin in skins:
+        pooled, tested = ({tuple(row) for row in part} for part in (skin.pool.db_uT, skin.test_uT))
+        assert not pooled & tested
+        assert len(np.unique(skin.pool.place_mm.round(0), axis=0)) == len(skin.pool)  # one a place
+
+
+def test_an_untrained_network_spoils_no_map_and_labels_improve_it(model, skins):
+    sizes = CalibrationSize(0, 0), CalibrationSize(65, 40)
+    calibration = calibrate_ways(model, skins, sizes[0])
+    rows = [row for size in sizes for skin in skins for row in score_skin(model, skin, size, calibration)]
+    off_N2 = {
+        (way, n): np.mean([row["mse_f_N2"] for row in rows if (row["way"], row["labels_n"]) == (way, n)])
+        for way in WAYS
+        for n in (0, 40)
+    }
+    assert off_N2["map", 40] < off_N2["map", 0] < off_N2["network", 0]
+    for row in rows:
+        assert row["mse_f_factor_N2"] <= min(row["mse_f_N2"], row["mse_f_weight_N2"]) + 1e-9  # the best factor of all
+
+
+def test_the_weight_is_estimated_last_and_its_force_is_nearly_known(model, skins):
+    skin, once = skins[0], dict.fromkeys(WAYS, 1.0)
+    (found,) = estimate(model, skin, CalibrationSize(16, 0), [once])
+    assert all(len(one.force_N) == len(skin.true) + 1 for one in found.values())
+    heavier = replace(skin, weight=replace(skin.weight, db_uT=2 * skin.weight.db_uT))
+    (changed,) = estimate(model, heavier, CalibrationSize(16, 0), [once])
+    for way in WAYS:
+        np.testing.assert_array_equal(changed[way].force_N[:-1], found[way].force_N[:-1])
+        assert changed[way].force_N[-1] != found[way].force_N[-1]
+    off = [np.log(one.weight.force_N / WEIGHT_N) for one in skins]
+    assert 0 < np.abs(off).max() < 5 * WEIGHT_SD
+
+
+def test_the_weight_share_is_that_at_the_chosen_power(skins, monkeypatch):
+    # Errors of force grow with the power; only intervals of one power cover 90 %.
+    def made_up(model, skin, size, powers):
+        found = []
+        for one in powers:
+            power = one["map"]
+            reach = 10.0 if power == BOARD_POWERS[1] else 0.0
+            true_mm = np.vstack([skin.true[:, :2], [[0, 0]]])
+            force_N = np.append(skin.true[:, 2] * np.exp(power), skin.weight.force_N * np.exp(0.1))
+            of = Estimate(true_mm + 0.1, np.full_like(true_mm, reach), force_N, np.full(len(force_N), np.nan))
+            found.append(dict.fromkeys(WAYS, of))
+        return found
+
+    monkeypatch.setattr(population, "estimate", made_up)
+    calibration = calibrate_ways(None, skins, CalibrationSize(0, 0))
+    assert set(calibration.power.values()) == {BOARD_POWERS[1]}
+    assert calibration.weight_share == pytest.approx(dict.fromkeys(WAYS, BOARD_POWERS[1] / 0.1))

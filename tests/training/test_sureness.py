@@ -1,4 +1,4 @@
-"""Intervals of experts that know no board widen as pokes misfit and labels are off; no answer is moved by it."""
+"""Intervals of the nominal variant widen with misfit and errors of labels; estimates do not change."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -8,21 +8,22 @@ import pytest
 
 from pipeline.training import universal
 from pipeline.training.universal import (
-    SURENESS,
-    Experts,
-    Pokes,
-    best,
-    by_own_labels,
-    read_both,
-    ready,
-    skins_of_prior,
-    tell_sureness,
-    told_of,
+    NOMINAL_POWERS,
+    PoolCalibration,
+    Powers,
+    Variant,
+    best_powers,
+    calibrate_on_simulated,
+    calibrate_to_simulated,
+    draw_prior_skins,
+    estimate,
+    lower_by_labels,
 )
 from reskin.seeds import rng_for
-from reskin.universal.calibration import variance_inflation
-from reskin.universal.map import NOMINAL, OF_NOMINAL
-from reskin.universal.training import Syllabus, draw_weights
+from reskin.universal.calibration import LabelledPresses, variance_inflation
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
+from reskin.universal.model import PriorModel
+from reskin.universal.training import SkinPrior, draw_weights
 from tests.universal.skins import SETUP, made_population, made_tables
 
 
@@ -33,9 +34,9 @@ def made(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def nominal() -> Experts:
-    networks = [draw_weights(15, rng_for(0, "sureness"))]
-    return Experts(made_tables(), networks, None, Syllabus("nominal", NOMINAL, OF_NOMINAL, SETUP))
+def nominal() -> Variant:
+    model = PriorModel(new_map(made_tables()), [draw_weights(15, rng_for(0, "sureness"))])
+    return Variant(SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), model)
 
 
 def plain(skins, rng):
@@ -46,52 +47,55 @@ def half_off(skins, rng):
     return skins.db_uT * np.exp(0.5 * rng.standard_normal((len(skins), 1, 15)))
 
 
-def test_that_temper_is_best_under_which_nine_in_ten_lie_inside():
-    held = [np.array([[0.5, 0.7], [0.9, 0.8], [1.0, 1.0]]), np.array([[0.7, 0.9], [0.9, 0.9], [1.0, 1.0]])]
-    assert best((1.0, 0.5, 0.1), held) == (0.5, 0.5)
+def calibrated(nominal: Variant, error) -> tuple[PoolCalibration, LabelledPresses]:
+    return calibrate_to_simulated(nominal.model, draw_prior_skins(nominal.prior, 1, 0, "asked", error), 0, 0)
 
 
-def test_pokes_that_fit_worse_make_intervals_wider_and_move_no_answer(nominal):
-    fits, misfits = (told_of(nominal, skins_of_prior(nominal, 1, 0, "asked", one), 0, 0) for one in (plain, half_off))
-    assert misfits[0].misfit > 2 * fits[0].misfit
-    assert misfits[0].tempers((0.2, 0.1))[0] == pytest.approx(min(1.0, 0.2 / misfits[0].misfit))
-    told, asked = misfits
-    by_misfit = [replace(told, misfit=misfit).tempers((0.5, 0.5)) for misfit in (0.1, 1.0, 4.0)]
+def test_the_best_powers_cover_nine_in_ten():
+    found = [np.array([[0.5, 0.7], [0.9, 0.8], [1.0, 1.0]]), np.array([[0.7, 0.9], [0.9, 0.9], [1.0, 1.0]])]
+    assert best_powers((1.0, 0.5, 0.1), found) == (0.5, 0.5)
+
+
+def test_a_larger_misfit_widens_intervals_and_moves_no_estimate(nominal):
+    (fitting, _), (misfitting, tested) = (calibrated(nominal, error) for error in (plain, half_off))
+    assert misfitting.misfit > 2 * fitting.misfit
+    powers = misfitting.nominal_powers(Powers(0.2, 0.1))
+    assert powers.map == pytest.approx(min(1.0, 0.2 / misfitting.misfit))
+    by_misfit = [replace(misfitting, misfit=misfit).nominal_powers(Powers(0.5, 0.5)) for misfit in (0.1, 1.0, 4.0)]
     assert by_misfit == [(1.0, 1.0), (0.5, 0.5), (0.125, 0.125)]
-    for answers in zip(*read_both(ready(told, 0), asked.db_uT, by_misfit), strict=True):
-        for one, wider in pairwise(answers):
+    for estimates in zip(*estimate(misfitting.with_labels(0), tested.db_uT, by_misfit), strict=True):
+        for one, wider in pairwise(estimates):
             np.testing.assert_array_equal(one.place_mm, wider.place_mm)
             assert wider.sd_mm.mean() > one.sd_mm.mean()
 
 
 @pytest.fixture
-def labelled(nominal):
+def fits_and_misled(nominal) -> tuple[PoolCalibration, PoolCalibration]:
     """A skin that fits, and the same with labels that are 3 mm off, each its own way."""
-    told, asked = told_of(nominal, skins_of_prior(nominal, 1, 0, "asked", plain), 0, 0)
-    off_mm = 3 * rng_for(1, "labels").standard_normal(told.pool.place_mm.shape)
-    misled = replace(told, pool=Pokes(told.pool.place_mm + off_mm, told.pool.force_N, told.pool.db_uT))
-    return told, misled, asked
+    fits, _ = calibrated(nominal, plain)
+    off_mm = 3 * rng_for(1, "labels").standard_normal(fits.pool.place_mm.shape)
+    return fits, replace(fits, pool=replace(fits.pool, place_mm=fits.pool.place_mm + off_mm))
 
 
-def test_labels_that_are_off_where_they_were_not_told_make_intervals_wider(labelled):
-    told, misled, _ = labelled
-    of_told, of_misled = (np.array(by_own_labels(one, 40, [(0.3, 0.3), (0.1, 0.1)])) for one in (told, misled))
-    assert (of_misled < of_told / 2).all()
-    assert by_own_labels(misled, 0, [(0.3, 0.2)]) == [(0.3, 0.2)]  # no label tells nothing
-    few = np.array(by_own_labels(misled, 3, [(0.3, 0.3), (0.1, 0.1)]))
-    assert (of_misled < few).all()  # three tell less than forty
+def test_errors_of_held_out_labels_widen_intervals(fits_and_misled):
+    powers = [Powers(0.3, 0.3), Powers(0.1, 0.1)]
+    of_fits, of_misled = (np.array(lower_by_labels(one, 40, powers)) for one in fits_and_misled)
+    _, misled = fits_and_misled
+    assert (of_misled < of_fits / 2).all()
+    assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, unchanged
+    assert (of_misled < np.array(lower_by_labels(misled, 3, powers))).all()  # three labels tell less than forty
 
 
-def test_a_single_label_is_read_by_experts_that_were_told_none(labelled):
-    told, misled, _ = labelled
-    (found,) = by_own_labels(misled, 1, [(0.3, 0.3)])
-    (blind,) = read_both(ready(told, 0), told.pool.db_uT[:1], [(0.3, 0.3)])
-    off = [np.abs(one.place_mm - misled.pool.place_mm[:1]) / one.sd_mm for one in blind]
+def test_a_single_label_is_held_out_from_a_calibration_without_labels(fits_and_misled):
+    fits, misled = fits_and_misled
+    (found,) = lower_by_labels(misled, 1, [Powers(0.3, 0.3)])
+    (without,) = estimate(fits.with_labels(0), fits.pool.db_uT[:1], [Powers(0.3, 0.3)])
+    off = [np.abs(one.place_mm - misled.pool.place_mm[:1]) / one.sd_mm for one in without]
     assert found == pytest.approx([0.3 / variance_inflation(one) for one in off])
 
 
-def test_sureness_is_told_by_skins_of_the_prior_for_every_number_of_labels(nominal, monkeypatch):
-    monkeypatch.setattr(universal, "FURTHER_N", 2)
-    found = tell_sureness(nominal, (0, 40), seed=0)
+def test_powers_are_calibrated_for_every_number_of_labels(nominal, monkeypatch):
+    monkeypatch.setattr(universal, "CALIBRATION_SKINS_N", 2)
+    found = calibrate_on_simulated(nominal, (0, 40), seed=0)
     assert set(found) == {0, 40}
-    assert set(np.ravel(list(found.values()))) <= set(SURENESS)
+    assert set(np.ravel(list(found.values()))) <= set(NOMINAL_POWERS)

@@ -9,7 +9,7 @@ from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import nominal
 from reskin.universal.law import Setup
 from reskin.universal.map import Tables, lattice_mm
-from reskin.universal.population import POKES_N, Population, draw_places
+from reskin.universal.population import PRESSES_N, Population, draw_places
 
 ROOT = Path(__file__).resolve().parents[2]
 CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0]])
@@ -51,7 +51,7 @@ def made_tables() -> Tables:
 def made_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
     """Draw made-up skins whose numbers differ; where a weight is given, its press comes last."""
     place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
-    force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, POKES_N)))
+    force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, PRESSES_N)))
     number = rng.standard_normal((skins_n, 3))
     if weight_N is not None:
         place_mm = np.concatenate([place_mm, np.zeros((skins_n, 1, 2))], axis=1)

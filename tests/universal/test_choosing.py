@@ -1,10 +1,9 @@
-"""The next poke is expected_gain what conditioning a Gaussian on it takes from the variance of all fields."""
+"""The gain of a labelled press is what conditioning a Gaussian on it takes from the variance of all fields."""
 
 import numpy as np
 import pytest
 
-from reskin.universal.calibration import expected_gain
-from reskin.universal.map import NOISE_uT, SkinMap, kernel, new_map, see_labelled
+from reskin.universal.map import NOISE_uT, SkinMap, condition_on_labels, expected_gain, kernel, new_map
 from reskin.universal.model import load_universal
 from tests.universal.skins import fields_uT, made_tables
 
@@ -16,34 +15,34 @@ def skin() -> SkinMap:
     return new_map(made_tables())
 
 
-def test_a_poke_is_worth_what_conditioning_on_it_takes_from_the_variance(skin):
+def test_the_gain_is_what_conditioning_takes_from_the_variance(skin):
     of, some = skin.hypotheses, np.arange(3, len(skin.hypotheses.mean_uT), len(skin.hypotheses.log_N))
     i = int(np.linalg.norm(of.place_mm - PLACE_mm[1], axis=1).argmin())
     slope = (of.slope_uT / np.linalg.norm(of.mean_uT, axis=1)[:, None, None])[some].astype(float)
     at_mm, at_log_N = (part[some] for part in of.at)
     force_N = np.exp(of.log_N[3:4])
-    poke_uT = np.linalg.norm(of.mean_uT[some[i]])
-    # All channels at all places, beside those of the poke, which is one of these places.
+    press_uT = np.linalg.norm(of.mean_uT[some[i]])
+    # All channels at all places, beside those of the press, which is one of these places.
     alike = kernel(at_mm, at_mm[i : i + 1], at_log_N, at_log_N[i : i + 1])[:, 0]
     beside = slope @ skin.cov @ slope[i].T + alike[:, None, None] * skin.error_cov
-    read = beside[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / poke_uT) ** 2 * np.eye(15)
+    read = beside[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / press_uT) ** 2 * np.eye(15)
     taken = [np.trace(one @ np.linalg.solve(read, one.T)) for one in beside]
     found = expected_gain(skin, of.place_mm[i : i + 1], force_N)
     assert found[0] == pytest.approx(np.mean(taken), rel=1e-5)  # tables in single precision
 
 
-def test_what_is_labelled_is_worth_little_and_what_lies_far_from_it_more(skin):
+def test_a_labelled_place_gains_little_more_and_a_far_one_more(skin):
     before = expected_gain(skin, PLACE_mm, FORCE_N)
-    told = see_labelled(skin, PLACE_mm[:1], FORCE_N[:1], fields_uT(PLACE_mm[:1], FORCE_N[:1]))
-    after = expected_gain(told, PLACE_mm, FORCE_N)
+    labelled = condition_on_labels(skin, PLACE_mm[:1], FORCE_N[:1], fields_uT(PLACE_mm[:1], FORCE_N[:1]))
+    after = expected_gain(labelled, PLACE_mm, FORCE_N)
     assert after[0] < 0.2 * before[0]
     assert after[1] > 1.5 * after[0]
 
 
-def test_the_model_that_comes_with_the_project_says_where_to_press_next():
+def test_the_shipped_model_chooses_the_next_place_to_press():
     model = load_universal()
     first_mm = model.next_place()
-    poke_uT = 300 * np.sin(np.arange(15.0))[None]
-    next_mm = model.label(first_mm[None], np.array([2.0]), poke_uT).next_place()
+    press_uT = 300 * np.sin(np.arange(15.0))[None]
+    next_mm = model.label(first_mm[None], np.array([2.0]), press_uT).next_place()
     assert ((first_mm > 0) & (first_mm < 16)).all()
     assert np.linalg.norm(next_mm - first_mm) > 2

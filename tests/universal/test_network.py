@@ -1,4 +1,4 @@
-"""The network is told a set: order does not count, and none is a set too."""
+"""The network is conditioned on a set of presses: their order does not matter, and there may be none."""
 
 import numpy as np
 import pytest
@@ -9,36 +9,38 @@ from reskin.universal.network import LOG_N, PLACE_MM, predict
 from reskin.universal.training import Network, draw_weights, inputs
 
 RNG = rng_for(0, "network")
-POKES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15), (7, 15), (15,)))
+PRESSES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15), (7, 15), (15,)))
 ONE, OTHER = (draw_weights(15, rng_for(0, name)) for name in ("one", "other"))
 
 
-def test_the_order_of_told_pokes_changes_nothing():
-    told, turned = predict([ONE], READ_uT, REST_uT, POKES_uT), predict([ONE], READ_uT, REST_uT, POKES_uT[::-1])
-    np.testing.assert_allclose(told.place_mm, turned.place_mm, atol=1e-4)  # sums in another order
-    other = predict([ONE], READ_uT, REST_uT, 2 * POKES_uT)
-    assert np.abs(told.place_mm - other.place_mm).max() > 1e-3
+def test_the_order_of_presses_does_not_matter():
+    forward, backward = predict([ONE], READ_uT, REST_uT, PRESSES_uT), predict([ONE], READ_uT, REST_uT, PRESSES_uT[::-1])
+    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)  # sums in another order
+    other = predict([ONE], READ_uT, REST_uT, 2 * PRESSES_uT)
+    assert np.abs(forward.place_mm - other.place_mm).max() > 1e-3
 
 
-def test_a_poke_that_is_not_kept_tells_nothing():
+def test_a_press_that_is_not_kept_does_not_count():
     network, rest = Network(ONE), torch.from_numpy(REST_uT[None].astype(np.float32))
-    pokes = torch.from_numpy(POKES_uT[None].astype(np.float32))
+    presses = torch.from_numpy(PRESSES_uT[None].astype(np.float32))
     kept = (torch.arange(20) < 5).float()[None]
-    torch.testing.assert_close(network.encode(pokes, rest, kept), network.encode(pokes[:, :5], rest, torch.ones(1, 5)))
+    torch.testing.assert_close(
+        network.encode(presses, rest, kept), network.encode(presses[:, :5], rest, torch.ones(1, 5))
+    )
     none = predict([ONE], READ_uT, REST_uT, np.empty((0, 15)))
     assert np.isfinite(none.place_mm).all()
 
 
-def test_a_reading_is_seen_as_direction_and_length():
+def test_inputs_are_direction_and_length():
     rest = torch.zeros(1, 15)
     near, far = (inputs(torch.from_numpy(size * READ_uT[None].astype(np.float32)), rest) for size in (1.0, 5.0))
     torch.testing.assert_close(near[..., :15], far[..., :15])
     torch.testing.assert_close(far[..., 15] - near[..., 15], torch.full((1, 7), float(np.log(5.0))), atol=1e-5, rtol=0)
 
 
-def test_several_networks_give_their_mean_and_count_their_difference_as_uncertainty():
-    one, other = (predict([each], READ_uT, REST_uT, POKES_uT) for each in (ONE, OTHER))
-    both = predict([ONE, OTHER], READ_uT, REST_uT, POKES_uT)
+def test_the_spread_of_several_networks_adds_to_their_variance():
+    one, other = (predict([each], READ_uT, REST_uT, PRESSES_uT) for each in (ONE, OTHER))
+    both = predict([ONE, OTHER], READ_uT, REST_uT, PRESSES_uT)
     np.testing.assert_allclose(both.place_mm, (one.place_mm + other.place_mm) / 2, rtol=1e-6)
     variance = (one.sd_mm**2 + other.sd_mm**2) / 2 + (one.place_mm - other.place_mm) ** 2 / 4
     np.testing.assert_allclose(both.sd_mm**2, variance, rtol=1e-6)
@@ -47,19 +49,21 @@ def test_several_networks_give_their_mean_and_count_their_difference_as_uncertai
 @pytest.mark.parametrize("chips_n", [1, 5])
 def test_weights_fit_any_number_of_chips(chips_n):
     weights = draw_weights(3 * chips_n, rng_for(0, "chips"))
-    assert predict([weights], READ_uT[:, : 3 * chips_n], REST_uT[: 3 * chips_n], POKES_uT[:, : 3 * chips_n]).log_N.shape
+    assert predict(
+        [weights], READ_uT[:, : 3 * chips_n], REST_uT[: 3 * chips_n], PRESSES_uT[:, : 3 * chips_n]
+    ).log_N.shape
 
 
-@pytest.mark.parametrize("pokes_n", [0, 20])
-def test_what_is_asked_without_pytorch_is_what_was_trained_in_it(pokes_n):
+@pytest.mark.parametrize("presses_n", [0, 20])
+def test_numpy_and_pytorch_agree(presses_n):
     weights = {name: value + 0.05 * RNG.standard_normal(value.shape).astype(np.float32) for name, value in ONE.items()}
-    found = predict([weights], READ_uT, REST_uT, POKES_uT[:pokes_n])
-    read, rest, pokes = (torch.from_numpy(part.astype(np.float32))[None] for part in (READ_uT, REST_uT, POKES_uT))
+    found = predict([weights], READ_uT, REST_uT, PRESSES_uT[:presses_n])
+    read, rest, presses = (torch.from_numpy(part.astype(np.float32))[None] for part in (READ_uT, REST_uT, PRESSES_uT))
     with torch.no_grad():
         network = Network(weights)
-        kept = (torch.arange(20) < pokes_n).float()[None]
-        answer, log_sd = (part[0].numpy() for part in network(read, rest, network.encode(pokes, rest, kept)))
-    asked = np.column_stack([found.place_mm / PLACE_MM, found.log_N / LOG_N])
-    asked_sd = np.column_stack([found.sd_mm / PLACE_MM, found.sd_log_N / LOG_N])
-    np.testing.assert_allclose(asked, answer, rtol=1e-5, atol=1e-5)  # sums in another order
-    np.testing.assert_allclose(np.log(asked_sd), log_sd, rtol=1e-5, atol=1e-5)
+        kept = (torch.arange(20) < presses_n).float()[None]
+        mean, log_sd = (part[0].numpy() for part in network(read, rest, network.encode(presses, rest, kept)))
+    found_mean = np.column_stack([found.place_mm / PLACE_MM, found.log_N / LOG_N])
+    found_sd = np.column_stack([found.sd_mm / PLACE_MM, found.sd_log_N / LOG_N])
+    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)  # sums in another order
+    np.testing.assert_allclose(np.log(found_sd), log_sd, rtol=1e-5, atol=1e-5)

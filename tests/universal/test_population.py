@@ -1,4 +1,4 @@
-"""Drawn skins come again from the same seed, and differ as the priors say."""
+"""Drawn skins are repeatable, and differ as their prior says."""
 
 from dataclasses import fields, replace
 
@@ -8,7 +8,7 @@ import pytest
 from reskin.seeds import rng_for
 from reskin.universal import population
 from reskin.universal.law import at_rest_uT, inside, simulate_uT
-from reskin.universal.map import NOMINAL, OF_NOMINAL
+from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import (
     LEAST,
     PLACES_N,
@@ -28,30 +28,30 @@ COARSE = replace(SETUP, rule=population.COARSE)
 def test_the_same_seed_draws_the_same_skins_however_many_more_are_drawn(monkeypatch):
     monkeypatch.setattr(population, "THICKNESSES_MM", {2.0: 1.0})  # each thickness and tip takes seconds to tabulate
     monkeypatch.setattr(population, "TIPS_MM", {2.0: 1.0})
-    one, two = (draw_population(NOMINAL, OF_NOMINAL, SETUP, n, rng_for(0, "skins")) for n in (1, 2))
+    one, two = (draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, n, rng_for(0, "skins")) for n in (1, 2))
     for field in fields(one):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name)[:1])
     assert not np.allclose(two.rest_uT[0], two.rest_uT[1])
-    second = draw_population(NOMINAL, OF_NOMINAL, SETUP, slice(1, 2), rng_for(0, "skins"))
+    second = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, slice(1, 2), rng_for(0, "skins"))
     np.testing.assert_array_equal(second.db_uT[0], two.db_uT[1])
-    weighed = draw_population(NOMINAL, OF_NOMINAL, SETUP, 1, rng_for(0, "skins"), replace(PLAIN, weight_N=5.0))
+    weighed = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(PLAIN, weight_N=5.0))
     np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)  # the press of a weight moves no other
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 
 
-def test_numbers_spread_as_the_table_says_and_stay_where_skins_can_be():
+def test_parameters_have_the_given_spreads_and_bounds():
     rng = rng_for(1, "laws")
-    laws = [draw_law(NOMINAL, OF_NOMINAL, rng) for _ in range(300)]
+    laws = [draw_law(NOMINAL, NOMINAL_SPREADS, rng) for _ in range(300)]
     for name in ("seat_x_mm", "label_y_mm", "tilt_x_deg", "give_x_um"):
         # The standard error of a standard deviation from 300 draws is 4 %.
-        assert np.std([getattr(law, name) for law in laws]) == pytest.approx(OF_NOMINAL[name], rel=0.16)
+        assert np.std([getattr(law, name) for law in laws]) == pytest.approx(NOMINAL_SPREADS[name], rel=0.16)
     for name, least in LEAST.items():
         assert min(getattr(law, name) for law in laws) >= least
     gap_mm, log = np.array([law.gap_mm for law in laws]), np.log([law.amplitude for law in laws])
     assert np.polyfit(gap_mm, log, 1)[0] == pytest.approx(population.STRONGER_PER_MM, abs=0.15)
 
 
-def test_pokes_begin_with_every_place_of_the_grid_and_all_lie_on_the_skin():
+def test_presses_begin_with_every_place_of_the_grid_and_all_lie_on_the_skin():
     place_mm = draw_places(rng_for(2, "places"))
     assert place_mm.shape == (2 * PLACES_N, 2)
     assert inside(place_mm).all()
@@ -71,7 +71,7 @@ def test_fields_grow_with_an_even_filler_and_an_uneven_one_moves_them(monkeypatc
     assert 0.05 < np.std(np.log(part)) < 0.3  # 0.15 over many skins; a skin is some six lengths wide
 
 
-def test_chips_read_nearly_what_is_there():
+def test_chips_read_nearly_the_true_field():
     gain = draw_gains(2000, rng_for(4, "gains"))
     np.testing.assert_allclose(gain.mean(axis=0), np.eye(3), atol=0.005)
     turn = np.deg2rad(population.CHIP_TURN_DEG)

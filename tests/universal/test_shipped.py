@@ -85,11 +85,11 @@ def test_other_boards_are_refused(skin):
 def test_pokes_one_by_one_tell_nearly_what_they_tell_at_once(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     stronger_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT
-    at_once = skin.zero(rest_uT).see(stronger_uT).skin.number
+    at_once = skin.zero(rest_uT).see(stronger_uT).skin.mean
     skin.zero(rest_uT).see(stronger_uT[:4])
     for i in range(4, len(stronger_uT)):
         skin.see(stronger_uT[i : i + 1])
-    assert np.linalg.norm(skin.skin.number - at_once) < 0.3 * np.linalg.norm(at_once)
+    assert np.linalg.norm(skin.skin.mean - at_once) < 0.3 * np.linalg.norm(at_once)
 
 
 def test_labels_that_it_cannot_foresee_make_it_less_sure_and_earlier_ones_are_forgotten(skin):
@@ -97,11 +97,11 @@ def test_labels_that_it_cannot_foresee_make_it_less_sure_and_earlier_ones_are_fo
     read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
     place_mm = np.tile(PLACES_MM, (3, 1))
     skin.zero(rest_uT).label(place_mm, force_N, read_uT)
-    fits, number = skin.power, skin.skin.number
+    fits, number = skin.power, skin.skin.mean
     skin.label(place_mm + 3 * np.random.default_rng(0).standard_normal(place_mm.shape), force_N, read_uT)
     assert skin.power < fits / 2
     skin.label(place_mm, force_N, read_uT)
-    np.testing.assert_allclose(skin.skin.number, number)
+    np.testing.assert_allclose(skin.skin.mean, number)
     assert skin.power == pytest.approx(fits)
     skin.zero(rest_uT)
     assert skin.power == pytest.approx(skin.powers.of(0, 0, even=False))

@@ -1,4 +1,4 @@
-"""Tables hold what the law simulates, and its slopes."""
+"""Tables are the fields that the law simulates, and their slopes."""
 
 from dataclasses import asdict, replace
 
@@ -7,11 +7,11 @@ import pytest
 
 from reskin.universal import map
 from reskin.universal.law import simulate_uT
-from reskin.universal.map import NOMINAL, OF_LOG, OF_NOMINAL, OF_RIG, STEP, middle, spread_by, tabulate
+from reskin.universal.map import LOGARITHMIC, NOMINAL, NOMINAL_SPREADS, RIG_SPREADS, STEP, mean_law, perturb, tabulate
 from tests.universal.skins import SETUP
 
 
-def test_tables_hold_the_laws_fields_and_their_slopes(monkeypatch):
+def test_tables_are_the_laws_fields_and_their_slopes(monkeypatch):
     monkeypatch.setattr(map, "lattice_mm", lambda: np.array([-4.0, 1.0]))
     found = tabulate(NOMINAL, {"amplitude": 0.2, "label_x_mm": 0.5}, SETUP)
     at_mm = np.array([[-4.0, 1.0]])
@@ -25,17 +25,17 @@ def test_tables_hold_the_laws_fields_and_their_slopes(monkeypatch):
     np.testing.assert_allclose(found.rest_slope_uT, np.outer(found.rest_uT, [grown, 0]), rtol=1e-9, atol=1e-9)
 
 
-def test_the_middle_of_laws_is_their_mean_with_the_seat_as_designed():
+def test_the_mean_law_has_the_seat_as_designed():
     weak, strong = replace(NOMINAL, amplitude=1.0, seat_x_mm=0.4), replace(NOMINAL, amplitude=4.0, gap_mm=2.0)
-    found = middle([weak, strong])
+    found = mean_law([weak, strong])
     assert (found.amplitude, found.gap_mm) == pytest.approx((2.0, 1.8))
     assert (found.seat_x_mm, found.seat_y_mm, found.rotation_deg) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("spreads", [OF_RIG, OF_NOMINAL])
-def test_spreads_are_of_numbers_of_a_law_and_what_moves_comes_back(spreads):
+@pytest.mark.parametrize("spreads", [RIG_SPREADS, NOMINAL_SPREADS])
+def test_perturbing_a_parameter_and_back_restores_it(spreads):
     assert set(spreads) <= set(asdict(NOMINAL))
-    assert set(OF_LOG) <= set(spreads)
+    assert set(LOGARITHMIC) <= set(spreads)
     for name, spread in spreads.items():
-        back = spread_by(spread_by(NOMINAL, name, spread), name, -spread)
+        back = perturb(perturb(NOMINAL, name, spread), name, -spread)
         assert getattr(back, name) == pytest.approx(getattr(NOMINAL, name))

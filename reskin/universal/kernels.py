@@ -1,0 +1,393 @@
+"""Compiled loops of the map: likelihoods of hypotheses given readings, and means over hypotheses.
+
+A hypothesis is a place and a force; forces run within places. Its Gaussian is held as the inverse root W of the
+covariance and W times the mean, so that chi^2 = |W d - W m|^2. Likelihoods are in single precision: chi^2 is off by
+less than 0.01 where a reading is likely.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from jaxtyping import Float, Float32, Int64
+from numba import njit
+
+LANES_N = 64  # Gaussians in a block, axis `l`: a row of vector instructions each
+
+
+@dataclass(frozen=True)
+class LinearMeans:
+    """Means of Gaussians that are linear in some parameters, in blocks; the last Gaussian fills up its block."""
+
+    mean: Float32[np.ndarray, "k ch l"]
+    slope: Float32[np.ndarray, "k ch t l"]
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Whitened Gaussians: for each channel W m and W's row up to it, and the log determinant of the covariance."""
+
+    row: Float32[np.ndarray, "f h"]
+    log_det: Float32[np.ndarray, " h"]
+
+    def evaluate(
+        self, read: Float32[np.ndarray, "n ch"]
+    ) -> tuple[Float32[np.ndarray, "n h"], Float32[np.ndarray, "n h"]]:
+        """Return chi^2 of readings, and their deviance: chi^2 plus the log determinant."""
+        chi2 = np.zeros((len(read), len(self.log_det)), np.float32)
+        _chi2(self.row, read, chi2)
+        return chi2, chi2 + self.log_det
+
+
+def in_blocks(mean: Float32[np.ndarray, "h ch"], slope: Float32[np.ndarray, "h ch t"]) -> LinearMeans:
+    """Lay Gaussians out in blocks."""
+    blocks_n = -(-len(mean) // LANES_N)
+    of_lane = np.minimum(np.arange(blocks_n * LANES_N), len(mean) - 1).reshape(blocks_n, LANES_N)
+    return LinearMeans(*(np.ascontiguousarray(np.moveaxis(part[of_lane], 1, -1)) for part in (mean, slope)))
+
+
+def whiten(
+    means: LinearMeans, parameters: tuple[Float32[np.ndarray, " t"], Float32[np.ndarray, "t t"]],
+    residual: Float32[np.ndarray, "h ch"], share: Float32[np.ndarray, " h"], error_cov: Float32[np.ndarray, "ch ch"],
+    noise_var: float,
+) -> Gaussians:  # fmt: skip
+    """Whiten Gaussians whose parameters have a mean and the lower root C of a covariance.
+
+    With M = mean + slope parameters, a Gaussian has the mean M + |M| residual and the covariance (slope C)(slope C)' +
+    |M|^2 share error_cov + noise_var 1.
+    """
+    channels_n = len(error_cov)
+    row = np.empty((channels_n * (channels_n + 3) // 2 + 1, len(share)), np.float32)
+    _fill((means.mean, means.slope), parameters, (residual, share), error_cov, np.float32(noise_var), row)
+    return Gaussians(row[:-1], row[-1])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _chi2(row, read, chi2):
+    y, with_mean = np.empty(row.shape[1], np.float32), np.empty(read.shape[1] + 1, np.float32)
+    with_mean[0] = -1
+    for r in range(len(read)):
+        with_mean[1:] = read[r]
+        f = 0
+        for i in range(2, len(with_mean) + 1):
+            np.dot(with_mean[:i], row[f : f + i], y)
+            for h in range(len(y)):
+                chi2[r, h] += y[h] * y[h]
+            f += i
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _fill(of, numbers, errors, shape, noise_var, row):
+    (mean, slope), (number, root) = of, numbers
+    c, t = slope.shape[1:3]
+    m, s = np.empty((c, LANES_N), np.float32), np.empty((c, t, LANES_N), np.float32)
+    a, b = np.empty((c, c, LANES_N), np.float32), np.empty((c, c, LANES_N), np.float32)
+    var, log_det = np.empty(LANES_N, np.float32), np.empty(LANES_N, np.float32)
+    for k in range(len(mean)):
+        _expect((mean[k], slope[k]), number, errors, k * LANES_N, m, var)
+        _spread(slope[k], root, s)
+        _cov(s, var, shape, noise_var, a)
+        _root(a, log_det)
+        _inverse(a, b)
+        _write(b, m, log_det, row[:, k * LANES_N : (k + 1) * LANES_N])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _expect(of, number, errors, first, m, var):
+    (mean, slope), (missed, left) = of, errors
+    _clear(var)
+    for i in range(len(m)):
+        m[i] = mean[i]
+        for p in range(len(number)):
+            _add_times(m[i], number[p], slope[i, p])
+        _add(var, m[i], m[i])
+    for lane in range(LANES_N):
+        h = min(first + lane, len(left) - 1)
+        for i in range(len(m)):
+            m[i, lane] += np.sqrt(var[lane]) * missed[h, i]
+        var[lane] *= left[h]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _spread(slope, root, s):
+    for i in range(len(s)):
+        for p in range(len(root)):
+            _clear(s[i, p])
+            for q in range(p, len(root)):
+                _add_times(s[i, p], root[q, p], slope[i, q])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _cov(s, var, shape, noise_var, a):
+    # The lower triangle of s s' + var shape + noise_var 1.
+    for i in range(len(a)):
+        for j in range(i + 1):
+            noise = noise_var if i == j else np.float32(0)
+            for lane in range(LANES_N):
+                a[i, j, lane] = var[lane] * shape[i, j] + noise
+            for p in range(s.shape[1]):
+                _add(a[i, j], s[i, p], s[j, p])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _root(a, log_det):
+    # Cholesky's root L in place of the lower triangle, but for its diagonal, which is that of 1/L.
+    _clear(log_det)
+    for j in range(len(a)):
+        for p in range(j):
+            for i in range(j, len(a)):
+                _subtract(a[i, j], a[i, p], a[j, p])
+        for lane in range(LANES_N):
+            log_det[lane] += np.log(a[j, j, lane])
+            a[j, j, lane] = np.float32(1) / np.sqrt(a[j, j, lane])
+        for i in range(j + 1, len(a)):
+            _scale(a[i, j], a[j, j])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _inverse(a, b):
+    # From the root L in `a` its inverse, lower too.
+    for j in range(len(a)):
+        b[j, j] = a[j, j]
+        for i in range(j + 1, len(a)):
+            _clear(b[i, j])
+            for p in range(j, i):
+                _subtract(b[i, j], a[i, p], b[p, j])
+            _scale(b[i, j], a[i, i])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@no_type_check
+def _write(b, m, log_det, row):
+    f, n, aimed = 0, row.shape[1], np.empty(LANES_N, np.float32)
+    for i in range(len(b)):
+        _clear(aimed)
+        for j in range(i + 1):
+            _add(aimed, b[i, j], m[j])
+            row[f + 1 + j] = b[i, j, :n]
+        row[f] = aimed[:n]
+        f += i + 2
+    row[f] = log_det[:n]
+
+
+# Loops over lanes are written out: as expressions of arrays they are not turned into vector instructions.
+@njit(inline="always")
+@no_type_check
+def _add(total, one, other):
+    for lane in range(LANES_N):
+        total[lane] += one[lane] * other[lane]
+
+
+@njit(inline="always")
+@no_type_check
+def _add_times(total, times, one):
+    for lane in range(LANES_N):
+        total[lane] += times * one[lane]
+
+
+@njit(inline="always")
+@no_type_check
+def _subtract(total, one, other):
+    for lane in range(LANES_N):
+        total[lane] -= one[lane] * other[lane]
+
+
+@njit(inline="always")
+@no_type_check
+def _scale(value, by):
+    for lane in range(LANES_N):
+        value[lane] *= by[lane]
+
+
+@njit(inline="always")
+@no_type_check
+def _clear(value):
+    for lane in range(LANES_N):
+        value[lane] = np.float32(0)
+
+
+CELL_SD_MM = 0.2  # least standard deviation of a place: its position within a cell of the lattice
+TINY = float(np.finfo(np.float32).tiny)  # least probability of a place by the map
+LEAST = math.log(TINY)
+FARTHEST = 200.0  # below the largest log likelihood: smaller ones are raised to this
+
+
+class Lattice(NamedTuple):
+    """Places of the hypotheses, and the logarithms of forces at each."""
+
+    place_mm: Float[np.ndarray, "p 2"]
+    log_N: Float[np.ndarray, " q"]
+
+
+Normals = Float[np.ndarray, "n 6"]  # means of x and y, their standard deviations; mean of log F and its own
+Moments = tuple[np.ndarray, np.ndarray, np.ndarray]  # x and y [n 2], their standard deviations [n 2], force in N [n]
+
+
+def means(
+    deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, power: float
+) -> Moments:
+    """Return means over all hypotheses, weighted by a power of their likelihoods.
+
+    deviance: -2 log likelihoods less a constant. best: the likeliest hypothesis of each reading.
+    """
+    found = np.empty((len(deviance), 5))
+    _means(deviance, best, tuple(lattice), 0.5 * power, found)
+    return found[:, :2], found[:, 2:4], found[:, 4]
+
+
+def products(
+    deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
+    map_power: float, power: float,
+) -> Moments:  # fmt: skip
+    """Return means over hypotheses of the map's probabilities times normals, of places and of forces separately.
+
+    map_power: power of the map's likelihoods. power: of the product, for standard deviations alone.
+    """
+    found = np.empty((len(deviance), 5))
+    _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), found)
+    return found[:, :2], found[:, 2:4], found[:, 4]
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _means(deviance, best, at, half_power, found):
+    place_mm, log_N = at
+    likely, forces_n = np.empty(deviance.shape[1]), len(log_N)
+    for r in range(len(deviance)):
+        _likelihoods(deviance[r], deviance[r, best[r]], half_power, likely)
+        sum_, x, y, xx, yy, log_F = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for p in range(len(place_mm)):
+            here = 0.0
+            for q in range(forces_n):
+                here += likely[p * forces_n + q]
+                log_F += likely[p * forces_n + q] * log_N[q]
+            sum_ += here
+            x += here * place_mm[p, 0]
+            y += here * place_mm[p, 1]
+            xx += here * place_mm[p, 0] ** 2
+            yy += here * place_mm[p, 1] ** 2
+        x, y = x / sum_, y / sum_
+        found[r, 0], found[r, 1], found[r, 4] = x, y, math.exp(log_F / sum_)
+        found[r, 2], found[r, 3] = _sd_mm(xx / sum_ - x**2), _sd_mm(yy / sum_ - y**2)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _products(deviance, best, at, normals, powers, found):
+    place_mm, log_N = at
+    likely, of_place, of_force = np.empty(deviance.shape[1]), np.empty(len(place_mm)), np.empty(len(log_N))
+    for r in range(len(deviance)):
+        mean_x, mean_y, sd_x, sd_y, mean_log_N, sd_log_N = normals[r]
+        _likelihoods(deviance[r], deviance[r, best[r]], powers[0], likely)
+        _margins(likely, of_place, of_force)
+        for p in range(len(of_place)):
+            off_x, off_y = place_mm[p, 0] - mean_x, place_mm[p, 1] - mean_y
+            of_place[p] -= 0.5 * ((off_x / sd_x) ** 2 + (off_y / sd_y) ** 2)
+        for q in range(len(of_force)):
+            of_force[q] -= 0.5 * ((log_N[q] - mean_log_N) / sd_log_N) ** 2
+        x, y, _, _ = _moments(of_place, place_mm, (0.0, 0.0), 1.0, likely)
+        _, _, xx, yy = _moments(of_place, place_mm, (x, y), powers[1], likely)
+        found[r, 0], found[r, 1], found[r, 2], found[r, 3] = x, y, _sd_mm(xx), _sd_mm(yy)
+        found[r, 4] = math.exp(_mean(of_force, log_N))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _likelihoods(deviance, least, half_power, likely):
+    for h in range(len(deviance)):
+        likely[h] = _exp(half_power * (least - deviance[h]))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _margins(likely, of_place, of_force):
+    # Logarithms of the probabilities of places, and of forces.
+    forces_n, sum_ = len(of_force), 0.0
+    for q in range(forces_n):
+        of_force[q] = 0.0
+    for p in range(len(of_place)):
+        of_place[p] = 0.0
+        for q in range(forces_n):
+            of_place[p] += likely[p * forces_n + q]
+            of_force[q] += likely[p * forces_n + q]
+        sum_ += of_place[p]
+    for p in range(len(of_place)):
+        of_place[p] = _log(of_place[p] / sum_)
+    for q in range(forces_n):
+        of_force[q] = _log(of_force[q] / sum_)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _moments(log, place_mm, about_mm, power, likely):
+    # Means of x and y, and of their squares about a place, of a power of the probabilities; `likely` is working memory.
+    most, sum_, x, y, xx, yy = _most(log), 0.0, 0.0, 0.0, 0.0, 0.0
+    for p in range(len(log)):
+        likely[p] = _exp(power * (log[p] - most))
+    for p in range(len(log)):
+        sum_ += likely[p]
+        x += likely[p] * place_mm[p, 0]
+        y += likely[p] * place_mm[p, 1]
+        xx += likely[p] * (place_mm[p, 0] - about_mm[0]) ** 2
+        yy += likely[p] * (place_mm[p, 1] - about_mm[1]) ** 2
+    return x / sum_, y / sum_, xx / sum_, yy / sum_
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _mean(log, values):
+    most, sum_, mean = _most(log), 0.0, 0.0
+    for q in range(len(log)):
+        likely = math.exp(log[q] - most)
+        sum_ += likely
+        mean += likely * values[q]
+    return mean / sum_
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _most(values):
+    most = values[0]
+    for i in range(1, len(values)):
+        most = values[i] if values[i] > most else most
+    return most
+
+
+@njit(inline="always")
+@no_type_check
+def _exp(x):
+    # Exponential of x <= 0; relative error 1e-9 down to -100, 5e-7 at -200. The Taylor series of x / 512, squared nine
+    # times: the library's exp is not vectorised.
+    p = (-FARTHEST if x < -FARTHEST else x) * (1 / 512)
+    y = p * (1 / 24 + p * (1 / 120 + p * (1 / 720 + p * (1 / 5040 + p * (1 / 40320)))))
+    y = 1.0 + p * (1.0 + p * (1 / 2 + p * (1 / 6 + y)))
+    y *= y
+    y *= y
+    y *= y
+    y *= y
+    y *= y
+    y *= y
+    y *= y
+    y *= y
+    y *= y
+    return y
+
+
+@njit(inline="always")
+@no_type_check
+def _log(probability):
+    return LEAST if probability < TINY else math.log(probability)
+
+
+@njit(inline="always")
+@no_type_check
+def _sd_mm(var_mm2):
+    return CELL_SD_MM if var_mm2 < CELL_SD_MM**2 else math.sqrt(var_mm2)

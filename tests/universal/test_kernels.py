@@ -1,0 +1,112 @@
+"""The compiled loops agree with NumPy and, for Gaussians, with the closed form."""
+
+import numpy as np
+import pytest
+
+from reskin.seeds import rng_for
+from reskin.universal.kernels import CELL_SD_MM, LANES_N, Lattice, in_blocks, means, products, whiten
+
+AXIS_mm = np.arange(-8, 8.01, 0.4)
+AT = Lattice(np.stack(np.meshgrid(AXIS_mm, AXIS_mm, indexing="ij"), axis=-1).reshape(-1, 2), np.log([0.5, 1, 2, 4, 8]))
+FIRST_mm, FIRST_SD_mm, LOG_N = np.array([1.0, -2.0]), 1.2, 0.8
+
+
+def total() -> np.ndarray:
+    """Deviances of a Gaussian about a place and a force, sharper, ruffled and flatter."""
+    of_place = ((AT.place_mm - FIRST_mm) ** 2).sum(axis=1) / FIRST_SD_mm**2
+    of_force = (AT.log_N - LOG_N) ** 2 / 0.5
+    of_all = (of_place[:, None] + of_force).ravel() + 300.0
+    ruffle = rng_for(0, "answers").normal(0, 5, of_all.shape)
+    return np.stack([of_all, 6 * (of_all + ruffle), of_all + ruffle, 0.1 * of_all]).astype(np.float32)
+
+
+def of(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The deviance and the likeliest hypothesis."""
+    return total, total.argmin(axis=1)
+
+
+def probabilities(power: float) -> np.ndarray:
+    found = np.exp(-0.5 * power * (total().astype(float) - total().min(axis=1, keepdims=True)))
+    return (found / found.sum(axis=1, keepdims=True)).reshape(4, len(AT.place_mm), -1)
+
+
+def spread(of_place: np.ndarray, about_mm: np.ndarray) -> np.ndarray:
+    var = np.array([p @ (AT.place_mm - m) ** 2 for p, m in zip(of_place, about_mm, strict=True)])
+    return np.sqrt(np.maximum(var, CELL_SD_MM**2))
+
+
+@pytest.mark.parametrize("power", [1.0, 0.3])
+def test_means_are_sums_over_all_hypotheses(power):
+    place_mm, sd_mm, force_N = means(*of(total()), AT, power)
+    of_place = probabilities(power).sum(axis=2)
+    np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)  # what lies e^-25 below is left out
+    np.testing.assert_allclose(sd_mm, spread(of_place, place_mm), atol=1e-6)
+    np.testing.assert_allclose(np.log(force_N), probabilities(power).sum(axis=1) @ AT.log_N, atol=1e-6)
+
+
+@pytest.mark.parametrize("power", [1.0, 0.3])
+def test_products_are_those_of_both_margins_and_normals(power):
+    rng = rng_for(1, "answers")
+    normals = np.column_stack(
+        [rng.normal(0, 3, (4, 2)), rng.uniform(0.5, 2, (4, 2)), rng.normal(0, 1, 4), np.full(4, 0.4)]
+    )
+    place_mm, sd_mm, force_N = products(*of(total()), AT, normals, 0.6, power)
+    off = (AT.place_mm - normals[:, None, :2]) / normals[:, None, 2:4]
+    of_place = probabilities(0.6).sum(axis=2) * np.exp(-0.5 * (off**2).sum(axis=2))
+    of_force = probabilities(0.6).sum(axis=1) * np.exp(-0.5 * ((AT.log_N - normals[:, 4:5]) / normals[:, 5:]) ** 2)
+    raised = of_place**power
+    of_place, of_force, raised = (part / part.sum(axis=1, keepdims=True) for part in (of_place, of_force, raised))
+    np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)
+    np.testing.assert_allclose(sd_mm, spread(raised, place_mm), atol=1e-6)
+    np.testing.assert_allclose(np.log(force_N), of_force @ AT.log_N, atol=1e-6)
+
+
+def test_a_product_on_a_lattice_is_the_closed_form_of_two_gaussians():
+    second_mm, second_sd = np.array([2.5, 0.0]), np.array([1.0, 0.8])
+    second = np.concatenate([second_mm, second_sd, np.ones(2)])[None]
+    place_mm, sd_mm, _ = products(*of(total()[:1]), AT, second, 1.0, 1.0)
+    var = 1 / (1 / FIRST_SD_mm**2 + 1 / second_sd**2)
+    np.testing.assert_allclose(place_mm[0], var * (FIRST_mm / FIRST_SD_mm**2 + second_mm / second_sd**2), atol=1e-4)
+    np.testing.assert_allclose(sd_mm[0], np.sqrt(var), atol=1e-4)
+
+
+def test_a_place_that_the_map_excludes_keeps_the_least_probability_of_single_precision():
+    far = np.full((1, total().shape[1]), 1e4, np.float32)
+    far[0, 0] = 0.0
+    normals = np.array([[8.0, 8.0, 0.1, 0.1, 1.0, 1.0]])
+    place_mm, sd_mm, _ = products(*of(far), AT, normals, 1.0, 1.0)
+    np.testing.assert_allclose(place_mm, [[8.0, 8.0]], atol=0.05)
+    assert np.isfinite(sd_mm).all()
+
+
+def test_nan_gives_nan():
+    none = np.full((1, total().shape[1]), np.nan, np.float32)
+    normals = np.ones((1, 6))
+    for found in (means(*of(none), AT, 1.0), products(*of(none), AT, normals, 1.0, 1.0)):
+        assert all(np.isnan(part).all() for part in found)
+
+
+@pytest.mark.parametrize("h", [1, LANES_N, LANES_N + 3])
+def test_chi2_is_the_mahalanobis_distance_however_many_fill_the_last_block(h):
+    rng = rng_for(0, "gaussians", h)
+    mean, slope = rng.normal(0, 300, (h, 6)), rng.normal(0, 60, (h, 6, 4))
+    number, root = rng.standard_normal(4), np.linalg.cholesky(np.cov(rng.standard_normal((4, 20))))
+    residual, share, error_cov = (
+        0.1 * rng.standard_normal((h, 6)),
+        rng.uniform(0.5, 1, h),
+        np.cov(rng.normal(0, 0.1, (6, 20))),
+    )
+    expected = mean + slope @ number
+    length = np.linalg.norm(expected, axis=1, keepdims=True)
+    expected, spread = expected + length * residual, slope @ root
+    read = expected[0] + rng.normal(0, 50, (5, 6))
+    mean, slope, number, root, residual, share, error_cov, read = (
+        part.astype(np.float32) for part in (mean, slope, number, root, residual, share, error_cov, read)
+    )
+    chi2, deviance = whiten(in_blocks(mean, slope), (number, root), residual, share, error_cov, 20.0).evaluate(read)
+    cov = spread @ spread.transpose(0, 2, 1) + (length[:, 0] ** 2 * share)[:, None, None] * error_cov + 20.0 * np.eye(6)
+    off = read[:, None] - expected
+    np.testing.assert_allclose(chi2, np.einsum("nhi,hij,nhj->nh", off, np.linalg.inv(cov), off), rtol=1e-4, atol=0.01)
+    np.testing.assert_allclose(
+        deviance - chi2, np.tile(np.linalg.slogdet(cov)[1], (5, 1)), atol=1e-3
+    )  # single precision
