@@ -223,6 +223,11 @@ class Universal:
         """Start from nominal skins."""
         self._noload_uT: np.ndarray | None = None
         self._prior_map = new_map(self.tables)
+        self._noload_map: SkinMap
+        self._misfits: np.ndarray  # of the unlabelled presses
+        self._calibration: PressCalibration
+        self._model: CalibratedModel
+        self._power: float | None  # None: not computed yet
         self._restart(self._prior_map, CalibrationData(self.tables.rest_uT))
 
     @property
@@ -394,7 +399,7 @@ class Universal:
             self._misfits[new] = press_map.evaluator.evaluate(data.presses_uT[new]).misfit()
         self._calibration = PressCalibration(press_map, self.networks, data)
         self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
-        self._power: float | None = None
+        self._power = None
         return self
 
 
