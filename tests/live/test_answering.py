@@ -145,7 +145,7 @@ def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_ope
     noload_uT, b_uT, place_mm, force_N = simulated
     learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     learnt.save(tmp_path / "s3.safetensors")
-    before, number = learnt.predict(b_uT), learnt.skin.number
+    before, number = learnt.predict(b_uT), learnt.skin.mean
     (tmp_path / "s3.json").write_text("{}")  # a user's own file of that name is no network's card
     for models in (learnt, read_models([tmp_path / "s3.safetensors"])):
         _, readings = played(poked(simulated), models)
@@ -154,7 +154,7 @@ def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_ope
         untaught = np.concatenate([each.target[each.contact] for each in played(poked(simulated), load_universal())[1]])
         assert np.abs(answers[:, :2] - true_mm).mean() < 0.6 * np.abs(untaught[:, :2] - true_mm).mean()
     np.testing.assert_array_equal(learnt.predict(b_uT), before)  # the user's own stays as it is
-    np.testing.assert_array_equal(learnt.skin.number, number)
+    np.testing.assert_array_equal(learnt.skin.mean, number)
 
 
 def test_one_skin_does_not_answer_for_several_boards(simulated, tmp_path):
