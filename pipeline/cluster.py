@@ -1,12 +1,10 @@
-"""Calls on a cluster that runs already: the address of a Dask scheduler -> a `concurrent.futures` executor.
+"""Run calls on a Dask cluster: a `concurrent.futures` executor for the address of a scheduler.
 
-Workers see the checkout under its own path (one machine, or a shared file system), as results are files in it; rows are
-read there once a process. They give a local run's bytes because they must have its code, its variables and one thread
-each: what differs is refused before work begins, and at a call to a worker that came later. Refuses to know what is
-run, and to start or end any worker.
+Workers see the checkout at its own path (one machine, or a shared file system), because results are files in it. They
+give the same bits as a local run: a worker with other code, libraries, variables or more than one thread is refused
+before work begins, and one that joins later at its first call.
 """
 
-import hashlib
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -20,6 +18,7 @@ from typing import Any
 
 import pipeline
 import reskin
+from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
@@ -27,18 +26,7 @@ CONNECT_MAX_s, WORKERS_MAX_s = 20.0, 60.0  # a worker that is started beside us 
 HOW = "docs/cluster.md says how workers are started."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
 CODE = (".py", ".json", ".safetensors")  # sources, and the tables that come with them; settings come with a call
-
-
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
-
-
-def _sources(*packages: Path) -> str:
-    """Digest the code of packages."""
-    found = hashlib.sha256()
-    for package in packages:
-        for file in sorted(file for file in package.rglob("*") if file.suffix in CODE):
-            found.update(f"{file.relative_to(package)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
-    return found.hexdigest()[:32]
 
 
 def _version(library: str) -> str:
@@ -48,12 +36,14 @@ def _version(library: str) -> str:
         return "none"
 
 
-# Of when this module was imported: a worker may outlive an edit, and computes on with what it has in memory.
-IMPORTED = {"sources as imported": _sources(*PACKAGES)} | {name: _version(name) for name in LIBRARIES}
+# As imported: a worker may outlive an edit of a file, and goes on with the code in its memory.
+IMPORTED = {"sources as imported": package_digest(*PACKAGES, suffixes=CODE)} | {
+    name: _version(name) for name in LIBRARIES
+}
 
 
 class Cluster(Executor):
-    """Submits calls to a Dask scheduler; each runs in this process's working directory, in one thread of a worker."""
+    """Submit calls to a Dask scheduler; each runs in this process's working directory, in one thread of a worker."""
 
     def __init__(self, address: str, imports: str) -> None:
         self._own, self._address = describe_process(), address
@@ -62,7 +52,7 @@ class Cluster(Executor):
             with suppress(TimeoutError):
                 self._client.wait_for_workers(1, timeout=WORKERS_MAX_s)
             _check_workers(self._client, address)
-            self._client.run(import_module_there, imports)
+            self._client.run(import_on_worker, imports)
         except BaseException:
             self._client.close()
             raise
@@ -72,8 +62,8 @@ class Cluster(Executor):
         """Run a call on one of the workers."""
         future: Future[Any] = Future()
         future.set_running_or_notify_cancel()
-        submitted = self._executor.submit(run_there, os.getcwd(), self._own, partial(fn, *args, **kwargs))
-        submitted.add_done_callback(partial(_pass_on, future, self._address))
+        submitted = self._executor.submit(run_on_worker, os.getcwd(), self._own, partial(fn, *args, **kwargs))
+        submitted.add_done_callback(partial(_copy_outcome, future, self._address))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -82,23 +72,23 @@ class Cluster(Executor):
         self._client.close()
 
 
-def run_there(folder: str, own: Mapping[str, str], call: Callable[[], Any]) -> Any:
-    """Run a call on a worker as if it ran in a folder: paths of stages are relative to the checkout.
+def run_on_worker(folder: str, own: Mapping[str, str], call: Callable[[], Any]) -> Any:
+    """Run a call on a worker, in the folder of the checkout, to which paths of stages are relative.
 
-    The worker may have come, or come back, after the others were compared with the process that calls.
+    The worker is checked again, because it may have joined after `_check_workers`.
     """
     _compare(own, describe_process(), f"process {os.getpid()}")
     os.chdir(folder)  # a worker has one thread
     return call()
 
 
-def import_module_there(name: str) -> None:
-    """Import on a worker what its calls will need."""
+def import_on_worker(name: str) -> None:
+    """Import a module on a worker."""
     import_module(name)
 
 
 def describe_process() -> dict[str, str]:
-    """Say what decides the bits of a result: versions and sources that this process imported, its variables."""
+    """Return what decides the bits of a result: versions and sources as imported, and variables."""
     from reskin.numerics import DEVICE_VARIABLE, device
 
     return {
@@ -144,11 +134,11 @@ def _compare(own: Mapping[str, str], theirs: Mapping[str, str], name: str) -> No
             raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Start it anew. {HOW}")
 
 
-def _pass_on(future: Future[Any], address: str, submitted: Future[Any]) -> None:
-    """Give a call's result or error on; a worker that died is told as a local one is."""
+def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
+    """Copy the result or error of a Dask future to ours; a worker that died is reported as a local one is."""
     from distributed import KilledWorker
 
-    if submitted.cancelled():  # by Dask, when it loses the scheduler; nobody waits for what we cancel ourselves
+    if submitted.cancelled():  # by Dask, when it loses the scheduler; nobody waits for calls that we cancel
         what, got = f"the scheduler at {address}", "one that went away"
         remedy = "Start it and its workers again, then run again: what was finished is kept."
         future.set_exception(ParamsError("RESKIN_EXECUTOR", what, "there until the work is done", got, remedy))

@@ -1,6 +1,6 @@
-"""Executors: where calls run, as RESKIN_EXECUTOR names it.
+"""Executors: run calls in processes, in this process or on a cluster, as RESKIN_EXECUTOR says.
 
-An environment variable and no parameter, because where a training ran must not change its hash.
+An environment variable and not a setting, because the place of a training must not change its hash.
 """
 
 import multiprocessing
@@ -22,11 +22,11 @@ CLUSTER = "dask:"  # before the address of a scheduler that runs already
 def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
     """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2), `here`, or `dask:ADDRESS`.
 
-    All have one thread a process. One task by itself runs here, unless a place is named. Module `imports` is what the
-    tasks need: it is imported once, for all processes.
+    Each process has one thread. A single task runs here, unless the variable is set. Module `imports` is imported once
+    for all processes.
     """
-    if address := _address():
-        from pipeline.cluster import Cluster  # late: Dask is an extra
+    if address := _scheduler_address():
+        from pipeline.cluster import Cluster  # imported late: Dask is an extra
 
         return Cluster(address, imports)
     workers_n = _workers_n(DEFAULT if tasks_n > 1 else HERE)
@@ -34,15 +34,15 @@ def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
 
 
 def prepare_workers(imports: str) -> None:
-    """Import what tasks will need where workers are forked from, while this process reads what they work on."""
-    if not _address() and _workers_n(DEFAULT):
+    """Start the process that workers are forked from, which imports a module while this process reads its data."""
+    if not _scheduler_address() and _workers_n(DEFAULT):
         _context(imports)
         forkserver.ensure_running()
 
 
-def _workers_n(otherwise: str) -> int:
-    """Read RESKIN_EXECUTOR: how many processes; 0 is `here`."""
-    name = os.environ.get(VARIABLE, otherwise)
+def _workers_n(default: str) -> int:
+    """Return the number of processes of RESKIN_EXECUTOR; 0 means `here`."""
+    name = os.environ.get(VARIABLE, default)
     if name == HERE:
         return 0
     kind, _, count = name.partition(":")
@@ -52,29 +52,29 @@ def _workers_n(otherwise: str) -> int:
     return int(count)
 
 
-def _address() -> str:
-    """Read RESKIN_EXECUTOR: the address of a cluster's scheduler; empty where work stays on this machine."""
+def _scheduler_address() -> str:
+    """Return the address of the scheduler in RESKIN_EXECUTOR; empty for work on this machine."""
     name = os.environ.get(VARIABLE, "")
     return name.removeprefix(CLUSTER) if name.startswith(CLUSTER) else ""
 
 
 def _context(imports: str) -> ForkServerContext:
-    # forkserver: a forked child of a threaded parent can hang in BLAS; one of a process that only imported does not.
+    # forkserver: a forked child of a threaded parent can hang in BLAS; that of a process that only imports does not.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([imports])
     return context
 
 
 def end_workers() -> None:
-    """Wait for the process that forks workers, so that what they took counts as taken by children of this one."""
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # else it ends unseen after its parent
+    """Stop the process that forks workers, so that their time counts as that of our children."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # else it ends after this process
 
 
 class Here(Executor):
-    """Runs each call at once in this process: for a debugger, and for trainings shorter than a worker's imports."""
+    """Run each call at once in this process: for a debugger, and for work shorter than a worker's imports."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Call it, and give what came of it as a finished future."""
+        """Call a function, and return a finished future with its result or error."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -84,7 +84,7 @@ class Here(Executor):
 
 
 def _end_with_parent() -> None:
-    """Let no worker outlive a killed stage: an orphan would train on, unseen, beside the next attempt."""
+    """End a worker when its stage is killed: an orphan would go on beside the next attempt."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -1,4 +1,4 @@
-"""Where a result came from: the checkout, the commit of the code, the machine, the cost in seconds. Knows no result."""
+"""Provenance of results: checkout, commit of the code, machine, and costs in seconds."""
 
 import os
 import platform
@@ -11,21 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from reskin import io
-from reskin.code import ROOT, files_of, meaning
+from reskin.code import ROOT, files_of, normalised
 from reskin.numerics import departures
 
 EXPERIMENTS = (".dvc", "tmp", "exps")  # where DVC makes copies of a checkout for experiments, and deletes them
 PACKAGES = (ROOT / "pipeline", ROOT / "reskin")
-NO_CODE = ("plan.yaml", "scenes")  # settings, which stand beside the code: they decide results by their values
+NO_CODE = ("plan.yaml", "scenes")  # settings beside the code
 COSTS = Path(".reskin/costs")
-SECONDS = Path(".reskin/seconds")  # what was timed here: beside the pipeline, as costs are
+SECONDS = Path(".reskin/seconds")  # times of trainings and predictions on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
 CPUINFO = Path("/proc/cpuinfo")  # Linux only
 INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
 
 
 def home() -> Path:
-    """Give the checkout, where caches lie: the working directory, or the one around a copy of DVC for an experiment."""
+    """Return the checkout with the caches: the working directory, or the one around DVC's copy for an experiment."""
     here = Path.cwd()
     around = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
     return around[-1] if around else Path()
@@ -36,9 +36,9 @@ def is_experiment() -> bool:
 
 
 def code_version() -> str:
-    """The last commit that changed code of the two packages, `+dirty` if it was changed since, `unknown` outside git.
+    """Return the last commit that changed the two packages, with `+dirty` if they changed since; `unknown` outside git.
 
-    Not the checkout's HEAD: a later commit of results must not make equal results look different.
+    Not HEAD: a later commit of results must not make equal results look different.
     """
     of_code = (*map(str, PACKAGES), *(f":(exclude){PACKAGES[0] / name}" for name in NO_CODE))
     commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *of_code)
@@ -47,40 +47,39 @@ def code_version() -> str:
     return commit + ("+dirty" if _git("status", "--porcelain", "--", *of_code) else "")
 
 
-def version_of(modules: Iterable[str]) -> str:
-    """The last commit that changed what these modules do; `+dirty` and `unknown` as for `code_version`.
+def code_version_of(modules: Iterable[str]) -> str:
+    """Return the last commit that changed what these modules do; `+dirty` and `unknown` as for `code_version`.
 
-    Later commits that change other modules, comments or docstrings leave it as it is, so that equal code names the same
-    commit in every checkout with its history.
+    Commits that change other modules, comments or docstrings do not count.
     """
     files = [str(file.relative_to(ROOT)) for name in modules for file in files_of(name)]
     edited = _git("status", "--porcelain", "--", *files) and any(
-        _meaning("HEAD", file) != meaning(file, (ROOT / file).read_bytes().strip()) for file in files
+        _normalised_at("HEAD", file) != normalised(file, (ROOT / file).read_bytes().strip()) for file in files
     )
     for commit in _git("log", "--format=%H", "--", *files).splitlines():
         words = ("diff-tree", "--root", "--no-commit-id", "--name-only", "--relative", "-r", commit)
         names = _git(*words, "--", *files).splitlines()
-        if any(_meaning(f"{commit}^", name) != _meaning(commit, name) for name in names):
+        if any(_normalised_at(f"{commit}^", name) != _normalised_at(commit, name) for name in names):
             return commit[:12] + ("+dirty" if edited else "")
     return "unknown"
 
 
-def _meaning(commit: str, file: str) -> bytes:
-    return meaning(file, _git("show", f"{commit}:./{file}").encode())
+def _normalised_at(commit: str, file: str) -> bytes:
+    return normalised(file, _git("show", f"{commit}:./{file}").encode())
 
 
-def device() -> str:
-    """The machine in words: processor and instruction sets, cores that this process may use, Python."""
+def machine() -> str:
+    """Describe the machine: processor and instruction sets, cores that this process may use, Python."""
     cores_n = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     cpuinfo = CPUINFO.read_text(encoding="utf-8", errors="replace") if CPUINFO.exists() else ""
-    named = processor(cpuinfo, os.environ, otherwise=platform.processor())
+    named = processor_name(cpuinfo, os.environ, otherwise=platform.processor())
     return f"cpu {platform.machine()} {named}, {cores_n} cores, Python {platform.python_version()}"
 
 
-def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
-    """The processor's model, the instruction sets that it offers, and what of `numerics` the user has set.
+def processor_name(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
+    """Return the processor's model, its instruction sets, and the settings that differ from those of `numerics`.
 
-    `cpuinfo` is Linux's /proc/cpuinfo; where it names no model, `otherwise` does.
+    cpuinfo: content of Linux's /proc/cpuinfo. otherwise: name of a processor whose model is not there.
     """
     lines = [line.partition(":") for line in cpuinfo.splitlines()]
     values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # the first processor's
@@ -93,19 +92,20 @@ def processor(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> st
 
 
 def versions() -> dict[str, str]:
-    """The versions of the packages whose arithmetic decides results."""
+    """Return the versions of the packages whose arithmetic decides results."""
     return {name: version(name) for name in COMPUTING}
 
 
-def begin_cost(folder: Path, stage: str) -> None:
-    """Forget the trainings of a stage's last run, which begins anew."""
+def clear_cost(folder: Path, stage: str) -> None:
+    """Delete the record of trainings of a stage's last run."""
     io.remove(_trainings_file(folder, stage))
 
 
-def note_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
-    """Add trainings to those of a stage's run: by key the seconds when computed, and whether an earlier run did.
+def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
+    """Record trainings of a stage's run.
 
-    `waited_s` is what the stage waited for them.
+    trained: for each key, the seconds that the training took, and whether an earlier run did it. waited_s: how long the
+    stage waited for them.
     """
     before = _read_trainings(folder, stage)
     reused = {key for key, (_, again) in trained.items() if again} - set(before["computed_s"])
@@ -119,12 +119,10 @@ def note_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, 
     )
 
 
-def note_cost(folder: Path, stage: str, seconds: float, settings: str | None = None) -> None:
-    """Keep what a stage cost beside the pipeline, never in an output: it differs between identical runs.
+def record_cost(folder: Path, stage: str, seconds: float) -> None:
+    """Record the cost of a stage beside the pipeline: in an output, it would differ between equal runs.
 
-    `settings` is a hash of the settings that it ran with.
-
-    A stage that does not run, or that DVC restores, keeps the cost that it had when it ran.
+    A stage that does not run, or that DVC restores, keeps the cost of its last run.
     """
     usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
@@ -135,8 +133,7 @@ def note_cost(folder: Path, stage: str, seconds: float, settings: str | None = N
         folder / f"{stage}.json",
         {
             "seconds": round(seconds, 2),
-            "settings": settings,
-            # Side by side they took less than their sum; what else passed meanwhile, as imports, counts here.
+            # Trainings side by side took less than their sum; other work meanwhile, such as imports, counts here.
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,
             "reused_n": len(trained["reused"]),
@@ -148,13 +145,13 @@ def note_cost(folder: Path, stage: str, seconds: float, settings: str | None = N
 
 
 def read_costs(folder: Path) -> dict[str, dict[str, Any]]:
-    """Read the costs of the stages that ran here, by stage; those of an older form tell nothing of trainings."""
+    """Read the costs of the stages that ran here, by stage; files of an older format are skipped."""
     costs = {file.stem: io.read_json(file) for file in sorted(folder.glob("*.json"))}
     return {stage: cost for stage, cost in costs.items() if "trainings_s" in cost}
 
 
-def add_up_costs(costs: Iterable[Mapping[str, Any]]) -> float:
-    """Add what stages cost when they were computed, in seconds; a training that two of them share counts once.
+def total_cost_s(costs: Iterable[Mapping[str, Any]]) -> float:
+    """Return the total cost of stages in seconds; a training that two of them share counts once.
 
     Trainings are added as if one ran after another: where two run side by side, less time passes.
     """

@@ -1,7 +1,7 @@
-"""A trained network as MLflow loads it: `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle is opened.
+"""MLflow's loader of trained networks: `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle is opened.
 
-In: changes of field in uT, one row a reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...). Out: x_mm, y_mm, force_N.
-Refuses to know the pipeline: a model's folder is all it reads.
+The model takes changes of field in uT, one row a reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...), and returns
+x_mm, y_mm and force_N.
 """
 
 from pathlib import Path
@@ -16,18 +16,18 @@ from reskin.predicting import read_network
 COLUMNS = ("x_mm", "y_mm", "force_N")
 
 
-class Loaded:
-    """What MLflow calls."""
+class NetworkModel:
+    """The model that MLflow calls."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
 
     def predict(self, model_input: pd.DataFrame) -> pd.DataFrame:
-        """Answer for changes of field in uT, [f ch]."""
+        """Predict from changes of field in uT, [f ch]."""
         db_uT: Float[np.ndarray, "f ch"] = np.atleast_2d(np.asarray(model_input, np.float32))
         return pd.DataFrame(self.network(db_uT), columns=list(COLUMNS))
 
 
-def _load_pyfunc(path: str) -> Loaded:
-    """Load the weights that a run's file MLmodel names; MLflow calls this."""
-    return Loaded(read_network(Path(path)))
+def _load_pyfunc(path: str) -> NetworkModel:
+    """Load the weights that the run's file MLmodel names (called by MLflow)."""
+    return NetworkModel(read_network(Path(path)))

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pipeline.executors import end_workers
-from pipeline.progress import announce, settings_of
-from pipeline.provenance import COSTS, begin_cost, note_cost
+from pipeline.progress import announce
+from pipeline.provenance import COSTS, clear_cost, record_cost
 from pipeline.settings import Settings, read_settings
 from reskin.errors import ReskinError, explaining
 
@@ -27,16 +27,15 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
     scene = options.pop("scene")
     if place := announce():
         say(f"{stage}: {place}")
-    digest = settings_of(scene) if place else None  # now: they may be edited while it runs
     start_s, costs, unit = time.monotonic(), COSTS / scene, _unit(stage, scene, options)
     try:
         with explaining(stage):
-            begin_cost(costs, unit)
+            clear_cost(costs, unit)
             if Settings in kinds.values():
                 options["settings"] = read_settings(scene)
             work(**options)
             end_workers()
-            note_cost(costs, unit, time.monotonic() - start_s, digest)
+            record_cost(costs, unit, time.monotonic() - start_s)
     except ReskinError as error:
         say(f"error: {error}")
         sys.exit(error.exit_code)

@@ -1,11 +1,9 @@
-"""The code behind a result: which modules a stage imports, and a digest of each without comments and docstrings.
-
-In: the package's files. Refuses to know stages by name, settings and data.
-"""
+"""Digests of code: of the modules that a stage imports, without comments and docstrings, and of whole packages."""
 
 import ast
 import hashlib
 import json
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,32 +16,41 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
 @cache
 def digest(name: str, *, data: bool = True) -> str:
-    """Give the digest of what a module does: of its syntax without docstrings, and of data files of the same name.
+    """Return a digest of a module: its syntax without docstrings, and data files of the same name.
 
-    Formatting, comments and the version of Python change nothing. `page.yaml` belongs to `page.py` beside it; without
-    `data`, files like it do not count.
+    Formatting, comments and the version of Python do not change it. `page.yaml` belongs to `page.py` beside it; with
+    `data=False`, such files do not count.
     """
     found = hashlib.sha256()
     for file in files_of(name) if data else [file_of(name)]:
-        found.update(meaning(file.name, file.read_bytes()))
+        found.update(normalised(file.name, file.read_bytes()))
     return found.hexdigest()[:32]
 
 
 def files_of(name: str) -> list[Path]:
-    """Give the files of a module: its own, and data files of the same name beside it."""
+    """Return the files of a module: its own, and data files of the same name beside it."""
     file = file_of(name)
     return [file, *sorted(one for one in file.parent.glob(f"{file.stem}.*") if one.suffix in DATA)]
 
 
-def meaning(file: str, content: bytes) -> bytes:
-    """Give what a file does: of Python its syntax without comments and docstrings, else all of it."""
+def normalised(file: str, content: bytes) -> bytes:
+    """Return the syntax of a Python file without comments and docstrings, and any other file as it is."""
     return json.dumps(_syntax(ast.parse(content))).encode() if file.endswith(".py") else content
 
 
-def imported(*names: str) -> list[str]:
-    """Name the modules of this package that some modules import, directly or not, these themselves and their packages.
+def package_digest(*packages: Path, suffixes: Sequence[str] = (".py",)) -> str:
+    """Return a digest of all files of packages with these suffixes, byte by byte."""
+    found = hashlib.sha256()
+    for package in packages:
+        for file in sorted(file for file in package.rglob("*") if file.suffix in suffixes):
+            found.update(f"{file.relative_to(package)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
+    return found.hexdigest()[:32]
 
-    Imports under `if TYPE_CHECKING:` run nothing and do not count.
+
+def imported(*names: str) -> list[str]:
+    """Return the modules of our packages that modules import, directly or not, with themselves and their packages.
+
+    Imports under `if TYPE_CHECKING:` do not count.
     """
     found = set(names).union(*map(_graph().find_upstream_modules, names))
     return sorted({name.rsplit(".", i)[0] for name in found for i in range(name.count(".") + 1)})
@@ -51,20 +58,20 @@ def imported(*names: str) -> list[str]:
 
 @cache
 def _graph() -> Any:
-    import grimp  # late: only the stage that follows imports needs it
+    import grimp  # imported late: only stages that follow imports need it
 
     return grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True, cache_dir=None)
 
 
 def file_of(name: str) -> Path:
-    """Give the file of a module, `reskin.io`."""
+    """Return the file of a module, such as `reskin.io`."""
     path = ROOT / name.replace(".", "/")
     module = path.with_suffix(".py")
     return module if module.is_file() else path / "__init__.py"
 
 
 def _syntax(node: ast.AST) -> list[Any]:
-    """Turn a syntax tree into lists; empty fields are left out, as which there are differs between Python versions.
+    """Convert a syntax tree to lists; empty fields are dropped, as they differ between Python versions.
 
     >>> same = ["x = 1", "'Say.'\\nx = (1)  # metres"]
     >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 import safetensors
 import safetensors.numpy
 
+from reskin.code import package_digest
 from reskin.errors import DISK_REMEDIES, SchemaError
 from reskin.numerics import signature
 from reskin.schema import Readings, arrow_schema, from_table, to_table
@@ -238,40 +239,38 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
         raise SchemaError(path, "the file", "readable Parquet", got, MEND) from None
 
 
+# --- Cache of computed arrays, beside the compiled code of a package ---
+
 LIBRARIES = ("numpy", "scipy", "numba")
 
 
-def load(package: Path, name: str) -> np.ndarray | None:
-    """Read the array of this name; None where none is kept, or what is there cannot be read as an array."""
+def load_cached_array(package: Path, name: str) -> np.ndarray | None:
+    """Read a cached array; None if there is none, or if it was computed by other code or other libraries."""
     try:
-        return np.load(_file(package, name), allow_pickle=False)
+        return np.load(_cache_file(package, name), allow_pickle=False)
     except (OSError, ValueError, EOFError):
         return None
 
 
-def save(package: Path, name: str, array: np.ndarray) -> None:
-    """Keep an array under this name, in place of an older one."""
+def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
+    """Cache an array, and delete those that other code computed."""
+    file = _cache_file(package, name)
     try:
-        with replacing(_file(package, name)) as temporary, temporary.open("wb") as stream:
+        with replacing(file) as temporary, temporary.open("wb") as stream:
             np.save(stream, array, allow_pickle=False)
-        for other in set(_folder(package).glob("kept-*.npy")) - set(_folder(package).glob(f"kept-{_state(package)}-*")):
-            remove(other)  # of a state that has passed
+        current = set(file.parent.glob(f"kept-{_cache_state(package)}-*"))
+        for old in set(file.parent.glob("kept-*.npy")) - current:
+            remove(old)
     except OSError:
-        return  # a read-only or full disk costs seconds, no result
+        return  # on a read-only or full disk, the array is computed again
 
 
-def _file(package: Path, name: str) -> Path:
-    return _folder(package) / f"kept-{_state(package)}-{hashlib.sha256(name.encode()).hexdigest()[:16]}.npy"
-
-
-def _folder(package: Path) -> Path:
-    return package / "__pycache__"
+def _cache_file(package: Path, name: str) -> Path:
+    digest = hashlib.sha256(name.encode()).hexdigest()[:16]
+    return package / "__pycache__" / f"kept-{_cache_state(package)}-{digest}.npy"
 
 
 @cache
-def _state(package: Path) -> str:
-    found = hashlib.sha256(repr([(name, version(name)) for name in LIBRARIES]).encode())
-    found.update(repr(signature()).encode())
-    for source in sorted(package.glob("*.py")):
-        found.update(source.read_bytes())
-    return found.hexdigest()[:16]
+def _cache_state(package: Path) -> str:
+    libraries = [(name, version(name)) for name in LIBRARIES]
+    return hashlib.sha256(repr((libraries, signature(), package_digest(package))).encode()).hexdigest()[:16]

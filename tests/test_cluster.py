@@ -122,7 +122,7 @@ def test_a_scheduler_that_goes_away_is_one_sentence():
     pytest.importorskip("distributed", reason="Dask is not installed")
     submitted, future = Future(), Future()
     submitted.cancel()  # as Dask does with every call when it loses the scheduler
-    cluster._pass_on(future, "tcp://there", submitted)
+    cluster._copy_outcome(future, "tcp://there", submitted)
     with pytest.raises(ParamsError, match="the scheduler at tcp://there must be there .* what was finished is kept"):
         future.result(0)
 
@@ -149,7 +149,7 @@ def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a
     with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Start it anew"):
         cluster._compare(now.describe_process(), before.describe_process(), "w")
     with pytest.raises(ParamsError, match="sources as imported of worker process"):
-        cluster.run_there(str(tmp_path), before.describe_process(), os.getcwd)
+        cluster.run_on_worker(str(tmp_path), before.describe_process(), os.getcwd)
 
 
 def test_workers_that_are_as_this_process_pass():

@@ -176,10 +176,10 @@ def _cached(designed: DesignedSkins, what: str, make: Callable[[], np.ndarray]) 
     code = [digest(module) for module in imported(TRAINS)]
     of = f"torch {version('torch')}; {code}; {first_skin}"
     name = f"{what}; {of}; {designed.prior.centre}; {spreads}; {designed.forces_N}; seed {designed.seed}"
-    found = io.load(PACKAGE, name)
+    found = io.load_cached_array(PACKAGE, name)
     if found is None:
         found = make()
-        io.save(PACKAGE, name, found)
+        io.save_cached_array(PACKAGE, name, found)
     return found
 
 

@@ -12,12 +12,12 @@ from pipeline.executors import make_executor
 from pipeline.provenance import (
     COSTS,
     SECONDS,
-    add_up_costs,
     code_version,
-    device,
     home,
     is_experiment,
+    machine,
     read_costs,
+    total_cost_s,
     versions,
 )
 from pipeline.report.choice import choose, to_record
@@ -196,5 +196,5 @@ def _provenance(
     return {
         "scene": settings.scene, "source": asked.source, "git": code_version(), "seed": settings.seed,
         "trained": ", ".join(sorted({card["git"] for card in cards})), "versions": versions(),
-        "device": f"{device()}, networks on {trained_on()}", "seconds": round(add_up_costs(costs.values()), 1),
+        "device": f"{machine()}, networks on {trained_on()}", "seconds": round(total_cost_s(costs.values()), 1),
     }  # fmt: skip

@@ -11,7 +11,7 @@ import pyarrow as pa
 from jaxtyping import Float32, Int64
 
 from pipeline.executors import make_executor, prepare_workers
-from pipeline.provenance import COSTS, SECONDS, home, note_trainings, version_of
+from pipeline.provenance import COSTS, SECONDS, code_version_of, home, record_trainings
 from pipeline.settings import Settings, Training
 from pipeline.stage import say
 from pipeline.stages import module_name
@@ -216,7 +216,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
             log=lambda line: say(f"{prefix}: {line}"),
         )
     took = {result.key: (result.seconds, result.reused) for result in results}
-    note_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
+    record_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
     for job, result in zip(jobs, results, strict=True):
         if result.stopped_step is not None:
             say(f"warning: {prefix}: {job.name} diverged by step {result.stopped_step}: kept as it was before")
@@ -230,7 +230,7 @@ def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> None:
     """Write models, cards and predictions; the times, which differ between equal runs, stand beside the outputs."""
-    code = version_of(imported(module_name(stage)))
+    code = code_version_of(imported(module_name(stage)))
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
     with io.replacing(models) as folder:
         folder.mkdir()

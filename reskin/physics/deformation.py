@@ -276,10 +276,10 @@ def _displaced(
 ) -> Float[np.ndarray, "d l p 3"]:
     """Load the table of one R/h, or compute it and cache it on disk: outward, up, tan(angle / 2)."""
     name = f"flow {table_i} {heights} {base}"
-    known = io.load(PACKAGE, name)
+    known = io.load_cached_array(PACKAGE, name)
     if known is None or len(known) < rungs_n:
         known = _follow_ladder(table_i, heights, rungs_n, base)
-        io.save(PACKAGE, name, known)
+        io.save_cached_array(PACKAGE, name, known)
     return known[:rungs_n]
 
 

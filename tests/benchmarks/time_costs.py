@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipeline.provenance import device
+from pipeline.provenance import machine
 from reskin.config import read_yaml
 from reskin.models.network import FEATURE_LAYERS_N, paper_layers
 from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
@@ -141,9 +141,9 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=["quick", "paper"])
     scenes, rates = parser.parse_args().scenes, measure_rates()
     MEASURED.mkdir(exist_ok=True)
-    (MEASURED / "rates.json").write_text(json.dumps({"machine": device(), **rates}, indent=1) + "\n")
+    (MEASURED / "rates.json").write_text(json.dumps({"machine": machine(), **rates}, indent=1) + "\n")
     parts = [
-        f"Rates of {device()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of products of matrices (float32) and "
+        f"Rates of {machine()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of products of matrices (float32) and "
         f"{rates['memory_bytes_per_s'] / 1e9:.1f} GB copied a CPU second of one thread; "
         f"{rates['disk_bytes_per_s'] / 1e6:.0f} MB written to disk a second."
     ]

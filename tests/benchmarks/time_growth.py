@@ -23,7 +23,7 @@ import numpy as np
 
 from pipeline import SCENES, plan
 from pipeline.manage.registry import Entry, Registry, write_registry
-from pipeline.provenance import code_version, device
+from pipeline.provenance import code_version, machine
 from reskin import io
 from reskin.config import read_yaml
 from reskin.recordings.header import HEADER_FILE, recorded, write_capture
@@ -173,7 +173,7 @@ def keep(out: Path, part: str, point: Mapping[str, Any], count: str) -> None:
     """Add a point to what is there, in place of one of the same count."""
     before: dict[str, Any] = json.loads(out.read_text()) if out.exists() else {}
     others = [row for row in before.get(part, []) if row[count] != point[count]]
-    of = {"git": code_version(), "machine": device()}
+    of = {"git": code_version(), "machine": machine()}
     out.write_text(
         json.dumps(before | of | {part: sorted([*others, point], key=lambda row: row[count])}, indent=1) + "\n"
     )

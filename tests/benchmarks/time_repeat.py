@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.manage.compare import compare
-from pipeline.provenance import code_version, device
+from pipeline.provenance import code_version, machine
 from reskin import io
 from reskin.config import read_yaml
 from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
@@ -115,7 +115,7 @@ def main() -> None:
             first = first or numbers
             found[name] = {"settings": setting, **differences(first, numbers)}
             print(f"{name}: {json.dumps(found[name])}", flush=True)
-            of = {"git": code_version(), "machine": device(), "experiments": EXPERIMENTS, "runs": found}
+            of = {"git": code_version(), "machine": machine(), "experiments": EXPERIMENTS, "runs": found}
             asked.out.write_text(json.dumps(of, indent=1) + "\n")
     show(json.loads(asked.out.read_text()))
 

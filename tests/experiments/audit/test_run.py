@@ -124,7 +124,7 @@ def as_drawn(job: TrainingJob, data: SceneData) -> TrainingResult:
 @pytest.fixture(autouse=True)
 def _at_home(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # seconds are noted in the working folder
-    monkeypatch.setattr(_training, "version_of", lambda modules: "abc")
+    monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def honest(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("honest")
         patch.chdir(folder)
-        patch.setattr(_training, "version_of", lambda modules: "abc")
+        patch.setattr(_training, "code_version_of", lambda modules: "abc")
         return build(folder / "scene")
 
 
