@@ -376,18 +376,6 @@ def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it
     assert (root / SCENES / "mine.yaml").read_text() == text
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["remove s c", "publish", "compare s", "readme", "scenes list", "scenes use s", "scenes tidy", "scenes check"],
-)
-def test_outside_a_checkout_a_command_says_so(tmp_path, monkeypatch, words):
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, words.split())
-    assert f"the working directory must be a checkout of the project, with dvc.yaml in it; got {tmp_path}" in str(
-        done.exception
-    )
-
-
 def test_a_scene_that_asks_for_folds_its_data_cannot_give_says_so(root, lab_file):
     add_lab(root, lab_file)
     done = run(root, "dvc", "repro", "split@small", check=False)

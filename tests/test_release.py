@@ -146,8 +146,9 @@ def test_the_command_of_the_library_knows_which_commands_a_checkout_adds():
     assert {"scenes", *names} == {*CHECKOUT_COMMANDS}
 
 
-def test_elsewhere_a_command_of_a_checkout_says_where_it_works(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", CHECKOUT_COMMANDS)
+def test_outside_a_checkout_its_commands_say_where_they_work(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["reskin", "add", "mine.csv"])
-    with pytest.raises(ParamsError, match="reskin add works in a checkout of the project"):
+    monkeypatch.setattr(sys, "argv", ["reskin", name, "any.csv"])
+    with pytest.raises(ParamsError, match=f"reskin {name} works in a checkout of the project"):
         add_checkout_commands()
