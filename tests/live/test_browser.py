@@ -24,7 +24,7 @@ from reskin.predicting import read_network
 from reskin.recordings.header import HEADER_FILE
 from reskin.universal.model import load_universal
 from tests.live.boards import PLACES, make_script, plugged_in, write_model, zeros_asked
-from tests.live.test_answering import poked, pressed, simulated  # noqa: F401 - fixtures
+from tests.live.test_estimators import poked, pressed, simulated  # noqa: F401 - fixtures
 from tests.live.test_server import LONG_S, serve
 from tests.live.test_several import GOES, RATES_HZ, plug_in_all
 
