@@ -261,7 +261,7 @@ class Session:
         if detected.problem is None:
             layout, alarms = skin.layout, list(skin.health.alarms.values())
             state |= {
-                "board": f"{detected.port}: {detected.format}, {detected.scale}",
+                "board": skin.description,
                 "seen": [[one.name, one.count_n, round(one.last_s - one.first_s, 1), one.action] for one in alarms],
                 "chips_mm": layout.chips_mm.tolist(), "places_known": layout.known, "corner_mm": layout.corner_mm,
                 "skin_mm": layout.skin_mm,

@@ -244,6 +244,7 @@ class LiveSkin:
     ) -> None:
         self.port, self.fault_policy = port, fault_policy
         self.detected = find.Found(port, WAITING)
+        self.description = port  # with wire format, chips and scale, once they are detected
         self.account: Counter[str] = Counter()  # of all streams since the start, as `FrameStream` counts
         self.reader = Reader(port, baud)
         self.estimator: NetworkEstimator | UniversalEstimator | None = None
@@ -370,6 +371,7 @@ class LiveSkin:
             return []
         if self.estimator is not None and self.estimator.channels_n != 3 * detected.chips_n:
             self._reject_model(self.estimator, detected.chips_n)
+        self.description = f"{detected.port}: {detected.format}, {detected.scale}"
         self.health, self.layout = Health(detected.chips_n, self.fault_policy), layout_of(detected.chips_n)
         self._start_stream(detected)
         self.detected = detected  # last: another thread that sees it uses the attributes above
