@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.experiments.sensitivity import levels_of
+from pipeline.experiments.sensitivity import group_by_level
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import load_protocol
@@ -80,7 +80,7 @@ class Press(NamedTuple):
 def finger_of(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finger:
     """Average a capture's readings under each weight; the noise is what is left about these averages."""
     change_uT = subtract(capture.b_uT, capture.noload_uT)
-    levels_uT = levels_of(
+    levels_uT = group_by_level(
         change_uT, capture.indentation, capture.Fz_N, levels_n=len(weight_N), where=capture.capture
     ).astype(np.float64)
     mean_uT = levels_uT.mean(axis=(0, 2))
@@ -157,7 +157,7 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
     }
 
 
-def answer_of(
+def analyse_levels(
     fingers: Sequence[Finger], networks: Mapping[str, Sequence[Answers]], how: Gripper, *, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Hold each force with each feedback, on every skin."""
@@ -198,7 +198,7 @@ def gripper(settings: Settings, indentations: Path, models: Path, results: Path)
     weight_N = load_steps_N(load.force_max_N, load.step_N)
     fingers = [finger_of(capture, weight_N) for capture in read_captures(indentations)]
     networks = {finger.board: networks_held_out(models, finger.board) for finger in fingers}
-    numbers, drawn = answer_of(fingers, networks, read(settings), seed=settings.seed)
+    numbers, drawn = analyse_levels(fingers, networks, read(settings), seed=settings.seed)
     write_results(results, numbers, drawn, read_losses(indentations, {}))
     best = max(numbers["rows"], key=lambda row: row["held_pct"])
     say(

@@ -1,4 +1,4 @@
-"""Error against run time: ways to sum a skin and to relax its force."""
+"""Error against run time of quadratures of the skin, and of integrators of its relaxation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -41,7 +41,7 @@ Changes = Float[np.ndarray, "n k 3"]
 
 @dataclass(frozen=True)
 class Prepared:
-    """A skin that only waits to be poked: all pokes of its trial in one call."""
+    """A prepared computation of dB: all indentations of a trial in one call."""
 
     nodes_n: int
     call: Callable[[], Changes]
@@ -49,7 +49,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Trial:
-    """One skin on its board, and pokes as commanded, depth after depth."""
+    """One skin on its board, and commanded indentations, depth after depth."""
 
     board: Board
     design: SkinDesign
@@ -61,16 +61,16 @@ class Trial:
 Positive = Annotated[float, Field(gt=0)]
 
 
-class Pokes(Strict):
-    """Every place, seen from the skin's middle, at every depth."""
+class Indentations(Strict):
+    """Every place, from the skin's centre, at every depth."""
 
     places_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1)]
     depths_mm: Annotated[tuple[Positive, ...], Field(min_length=1)]
 
 
-REFERENCE = "reference"  # the method of a row that says how wrong the reference of its study is at most
-CANDIDATES = "Gauss in z"  # the rules that `nodes.place_nodes` can lay
-ERROR_MAX = 0.02  # DESIGN 6: an indentation at no more than 2 % error of dB
+REFERENCE = "reference"  # the method of a row with the largest error of the reference itself
+CANDIDATES = "Gauss in z"  # the rules of `magnet.place_nodes`
+ERROR_MAX = 0.02  # largest acceptable error of dB (DESIGN 6)
 Key = tuple[str, str, str]  # study, method, setting
 
 
@@ -89,12 +89,12 @@ class Row:
 
 @dataclass(frozen=True)
 class Precision(Row):
-    """How wrong one method is with one setting, relative to the size of what it computes; or why it failed."""
+    """Relative error of one method with one setting, or why it failed."""
 
-    work_n: int  # nodes that are summed, or right-hand sides that were called
+    work_n: int  # number of nodes, or of evaluations of the right-hand side
     error: float | None  # None: failed
     failure: str | None = None
-    parts: dict[str, float] = field(default_factory=dict)  # the error of each depth, where a study has depths
+    parts: dict[str, float] = field(default_factory=dict)  # error by depth, if the study has depths
 
 
 @dataclass(frozen=True)
@@ -106,8 +106,8 @@ class Seconds(Row):
 
 
 @dataclass(frozen=True)
-class Contestant:
-    """A call to be timed, and how many indentations it computes."""
+class TimedCall:
+    """A call to time, and the number of indentations that it computes."""
 
     key: Key
     call: Callable[[], Any]
@@ -116,7 +116,7 @@ class Contestant:
 
 @dataclass(frozen=True)
 class Choice:
-    """The cheapest rule that is good enough (None: no rule is), and how the rule in use compares (None: not tried)."""
+    """The cheapest acceptable rule (None: there is none), and the rule in use (None: not tried)."""
 
     setting: str | None
     nodes_n: int | None
@@ -127,48 +127,48 @@ class Choice:
     differs: bool
 
 
-def written(rule: Quadrature) -> str:
-    """Write a rule as rows and figures do."""
+def rule_name(rule: Quadrature) -> str:
+    """Return the name of a rule in rows and figures."""
     return f"{rule.cell_m / milli:.3g} mm x {rule.layers_n}"
 
 
 def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ERROR_MAX) -> Choice:
-    """Take the rule with the fewest nodes among those whose error, of the worst depth, is below `error_max`.
+    """Choose the rule with the fewest nodes among those whose error at the worst depth is below `error_max`.
 
-    Nodes stand for time, to which they are proportional, so that the choice is the same in every run.
+    The number of nodes is proportional to the time, but the same in every run.
     """
     tried = {row.setting: row for row in rows if row.method == CANDIDATES}
     passing = [row for row in tried.values() if row.error is not None and row.error < error_max]
     best = min(passing, key=lambda row: (row.work_n, row.error), default=None)
-    now = tried.get(written(used))
+    now = tried.get(rule_name(used))
     return Choice(
         setting=best.setting if best else None,
         nodes_n=best.work_n if best else None,
         error=best.error if best else None,
-        used_setting=written(used),
+        used_setting=rule_name(used),
         used_nodes_n=now.work_n if now else None,
         used_error=now.error if now else None,
-        differs=best is None or best.setting != written(used),
+        differs=best is None or best.setting != rule_name(used),
     )
 
 
-def race(contestants: Sequence[Contestant], repeats_n: int) -> list[Seconds]:
-    """Time all contestants in turn, `repeats_n` rounds of them, so that a busy moment of the machine hits all alike.
+def time_calls(calls: Sequence[TimedCall], repeats_n: int) -> list[Seconds]:
+    """Time all calls in `repeats_n` rounds, so that a busy moment of the machine affects all alike.
 
-    Each has run before, when its error was found: compilation and caches are not part of an indentation.
+    Each has run before, when its error was computed: compilation and caches are not included.
     """
     if repeats_n < 1:
-        raise ParamsError("stopwatch", "repeats_n", "1 or more", repeats_n, "Repeat.")
-    times_s = np.empty((repeats_n, len(contestants)))
+        raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Raise it.")
+    times_s = np.empty((repeats_n, len(calls)))
     for round_i in range(repeats_n):
-        # Every other round runs backwards, so that nobody always inherits the caches of the same neighbour.
-        for i in range(len(contestants))[:: -1 if round_i % 2 else 1]:
+        # Every other round runs backwards, so that no call always follows the same one.
+        for i in range(len(calls))[:: -1 if round_i % 2 else 1]:
             start_s = perf_counter()
-            contestants[i].call()
+            calls[i].call()
             times_s[round_i, i] = perf_counter() - start_s
     return [
-        Seconds(*contestant.key, median_s=float(np.median(laps_s)) / contestant.indentations_n, repeats_n=repeats_n)
-        for contestant, laps_s in zip(contestants, times_s.T, strict=True)
+        Seconds(*call.key, median_s=float(np.median(laps_s)) / call.indentations_n, repeats_n=repeats_n)
+        for call, laps_s in zip(calls, times_s.T, strict=True)
     ]
 
 
@@ -178,23 +178,23 @@ Cell_mm = Annotated[float, Field(gt=0, le=20)]
 Layers = Annotated[int, Field(ge=1, le=100)]
 
 
-class Quadratures(Pokes):
-    """Pokes seen from the skin's middle, on so many skins, and (cell, layers) of every rule of every method."""
+class Quadratures(Indentations):
+    """Indentations, number of skins, and (cell, layers) of every rule of every method."""
 
     skins_n: Annotated[int, Field(ge=1, le=100)]
     rules: Annotated[dict[str, tuple[tuple[Cell_mm, Layers], ...]], Field(min_length=1)]
 
     def rules_of(self) -> dict[str, list[Quadrature]]:
-        """Give the rules of every method."""
+        """Rules by method, in SI units."""
         return {name: [Quadrature(milli * cell, n) for cell, n in rules] for name, rules in self.rules.items()}
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Gauss rules along x, y and z: the truth is the finer one, and the coarser one bounds its error.
+    """Gauss rules along x, y and z: the finer one is the reference, the coarser one bounds its error.
 
-    Moved boxes would be the obvious truth, but rigid boxes overlap where the skin is squeezed: they approach this one
-    with the square of the cell, 5-9 % off at 0.4 mm x 20 layers, and extrapolated to no cell within 1 %.
+    Moved boxes would be an obvious reference, but rigid boxes overlap where the skin is compressed: they converge to
+    this one with the square of the cell, 5-9 % off at 0.4 mm x 20 layers, and within 1 % when extrapolated.
     """
 
     coarser: Quadrature
@@ -207,10 +207,10 @@ FINE = Reference(coarser=Quadrature(0.7e-3, 8), finer=Quadrature(0.5e-3, 10), pe
 
 def study_quadratures(
     trials: Sequence[Trial], rules: Mapping[str, Sequence[Quadrature]], reference: Reference = FINE
-) -> tuple[list[Precision], list[Contestant]]:
-    """Compare every rule of every method with the reference, over all trials; the first trial is what is timed.
+) -> tuple[list[Precision], list[TimedCall]]:
+    """Compare every rule of every method with the reference on all trials; the first trial is timed.
 
-    `parts` of a row holds the error of each depth, of the skin that is worst there; `error` is the worst of these.
+    `parts` of a row holds the error by depth, of the worst skin; `error` is the largest of these.
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
@@ -219,13 +219,13 @@ def study_quadratures(
     coarser = [_reference(trial, reference.coarser, reference.per_cell_n) for trial in trials]
     found_T = [prepared.call() for prepared in coarser]
     rows = [_row(REFERENCE, reference.coarser, coarser[0].nodes_n, errors(trials, found_T, truths_T))]
-    contestants = []
+    calls = []
     for method, rule in ((method, rule) for method, of_method in rules.items() for rule in of_method):
         skins = [METHODS[method](trial, rule) for trial in trials]
         found_T = [prepared.call() for prepared in skins]
         rows.append(_row(method, rule, skins[0].nodes_n, errors(trials, found_T, truths_T)))
-        contestants.append(Contestant(rows[-1].key, skins[0].call, len(trials[0].pokes_m)))
-    return rows, contestants
+        calls.append(TimedCall(rows[-1].key, skins[0].call, len(trials[0].pokes_m)))
+    return rows, calls
 
 
 def errors(
@@ -233,7 +233,7 @@ def errors(
     found_T: Sequence[Float[np.ndarray, "n k 3"]],
     truth_T: Sequence[Float[np.ndarray, "n k 3"]],
 ) -> dict[str, float]:
-    """Give rms error over rms of dB at each depth, of the skin that is worst there, and over all pokes of all skins."""
+    """Return rms error over rms dB at each depth (of the worst skin), and over everything."""
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)
@@ -244,31 +244,31 @@ def errors(
 
 
 def _row(method: str, rule: Quadrature, nodes_n: int, parts: dict[str, float]) -> Precision:
-    return Precision(STUDY, method, written(rule), work_n=nodes_n, error=max(parts.values()), parts=parts)
+    return Precision(STUDY, method, rule_name(rule), work_n=nodes_n, error=max(parts.values()), parts=parts)
 
 
 def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
-    return whole(trial, gauss_everywhere(trial.skin.thickness_m, rule, per_cell_n=per_cell_n))
+    return prepare(trial, gauss_everywhere(trial.skin.thickness_m, rule, per_cell_n=per_cell_n))
 
 
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # of scipy.integrate
-IMPLICIT = ("Radau", "BDF", "LSODA")  # these are given the Jacobian, which is constant
+IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that take the Jacobian, which is constant
 ATOL = 1e-3  # of the relative tolerance: states are shares, a few percent, of a force of 1
 DIVERGED = 1.0  # an error as large as the force itself
 PERIOD_S = 1.5  # twenty pokes take the 30 s of PHYSICS 5
 DOWN_S, HELD_S = 0.3, 0.7
 
-Forces = Float[np.ndarray, " u"]  # with memory, relative to the peak of the elastic one; at the end of straight pieces
+Forces = Float[np.ndarray, " u"]  # relaxed, relative to the peak elastic force; at the end of linear pieces
 State = Float[np.ndarray, " p"]
-History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]  # times in s, elastic forces: straight between them
+History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]  # times in s, and elastic forces, linear in between
 Rates = Callable[[float, State], State]
 Piece = Callable[[Rates, float, State], State]
 Run = Callable[["Counter"], Forces]
 
 
 class Failed(Exception):
-    """An integrator that gave up, or was stopped."""
+    """An integrator gave up or was stopped."""
 
 
 class Integrators(Strict):
@@ -282,13 +282,13 @@ class Integrators(Strict):
 
 
 class Counter:
-    """Counts calls of the right-hand side, and stops an integrator that makes too many."""
+    """Counts evaluations of the right-hand side, and stops an integrator that makes too many."""
 
     def __init__(self, calls_max_n: int) -> None:
         self.calls_n, self.calls_max_n = 0, calls_max_n
 
     def rates(self, prony: Prony, speed: float) -> Rates:
-        """Give q' = -q / tau + share e' for one straight piece of e."""
+        """Return q' = -q / tau + share e' for one linear piece of e."""
         driven = prony.share * speed
 
         def rates(_: float, state: State) -> State:
@@ -300,31 +300,31 @@ class Counter:
         return rates
 
 
-def study_integrators(tried: Integrators) -> tuple[list[Precision], list[Contestant]]:
-    """Compare every integrator with 50 digits at every stiffness ratio; those that did not fail may be timed."""
-    history, calls_max_n = poke_often(tried.pokes_n), tried.pokes_n * tried.calls_per_poke_max_n
-    rows, contestants = [], []
+def study_integrators(tried: Integrators) -> tuple[list[Precision], list[TimedCall]]:
+    """Compare every integrator with 50 digits at every stiffness ratio; those that did not fail are timed."""
+    history, calls_max_n = repeated_presses(tried.pokes_n), tried.pokes_n * tried.calls_per_poke_max_n
+    rows, calls = [], []
     for ratio in tried.ratios:
         prony = stiff(ratio)
         truth = hereditary(*history, prony)[1:]
         for method, setting, run in _entries(history, prony, tried):
             counter = Counter(calls_max_n)
             error, failure = _judge(run, counter, truth)
-            rows.append(Precision(study(ratio), method, setting, counter.calls_n, error, failure))
+            rows.append(Precision(study_name(ratio), method, setting, counter.calls_n, error, failure))
             if failure is None:
-                contestants.append(Contestant(rows[-1].key, partial(_fresh, run, calls_max_n), tried.pokes_n))
-    return rows, contestants
+                calls.append(TimedCall(rows[-1].key, partial(_fresh, run, calls_max_n), tried.pokes_n))
+    return rows, calls
 
 
-def study(ratio: float) -> str:
-    """Name the study of one stiffness ratio."""
+def study_name(ratio: float) -> str:
+    """Return the name of the study of one stiffness ratio."""
     return f"relaxation, stiffness {ratio:.0e}"
 
 
-def poke_often(pokes_n: int) -> History:
-    """Press to a force of 1, hold and let go, again and again.
+def repeated_presses(pokes_n: int) -> History:
+    """Return the history of presses to a force of 1 that are held and released, again and again.
 
-    Every poke asks the same of an integrator, so that error and time of a poke hardly depend on how many there are.
+    Every press is the same, so that error and time per press hardly depend on their number.
     """
     knots_s = np.array([DOWN_S, DOWN_S + HELD_S, PERIOD_S])
     times_s = (PERIOD_S * np.arange(pokes_n)[:, None] + knots_s).ravel()
@@ -332,9 +332,9 @@ def poke_often(pokes_n: int) -> History:
 
 
 def stiff(ratio: float) -> Prony:
-    """Spread the skin's relaxation times over another ratio of slowest to fastest: 1e7 gives the skin's own.
+    """Return the skin's relaxation with another ratio of the slowest to the fastest time; 1e7 is the skin's own.
 
-    The slowest stays, so that the fastest goes below any step of an explicit method; shares are the skin's.
+    The slowest time and the shares stay; the fastest drops below any step of an explicit method.
     """
     slowest_s, fastest_s = SKIN_RELAXATION.tau_s.max(), SKIN_RELAXATION.tau_s.min()
     power = np.log(ratio) / np.log(slowest_s / fastest_s)
@@ -342,7 +342,7 @@ def stiff(ratio: float) -> Prony:
 
 
 def integrate(history: History, prony: Prony, piece: Piece, counter: Counter) -> Forces:
-    """Carry the states over each straight piece of the history; give the force with memory at the end of each."""
+    """Integrate the states over each linear piece of the history; return the relaxed force at the end of each."""
     (time_s, elastic), state = history, np.zeros_like(prony.tau_s)
     forces = np.empty(len(time_s) - 1)
     for i, (length_s, change) in enumerate(zip(np.diff(time_s), np.diff(elastic), strict=True)):
@@ -352,16 +352,16 @@ def integrate(history: History, prony: Prony, piece: Piece, counter: Counter) ->
 
 
 def euler(rates: Rates, length_s: float, state: State, *, step_s: float) -> State:
-    """Take equal explicit Euler steps of at most `step_s`; stable only below twice the shortest relaxation time."""
+    """Explicit Euler with equal steps of at most `step_s`; stable below twice the shortest relaxation time."""
     steps_n = ceil(length_s / step_s - 1e-9)
-    with np.errstate(over="ignore", invalid="ignore"):  # a state that grows without bound is judged at the end
+    with np.errstate(over="ignore", invalid="ignore"):  # divergence is detected at the end
         for _ in range(steps_n):
             state = state + length_s / steps_n * rates(0.0, state)
     return state
 
 
 def solve(rates: Rates, length_s: float, state: State, *, method: str, tolerance: float, prony: Prony) -> State:
-    """Let one of SciPy's solvers choose its steps."""
+    """Integrate with one of SciPy's adaptive solvers."""
     jacobian = np.diag(-1 / prony.tau_s)
     more = {"jac": lambda _, __: jacobian} if method in IMPLICIT else {}
     span_s = (0.0, length_s)
@@ -387,7 +387,7 @@ def _fresh(run: Run, calls_max_n: int) -> Forces:
 
 
 def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str | None]:
-    # rms error over rms force, or why there is none
+    # Relative rms error, or why there is none.
     try:
         found = run(counter)
     except Failed as failure:
@@ -397,44 +397,45 @@ def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str
     return (error, None) if error < DIVERGED else (None, f"diverged: error {error:.0e} of the force")
 
 
-RADII_N, HEIGHTS_N = 56, 16  # of the splines that move nodes; twice as many change dB by 0.1 %
+RADII_N, HEIGHTS_N = 56, 16  # of the splines of the displacement; twice as many change dB by 0.1 %
 
 
 @dataclass(frozen=True)
 class NodePath:
-    """Place and rotation vector of every node under every poke."""
+    """Position and rotation vector of every node under every indentation."""
 
     nodes_m: Float[np.ndarray, "n s 3"]
     turns_rad: Float[np.ndarray, "n s 3"]
 
 
-def whole(trial: Trial, rest: Nodes) -> Prepared:
-    """Take the product's way over any nodes: flow and field of every poke."""
-    skin = laid(trial, rest)
+def prepare(trial: Trial, rest: Nodes) -> Prepared:
+    """Compute dB as the simulator does, on any nodes."""
+    skin = with_nodes(trial, rest)
     return Prepared(len(skin.nodes_m), lambda: changes_of_field(trial.board, skin, trial.pokes_m)[1])
 
 
 def gauss_in_z(trial: Trial, rule: Quadrature) -> Prepared:
-    """Take the product's way: cells that end at the seams, Gauss nodes over the thickness, flow and field included."""
-    return whole(trial, place_nodes(trial.skin.thickness_m, rule))
+    """Compute dB as the simulator does: cells that end at the seams, Gauss nodes over the thickness."""
+    return prepare(trial, place_nodes(trial.skin.thickness_m, rule))
 
 
 def midpoint(trial: Trial, rule: Quadrature) -> Prepared:
-    """Take the product's way over the middles of equal boxes."""
-    return whole(trial, midpoints(trial.skin.thickness_m, rule))
+    """Compute dB as the simulator does, on the centres of equal boxes."""
+    return prepare(trial, midpoints(trial.skin.thickness_m, rule))
 
 
 def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
-    """Take the product's way over 2 x 2 Gauss nodes in each cell, times the Gauss nodes over the thickness."""
-    return whole(trial, gauss_everywhere(trial.skin.thickness_m, rule, per_cell_n=2))
+    """Compute dB as the simulator does, on 2 x 2 Gauss nodes in each cell times the nodes over the thickness."""
+    return prepare(trial, gauss_everywhere(trial.skin.thickness_m, rule, per_cell_n=2))
 
 
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the product's nodes by its compiled kernel, moved before: what magpylib's times are to be compared with.
+    """Sum the field of nodes that are already moved by the compiled kernel, for comparison with magpylib's times.
 
-    It computes each node at rest and moved, and so needs no difference of large sums; magpylib's rest is kept instead.
+    It computes each node at rest and moved, which avoids the difference of large sums; for magpylib the field at rest
+    is kept.
     """
-    skin = laid(trial, place_nodes(trial.skin.thickness_m, rule))
+    skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
     moments = _turned(path, skin.moments_A_m2)
 
@@ -446,8 +447,8 @@ def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the product's nodes by magpylib.core: every pair of node and chip in one vectorised call a poke."""
-    skin = laid(trial, place_nodes(trial.skin.thickness_m, rule))
+    """Sum the field of the nodes by magpylib.core: all pairs of node and chip in one call per indentation."""
+    skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
     moments = _turned(path, skin.moments_A_m2)
     rest_T = field_of((skin.nodes_m, skin.moments_A_m2), trial.board.chips_m)
@@ -460,15 +461,15 @@ def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def magpylib_dipoles(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the product's nodes by magpylib's objects: one Dipole a node, each with its path through all pokes."""
-    skin = laid(trial, place_nodes(trial.skin.thickness_m, rule))
+    """Sum the field of the nodes by magpylib's objects: one Dipole per node with its path through all indentations."""
+    skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     return _by_objects(trial, skin, lambda i: Dipole(moment=skin.moments_A_m2[i]))
 
 
 def magpylib_cuboids(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum equal boxes by magpylib's objects: one Cuboid a box that moves and turns with its middle, undeformed."""
+    """Sum the field of equal boxes by magpylib's objects: Cuboids that move and turn with their centres."""
     rest = midpoints(trial.skin.thickness_m, rule)
-    skin = laid(trial, rest)
+    skin = with_nodes(trial, rest)
     j_T = mu_0 * skin.moments_A_m2 / rest.volumes_m3[:, None]
     sides_m = box_m(trial.skin.thickness_m, rule)
     return _by_objects(trial, skin, lambda i: Cuboid(polarization=j_T[i], dimension=sides_m))
@@ -493,7 +494,7 @@ def _by_objects(trial: Trial, skin: Skin, at_origin: Callable[[int], Any]) -> Pr
     chips_m, path = trial.board.chips_m, paths(trial, skin)
     objects = []
     for i, place_m in enumerate(skin.nodes_m):
-        # The first place of each path is rest, so that one call gives the field before and under every poke.
+        # Each path begins at rest, so that one call gives the field before and during every indentation.
         source = at_origin(i)
         source.position = np.vstack([place_m, path.nodes_m[:, i]])
         source.orientation = Rotation.from_rotvec(np.vstack([np.zeros(3), path.turns_rad[:, i]]))
@@ -507,19 +508,19 @@ def _by_objects(trial: Trial, skin: Skin, at_origin: Callable[[int], Any]) -> Pr
 
 
 def paths(trial: Trial, skin: Skin) -> NodePath:
-    """Follow the skin's nodes through every poke of the trial."""
+    """Follow the skin's nodes through every indentation of the trial, by splines."""
     nodes_m = np.tile(skin.nodes_m, (len(trial.pokes_m), 1, 1))
     turns_rad = np.zeros_like(nodes_m)
     true_m = trial.pokes_m[:, 2] + skin.depth_zero_m
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
-    bends, reach_m = _bends(press, tuple(np.unique(true_m).tolist()))
+    splines, reach_m = _deformation_splines(press, tuple(np.unique(true_m).tolist()))
     for poke_i, (poke_m, depth_m) in enumerate(zip(trial.pokes_m, true_m, strict=True)):
-        bend = bends[float(depth_m)]
+        deformed = splines[float(depth_m)]
         away_m = skin.nodes_m[:, :2] - poke_m[:2]
         r_m = np.hypot(*away_m.T)
-        outward_m, up_m, angle_rad = np.sqrt(r_m**2 + bend.grown_m2) - r_m, np.zeros_like(r_m), np.zeros_like(r_m)
+        outward_m, up_m, angle_rad = np.sqrt(r_m**2 + deformed.grown_m2) - r_m, np.zeros_like(r_m), np.zeros_like(r_m)
         here = r_m < reach_m
-        for part, spline in zip((outward_m, up_m, angle_rad), bend.splines, strict=True):
+        for part, spline in zip((outward_m, up_m, angle_rad), deformed.splines, strict=True):
             part[here] = spline.ev(r_m[here], skin.nodes_m[here, 2])
         cos, sin = (away_m / np.where(r_m > 0, r_m, 1.0)[:, None]).T
         nodes_m[poke_i] += np.stack([outward_m * cos, outward_m * sin, up_m], axis=1)
@@ -541,15 +542,17 @@ def _slide(
 
 
 @dataclass(frozen=True)
-class _Bend:
-    """Splines of the change of r, of z and of the angle over (r, z); past their reach r^2 grows."""
+class _DeformationSplines:
+    """Splines of the change of r, z and angle over (r, z); beyond their reach r^2 grows by a constant."""
 
     splines: tuple[RectBivariateSpline, ...]
     grown_m2: float
 
 
 @lru_cache(maxsize=8)
-def _bends(press: layer.IndentedLayer, depths_m: tuple[float, ...]) -> tuple[dict[float, _Bend], float]:
+def _deformation_splines(
+    press: layer.IndentedLayer, depths_m: tuple[float, ...]
+) -> tuple[dict[float, _DeformationSplines], float]:
     reach_m = press.thickness_m * deformation.reach(press.tip_radius_m / press.thickness_m, press.base)
     r_m = reach_m * np.linspace(0, 1, RADII_N) ** 1.5
     z_m = press.thickness_m * np.linspace(0, 1, HEIGHTS_N)
@@ -563,15 +566,19 @@ def _bends(press: layer.IndentedLayer, depths_m: tuple[float, ...]) -> tuple[dic
         ]
         edge_m = reach_m + float(changes[0][-1].mean())
         grown_m2 = edge_m**2 - reach_m**2 if press.base == "slipping" else 0.0
-        found[float(step_m)] = _Bend(tuple(RectBivariateSpline(r_m, z_m, change) for change in changes), grown_m2)
+        found[float(step_m)] = _DeformationSplines(
+            tuple(RectBivariateSpline(r_m, z_m, change) for change in changes), grown_m2
+        )
     return found, reach_m
 
 
 COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # its nodes are replaced
 
 
-def draw_trial(board: Board, design: SkinDesign, *, spreads: Spreads, seed: int, name: str, pokes: Pokes) -> Trial:
-    """Draw the skin called `name`, even and straight, and lay the pokes on its pattern wherever that sits."""
+def draw_trial(
+    board: Board, design: SkinDesign, *, spreads: Spreads, seed: int, name: str, pokes: Indentations
+) -> Trial:
+    """Draw a uniform, unrotated skin, and place the indentations relative to its centre."""
     even = spreads.model_copy(update=dict.fromkeys(("skin_amplitude", "skin_filler", "skin_rotation_deg"), 0.0))
     skin = draw_skin(design, even, seed=seed, name=name, rule=COARSEST)
     pokes_m = milli * np.array([(*place, depth) for depth, place in product(pokes.depths_mm, pokes.places_mm)])
@@ -582,8 +589,8 @@ def draw_trial(board: Board, design: SkinDesign, *, spreads: Spreads, seed: int,
     return Trial(board, design, skin, pokes.depths_mm, pokes_m)
 
 
-def laid(trial: Trial, rest: Nodes) -> Skin:
-    """Give the trial's skin on these nodes (from its middle and its base), magnetised as any skin is."""
+def with_nodes(trial: Trial, rest: Nodes) -> Skin:
+    """Return the trial's skin with other nodes (from its centre and base), magnetised as usual."""
     b_T = magnet.array_field(rest.nodes_m, trial.skin.thickness_m, trial.design.polarity)
     j_T = magnet.magnetise(b_T, saturation_T=trial.design.saturation_T, half_field_T=trial.design.half_field_T)
     nodes_m = rest.nodes_m + np.append(trial.skin.seat_m, 0.0)
@@ -591,7 +598,7 @@ def laid(trial: Trial, rest: Nodes) -> Skin:
 
 
 def midpoints(thickness_m: float, rule: Quadrature) -> Nodes:
-    """Fill the skin with the middles of equal boxes that heed no seam: the lattice one would take first."""
+    """Place nodes at the centres of equal boxes that ignore the seams: the obvious lattice."""
     side_m, _, high_m = box_m(thickness_m, rule)
     side_n = round(SKIN_SIDE_M / side_m)
     x_m = side_m * (np.arange(side_n) + 0.5) - SKIN_SIDE_M / 2
@@ -600,13 +607,13 @@ def midpoints(thickness_m: float, rule: Quadrature) -> Nodes:
 
 
 def box_m(thickness_m: float, rule: Quadrature) -> tuple[float, float, float]:
-    """Give the sides of the boxes whose middles `midpoints` are."""
+    """Return the sides of the boxes of `midpoints`."""
     side_m = SKIN_SIDE_M / ceil(SKIN_SIDE_M / rule.cell_m - 1e-9)
     return side_m, side_m, thickness_m / rule.layers_n
 
 
 def gauss_everywhere(thickness_m: float, rule: Quadrature, *, per_cell_n: int) -> Nodes:
-    """Fill the skin with cells that end at the seams, each with Gauss nodes along x and y too: an order higher."""
+    """Place nodes in cells that end at the seams, with Gauss nodes along x and y too: one order higher."""
     spans_m = pairwise((-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2))
     edges_m = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in spans_m]
     starts_m, widths_m = np.concatenate([e[:-1] for e in edges_m]), np.concatenate([np.diff(e) for e in edges_m])
@@ -633,7 +640,7 @@ def _product(
 
 
 class RunTime(Strict):
-    """Section `runtime`: both studies, and how often each call is timed."""
+    """Section `runtime`: both studies, and the number of timings of each call."""
 
     quadratures: Quadratures
     integrators: Integrators
@@ -646,25 +653,25 @@ def read(settings: Settings) -> RunTime:
 
 
 def runtime(settings: Settings, results: Path) -> None:
-    """Compare quadratures and integrators; seconds differ between identical runs, so they are no output."""
+    """Compare quadratures and integrators; times differ between equal runs, so they are no output of DVC."""
     of, tried = simulation_settings(settings), read(settings)
     rows, calls = study_quadratures(_trials(of, tried.quadratures, settings.seed), tried.quadratures.rules_of())
     more, more_calls = study_integrators(tried.integrators)
     choice = choose(rows, used=of.main_boards.quadrature.in_si())
-    seconds = race([*calls, *more_calls], tried.repeats_n)
+    seconds = time_calls([*calls, *more_calls], tried.repeats_n)
     io.write_json(SECONDS / settings.scene / "runtime.json", [asdict(row) for row in seconds])
-    words: dict[str, Any] = {"choice": asdict(choice)}
-    words |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
-    io.write_json(results, words)
+    answer: dict[str, Any] = {"choice": asdict(choice)}
+    answer |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
+    io.write_json(results, answer)
     failed_n = sum(row.failure is not None for row in [*rows, *more])
     say(
-        f"{settings.scene}: {len(rows) + len(more)} ways tried, {failed_n} failed; "
+        f"{settings.scene}: {len(rows) + len(more)} settings tried, {failed_n} failed; "
         f"cheapest quadrature: {choice.setting}"
     )
 
 
 def _trials(of: SimulationSettings, tried: Quadratures, seed: int) -> list[Trial]:
-    """Take the skins on the boards whose chips are nearest: there a quadrature has to be finest."""
+    """Return the skins on the boards with the nearest chips, which need the finest quadrature."""
     drawn = [
         (draw_board(of.main_boards.design, of.spreads, seed=seed, name=board), skin)
         for board, skin in list_captures(of, MAIN)

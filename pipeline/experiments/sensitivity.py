@@ -1,4 +1,4 @@
-"""The smallest weight told apart (paper section 6)."""
+"""The smallest difference of weight that readings resolve (paper section 6)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,11 +20,11 @@ from reskin.data.baseline import subtract
 from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
 
-TOLD_SHARE = 0.95  # of pairs ordered rightly: told apart
+RESOLVED_SHARE = 0.95  # of pairs of readings in the right order: resolved
 WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
 
 
-def levels_of(
+def group_by_level(
     db_uT: Float32[np.ndarray, "f ch"],
     indentation: Int32[np.ndarray, " f"],
     force_N: Float32[np.ndarray, " f"],
@@ -32,7 +32,7 @@ def levels_of(
     levels_n: int,
     where: str,
 ) -> Float32[np.ndarray, "n p r ch"]:
-    """Sort readings by filling, weight and reading; a stop is a run of one force reading, as the log has one a stop."""
+    """Group readings by filling, weight and reading; a stop is a run of equal force readings of the log."""
     new = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
     stops = np.split(np.arange(len(force_N)), new)
     fillings_n = len(np.unique(indentation))
@@ -44,17 +44,20 @@ def levels_of(
     return db_uT[np.stack(stops)].reshape(fillings_n, levels_n, lengths.pop(), -1)
 
 
-def answer_of(
+def analyse_levels(
     db_uT: Float32[np.ndarray, "n p r ch"], weight_N: Float64[np.ndarray, " p"]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Measure what one skin tells of weights that go up by even steps: numbers, and what figures draw besides."""
+    """Analyse the readings under weights that increase in equal steps: numbers, and data of the figures."""
     fitted, held = np.split(db_uT.astype(np.float64), [len(db_uT) // 2])
     along_uT = held @ direction(fitted)
     response_uT, step_N = along_uT.mean(axis=(0, 2)), float(weight_N[1] - weight_N[0])
-    told = {"one_reading": told_apart(along_uT), "five_readings": told_apart(along_uT.mean(axis=2, keepdims=True))}
+    told = {
+        "one_reading": ordered_share(along_uT),
+        "five_readings": ordered_share(along_uT.mean(axis=2, keepdims=True)),
+    }
     by_length = {
-        "one_reading": told_apart(np.linalg.norm(held, axis=3)),
-        "five_readings": told_apart(np.linalg.norm(held.mean(axis=2, keepdims=True), axis=3)),
+        "one_reading": ordered_share(np.linalg.norm(held, axis=3)),
+        "five_readings": ordered_share(np.linalg.norm(held.mean(axis=2, keepdims=True), axis=3)),
     }
     steps_N = _known({name: smallest_step_N(share, step_N) for name, share in told.items()})
     numbers = {
@@ -63,7 +66,7 @@ def answer_of(
         "held_out_n": len(held),
         "readings_per_stop_n": db_uT.shape[2],
         "step_N": step_N,
-        "told_pct": 100 * TOLD_SHARE,
+        "told_pct": 100 * RESOLVED_SHARE,
         "range_N": float(weight_N[-1]),
         "smallest_step_N": steps_N,
         "smallest_step_mL": {name: value_N / WATER_N_PER_ML for name, value_N in steps_N.items()},
@@ -87,15 +90,15 @@ def _known(steps_N: dict[str, float | None]) -> dict[str, float]:
 
 
 def direction(db_uT: Float64[np.ndarray, "n p r ch"]) -> Float64[np.ndarray, " ch"]:
-    """Give the unit vector along the mean change of field."""
+    """Return the unit vector along the mean dB."""
     mean_uT = db_uT.mean(axis=(0, 1, 2))
     return mean_uT / np.linalg.norm(mean_uT)
 
 
-def told_apart(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarray, " d"]:
-    """Give the share of pairs of readings whose order is that of their weights, by difference: 1 step, 2 steps, ...
+def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarray, " d"]:
+    """Return the share of pairs of readings in the order of their weights, for differences of 1 step, 2 steps, ...
 
-    A pair is two readings of the same filling, as both share its no-load reading; equal responses count half.
+    A pair is two readings of the same filling, which share its no-load reading; equal responses count half.
     """
     levels_n = response_uT.shape[1]
     shares = []
@@ -106,22 +109,22 @@ def told_apart(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarray,
 
 
 def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | None:
-    """Give the smallest difference from which on all larger ones are told apart; None if the largest is not."""
-    untold_i = np.flatnonzero(share < TOLD_SHARE)  # index 0 is one step
-    last_i = int(untold_i.max(initial=-1))
+    """Return the smallest difference from which on all are resolved; None if the largest is not."""
+    unresolved_i = np.flatnonzero(share < RESOLVED_SHARE)  # index 0 is one step
+    last_i = int(unresolved_i.max(initial=-1))
     return None if last_i == len(share) - 1 else step_N * (last_i + 2)
 
 
 def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndarray, " p"]) -> dict[str, Any]:
-    """Tell whether the fillings' mean response rises from every weight to the one `step_N` above it.
+    """Test whether the mean response over fillings increases from every weight to the one `step_N` above it.
 
-    The step is the least of whole ones whose mean rise noise hides from one filling in no more than 5 % of cases:
-    pouring finer does not make a skin fall. It comes from noise and gain, not from the order found, or a fall would
-    lengthen the step until it hides. Where no step is as long, no rise is shown, and there is no `step_N`.
+    The step is the smallest whole number of steps whose mean rise exceeds the noise of one filling in 95 % of cases, so
+    that finer pouring does not make the response fall. It follows from noise and gain, not from the observed order, or
+    a fall would lengthen the step until it disappears. If no step is long enough, there is no `step_N`.
     """
     mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
     noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # of one rise
-    gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # a step
+    gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # per step
     found: dict[str, Any] = {
         "holds": False,
         "falls_n": 0,
@@ -129,57 +132,56 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
         "spearman": float(np.corrcoef(weight_N, pd.Series(mean_uT).rank())[0, 1]),
         "neighbours": {"falls_n": int((np.diff(mean_uT) <= 0).sum())},
     }
-    needed = ndtri(TOLD_SHARE) * noise_uT / gain_uT if gain_uT > 0 else np.inf
+    needed = ndtri(RESOLVED_SHARE) * noise_uT / gain_uT if gain_uT > 0 else np.inf
     if needed <= len(mean_uT) - 1:
         steps_n = max(int(np.ceil(needed)), 1)
         falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
         step_N = steps_n * float(weight_N[1] - weight_N[0])
         found |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
-    if noise_uT > 0:  # of an even, straight rise with the standard error of a mean one
+    if noise_uT > 0:  # of a linear rise, with the standard error of the mean
         z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
         found["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
     return found
 
 
 def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
-    """Tell how small a weight the one skin tells that was loaded."""
+    """Find the smallest difference of weight that the loaded skin resolves."""
     load = load_protocol(settings, "glass")
     one = only(read_captures(indentations), indentations)
     weight_N = load_steps_N(load.force_max_N, load.step_N)
     change_uT = subtract(one.b_uT, one.noload_uT)
-    levels_uT = levels_of(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
-    numbers, drawn = answer_of(levels_uT, weight_N)
+    levels_uT = group_by_level(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
+    numbers, drawn = analyse_levels(levels_uT, weight_N)
     write_results(results, numbers, drawn, read_losses(indentations, {}))
-    say(f"{settings.scene}: weights {numbers['smallest_step_N']} N apart are told, in {numbers['fillings_n']} fillings")
+    say(f"{settings.scene}: weights {numbers['smallest_step_N']} N apart resolved, {numbers['fillings_n']} fillings")
 
 
 MEANING = (  # {told_pct} comes from the numbers
-    "A weight at the skin's middle goes up step by step; the glass's flat foot is taken as the rig's round tip. Two "
-    "weights are told apart where at least {told_pct:g} % of the pairs of readings within a filling, in fillings that "
-    "fitted nothing, are in the order of the weights, and so are those of all larger differences. The response is the "
-    "change of field along its mean direction in the other half of the fillings. Whether its mean over fillings rises "
-    "is judged at the least step whose mean rise stands out of the noise of a stop's readings in {told_pct:g} % of "
-    "cases: at finer ones noise alone makes it fall."
+    "The weight on the skin's centre increases step by step; the glass's flat foot is taken as the rig's round tip. A "
+    "difference is resolved if at least {told_pct:g} % of the pairs of readings within a held-out filling are in the "
+    "order of the weights, for it and all larger differences. The response is the change of field along its mean "
+    "direction in the other half of the fillings. Monotonicity is tested at the smallest step whose mean rise exceeds "
+    "the noise of a stop's readings in {told_pct:g} % of cases: at finer steps noise alone makes it fall."
 )
 READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's readings"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show the smallest step told apart, in newtons and in water, and whether the response is monotonic."""
+    """Tabulate the smallest resolved step, in N and mL of water, and whether the response is monotonic."""
     rows = []
     for name, words in READINGS.items():
         rows += [
             (
-                f"smallest step told apart, {words}, N",
+                f"smallest resolved step, {words}, N",
                 _show(numbers["smallest_step_N"], name, numbers),
                 f"< {paper.SENSITIVITY_N:g}",
             ),
-            (f"smallest step told apart, {words}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
+            (f"smallest resolved step, {words}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
             (f"the same by |dB| alone, {words}, N", _show(numbers["by_length_N"], name, numbers), "–"),
         ]
     rise = numbers["monotonic"]
     rows += [
-        ("mean response rises at every step that stands out of noise", _rises(rise), paper.MONOTONIC),
+        ("mean response rises at every step above the noise", _rises(rise), paper.MONOTONIC),
         (f"falls from level to level, {numbers['step_N']:g} N apart", _falls(rise["neighbours"], numbers), "–"),
         ("gain, straight line, µT/N", f"{numbers['gain_uT_per_N']:.3g}", "–"),
         ("noise of one reading along the response, µT", f"{numbers['noise_uT']:.2g}", "–"),
@@ -192,7 +194,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the response against weight, and how sure a difference is told."""
+    """Plot the response against weight, and the share of pairs in the right order against their difference."""
     with drawing(7.6, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         weight_N, response_uT, sd_uT = (np.array(drawn[name]) for name in ("weight_N", "response_uT", "sd_uT"))
@@ -216,7 +218,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _rises(rise: Mapping[str, Any]) -> str:
     ranks = f"rank correlation {rise['spearman']:.4f}"
     if "step_N" not in rise:
-        return f"{INCONCLUSIVE}: no step stands out of noise; {ranks}"
+        return f"{INCONCLUSIVE}: no step is above the noise; {ranks}"
     here = "rises" if rise["holds"] else "does not rise"
     rises_n = rise["pairs_n"] - rise["falls_n"]
     return (
@@ -242,4 +244,4 @@ def _show_mL(name: str, numbers: Mapping[str, Any]) -> str:
 
 
 def _least(step_N: float, numbers: Mapping[str, Any]) -> str:
-    return "at most " if step_N <= numbers["step_N"] else ""  # no finer one was tried
+    return "at most " if step_N <= numbers["step_N"] else ""  # the finest step tried

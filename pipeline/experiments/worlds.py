@@ -1,4 +1,4 @@
-"""What decides table 2: its rows against what simulated skins differ in."""
+"""What decides table 2: its rows for different spreads and model errors of the simulated skins."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ from reskin.simulation.capture import list_captures
 from reskin.simulation.rig import actual_positions, read_force
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-WAVES_N = 48  # cosines that make a smooth error
+WAVES_N = 48  # cosines of the smooth error
 DEFAULT = "default"
 Size = Annotated[float, Field(ge=0, le=2)]
 Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
@@ -50,7 +50,7 @@ EXPERIMENTS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "ada
 
 
 class Residual(Strict):
-    """What the law leaves: rms sizes as parts of |dB|, over which it is alike, and how much is one skin's own."""
+    """Error of the simulation: rms sizes relative to |dB|, correlation lengths, and the part specific to a skin."""
 
     sizes: Sizes
     length_mm: Annotated[float, Field(gt=0, le=50)]
@@ -59,7 +59,7 @@ class Residual(Strict):
 
 
 class Worlds(Strict):
-    """Section worlds: the values that each factor takes, all others at the scene's."""
+    """Section `worlds`: the values of each factor; all others are the scene's."""
 
     residual: Residual
     skin_modulus: Sizes  # spreads.skin_modulus
@@ -69,7 +69,7 @@ class Worlds(Strict):
 
 @dataclass(frozen=True)
 class World:
-    """One world: a factor's value, its settings, and the size of the law's error."""
+    """One world: a factor and its value, the settings, and the size of the simulation's error."""
 
     factor: str
     value: float
@@ -78,12 +78,12 @@ class World:
 
     @property
     def name(self) -> str:
-        """Name it in files and folds."""
+        """Name in files and folds."""
         return f"{self.factor}-{self.value:g}"
 
 
 def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
-    """List the worlds; that of the scene's own settings comes first, and once."""
+    """List the worlds, the default (the scene's settings) first."""
     spreads, hold = simulation.spreads, simulation.skin.hold
     found = [World(DEFAULT, 1.0, simulation)]
     found += [World("residual", size, simulation, size) for size in section.residual.sizes if size > 0]
@@ -106,7 +106,7 @@ def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
 def smooth(
     at: Float[np.ndarray, "n 3"], channels_n: int, how: Residual, rng: np.random.Generator
 ) -> Float[np.ndarray, "n ch"]:
-    """Draw a smooth field of each channel with a variance of 1, over x and y in mm and log force."""
+    """Draw a smooth random function of each channel with variance 1, over x and y in mm and log force."""
     lengths = np.array([how.length_mm, how.length_mm, how.length_log_N])
     waves = rng.standard_normal((3, WAVES_N)) / lengths[:, None]
     phase = rng.uniform(0, 2 * np.pi, WAVES_N)
@@ -117,9 +117,9 @@ def smooth(
 def with_residual(
     change_uT: Float[np.ndarray, "n ch"], at: Float[np.ndarray, "n 3"], size: float, how: Residual, seed: int, skin: str
 ) -> Float[np.ndarray, "n ch"]:
-    """Add what the law leaves to a skin's changes of field: `size` times |dB|, rms over presses.
+    """Add the simulation's error to a skin's changes of field: `size` times |dB|, rms over indentations.
 
-    A part is the same on all skins, as a law errs alike on them; the rest bears the skin's name.
+    A part is the same for all skins; the rest is drawn by the skin's name.
     """
     if size == 0:
         return change_uT
@@ -132,7 +132,7 @@ def with_residual(
 
 
 def rows_of(world: World, section: Worlds, seed: int) -> Rows:
-    """Press every skin of a world as the main protocol does, and read its chips and the force sensor."""
+    """Simulate the main protocol on every skin of a world, and read its chips and the force sensor."""
     parts = [_skin_rows(world, section, seed, board, skin) for board, skin in list_captures(world.simulation, MAIN)]
     rows = parts[0]
     for part in parts[1:]:
@@ -162,22 +162,22 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
     noload_uT = noise_uT / np.sqrt(rig.noload_frames_n) * rng.standard_normal((n, 1, channels_n))
     reading_uT = noise_uT * rng.standard_normal((n, rig.readings_n, channels_n))
     db_uT = (change_uT[:, None] + reading_uT - noload_uT).reshape(-1, channels_n)
-    pushed_N = np.column_stack([np.zeros((n, 2)), force_N])
-    read_N, _ = read_force(pushed_N, noise_N=rig.force_noise_N, rng=rng)
+    tip_N = np.column_stack([np.zeros((n, 2)), force_N])
+    read_N, _ = read_force(tip_N, noise_N=rig.force_noise_N, rng=rng)
     target = np.column_stack([plan.x_mm[:, 0], plan.y_mm[:, 0], read_N[:, 2]]).astype(np.float32)
-    felt = np.repeat(read_N[:, 2] >= 0, rig.readings_n)  # as `Selection` of a scene does
+    kept = np.repeat(read_N[:, 2] >= 0, rig.readings_n)  # as `Selection` of a scene does
     rows_n = n * rig.readings_n
     return Rows(
-        capture=np.full(rows_n, skin_name)[felt], board=np.full(rows_n, board_name)[felt],
-        skin=np.full(rows_n, skin_name)[felt], db_uT=db_uT.astype(np.float32)[felt],
-        target=np.repeat(target, rig.readings_n, axis=0)[felt],
-        pass_i=np.repeat(plan.pass_i.astype(np.int32), rig.readings_n)[felt],
-        indentation=np.repeat(np.arange(n), rig.readings_n)[felt], dropped={},
+        capture=np.full(rows_n, skin_name)[kept], board=np.full(rows_n, board_name)[kept],
+        skin=np.full(rows_n, skin_name)[kept], db_uT=db_uT.astype(np.float32)[kept],
+        target=np.repeat(target, rig.readings_n, axis=0)[kept],
+        pass_i=np.repeat(plan.pass_i.astype(np.int32), rig.readings_n)[kept],
+        indentation=np.repeat(np.arange(n), rig.readings_n)[kept], dropped={},
     )  # fmt: skip
 
 
 def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> Iterator[Fold]:
-    """Draw a world's folds, numbered among the rows of all worlds and named after it."""
+    """Draw a world's folds, indexed in the rows of all worlds and named after it."""
     for fold in draw_folds(rows, ("transfer", "lobo"), split, seed):
         sides = [side + before_n for side in (fold.train, fold.test, fold.pool)]
         yield Fold(fold.experiment, f"{world}.{fold.name}", *sides)
@@ -198,16 +198,16 @@ def worlds(settings: Settings, results: Path) -> None:
         own = rows_of(world, section, settings.seed)
         folds += list(folds_of(own, split, settings.seed, world.name, 0 if rows is None else len(rows)))
         rows = own if rows is None else stack(rows, own)
-        say(f"{settings.scene} worlds: {i + 1} of {len(listed)} worlds are pressed ({world.name})")
-    assert rows is not None, "the scene's own world is always there"
+        say(f"{settings.scene} worlds: {i + 1} of {len(listed)} worlds simulated ({world.name})")
+    assert rows is not None, "the default world always exists"
     data = SceneData(settings.scene, settings, rows, folds)
-    cards = _trained(data, listed)
+    cards = _train(data, listed)
     numbers = {"by_world": [_scored(cards, world) for world in listed], **_constants(section, data, listed)}
     write_results(results, numbers, {})
 
 
-def _trained(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
-    """Train one skin, many skins, and many with triplets, then adapt the last; give their cards."""
+def _train(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
+    """Train single, multi and triplet networks, adapt the last, and return their cards."""
     lobo = data.folds_of("lobo")
     jobs = make_jobs(data, data.settings.training("train_single"), data.folds_of("transfer"))
     jobs += make_jobs(data, data.settings.training("train_multi"), lobo)
@@ -249,7 +249,7 @@ def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
 
 
 def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dict[str, Any]:
-    """Say what was done: settings of the scene's own world, and how much was trained."""
+    """Return the settings of the default world, and the size of the trainings."""
     first = listed[0].simulation
     return {
         "residual_length_mm": section.residual.length_mm, "residual_own_share": section.residual.own_share,
@@ -262,23 +262,23 @@ def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dic
 
 DEFAULT_WORLD = "default"
 FACTORS = {
-    "residual": "error that the law leaves, part of |dB|", "skin_modulus": "spread of stiffness (sd of the logarithm)",
+    "residual": "error of the simulation, part of |dB|", "skin_modulus": "spread of stiffness (sd of the logarithm)",
     "amplitude_and_gap": "spreads of amplitude and gap, times the default", "friction": "friction under the tip",
 }  # fmt: skip
 DRAWN = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
 MEANING = (
-    "Each world differs from the default in one thing; the same skins, presses, noise and folds in all. Law's error: "
-    "the largest is what the fitted law leaves on recorded boards (scene lab, 1 - explained), alike over "
-    "{residual_length_mm:g} mm, {residual_own_share:.0%} of its variance one skin's own; simulated skins of all other "
-    "scenes have none. {folds_n} boards held out in turn, {steps_n} steps, one network each."
+    "Each world differs from the default in one factor; skins, indentations, noise and folds are the same. Error "
+    "of the simulation: the largest is that on recorded boards (scene lab, 1 - explained), correlated over "
+    "{residual_length_mm:g} mm, {residual_own_share:.0%} of its variance specific to a skin; simulated skins of all "
+    "other scenes have none. {folds_n} boards held out in turn, {steps_n} steps, one network each."
 )
-DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # of the other factors: among the numbers
+DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # those of the other factors are in the numbers
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """List each world's rows of table 2."""
+    """Tabulate the rows of table 2 for each world."""
     lines = [
-        {"world": _say(world), "row": SHORT[row], "source": source}
+        {"world": _describe(world), "row": SHORT[row], "source": source}
         | {title: show(world[row].get(metric)) for metric, title in COLUMNS.items()}
         for world in numbers["by_world"]
         for row in TABLE_2
@@ -287,7 +287,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the rows of table 2 against each factor; the default is where all panels of a row meet."""
+    """Plot the rows of table 2 against each factor."""
     with drawing(11.0, 7.6) as figure:
         panels = figure.subplots(len(DRAWN), len(FACTORS), sharey="row", squeeze=False)
         for column, (factor, words) in enumerate(FACTORS.items()):
@@ -326,5 +326,5 @@ def _default(numbers: Mapping[str, Any], factor: str) -> float:
     return DEFAULTS[factor] if factor in DEFAULTS else float(numbers[factor])
 
 
-def _say(world: Mapping[str, Any]) -> str:
+def _describe(world: Mapping[str, Any]) -> str:
     return "default" if world["factor"] == DEFAULT_WORLD else f"{FACTORS[world['factor']]}: {world['value']:g}"

@@ -3,11 +3,11 @@
 import numpy as np
 
 from pipeline.experiments import dynamics, sensitivity
-from pipeline.experiments.sensitivity import answer_of
+from pipeline.experiments.sensitivity import analyse_levels
 from reskin.seeds import rng_for
 
 ERROR = {"mean": 0.5, "sd": 0.1, "n": 3}
-RISES = "mean response rises at every step that stands out of noise"
+RISES = "mean response rises at every step above the noise"
 BETTER = {"mean": 0.25, "n": 1}
 
 
@@ -29,7 +29,7 @@ NUMBERS = {
 def glass(noise_uT):
     noise = noise_uT * rng_for(0, "glass").standard_normal((8, 11, 5, 3))
     levels = np.arange(11)[:, None, None] * np.array([3.0, 4.0, 0.0]) + noise
-    return answer_of(levels.astype(np.float32), 0.1 * np.arange(11))
+    return analyse_levels(levels.astype(np.float32), 0.1 * np.arange(11))
 
 
 def test_a_step_finer_than_was_tried_is_said_to_be_an_upper_limit():
@@ -44,7 +44,7 @@ def test_what_is_not_told_apart_is_said_so():
     table = sensitivity.tables(glass(1e3)[0], "simulated")["sensitivity"]
     assert table["ours"][0] == "none up to 1"
     assert table["ours"][1] == "none"
-    assert "undecided: no step stands out of noise" in table.set_index("what")["ours"][RISES]
+    assert "undecided: no step is above the noise" in table.set_index("what")["ours"][RISES]
 
 
 def test_the_verdict_on_rising_says_at_which_step_it_was_judged():

@@ -20,28 +20,28 @@ from pipeline.experiments.runtime import (
     METHODS,
     REFERENCE,
     SOLVERS,
-    Contestant,
+    Indentations,
     Integrators,
     NodePath,
-    Pokes,
     Precision,
     Reference,
+    TimedCall,
     Trial,
     box_m,
     choose,
     draw_trial,
     errors,
     gauss_everywhere,
-    laid,
     midpoints,
     paths,
-    poke_often,
-    race,
+    prepare,
+    repeated_presses,
+    rule_name,
     study_integrators,
     study_quadratures,
-    whole,
+    time_calls,
+    with_nodes,
 )
-from pipeline.experiments.runtime import written as name_of
 from pipeline.experiments.verification.signals import hereditary
 from reskin.errors import ParamsError
 from reskin.physics import deformation, layer
@@ -53,7 +53,7 @@ from tests.physics.test_board import draw_board, no_spread, spreads
 from tests.physics.test_skin import design
 
 BOARD = draw_board(board_design(), no_spread(), seed=0, name="b0")
-POKES = Pokes(places_mm=((6.35, 0.0), (-2.0, 5.0)), depths_mm=(0.6, 1.2))
+POKES = Indentations(places_mm=((6.35, 0.0), (-2.0, 5.0)), depths_mm=(0.6, 1.2))
 COARSE = Quadrature(1e-3, 4)
 
 
@@ -83,7 +83,7 @@ def quadratures():
 
 
 def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
-    setting = None if cell_mm is None else name_of(Quadrature(1e-3 * cell_mm, layers_n))
+    setting = None if cell_mm is None else rule_name(Quadrature(1e-3 * cell_mm, layers_n))
     (row,) = [row for row in rows if row.method == method and setting in (None, row.setting)]
     return row.error
 
@@ -91,7 +91,7 @@ def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
 def test_a_skin_laid_on_the_products_nodes_is_the_drawn_one_but_for_its_unevenness():
     even = spreads(skin_amplitude=0.0, skin_filler=0.0, skin_rotation_deg=0.0)
     drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
-    ours = laid(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
+    ours = with_nodes(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
     np.testing.assert_array_equal(ours.nodes_m, drawn.nodes_m)
     np.testing.assert_allclose(ours.moments_A_m2, drawn.moments_A_m2, rtol=1e-14)  # a factor of one less
     assert (ours.seat_m == drawn.seat_m).all()
@@ -108,7 +108,7 @@ def test_pokes_sit_on_the_skins_pattern_wherever_that_sits_on_the_board():
 
 def test_a_poke_that_would_not_touch_is_refused():
     with pytest.raises(ParamsError, match="skin s0: true depth of every poke must be above 0 m"):
-        trial(pokes=Pokes.model_construct(places_mm=((0.0, 0.0),), depths_mm=(0.0,)), skin_depth_zero_mm=0.0)
+        trial(pokes=Indentations.model_construct(places_mm=((0.0, 0.0),), depths_mm=(0.0,)), skin_depth_zero_mm=0.0)
 
 
 @pytest.mark.parametrize(("cell_mm", "layers_n"), [(0.5, 4), (3.0, 1)])
@@ -135,9 +135,14 @@ def test_a_box_that_is_lifted_changes_the_field_as_charged_faces_do(monkeypatch)
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(
-        BOARD, like, spreads=no_spread(), seed=0, name="s0", pokes=Pokes(places_mm=((0.0, 0.0),), depths_mm=(1.0,))
+        BOARD,
+        like,
+        spreads=no_spread(),
+        seed=0,
+        name="s0",
+        pokes=Indentations(places_mm=((0.0, 0.0),), depths_mm=(1.0,)),
     )
-    skin = laid(one, midpoints(one.skin.thickness_m, whole_skin))
+    skin = with_nodes(one, midpoints(one.skin.thickness_m, whole_skin))
     lifted = NodePath(skin.nodes_m[None] + lift_m, np.zeros((1, 1, 3)))
     monkeypatch.setattr(runtime, "paths", lambda *_: lifted)
     found_T = runtime.magpylib_cuboids(one, whole_skin).call()[0]
@@ -160,7 +165,7 @@ def test_gauss_nodes_in_every_cell_integrate_polynomials_that_midpoints_cannot()
 
 def test_a_path_goes_where_the_flow_carries_the_very_node():
     one = trial()
-    skin = laid(one, place_nodes(one.skin.thickness_m, COARSE))
+    skin = with_nodes(one, place_nodes(one.skin.thickness_m, COARSE))
     path, poke_m, few = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
     away_m = skin.nodes_m[few, :2] - poke_m[:2]
     r_m, z_m, depths_m = np.linalg.norm(away_m, axis=1), skin.nodes_m[few, 2], one.pokes_m[:, 2] + skin.depth_zero_m
@@ -214,8 +219,8 @@ def test_the_reference_is_ten_times_as_good_as_a_rule_must_be(quadratures):
 
 
 def test_magpylib_and_the_kernel_say_the_same_of_the_same_nodes(quadratures):
-    _, contestants = quadratures
-    calls = {one.key[1]: one.call for one in contestants if one.key[2] == name_of(COARSE)}
+    _, calls = quadratures
+    calls = {one.key[1]: one.call for one in calls if one.key[2] == rule_name(COARSE)}
     kernel_T = calls["kernel alone"]()
     for name in ("magpylib.core dipoles", "magpylib dipoles"):
         # The others lose digits to the difference of two sums, and magpylib's mu_0 is of another year.
@@ -233,20 +238,20 @@ def test_far_away_boxes_are_dipoles():
     deep = replace(BOARD, chips_m=BOARD.chips_m - (0.0, 0.0, 40e-3))
     one = trial(deep)
     boxes_T = METHODS["magpylib cuboids"](one, Quadrature(2e-3, 2)).call()
-    dipoles_T = whole(one, midpoints(one.skin.thickness_m, Quadrature(2e-3, 2))).call()
+    dipoles_T = prepare(one, midpoints(one.skin.thickness_m, Quadrature(2e-3, 2))).call()
     # 1 %: (cell / distance)^2 is 0.2 %, and the flows are interpolated differently
     assert np.linalg.norm(boxes_T - dipoles_T) < 0.01 * np.linalg.norm(dipoles_T)
 
 
 def test_every_rule_has_one_row_and_may_be_timed(quadratures):
-    rows, contestants = quadratures
-    asked = {(method, name_of(rule)) for method, own in TRIED.items() for rule in own}
+    rows, calls = quadratures
+    asked = {(method, rule_name(rule)) for method, own in TRIED.items() for rule in own}
     assert {(row.method, row.setting) for row in rows[1:]} == asked
     assert len(rows) == 1 + len(asked)
-    assert [one.key for one in contestants] == [row.key for row in rows[1:]]
+    assert [one.key for one in calls] == [row.key for row in rows[1:]]
     assert all(row.error == max(row.parts.values()) for row in rows)
     nodes_n = {row.setting: row.work_n for row in rows if row.method == CANDIDATES}
-    assert nodes_n[name_of(DEFAULT_QUADRATURE)] == len(place_nodes(1e-3, DEFAULT_QUADRATURE).nodes_m)
+    assert nodes_n[rule_name(DEFAULT_QUADRATURE)] == len(place_nodes(1e-3, DEFAULT_QUADRATURE).nodes_m)
 
 
 def test_a_method_nobody_knows_is_refused():
@@ -300,15 +305,15 @@ def test_who_accepts_more_error_never_pays_more(points, strict, extra):
 
 def test_contestants_run_in_turn_and_backwards_in_every_other_round():
     ran = []
-    contestants = [Contestant(("study", name, ""), lambda name=name: ran.append(name), 1) for name in "abc"]
-    assert [one.method for one in race(contestants, 3)] == ["a", "b", "c"]
+    calls = [TimedCall(("study", name, ""), lambda name=name: ran.append(name), 1) for name in "abc"]
+    assert [one.method for one in time_calls(calls, 3)] == ["a", "b", "c"]
     assert "".join(ran) == "abc" + "cba" + "abc"
 
 
 def test_seconds_are_medians_an_indentation(monkeypatch):
     now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])  # before and after each of three naps
     monkeypatch.setattr("pipeline.experiments.runtime.perf_counter", lambda: next(now_s))
-    (slow,) = race([Contestant(("study", "naps", "x"), lambda: None, 5)], 3)
+    (slow,) = time_calls([TimedCall(("study", "naps", "x"), lambda: None, 5)], 3)
     assert slow.key == ("study", "naps", "x")
     assert slow.median_s == pytest.approx(0.001)
     assert slow.repeats_n == 3
@@ -316,7 +321,7 @@ def test_seconds_are_medians_an_indentation(monkeypatch):
 
 def test_a_race_without_rounds_is_refused():
     with pytest.raises(ParamsError, match="repeats_n must be 1 or more"):
-        race([], 0)
+        time_calls([], 0)
 
 
 RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)
@@ -334,7 +339,7 @@ def relaxations():
 
 
 def of(rows, ratio, method) -> list[Precision]:
-    return [row for row in rows if row.study == runtime.study(ratio) and row.method == method]
+    return [row for row in rows if row.study == runtime.study_name(ratio) and row.method == method]
 
 
 def test_the_skins_own_relaxation_has_its_own_stiffness():
@@ -351,7 +356,7 @@ def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio
 
 def test_the_exact_force_is_the_convolution_with_the_relaxation_function():
     # Lee & Radok 1960, by adaptive quadrature instead of by states
-    prony, (time_s, elastic) = runtime.stiff(1e5), poke_often(2)
+    prony, (time_s, elastic) = runtime.stiff(1e5), repeated_presses(2)
     speeds = np.diff(elastic) / np.diff(time_s)
 
     def relaxation(t_s):
@@ -365,7 +370,7 @@ def test_the_exact_force_is_the_convolution_with_the_relaxation_function():
 
 
 def test_a_history_of_twenty_pokes_takes_thirty_seconds():
-    time_s, elastic = poke_often(20)
+    time_s, elastic = repeated_presses(20)
     assert time_s[-1] == pytest.approx(30.0)
     assert len(time_s) == 61
     assert (np.diff(time_s) > 0).all()
@@ -380,13 +385,13 @@ def test_the_exact_update_is_exact_however_stiff(relaxations, ratio):
 
 
 def test_every_method_has_a_row_for_every_stiffness_and_setting(relaxations):
-    rows, contestants = relaxations
+    rows, calls = relaxations
     asked = [(EXACT, 1), *((name, 2) for name in SOLVERS), (EULER, 2)]
     for ratio in RATIOS:
         for method, settings_n in asked:
             assert len(of(rows, ratio, method)) == settings_n
     assert len({row.key for row in rows}) == len(rows) == 11 * len(RATIOS)
-    assert {one.key for one in contestants} == {row.key for row in rows if row.failure is None}
+    assert {one.key for one in calls} == {row.key for row in rows if row.failure is None}
     assert all((row.error is None) == (row.failure is not None) for row in rows)
 
 
@@ -407,14 +412,14 @@ def test_euler_is_of_first_order(relaxations):
 @pytest.mark.parametrize(("step_over_fastest", "stable"), [(1.9, True), (2.1, False)])
 def test_euler_diverges_above_twice_the_fastest_relaxation_and_is_listed(step_over_fastest, stable):
     sweep = few(ratios=(1e7,), tolerances=(), euler_steps_s=(1e-3 * step_over_fastest,), pokes_n=4)
-    rows, contestants = study_integrators(sweep)
+    rows, calls = study_integrators(sweep)
     (euler,) = of(rows, 1e7, EULER)
     if stable:
         assert euler.error < 1e-2
     else:
         assert euler.error is None
         assert euler.failure.startswith("diverged: error")
-        assert euler.key not in {one.key for one in contestants}
+        assert euler.key not in {one.key for one in calls}
 
 
 def test_euler_beyond_any_number_is_listed_as_diverged(relaxations):
@@ -453,5 +458,5 @@ def test_more_pokes_leave_the_error_and_the_work_of_a_poke_nearly_as_they_are():
 
 
 def test_the_same_sweep_gives_the_same_rows(relaxations):
-    again, study = study_integrators(few(ratios=(1e6,)))[0], runtime.study(1e6)
+    again, study = study_integrators(few(ratios=(1e6,)))[0], runtime.study_name(1e6)
     assert again == [row for row in relaxations[0] if row.study == study]

@@ -1,4 +1,4 @@
-"""Weights that are told apart: naive loops, the normal distribution and scipy as truth; scaling as law."""
+"""Resolved weights against naive loops, the normal distribution and scipy; scaling."""
 
 from itertools import pairwise
 
@@ -8,7 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import linregress, norm, spearmanr
 
-from pipeline.experiments.sensitivity import answer_of, direction, levels_of, monotonic, smallest_step_N, told_apart
+from pipeline.experiments.sensitivity import (
+    analyse_levels,
+    direction,
+    group_by_level,
+    monotonic,
+    ordered_share,
+    smallest_step_N,
+)
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
 
@@ -34,18 +41,18 @@ def test_shares_are_those_of_a_loop_over_all_pairs():
             for a in filling[i + steps_n]
             for b in filling[i]
         ]
-        assert told_apart(response)[steps_n - 1] == pytest.approx(np.mean(right))
+        assert ordered_share(response)[steps_n - 1] == pytest.approx(np.mean(right))
 
 
 def test_on_a_linear_skin_a_difference_is_told_as_often_as_two_normal_readings_say():
-    told = answer_of(fillings(), WEIGHT_N)[1]["told"]
+    told = analyse_levels(fillings(), WEIGHT_N)[1]["told"]
     z = GAIN_uT_PER_N * STEP_N * np.arange(1, 4) / (np.sqrt(2) * NOISE_uT)
     np.testing.assert_allclose(told["one_reading"][:3], norm.cdf(z), atol=0.015)  # 12,500 pairs, sharing readings
     np.testing.assert_allclose(told["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)  # 500 pairs
 
 
 def test_gain_and_noise_are_found_again():
-    numbers, drawn = answer_of(fillings(), WEIGHT_N)
+    numbers, drawn = analyse_levels(fillings(), WEIGHT_N)
     assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)  # 0.5 uT of error a level of 150 uT
     assert numbers["noise_uT"] == pytest.approx(NOISE_uT, rel=0.05)  # 2080 degrees of freedom: 1.6 %
     # the least difference that both shares reach: 1.645 sqrt(2) sd / gain, up to the next step
@@ -62,13 +69,13 @@ def test_the_direction_is_that_of_the_fitting_half_alone():
     np.testing.assert_allclose(direction(uT[:20].astype(float)), ALONG, atol=1e-6)  # float32
     turned = uT.copy()
     turned[20:] = turned[20:, :, :, [1, 0, 2]]  # what is held out points elsewhere
-    assert answer_of(turned, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
+    assert analyse_levels(turned, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
 
 
 @given(st.floats(0.1, 10.0))
 def test_a_stronger_skin_with_as_much_more_noise_tells_the_same(factor):
     uT = fillings(4)
-    one, other = (answer_of((own * uT).astype(np.float32), WEIGHT_N)[0] for own in (1.0, factor))
+    one, other = (analyse_levels((own * uT).astype(np.float32), WEIGHT_N)[0] for own in (1.0, factor))
     assert one["smallest_step_N"] == other["smallest_step_N"]
 
 
@@ -79,7 +86,7 @@ def test_the_smallest_step_is_the_one_after_the_last_that_fails():
 
 
 def test_a_skin_that_tells_nothing_has_no_smallest_step():
-    numbers, _ = answer_of(fillings(noise_uT=1e6), WEIGHT_N)
+    numbers, _ = analyse_levels(fillings(noise_uT=1e6), WEIGHT_N)
     assert numbers["smallest_step_N"] == numbers["smallest_step_mL"] == {}
     assert not numbers["monotonic"]["holds"]
     assert "step_N" not in numbers["monotonic"]
@@ -117,7 +124,7 @@ def test_a_skin_is_judged_alike_however_finely_the_glass_is_filled():
     noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
     fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
     pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
-    found, coarse = (answer_of(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
+    found, coarse = (analyse_levels(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
     assert found["neighbours"]["falls_n"] > 0  # noise of a mean rise: 5 sqrt(2 / 100) = 0.7 uT, as much as a step's 0.6
     assert found["holds"]
     assert coarse["holds"]
@@ -127,7 +134,7 @@ def test_a_skin_is_judged_alike_however_finely_the_glass_is_filled():
 def test_a_response_that_falls_by_more_than_is_told_apart_is_not_monotonic():
     uT = fillings()
     uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # drops by half of what it had reached
-    assert not answer_of(uT, WEIGHT_N)[0]["monotonic"]["holds"]
+    assert not analyse_levels(uT, WEIGHT_N)[0]["monotonic"]["holds"]
 
 
 def test_falls_that_noise_makes_are_as_many_as_expected():
@@ -144,10 +151,10 @@ def test_readings_are_sorted_by_filling_weight_and_reading():
     db_uT = np.arange(24, dtype=np.float32).reshape(12, 2)
     indentation = np.repeat([0, 1], 6).astype(np.int32)
     force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # the second begins as the first ends
-    levels = levels_of(db_uT, indentation, force_N, levels_n=3, where="glass")
+    levels = group_by_level(db_uT, indentation, force_N, levels_n=3, where="glass")
     assert levels.shape == (2, 3, 2, 2)
     np.testing.assert_array_equal(levels.reshape(12, 2), db_uT)
     with pytest.raises(SchemaError, match=r"glass: stops must be 4 a filling.*got 6 stops of \[2\] readings"):
-        levels_of(db_uT, indentation, force_N, levels_n=4, where="glass")
+        group_by_level(db_uT, indentation, force_N, levels_n=4, where="glass")
     with pytest.raises(SchemaError, match=r"got 6 stops of \[1, 2\] readings"):
-        levels_of(db_uT[1:], indentation[1:], force_N[1:], levels_n=3, where="glass")
+        group_by_level(db_uT[1:], indentation[1:], force_N[1:], levels_n=3, where="glass")
