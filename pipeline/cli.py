@@ -62,18 +62,18 @@ def add(
     from pipeline.scenes import read_plan
     from reskin.recordings import preparing
 
-    labels, marks = preparing.Labels(board, skin, name), preparing.parse_marks(mark or [])
+    names, marks = preparing.CaptureNames(board, skin, name), preparing.parse_marks(mark or [])
     running = read_plan(ROOT / PLAN).scenes
     with plan.copied(ROOT, scene, like), preparing.suggesting_layout(recording, layout):
         if layout == "capture":
-            prepared = preparing.native(recording, labels, probe, marks)
+            prepared = preparing.native(recording, names, probe, marks)
         elif layout == "serial-binary" or layout == "serial-text":
             usual: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
-            prepared = preparing.dump(recording, labels, preparing.Dump(wire or usual, chips_n, rate_hz, probe, marks))
+            prepared = preparing.dump(recording, names, preparing.Dump(wire or usual, chips_n, rate_hz, probe, marks))
         else:
             options = {"force_axis": str(force_axis)} if layout == "eflesh" else {}
             options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
-            prepared = preparing.foreign(recording, layout, labels, options)
+            prepared = preparing.foreign(recording, layout, names, options)
         header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro (or: report@{scene})")
     if scene not in running:

@@ -19,7 +19,7 @@ from reskin.errors import CaptureError, ReskinError
 from reskin.recordings import preparing, probe
 from reskin.recordings.header import Clock, write_capture
 from reskin.recordings.ingest import open_capture, read_header
-from reskin.recordings.preparing import Dump, Labels
+from reskin.recordings.preparing import CaptureNames, Dump
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import table
 from reskin.seeds import rng_for
@@ -52,8 +52,8 @@ def lab_file(tmp_path) -> Path:
     return write(tmp_path / "recording", *PRESSES) / "readings.csv"
 
 
-def labels(board: str = "board1", skin: str = "skin1", name: str | None = None) -> Labels:
-    return Labels(board, skin, name)
+def labels(board: str = "board1", skin: str = "skin1", name: str | None = None) -> CaptureNames:
+    return CaptureNames(board, skin, name)
 
 
 def add_lab(root: Path, file: Path, *, allow_copy: bool = False, **words: str):

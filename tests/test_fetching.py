@@ -20,7 +20,7 @@ from pipeline.manage.registry import read_registry
 from pipeline.scenes import read_plan
 from reskin.errors import ReskinError
 from reskin.recordings import preparing
-from reskin.recordings.preparing import Labels
+from reskin.recordings.preparing import CaptureNames
 from reskin.recordings.readers import eflash7, eflesh, ini, lab
 from tests import repositories
 from tests.recordings.headers import AS_USUAL
@@ -147,7 +147,7 @@ def test_adding_that_was_stopped_goes_on_where_it_was(root, monkeypatch):
 
 def test_a_recording_that_was_added_by_hand_under_another_name_is_not_added_again(root, world, tmp_path):
     (tmp_path / "mine.csv").write_bytes(world.files["board1.csv"])
-    prepared = preparing.foreign(tmp_path / "mine.csv", "lab", Labels("b", "s", "mine"), {})
+    prepared = preparing.foreign(tmp_path / "mine.csv", "lab", CaptureNames("b", "s", "mine"), {})
     adding.add(root, "small", prepared, allow_copy=False)
     assert "small/mine: added already" in fetch(root)
     assert sorted(read_registry(root).captures["small"]) == ["board2_skin-board2_board2", "mine"]
@@ -300,7 +300,7 @@ def test_real_recordings_have_the_checksums_on_record_and_are_read(name, shared_
     counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # rows, as data/README.md tells
     readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7}
     for recording in SOURCES[name].recordings[:1]:
-        labels = Labels(recording.board, recording.skin, None)
+        labels = CaptureNames(recording.board, recording.skin, None)
         prepared = preparing.foreign(tmp_path / name / recording.path, recording.layout, labels, recording.options)
         header = preparing.headers.write_capture(tmp_path / prepared[0].capture, *prepared)
         _, account = readers[name].read(tmp_path / header.capture, header, AS_USUAL)

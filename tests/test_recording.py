@@ -17,7 +17,7 @@ from reskin.board.wire import encode
 from reskin.errors import CaptureError
 from reskin.recordings.header import HEADER_FILE, parse
 from reskin.recordings.label_sources import LabelSource
-from reskin.recordings.preparing import Labels, native
+from reskin.recordings.preparing import CaptureNames, native
 from reskin.recordings.recorder import (
     NO_INFO,
     CaptureInfo,
@@ -74,7 +74,7 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     assert header.options == {"scan": "random"}
     probe = tmp_path / "probe.csv"
     probe.write_text("")
-    added, files = native(tmp_path / "run1", Labels("b0", "s0", None), probe, ())
+    added, files = native(tmp_path / "run1", CaptureNames("b0", "s0", None), probe, ())
     assert added.options == header.options
     assert set(files) == {"stream.bin", "arrivals.csv", "probe.csv"}
 
@@ -99,7 +99,7 @@ def test_what_a_killed_recorder_had_read_can_still_be_added(terminal, tmp_path):
     recorder.communicate()
     probe = tmp_path / "probe.csv"
     probe.write_text("")
-    header, files = native(tmp_path / "run1.part", Labels("b0", "s0", None), probe, ())
+    header, files = native(tmp_path / "run1.part", CaptureNames("b0", "s0", None), probe, ())
     assert header.capture == "run1"
     assert files["stream.bin"].stat().st_size > 0
 

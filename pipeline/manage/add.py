@@ -1,7 +1,6 @@
-"""Adding a recording: a header and files -> data/raw/<scene>/<capture>/, tracked, registered, planned. Or nothing.
+"""Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, register it, plan its scene.
 
-Everything is read through and checked before it counts; what fails, or is stopped, leaves no trace. Refuses to know
-layouts (`preparing`, `capture.readers`) and stages (`plan`).
+The recording is read through and checked first. An add that fails or is stopped leaves nothing behind.
 """
 
 import hashlib
@@ -35,15 +34,13 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     header, files = prepared
     settings = read_scene(root, plan.scene_file(root, scene).stem)
     if settings.source != header.source:
-        rule, remedy = (
-            f"{settings.source}, as scene {scene} is",
-            "Simulated and recorded captures belong to different scenes.",
-        )
+        remedy = "Simulated and recorded captures belong to different scenes."
+        rule = f"{settings.source}, as scene {scene} is"
         raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
     shared, before = read_shared(root / PARAMS), read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
-    with io.restoring(root / REGISTRY, root / PLAN), _forgetting_on_failure(target):
+    with io.restoring(root / REGISTRY, root / PLAN), _removing_on_failure(target):
         with _naming_sources(target, files):
             complete = write_capture(target, header, files)
             fingerprints = _read_through(target, complete, shared.lost_fraction_max, shared.faults)
@@ -59,13 +56,13 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
 
 
 def remove(root: Path, scene: str, capture: str) -> None:
-    """Take a capture out again: its entry and its stage, then its raw files and its readings."""
+    """Remove a capture from its scene: its entry and its stage, then its raw files and its readings."""
     after = without_capture(read_registry(root), scene, capture)
     running = read_plan(root / PLAN).scenes
     with io.restoring(root / REGISTRY, root / PLAN):
         write_registry(root, after)
         plan.use(root, [name for name in running if name != scene or scene in after.captures])
-    _forget(root / RAW / scene / capture)
+    _remove_files(root / RAW / scene / capture)
     io.remove(root / INDENTATIONS / scene / f"{capture}.parquet")
 
 
@@ -79,7 +76,7 @@ def _check_free(target: Path, registered: bool) -> None:
 
 
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
-    """Read a capture as ingest will; return the hashes that tell a copy of it, however it is labelled or laid out."""
+    """Read a capture as ingestion will; return hashes that a copy of it shares, whatever its names and layout."""
     _, blocks, account = open_capture(folder, policy)
     rows_n, readings = 0, hashlib.sha256()
     for block in blocks:
@@ -89,13 +86,14 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
     if rows_n == 0:
         counts = f"none; counted {dict(account)}"
         raise CaptureError(folder.name, "a capture", "one reading or more", counts, "Check its files.")
-    if told := ", ".join(f"{key.removeprefix('fault_')} {n}" for key, n in account.items() if key.startswith("fault_")):
-        say(f"warning: capture {folder.name} has faults: {told}")
+    faults = [f"{key.removeprefix('fault_')} {n}" for key, n in account.items() if key.startswith("fault_")]
+    if faults:
+        say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
 
 
 def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
-    """Warn if a capture seems to lie otherwise than section compare of its scene says; it stays added."""
+    """Warn if chips, labels or skin of a capture seem to lie otherwise than its scene's section `compare` says."""
     from pipeline.experiments.compare import (
         Compare,
         find_departure,  # late: the physics takes seconds
@@ -113,7 +111,7 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
 
 
 def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:
-    """Warn if places seem turned, mirrored or exchanged beside those of the scene's other captures; it stays added."""
+    """Warn if places seem turned, mirrored or exchanged, compared with the scene's other captures."""
     found = []
     own = presses_of(open_capture(folder, policy)[1])
     for other in others[-COMPARED_N:]:
@@ -129,7 +127,7 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
 
 @contextmanager
 def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
-    """Let errors name the user's files, and not copies that are about to go."""
+    """Name the user's own files in errors instead of their copies, which are removed."""
     try:
         yield
     except ReskinError as error:
@@ -141,15 +139,15 @@ def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator
 
 
 @contextmanager
-def _forgetting_on_failure(target: Path) -> Iterator[None]:
+def _removing_on_failure(target: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        _forget(target)  # Ctrl-C included: a half-added recording is worse than none
+        _remove_files(target)  # after Ctrl-C too
         raise
 
 
-def _forget(target: Path) -> None:
+def _remove_files(target: Path) -> None:
     io.remove(target)
     io.remove(target.with_name(f"{target.name}.dvc"))
     if target.parent.is_dir():
@@ -162,7 +160,7 @@ def _forget(target: Path) -> None:
 
 
 def _track(folder: Path, root: Path) -> None:
-    """Let DVC track a folder, as `dvc add` does; in this process, as starting another takes longer than all else."""
+    """Track a folder with DVC, as `dvc add` does; within this process, as starting another takes seconds."""
     from dvc.exceptions import DvcException  # late: DVC takes a second
     from dvc.repo import Repo
 

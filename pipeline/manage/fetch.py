@@ -27,7 +27,7 @@ from reskin.recordings import ReaderLayout, preparing
 from reskin.recordings.header import HEADER_FILE
 from reskin.recordings.ingest import read_header
 from reskin.recordings.pickled import to_lab_csv
-from reskin.recordings.preparing import Labels, Prepared
+from reskin.recordings.preparing import CaptureNames, Prepared
 
 SOURCES = "pipeline/fetch.yaml"
 FETCHED = "data/fetched"
@@ -170,7 +170,7 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
     done_n = 0
     try:
         for recording in source.recordings:
-            labels = Labels(recording.board, recording.skin, None)
+            labels = CaptureNames(recording.board, recording.skin, None)
             prepared = preparing.foreign(folder / recording.path, recording.layout, labels, recording.options)
             if capture := _find_added(root, scene, prepared):
                 say(f"{scene}/{capture}: added already")

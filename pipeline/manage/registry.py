@@ -1,7 +1,4 @@
-"""The recorded captures of this checkout: `data/captures.yaml`. In: YAML. Out: names, labels and hashes by scene.
-
-Refuses to know what is in a capture.
-"""
+"""The registry of recorded captures, `data/captures.yaml`: names, layout and fingerprints, by scene."""
 
 from pathlib import Path
 
@@ -17,13 +14,13 @@ COMMENT = "# The recorded captures of this checkout, by scene; written by `reski
 
 
 class Entry(Strict):
-    """One recorded capture: its labels, and the hashes that tell a second copy."""
+    """One recorded capture: its names, and fingerprints by which a copy is found."""
 
     board: str
     skin: str
     layout: str
     chips_n: int
-    fingerprints: tuple[str, ...]  # of readings, and of the stream: one in common tells a copy
+    fingerprints: tuple[str, ...]  # SHA-256 of the readings and of the stream; a copy has one in common
     copy_of: str | None
 
 
@@ -41,18 +38,22 @@ def read_registry(root: Path) -> Registry:
 def with_capture(
     registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
 ) -> Registry:
-    """Add a capture, or raise if it is there already or contradicts what is there."""
-    labels = {name: getattr(header, name) for name in ("board", "skin", "layout", "chips_n")}
-    entry = Entry(**labels, fingerprints=fingerprints, copy_of=None)
+    """Return the registry with one more capture; raise `CaptureError` for a copy, or if it contradicts other captures."""
+    entry = Entry(
+        board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n,
+        fingerprints=fingerprints, copy_of=None,
+    )  # fmt: skip
     return with_entry(registry, scene, header.capture, entry, allow_copy=allow_copy)
 
 
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
-    """Add the entry of a capture by the same rules; also one that another clone has made."""
+    """Add an entry by the rules of `with_capture`; also one that another clone has made."""
     captures, where = registry.captures.get(scene, {}), f"capture {capture}"
-    twin = next((name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None)
-    if twin is not None:
-        _refuse_copy(where, twin, captures[twin], entry, allow_copy)
+    original = next(
+        (name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None
+    )
+    if original is not None:
+        _refuse_copy(where, original, captures[original], entry, allow_copy)
     if capture in captures:
         raise CaptureError(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
     for name, other in captures.items():
@@ -63,12 +64,12 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
         if other.chips_n != entry.chips_n:
             rule, remedy = f"the {other.chips_n} of {name}", "Add it to a scene of its own."
             raise CaptureError(where, "chips", rule, entry.chips_n, remedy)
-    added = entry.model_copy(update={"copy_of": twin})
+    added = entry.model_copy(update={"copy_of": original})
     return Registry(captures={**registry.captures, scene: {**captures, capture: added}})
 
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
-    """Take a capture out; a scene without captures goes too."""
+    """Return the registry without a capture; a scene without captures goes too."""
     captures = registry.captures.get(scene, {})
     if capture not in captures:
         known = ", ".join(sorted(captures)) or "none"
@@ -86,11 +87,11 @@ def write_registry(root: Path, registry: Registry) -> None:
         yaml.dump(registry.model_dump(mode="json"), stream)
 
 
-def _refuse_copy(where: str, twin: str, before: Entry, entry: Entry, allow_copy: bool) -> None:
+def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_copy: bool) -> None:
     relabelled = (before.board, before.skin) != (entry.board, entry.skin)
     if relabelled and allow_copy:
         return
     remedy = "It is in the scene already."
     if relabelled:
         remedy = "Under two labels it would stand on both sides of a fold; to try that knowingly, add --allow-copy."
-    raise CaptureError(where, "a recording", "new to its scene", f"the readings of {twin}", remedy)
+    raise CaptureError(where, "a recording", "new to its scene", f"the readings of {original}", remedy)

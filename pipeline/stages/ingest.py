@@ -20,7 +20,7 @@ NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
 
 def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
-    """Read one recorded capture, check what it lost, and write its readings: one row each."""
+    """Read one recorded capture, check its losses, and write its readings, one row each."""
     policy = settings.shared_section(FaultPolicy, "faults")
     header, blocks, account = open_capture(raw, policy)
     io.write_readings(indentations, blocks, account)
@@ -34,7 +34,7 @@ def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
 
 
 def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
-    """Read every capture of one simulated protocol, as recorded captures are read."""
+    """Read every capture of one simulated protocol like recorded ones."""
     with io.replacing(indentations) as folder:
         folder.mkdir()
         for capture in sorted(child for child in raw.iterdir() if child.is_dir()):
@@ -42,7 +42,7 @@ def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
 
 
 def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -> None:
-    """Read the captures of a recorded scene that has many of them; a DVC stage each would cost more than the reading.
+    """Read the captures of a recorded scene with many of them; one DVC stage each would cost more than the reading.
 
     Captures that were read before, with the same bytes, code and settings, come from a cache (docs/growth.md).
     """
@@ -58,7 +58,9 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
                 fresh = cache / f"{key}.parquet"
                 ingest(settings, raw / name, fresh)
                 before[key], read_n = fresh.rename(cache / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
-            shutil.copyfile(before[key], folder / f"{name}.parquet")  # no link: an edit of one must not edit the other
+            shutil.copyfile(
+                before[key], folder / f"{name}.parquet"
+            )  # no link: an edit of one must not change the other
             used.add(before[key])
     for file in set(cache.glob("*.parquet")) - used:
         io.remove(file)

@@ -1,6 +1,6 @@
-"""Preparing a recording to be added: somebody's files and labels -> a header and the files it will vouch for.
+"""Prepare a recording of any layout to be added: the header of its capture, and the files that go with it.
 
-Nothing is written here. Refuses to know scenes, DVC and where captures are kept (`adding`).
+Nothing is written here; see `header.write_capture`.
 """
 
 import re
@@ -23,15 +23,15 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import READERS
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
-UNNAMED = "unnamed"  # the board and skin of a recording that was made without their names
+UNNAMED = "unnamed"  # board and skin of a recording that was made without their names
 
 Marks = tuple[tuple[float, float], ...]
 Prepared = tuple[Header, Mapping[str, bytes | Path]]
 
 
 @dataclass(frozen=True)
-class Labels:
-    """What the user says of a recording; `name` None makes one from the labels."""
+class CaptureNames:
+    """The names of a board and skin, and of the capture; None makes the last from the others."""
 
     board: str
     skin: str
@@ -40,7 +40,7 @@ class Labels:
 
 @dataclass(frozen=True)
 class Dump:
-    """What a bare serial dump does not say: wire format, chips, rate, where the robot was, and on which clock."""
+    """What a bare serial dump lacks: wire format, chips, rate, the rig's probe log, and marks between the clocks."""
 
     wire: headers.Wire
     chips_n: int
@@ -49,24 +49,24 @@ class Dump:
     marks: Marks
 
 
-def parse_marks(words: list[str]) -> Marks:
+def parse_marks(texts: list[str]) -> Marks:
     """Read `STREAM_S,PROBE_S` pairs.
 
     >>> parse_marks(["0,12.5"])
     ((0.0, 12.5),)
     """
     marks = []
-    for word in words:
-        if not re.fullmatch(r"-?[0-9.]+(e[0-9]+)?,-?[0-9.]+(e[0-9]+)?", word):
-            raise CaptureError("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(word), "Try: --mark 0,12.5")
-        stream_s, probe_s = map(float, word.split(","))
+    for text in texts:
+        if not re.fullmatch(r"-?[0-9.]+(e[0-9]+)?,-?[0-9.]+(e[0-9]+)?", text):
+            raise CaptureError("--mark", "a mark", "STREAM_S,PROBE_S in seconds", repr(text), "Try: --mark 0,12.5")
+        stream_s, probe_s = map(float, text.split(","))
         marks.append((stream_s, probe_s))
     return tuple(marks)
 
 
 @contextmanager
 def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
-    """Let an error about a recording name the layouts that it can be read in, if `layout` is none of them."""
+    """Add to an error about a recording the layouts that it can be read in, if `layout` is none of them."""
     try:
         yield
     except ReskinError as error:
@@ -91,7 +91,7 @@ def layouts_of(recording: Path) -> list[str]:
 def _reads(recording: Path, layout: ReaderLayout) -> bool:
     options = {"force_axis": "z"} if layout == "eflesh" else {}
     try:
-        prepared = foreign(recording, layout, Labels("board", "skin", None), options)
+        prepared = foreign(recording, layout, CaptureNames("board", "skin", None), options)
         with TemporaryDirectory() as folder:
             copy = Path(folder) / "it"
             READERS[layout].read(copy, headers.write_capture(copy, *prepared), REFUSE_NONE)
@@ -100,16 +100,16 @@ def _reads(recording: Path, layout: ReaderLayout) -> bool:
     return True
 
 
-def foreign(recording: Path, layout: ReaderLayout, labels: Labels, options: Mapping[str, str]) -> Prepared:
-    """Prepare somebody else's recording: its own files, untouched, under a header."""
+def foreign(recording: Path, layout: ReaderLayout, names: CaptureNames, options: Mapping[str, str]) -> Prepared:
+    """Prepare a recording of a layout with a reader: its own files, unchanged, and a header."""
     _need(recording, folder=True)
     files = READERS[layout].collect(recording)
     chips_n = READERS[layout].count_chips(files)
-    return _header(labels, recording, layout=layout, chips_n=chips_n, options=dict(options)), files
+    return _header(names, recording, layout=layout, chips_n=chips_n, options=dict(options)), files
 
 
-def dump(recording: Path, labels: Labels, what: Dump) -> Prepared:
-    """Prepare a bare dump of a port with the robot's log; frames get their time from a constant rate."""
+def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
+    """Prepare a bare dump of a port with its probe log; frames get their time from a constant rate."""
     if what.probe is None:
         remedy = "Add --probe PROBE.csv (columns in data/README.md)."
         raise CaptureError(recording, "a serial dump", "accompanied by its probe log", "none", remedy)
@@ -119,24 +119,23 @@ def dump(recording: Path, labels: Labels, what: Dump) -> Prepared:
         rule = f"above 0, at most {headers.RATE_MAX_HZ:g}"
         raise CaptureError("--rate-hz", "the rate", rule, what.rate_hz, "Count frames.")
     clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
-    header = _header(labels, recording, layout="native", chips_n=what.chips_n, wire=what.wire, clock=clock)
+    header = _header(names, recording, layout="native", chips_n=what.chips_n, wire=what.wire, clock=clock)
     return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
 
 
-def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) -> Prepared:
-    """Prepare a capture folder that `reskin record` wrote; `probe` adds the robot's log to it."""
+def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Marks) -> Prepared:
+    """Prepare a capture folder that `reskin record` wrote; `probe` is a probe log to add to it."""
     _need(recording, folder=True)
     found = read_header(recording)
-    for what, said, written in (("board", labels.board, found.board), ("skin", labels.skin, found.skin)):
-        if written not in (said, UNNAMED):
-            rule = f"{written!r}, as its header says"
-            raise CaptureError(recording, f"--{what}", rule, repr(said), "Which is right?")
-    # A recorder that was killed has not hashed its files into the header; they are there all the same.
+    for option, given, in_header in (("--board", names.board, found.board), ("--skin", names.skin, found.skin)):
+        if in_header not in (given, UNNAMED):
+            raise CaptureError(recording, option, f"{in_header!r}, as its header says", repr(given), "Which is right?")
+    # A recorder that was killed has not hashed its files into the header.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
     marks_before = found.clock.marks
     if probe is not None:
         _need(probe)
-        marks_before = () if headers.PROBE_FILE in files else marks_before  # these are of the log that was recorded
+        marks_before = () if headers.PROBE_FILE in files else marks_before  # those of the recorded log
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
         raise CaptureError(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
@@ -144,30 +143,30 @@ def native(recording: Path, labels: Labels, probe: Path | None, marks: Marks) ->
         _need(file)
         if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
             raise CaptureError(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
-    _check_names(labels)
+    _check_names(names)
     clock = found.clock.model_copy(update={"marks": (*marks_before, *marks)})
-    named = {"capture": labels.name or found.capture, "board": labels.board, "skin": labels.skin}
+    named = {"capture": names.name or found.capture, "board": names.board, "skin": names.skin}
     return found.model_copy(update=named | {"clock": clock}), files
 
 
-def _check_names(labels: Labels) -> None:
-    for option, word in (("--board", labels.board), ("--skin", labels.skin), ("--name", labels.name)):
-        if word is not None and not re.fullmatch(headers.NAME, word):
-            raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(word), "Choose another.")
+def _check_names(names: CaptureNames) -> None:
+    for option, name in (("--board", names.board), ("--skin", names.skin), ("--name", names.name)):
+        if name is not None and not re.fullmatch(headers.NAME, name):
+            raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another.")
 
 
-def _header(labels: Labels, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:
-    _check_names(labels)
+def _header(names: CaptureNames, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:
+    _check_names(names)
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", recording.resolve().stem)
     return headers.recorded(
-        str(recording), capture=labels.name or f"{labels.board}_{labels.skin}_{stem}"[:64], board=labels.board,
-        skin=labels.skin, layout=layout, chips_n=chips_n, protocol=f"as recorded in {stem}", note="added by reskin add",
+        str(recording), capture=names.name or f"{names.board}_{names.skin}_{stem}"[:64], board=names.board,
+        skin=names.skin, layout=layout, chips_n=chips_n, protocol=f"as recorded in {stem}", note="added by reskin add",
         **fields,
     )  # fmt: skip
 
 
 def _need(path: Path, *, folder: bool = False) -> None:
-    """Raise if there is nothing at a path, or a folder where a file is needed."""
+    """Raise `CaptureError` if a path does not exist, or is a folder where a file is needed."""
     if not path.exists():
         raise CaptureError(path, "the file", "there", "nothing", "Check the path.")
     if path.is_dir() and not folder:

@@ -21,7 +21,7 @@ from reskin import io
 from reskin.cli import app
 from reskin.errors import ReskinError
 from reskin.recordings.header import HEADER_FILE, parse
-from reskin.recordings.preparing import Labels, native
+from reskin.recordings.preparing import CaptureNames, native
 from tests.live.boards import PLACES, make_script, write_model, write_script
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT
@@ -150,7 +150,7 @@ def test_what_a_killed_recorder_had_read_of_an_emulated_board_can_be_added(shell
     recorder.kill()
     recorder.communicate()
     (tmp_path / "probe.csv").write_text("")
-    header, files = native(tmp_path / "run1.part", Labels("b0", "s0", None), tmp_path / "probe.csv", ())
+    header, files = native(tmp_path / "run1.part", CaptureNames("b0", "s0", None), tmp_path / "probe.csv", ())
     assert (header.capture, header.board, header.skin) == ("run1", "b0", "s0")
     assert files["stream.bin"].stat().st_size > 8200
 

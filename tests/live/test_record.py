@@ -18,7 +18,7 @@ from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, PROBE_FILE, STR
 from reskin.recordings.ingest import open_capture
 from reskin.recordings.label_sources import LabelContext
 from reskin.recordings.labels import Dwell
-from reskin.recordings.preparing import Labels, native
+from reskin.recordings.preparing import CaptureNames, native
 from tests.live.boards import make_script, plugged_in
 from tests.recordings.headers import AS_USUAL
 
@@ -57,7 +57,7 @@ def read(folder):
     """Read a capture as `reskin add` does: its own files, under its own header."""
     from reskin.recordings.header import write_capture
 
-    header, files = native(folder, Labels("b0", "s0", None), None, ())
+    header, files = native(folder, CaptureNames("b0", "s0", None), None, ())
     into = folder.parent / "added" / header.capture
     _, blocks, account = open_capture(write_capture(into, header, files) and into, AS_USUAL)
     return list(blocks), account

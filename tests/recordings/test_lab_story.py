@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from pipeline import SCENES, plan
 from pipeline.manage import add
 from reskin.recordings import preparing
-from reskin.recordings.preparing import Labels
+from reskin.recordings.preparing import CaptureNames
 from tests.stages.checkout import copy_checkout, run
 
 SAID = "said.txt"  # by DVC in the first run
@@ -32,7 +32,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
         YAML().dump(settings, stream)
     plan.use(root, [])
     for board in (1, 2):
-        labels = Labels(f"board{board}", f"skin{board}", None)
+        labels = CaptureNames(f"board{board}", f"skin{board}", None)
         prepared = preparing.foreign(shared_data / f"lab/board{board}_depth2.csv", "lab", labels, {})
         add.add(root, "lab", prepared, allow_copy=False)
     (root / SAID).write_text(run(root, "dvc", "repro").stdout)
