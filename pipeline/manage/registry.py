@@ -38,7 +38,7 @@ def read_registry(root: Path) -> Registry:
 def with_capture(
     registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
 ) -> Registry:
-    """Return the registry with one more capture; raise `CaptureError` for a copy, or if it contradicts other captures."""
+    """Return the registry with one more capture; raise `CaptureError` for a copy or a contradiction."""
     entry = Entry(
         board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n,
         fingerprints=fingerprints, copy_of=None,

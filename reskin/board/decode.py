@@ -26,7 +26,7 @@ def decode_dump(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[pa.T
 def read_frames(
     table: pa.Table, rate_hz: float, where: str
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
-    """Give time in s, field in uT and temperature in degC of the frames of a decoded dump.
+    """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
 
     Time is the device's where all frames have it, else that of a constant rate; lost bytes then keep their time, if
     frames have one length.

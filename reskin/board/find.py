@@ -1,4 +1,4 @@
-"""Find which serial port is a board: listen to each, and say what its bytes are."""
+"""Find boards among the serial ports: listen to each, and recognise format, chips, rate and scale."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -26,7 +26,7 @@ Chunk = tuple[bytes, float]  # and when it came, in s
 
 
 class Found(NamedTuple):
-    """A port, and the board on it; without one, `problem` says what is there instead."""
+    """A port and the board on it; without a board, `problem` says why."""
 
     port: str
     problem: str | None
@@ -37,7 +37,7 @@ class Found(NamedTuple):
 
     @property
     def gain_sel(self) -> int | None:
-        """The setting of the chips' gain whose steps these are."""
+        """GAIN_SEL of the chips, by their LSB; None if no gain has it."""
         for gain_sel in range(len(GAINS)):
             xy_uT, _, z_uT = steps_uT(gain_sel)
             if np.allclose(self.lsb_uT, (xy_uT, z_uT), rtol=LSB_TOLERANCE):
@@ -67,7 +67,7 @@ def find_boards(names: Sequence[str] | None = None, *, listening_s: float = LIST
 
 
 def the_board(names: Sequence[str] | None = None) -> Found:
-    """Give the one board that is there; raise if there is none or more."""
+    """Return the one board that is there; raise if there is none or more."""
     boards = the_boards(names)
     if len(boards) != 1:
         got, remedy = "; ".join(map(str, boards)), "Give --port."
@@ -76,7 +76,7 @@ def the_board(names: Sequence[str] | None = None) -> Found:
 
 
 def the_boards(names: Sequence[str] | None = None) -> list[Found]:
-    """Give all boards that are there; raise if there is none."""
+    """Return all boards that are there; raise if there is none."""
     found = find_boards(names)
     boards = [each for each in found if each.problem is None]
     if not boards:
@@ -86,7 +86,7 @@ def the_boards(names: Sequence[str] | None = None) -> list[Found]:
 
 
 def look(port: str, listening_s: float = LISTENING_S) -> Found:
-    """Listen to a port for a while and say what is there."""
+    """Listen to a port for `listening_s`; recognise the board on it."""
     chunks: list[Chunk] = []
     try:
         with open_port(port, BAUD) as device:
@@ -102,7 +102,7 @@ def look(port: str, listening_s: float = LISTENING_S) -> Found:
 
 
 def recognise(port: str, chunks: Sequence[Chunk]) -> Found:
-    """Say what a port's bytes are: their format, chips, rate and scale."""
+    """Recognise a board by the bytes of its port: format, chips, rate and scale."""
     data = b"".join(chunk for chunk, _ in chunks)
     if not data:
         return Found(port, "no byte came: is the board running?")
@@ -118,7 +118,7 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> Found:
 
 
 def _spread_degC(decoded: tuple[Frames, Wire, int]) -> float:
-    """Text may hold temperatures first or last; they differ less than fields do."""
+    """Spread of the temperatures; text may have them first or last, and fields spread more."""
     return float(decoded[0].temperature_degC.std(dtype=np.float64))
 
 

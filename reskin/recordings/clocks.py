@@ -53,7 +53,7 @@ def render(arrivals: Arrivals) -> str:
 
 
 def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[np.ndarray, " f"]:
-    """Give each frame the time of its last byte, on a straight line between the ends of the chunks around it.
+    """Return each frame the time of its last byte, on a straight line between the ends of the chunks around it.
 
     A byte came before its chunk was read and, but for the port's buffer, after the one before it was: the error is
     less than the time between the two. Frames of the first chunk lie on a line at the stream's mean rate. A frame
@@ -66,7 +66,7 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
 
 
 def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
-    """Give each frame the time of its place in a stream of constant rate; 0 at the start of the stream.
+    """Return each frame the time of its place in a stream of constant rate; 0 at the start of the stream.
 
     `frame` is the place in frames: bytes up to its end over bytes a frame, where frames have one length, so that
     broken bytes keep their time; else a running count. Frames lost before the dump shift all that follow.
@@ -106,7 +106,7 @@ class ClockMap:
     explained: float
 
     def probe_s(self, stream_s: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " f"]:
-        """Give the probe's time of each stream time; NaN stays NaN."""
+        """Return the probe's time of each stream time; NaN stays NaN."""
         return self.offset_s + self.rate * stream_s
 
 
@@ -163,11 +163,11 @@ class _Pattern:
         self._dwelt = _running(scaled)
 
     def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Give the weight of each step of a grid in probe time: contact above 0, no-load below, between dwells 0."""
+        """Return the weight of each step of a grid in probe time: contact above 0, no-load below, between dwells 0."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
 
     def dwelt(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Give the same without sign."""
+        """Return the same without sign."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._dwelt))
 
 
@@ -219,7 +219,7 @@ def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " 
 
 
 def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
-    """Give the middle of a peak between its flanks at `PEAK_DROP` below its top, in fractions of a step."""
+    """Return the middle of a peak between its flanks at `PEAK_DROP` below its top, in fractions of a step."""
     level = (1 - PEAK_DROP) * score[top_i]
     below_i = np.flatnonzero(score < level)
     left_i, right_i = below_i[below_i < top_i][-1:], below_i[below_i > top_i][:1]
@@ -234,7 +234,7 @@ def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
 def _contact_signal(
     blocks: Iterable[Block], pattern: _Pattern, step_s: float, where: str
 ) -> tuple[float, Int8[np.ndarray, " g"]]:
-    """Give the time of the first step, and +1 (contact), -1 (no-load) or 0 (no frame) for each step of the stream."""
+    """Return the time of the first step, and +1 (contact), -1 (no-load) or 0 (no frame) for each step of the stream."""
     parts: list[tuple[int, Int8[np.ndarray, " g"]]] = []
     start_s = None
     for t_s, contact in _touched(blocks, pattern):

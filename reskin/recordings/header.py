@@ -1,8 +1,7 @@
-"""The header of a capture: who, what, in which units, on which clock. In: JSON text. Out: a checked `Header`, a folder.
+"""The header of a capture, `header.json`: names, layout, units and clock.
 
 A capture is a folder `data/raw/<scene>/<capture>/` that holds `header.json` and either the byte stream of a
-port (`stream.bin`, `arrivals.csv`, `probe.csv`) or the untouched files of somebody else's recording.
-Refuses to know what the bytes mean (`wire`, `readers`).
+port (`stream.bin`, `arrivals.csv`, `probe.csv`) or the unchanged files of a recording in another layout.
 """
 
 import json

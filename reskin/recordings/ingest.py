@@ -126,7 +126,7 @@ class Joiner:
         return self._readings(held.where(slice(0, over_n)))
 
     def close(self) -> Readings:
-        """Give the readings of the last indentation, as far as the stream went."""
+        """Return the readings of the last indentation, as far as the stream went."""
         held, self._held = self._held, self._nothing()
         return self._readings(held)
 
@@ -197,7 +197,7 @@ class Joiner:
 def _means(
     b_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"], wanted_i: Int64[np.ndarray, " g"]
 ) -> tuple[Float32[np.ndarray, "i ch"], Int64[np.ndarray, " g"]]:
-    """Give the mean field of each run of equal `group_i`, and the run that each of `wanted_i` belongs to."""
+    """Return the mean field of each run of equal `group_i`, and the run that each of `wanted_i` belongs to."""
     runs_i, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
     if not len(runs_i):
         return b_uT, wanted_i

@@ -1,8 +1,8 @@
-"""Whether the places of a capture lie as those of other captures: turned, mirrored, or with x and y exchanged.
+"""Find captures whose places are turned, mirrored or exchanged, by comparison with other captures of their scene.
 
 Boards of one scene read alike where they are pressed alike, so the place of a press can be looked up among the presses
 of other captures. If the looked-up places agree with the labels only after the labels are turned or mirrored, the
-labels of one of them are probably wrong. Nothing is assumed of the board, so one capture alone says nothing.
+labels of one of them are probably wrong. Nothing is assumed of the board, so one capture alone shows nothing.
 """
 
 from collections.abc import Iterable

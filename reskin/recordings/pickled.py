@@ -1,7 +1,7 @@
-"""Archives of pickled samples (.npz, as the rig of layout `lab` wrote them) -> the text of one CSV file of that layout.
+"""Convert archives of pickled samples (.npz, written by the rig of layout `lab`) to one CSV file of that layout.
 
-No pickle is loaded: its opcodes are followed as data, so nothing in it is imported, called or run, and what is neither
-plain values nor NumPy numbers is refused. Refuses to know where archives come from (`fetching`).
+No pickle is loaded: its opcodes are followed as data, so nothing in it is imported, called or run. Anything but plain
+values and NumPy numbers is refused.
 """
 
 import pickletools
@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -37,9 +37,9 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
     except CaptureError:
         raise
-    except Exception as error:  # whatever a foreign archive may hold instead; it is refused, with its reason
+    except Exception as error:  # an archive may hold anything; it is refused, with the reason
         rule = f"a .npz with samples under {' and '.join(PHASES.values())}"
-        raise CaptureError(where, "the archive", rule, _words(error), REMEDY) from None
+        raise CaptureError(where, "the archive", rule, _describe(error), REMEDY) from None
     rows.sort(key=lambda row: row[0])  # stable: no-load rows stay before contact rows
     return "".join(f"{line}\r\n" for line in [HEAD, *(f"{i},{phase},{cells}" for i, phase, cells in rows)]).encode()
 
@@ -53,7 +53,7 @@ def _row(sample: Mapping[str, Any]) -> str:
 
 
 def decode_array(npy: bytes, where: str) -> Any:
-    """Give the objects of an .npy file that holds an array of them."""
+    """Return the objects of an .npy file that holds an array of them."""
     stream = BytesIO(npy)
     version = np.lib.format.read_magic(stream)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -64,7 +64,7 @@ def decode_array(npy: bytes, where: str) -> Any:
 
 
 def decode(pickled: bytes, where: str) -> Any:
-    """Give the plain values of a pickle: lists, tuples, dicts, numbers, text, bytes; NumPy's numbers and arrays too.
+    """Return the plain values of a pickle: lists, tuples, dicts, numbers, text, bytes; NumPy's numbers and arrays too.
 
     Of protocols 3 and 4, in which NumPy has written arrays of objects.
     """
@@ -79,12 +79,12 @@ def decode(pickled: bytes, where: str) -> Any:
     except CaptureError:
         raise
     except Exception as error:  # bytes that are no pickle fail anywhere: in pickletools, on an empty stack, in NumPy
-        raise CaptureError(where, "a pickle", "whole", _words(error), REMEDY) from None
+        raise CaptureError(where, "a pickle", "whole", _describe(error), REMEDY) from None
 
 
 @dataclass
 class Call:
-    """What a pickle asks to be called: a name, never looked up."""
+    """A call that a pickle contains: a name, never looked up, and its arguments."""
 
     name: str
     args: Any
@@ -164,9 +164,9 @@ STEPS: Mapping[str, Step] = {
 
 
 def plain(value: Any, known: dict[int, Any] | None = None) -> Any:
-    """Turn what NumPy's pickles ask for into lists and numbers; raise if anything else is to be called.
+    """Convert NumPy's calls into lists and numbers; raise `ValueError` for any other call.
 
-    What a pickle names several times is turned once, or lists of lists of one list would take for ever.
+    A value that a pickle uses several times is converted once, or nested lists of one list would take forever.
     """
     known = {} if known is None else known
     if not isinstance(value, NESTED):
@@ -205,9 +205,9 @@ def _dtype(call: Call) -> "np.dtype[Any]":
     return np.dtype(kind if order == "|" else order + kind)
 
 
-def _refuse(got: str) -> Any:
+def _refuse(got: str) -> NoReturn:
     raise ValueError(got)
 
 
-def _words(error: Exception) -> str:
+def _describe(error: Exception) -> str:
     return f"{type(error).__name__} {error}".strip()[:200]

@@ -122,7 +122,7 @@ def make_readings(
 def mean_by_group(
     b_uT: Float64[np.ndarray, "f ch"], group_i: Int[np.ndarray, " f"], groups_n: int
 ) -> Float64[np.ndarray, "n ch"]:
-    """Give the mean field of each group of rows; NaN for a group without rows."""
+    """Return the mean field of each group of rows; NaN for a group without rows."""
     sums_uT = np.zeros((groups_n, b_uT.shape[1]))
     np.add.at(sums_uT, group_i, b_uT)
     rows_n = np.bincount(group_i, minlength=groups_n)[:, None]
@@ -190,7 +190,7 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
 
 
 def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:
-    """Tell rows of contact from rows without; another word is an error, and so is a table without contact."""
+    """Mark rows of contact from rows without; another word is an error, and so is a table without contact."""
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {first_line_n + row_i}"

@@ -108,7 +108,7 @@ def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n:
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:
-    """Give the usual step of the chips along x and y; NaN where none shows, or where it is that of rounded decimals."""
+    """Return the usual step of the chips along x and y; NaN where none shows, or where it is a rounded decimal."""
     steps_uT = faults.find_lsb(b_uT, step_min_uT=0.0, steps_min_n=faults.SURE_STEPS_MIN_N)[:, 0]
     steps_uT = steps_uT[np.isfinite(steps_uT)]
     if not len(steps_uT):

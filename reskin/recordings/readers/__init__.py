@@ -1,7 +1,4 @@
-"""One module a layout of recording: files in, `Readings` and an account of what was left out.
-
-Refuses to know where captures are kept and what becomes of readings.
-"""
+"""Readers of recordings in other layouts, one module each: files in, `Readings` and an account of dropped rows out."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +11,7 @@ from reskin.schema import Readings
 
 
 class Reader(Protocol):
-    """What each module of a layout offers."""
+    """The functions that each module of a layout has."""
 
     def collect(self, recording: Path) -> dict[str, Path]:
         """Find a recording's files: name in the capture folder -> source."""

@@ -1,9 +1,9 @@
-"""Layout `eflash7`: an eFlesh pad pressed over a six-axis sensor, one CSV file a recording. In: it. Out: readings.
+"""Read layout `eflash7`: an eFlesh pad pressed over a six-axis sensor, one CSV file a recording.
 
-One place is touched, or two at once, of a 3 x 3 grid whose pitch nobody states: `x_mm`, `y_mm` are NaN, and the account
-counts the rows of each place by its number, `place_<n>_rows_n`, which is 1 + column + 3 row. The recorder subtracted a
-baseline that it does not give, so `b_uT` is known but for a constant a channel; the no-load field is the mean of the
-untouched rows that a recording begins with, and the sensor's force is told from theirs. Refuses to guess a pitch.
+One place is touched, or two at once, of a 3 x 3 grid of unknown pitch: `x_mm`, `y_mm` are NaN, and the account counts
+One or two places of a 3 x 3 grid of unknown pitch are touched: `x_mm`, `y_mm` are NaN, and the account counts
+baseline, so `b_uT` lacks a constant in each channel. The no-load field is the mean of the untouched rows with which a
+recording begins, and forces are relative to theirs.
 """
 
 import re

@@ -1,9 +1,8 @@
-"""Layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder. In: that folder. Out: readings.
+"""Read layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder.
 
-Places are the recording's robot coordinates less their minimum, so a scan reads 0 mm upwards; the depth is counted
-down from the highest z of the recording, which may hang above the skin: its offset is unknown. Only one force is known,
-and along x or y its sign is not: the recorder does not say whether it is the skin's or the gauge's. These are counted.
-Refuses to guess a unit, a sign or a clock that the files do not tell.
+Places are robot coordinates less their minimum, so a scan begins at 0 mm. The depth is counted down from the highest z
+of the recording, which may be above the skin: its offset is unknown. One axis of force is known; along x or y its sign
+is not, as the recorder does not state whether it is the force on the skin or on the gauge. Such rows are counted.
 """
 
 from collections.abc import Mapping
@@ -171,7 +170,7 @@ def _number_passes(
 
 
 def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Give the force along the gauge's axis by its column, NaN where it had no new reading; nothing without a gauge."""
+    """Return the force of the gauge by its column, NaN where it had no new reading; nothing without a gauge."""
     if states.shape[1] <= WEIGHT_COLUMN:
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:

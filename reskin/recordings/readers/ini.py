@@ -1,11 +1,10 @@
-"""Layout `ini`: a 3-D printer and a force gauge, two text files. In: readings and truths. Out: one reading a press.
+"""Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row an indentation.
 
-Rows below the gauge's 0.02 N count as no contact, wherever the truths say they are: they stay, without place or force.
-Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are NaN: none is known.
-Fields may come late: row i of the truths goes with a later row of the readings. By how many rows, the header says
-(`rows_late`) or, if it does not, the recording itself, where it tells: by as many as make |dB| go best with the force.
-A recording whose fields do not come as late throughout lost a row in one file, and is refused.
-Refuses to know which chips can be believed (`chips`) and who is tested on what.
+Rows below the gauge's 0.02 N count as no contact, wherever the truths place them: they stay, without place or force.
+Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are unknown (NaN).
+Fields may come late: row i of the truths belongs to a later row of the readings. By how many rows is given in the
+header (`rows_late`) or else found: the lag at which |dB| correlates best with the force. A recording whose lag changes
+on the way lost a row in one file, and is refused.
 """
 
 from collections.abc import Mapping
@@ -191,7 +190,7 @@ def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"
 def _noload_field(
     b_uT: Float64[np.ndarray, "f ch"], pass_i: Int32[np.ndarray, " f"], corner: Bool[np.ndarray, " f"], header: Header
 ) -> Float64[np.ndarray, "f ch"]:
-    """Give each row the mean field of the corner rows of its pass."""
+    """Return each row the mean field of the corner rows of its pass."""
     noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):

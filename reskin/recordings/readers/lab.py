@@ -1,9 +1,7 @@
-"""Layout `lab`: a robot, a six-axis gauge, one CSV file a depth. In: that file. Out: readings, 100 or so a press.
+"""Read layout `lab`: a robot and a six-axis gauge, one CSV file a depth, about 100 readings an indentation.
 
-Signs: the file has the force on the gauge (Fz negative in compression), so all three are turned (`core.schema`). That
-the gauge's x and y are those of the labels is read from the data: see `ON_SKIN`.
-The file's depth is only an index in its name, so `depth_mm` is NaN; it has no clock, so `t_s` is NaN. Refuses to know
-which chips can be believed (`chips`) and who is tested on what.
+The file has the force on the gauge (Fz negative in compression), so all three are negated, see `reskin.schema` and
+`ON_SKIN`. The depth is only an index in the file's name, so `depth_mm` is NaN; there is no clock, so `t_s` is NaN.
 """
 
 from collections.abc import Mapping

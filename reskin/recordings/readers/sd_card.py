@@ -1,7 +1,6 @@
-"""The log that a board writes to an SD card (section 6: dog shoe, glove). In: a CSV. Out: timed readings, an account.
+"""Read and write the log that a board writes to an SD card (paper, section 6): one CSV line a frame, without labels.
 
-One line a frame: seconds of the board's clock, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware
-prints them. Refuses to know contacts, places and forces: the log does not either.
+A line has seconds of the board's clock, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware does.
 """
 
 from codecs import BOM_UTF8

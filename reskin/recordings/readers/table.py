@@ -136,7 +136,7 @@ def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str)
 
 
 def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
-    """Tell whether nothing stands in a column that may be left out, as in a template that was not filled in there."""
+    """Return whether nothing stands in a column that may be left out, as in a template that was not filled in there."""
     at = names.index(column)
     return (column in OPTIONAL or column[0] == "T") and all(row[at].strip() in EMPTY for row in cells)
 
