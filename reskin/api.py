@@ -496,11 +496,11 @@ def record(
     ...         yield reskin.touch(x_mm, y_mm, Fz_N=robot.force_N())
     >>> reskin.record(presses(), board="b1", skin="s1", scan="random")  # doctest: +SKIP
     """
-    from reskin.board.find import the_board
+    from reskin.board.find import find_board
     from reskin.live.record import record_board
     from reskin.recordings.label_sources import from_program
 
-    board = the_board(None if port is None else [port])
+    board = find_board(None if port is None else [port])
     folder = Path(out) if out is not None else None
     done = record_board(board, from_program(labels, dwell_s), folder=folder, seconds=seconds, names=names)
     print(done.summary, file=sys.stderr)

@@ -95,7 +95,7 @@ def find_ports(
     """Find boards: their port, wire format, number of chips, rate and scale."""
     from reskin.board import find
 
-    for found in find.find_boards([find.hunt(typer.echo)] if hunt else names):
+    for found in find.scan_ports([find.find_replugged_port(typer.echo)] if hunt else names):
         typer.echo(found)
 
 
@@ -132,15 +132,15 @@ def record(
     dwell_s: Annotated[float, Option("--dwell", help="Seconds for which the label of a prompt holds.", min=0.1)] = 1.0,
 ) -> None:
     """Record what a board sends, with labels if asked; a robot's log can give labels later, in `reskin add`."""
-    from reskin.board.find import Found, the_board
+    from reskin.board.find import DetectedBoard, find_board
     from reskin.live.record import label_source, record_board
 
     source = label_source(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
     if port is None:
-        found = the_board()
+        found = find_board()
         typer.echo(str(found))
     else:
-        found = Found(port, None, wire or "binary", chips_n or 5)
+        found = DetectedBoard(port, None, wire or "binary", chips_n or 5)
     given = {"board": board, "skin": skin, "scan": scan}
     names = {key: name for key, name in given.items() if name is not None}
     done = record_board(found, source, folder=out, seconds=seconds, baud=baud, names=names)
@@ -189,7 +189,7 @@ def live(
     """Show boards in the browser: chips, contact, force, traces and alarms."""
     from contextlib import ExitStack
 
-    from reskin.board.find import the_boards
+    from reskin.board.find import find_boards
     from reskin.live.emulator import playing, read_script
     from reskin.live.health import LIVE_POLICY
     from reskin.live.server import serve
@@ -207,7 +207,7 @@ def live(
         if source := replay or emulate:
             script = read_script(source)
             port, shown = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
-        sessions = open_sessions(port or [found.port for found in the_boards()], models, shown, fault_policy)
+        sessions = open_sessions(port or [found.port for found in find_boards()], models, shown, fault_policy)
         serve(sessions, host=host, http_port=http_port, say=typer.echo)
 
 

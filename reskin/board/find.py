@@ -25,7 +25,7 @@ LSB_TOLERANCE = 0.05  # gains are a fifth or more apart
 Chunk = tuple[bytes, float]  # and when it came, in s
 
 
-class Found(NamedTuple):
+class DetectedBoard(NamedTuple):
     """A port and the board on it; without a board, `problem` says why."""
 
     port: str
@@ -59,25 +59,25 @@ class Found(NamedTuple):
         return "steps not seen yet: does it move?"
 
 
-def find_boards(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[Found]:
+def scan_ports(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[DetectedBoard]:
     """Listen to ports, all at once: those given, or all of this machine."""
     names = port_names() if names is None else names
     with ThreadPoolExecutor(max(len(names), 1)) as pool:
-        return list(pool.map(lambda name: look(name, listening_s), names))
+        return list(pool.map(lambda name: detect_board(name, listening_s), names))
 
 
-def the_board(names: Sequence[str] | None = None) -> Found:
-    """Return the one board that is there; raise if there is none or more."""
-    boards = the_boards(names)
+def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
+    """Return the board of this machine; raise `CaptureError` if there is none, or more than one."""
+    boards = find_boards(names)
     if len(boards) != 1:
         got, remedy = "; ".join(map(str, boards)), "Give --port."
         raise CaptureError("ports", "the board", "one, to go without --port", got, remedy)
     return boards[0]
 
 
-def the_boards(names: Sequence[str] | None = None) -> list[Found]:
-    """Return all boards that are there; raise if there is none."""
-    found = find_boards(names)
+def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
+    """Return the boards of this machine; raise `CaptureError` if there is none."""
+    found = scan_ports(names)
     boards = [each for each in found if each.problem is None]
     if not boards:
         got = "; ".join(map(str, found)) or "no serial port at all"
@@ -85,7 +85,7 @@ def the_boards(names: Sequence[str] | None = None) -> list[Found]:
     return boards
 
 
-def look(port: str, listening_s: float = LISTENING_S) -> Found:
+def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
     """Listen to a port for `listening_s`; recognise the board on it."""
     chunks: list[Chunk] = []
     try:
@@ -95,31 +95,26 @@ def look(port: str, listening_s: float = LISTENING_S) -> Found:
                 if chunk := read_waiting(device):
                     chunks.append((chunk, time.monotonic()))
     except CaptureError as error:
-        return Found(port, str(error).removeprefix(f"{port}: "))
+        return DetectedBoard(port, str(error).removeprefix(f"{port}: "))
     except OSError as error:
-        return Found(port, f"gone while it was read: {error}")
+        return DetectedBoard(port, f"gone while it was read: {error}")
     return recognise(port, chunks)
 
 
-def recognise(port: str, chunks: Sequence[Chunk]) -> Found:
+def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     """Recognise a board by the bytes of its port: format, chips, rate and scale."""
     data = b"".join(chunk for chunk, _ in chunks)
     if not data:
-        return Found(port, "no byte came: is the board running?")
+        return DetectedBoard(port, "no byte came: is the board running?")
     fits = fitting(data)
     if not fits:
-        return Found(port, f"no frame in {len(data)} bytes: another baud rate, or another device")
-    frames, wire, chips_n = min(
-        ((decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in fits), key=_spread_degC
-    )
+        return DetectedBoard(port, f"no frame in {len(data)} bytes: another baud rate, or another device")
+    decoded = [(decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in fits]
+    # Text may have temperatures first or last; fields differ more than they do.
+    frames, wire, chips_n = min(decoded, key=lambda found: float(found[0].temperature_degC.std(dtype=np.float64)))
     with np.errstate(over="ignore"):  # any finite number may stand in a frame
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
-    return Found(port, None, wire, chips_n, _rate_hz(frames, chunks), (lsb_uT[0], lsb_uT[1]))
-
-
-def _spread_degC(decoded: tuple[Frames, Wire, int]) -> float:
-    """Spread of the temperatures; text may have them first or last, and fields spread more."""
-    return float(decoded[0].temperature_degC.std(dtype=np.float64))
+    return DetectedBoard(port, None, wire, chips_n, _rate_hz(frames, chunks), (lsb_uT[0], lsb_uT[1]))
 
 
 def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
@@ -134,14 +129,14 @@ def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
     return later_n / took_s if took_s > 0 else np.nan
 
 
-def hunt(
+def find_replugged_port(
     say: Callable[[str], None],
     *,
     names: Callable[[], Iterable[str]] = port_names,
     pause: Callable[[float], None] = time.sleep,
     hunting_s: float = HUNTING_S,
 ) -> str:
-    """Find the port that goes when the board is unplugged, and comes when it is plugged in again."""
+    """Find a board's port: the one that goes when it is unplugged, and comes when it is plugged in again."""
     say("Unplug the board.")
     before = set(names())
     gone = _wait(lambda: before - set(names()), pause, hunting_s, "a port that goes")
@@ -159,7 +154,7 @@ def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], huntin
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:
-    """Raise unless boards that work at once have a port each."""
+    """Raise `ParamsError` unless each of several boards has its own port."""
     if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
         rule = f"1 to {BOARDS_MAX_N}, each named once"
         raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Give each port once.")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from reskin.board.find import BAUD, Found
+from reskin.board.find import BAUD, DetectedBoard
 from reskin.board.port import PortSettings
 from reskin.errors import ParamsError
 from reskin.live.health import Health
@@ -70,7 +70,7 @@ def label_source(
 
 
 def record_board(
-    board: Found,
+    board: DetectedBoard,
     labels: LabelSource | None,
     *,
     folder: Path | None = None,

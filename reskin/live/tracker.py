@@ -243,7 +243,7 @@ class LiveSkin:
         self, port: str, models: Models = (), *, baud: int = find.BAUD, fault_policy: FaultPolicy = LIVE_POLICY
     ) -> None:
         self.port, self.fault_policy = port, fault_policy
-        self.detected = find.Found(port, WAITING)
+        self.detected = find.DetectedBoard(port, WAITING)
         self.description = port  # with wire format, chips and scale, once they are detected
         self.account: Counter[str] = Counter()  # of all streams since the start, as `FrameStream` counts
         self.reader = Reader(port, baud)
@@ -387,7 +387,7 @@ class LiveSkin:
         self.estimator = None
         self._model_problem = f"no place and force: the {estimator.name} is for five chips. Give a model of this board."
 
-    def _start_stream(self, detected: find.Found) -> None:
+    def _start_stream(self, detected: find.DetectedBoard) -> None:
         self._stream = FrameStream(detected.wire, detected.chips_n)
         self._counted: Counter[str] = Counter()
         self._garbage_bytes_n = self._first_bytes_n = 0

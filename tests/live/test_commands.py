@@ -47,7 +47,9 @@ def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
 def test_a_page_without_options_is_that_of_all_boards_that_are_there(monkeypatch):
     shown = {}
     monkeypatch.setattr("reskin.live.server.serve", lambda sessions, **words: shown.update(words, sessions=sessions))
-    monkeypatch.setattr("reskin.board.find.the_boards", lambda: [find.Found(f"/dev/ttyACM{i}", None) for i in (0, 1)])
+    monkeypatch.setattr(
+        "reskin.board.find.find_boards", lambda: [find.DetectedBoard(f"/dev/ttyACM{i}", None) for i in (0, 1)]
+    )
     commands.live(None, None, None, None, "127.0.0.1", 8765, ["stuck=flag"])
     assert [str(session) for session in shown["sessions"]] == ["a board on /dev/ttyACM0", "a board on /dev/ttyACM1"]
     assert (shown["host"], shown["http_port"]) == ("127.0.0.1", 8765)

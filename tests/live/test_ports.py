@@ -41,7 +41,7 @@ def test_what_is_no_board_is_told_as_such():
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
     assert "another baud rate" in str(find.recognise("port", wrong_baud))
     assert "no byte came" in str(find.recognise("port", []))
-    assert "must be one that opens" in str(find.look("/dev/none"))
+    assert "must be one that opens" in str(find.detect_board("/dev/none"))
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
@@ -68,12 +68,12 @@ def test_chips_at_rest_without_noise_show_no_scale():
 def test_the_one_board_is_found_among_ports_and_two_are_one_too_many(tmp_path):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
-        assert find.the_board([name, "/dev/none"]).port == name
+        assert find.find_board([name, "/dev/none"]).port == name
         with pytest.raises(CaptureError, match=r"the board must be one, .*; got .*5 chips.*; .*5 chips"):
-            find.the_board([name, other])
-        assert [found.port for found in find.the_boards([name, "/dev/none", other])] == [name, other]
+            find.find_board([name, other])
+        assert [found.port for found in find.find_boards([name, "/dev/none", other])] == [name, other]
     with pytest.raises(CaptureError, match="no serial port at all"):
-        find.the_board([])
+        find.find_board([])
 
 
 class TestHunt:
@@ -86,7 +86,7 @@ class TestHunt:
             last[0] = set(next(looks, last[0]))
             return last[0]
 
-        return find.hunt(said.append, names=names, pause=lambda _: None, hunting_s=1.0), said
+        return find.find_replugged_port(said.append, names=names, pause=lambda _: None, hunting_s=1.0), said
 
     def test_the_port_that_goes_and_comes_is_the_board(self):
         found, said = self.hunt("ab", "ab", "ab", "b", "b", "b", "bc")

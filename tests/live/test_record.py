@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import reskin
-from reskin.board.find import Found
+from reskin.board.find import DetectedBoard
 from reskin.board.stream import decode_all
 from reskin.errors import ParamsError
 from reskin.live.record import label_source, record_board
@@ -94,7 +94,7 @@ def test_a_recording_that_is_killed_has_the_labels_that_had_come(tmp_path):
         source = label_source(str(robot), None, None, dwell_s=1.0, say=print)
         child = os.fork()
         if child == 0:
-            record_board(Found(port, None, "binary", 5), source, folder=tmp_path / "run1", seconds=60.0)
+            record_board(DetectedBoard(port, None, "binary", 5), source, folder=tmp_path / "run1", seconds=60.0)
             os._exit(0)
         write_robots_log(robot, tmp_path / "run1.part")
         os.kill(child, signal.SIGKILL)
