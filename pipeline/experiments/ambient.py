@@ -1,4 +1,8 @@
-"""Fields from outside, and iron nearby (paper section 7)."""
+"""Ambient fields and iron nearby that come up after the no-load reading (paper section 7, future work).
+
+What they cost on held-out boards, and what is recovered by subtracting the reading of a reference chip, or the common
+part of the board's own chips.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,11 +35,71 @@ from reskin.seeds import rng_for
 from reskin.simulation.settings import SimulationSettings
 
 REFERENCE_ASIDE_MM = 30.0  # the lone chip, from the board's middle along x: assumed far enough to read no poke
+AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
+
+Networks = Mapping[str, Sequence[Network]]  # by method
+
+
+class Iron(Strict):
+    """A ball of soft iron right above the middle of the skin."""
+
+    radius_mm: Annotated[float, Field(gt=0, le=100)]
+    distances_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]  # from the skin's top
+
+
+class Ambient(Strict):
+    """Section ambient: uniform fields, and distances of a ball of iron."""
+
+    fields_uT: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
+    iron: Iron
+
+
+def read(settings: Settings) -> Ambient:
+    """Read section ambient."""
+    return settings.section(Ambient, "ambient")
+
+
+def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
+    """Test every held-out board in ambient fields; train networks without the common part for the last board."""
+    data = read_data(settings, indentations, folds)
+    synthesis, seed = simulation_settings(data.settings), data.settings.seed
+    section, training = read(data.settings), data.settings.training("train_multi")
+    held_out = data.folds_of("lobo")
+    boards = [fold.name for fold in held_out]
+    points: list[dict[str, Any]] = []
+    for fold in held_out:
+        instrument = draw_instrument(synthesis, fold.name, seed=seed)
+        networks = dict.fromkeys((AS_IT_IS, ASIDE), networks_held_out(models, fold.name))
+        if fold is held_out[-1]:
+            networks[OWN], trainings = train_without_common_part(data, fold, training, instrument)
+        points += score_board(data, fold, section, synthesis, instrument, networks)
+    last = boards[-1:]
+    numbers = {
+        "arms": {
+            AS_IT_IS: "the paper's network",
+            ASIDE: f"a chip {REFERENCE_ASIDE_MM:g} mm aside reads the ambient field, and its mean reading is taken off",
+            OWN: "the uniform field that fits a board's own chips best is taken off, in training as in use",
+        },
+        "boards_n": len(boards),
+        "seeds_n": training.seeds_n,
+        "directions": "a random one for each poke",
+        "earth_uT": EARTH_SIZE_T / micro,
+        "earth_dip_deg": EARTH_DIP_DEG,
+        "iron_radius_mm": section.iron.radius_mm,
+        "uniform": scores_by_field(points, "field_uT", boards),
+        "iron": scores_by_field(points, "distance_mm", boards),
+        "last_board": {
+            "board": boards[-1],
+            "uniform": scores_by_field(points, "field_uT", last),
+            "iron": scores_by_field(points, "distance_mm", last),
+        },
+    }
+    write_results(results, numbers, {}, trainings=trainings)
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """A board as it really is, a chip aside on a board of its own, and what is known of both: the design's turns."""
+    """A board and a reference chip aside as manufactured, and the rotations of the design, which are what is known."""
 
     board: Board
     aside: Board
@@ -43,148 +107,20 @@ class Instrument:
     noise_uT: Float[np.ndarray, " 3"]  # of the change that the chip aside reads
 
 
-def take_board(of: SimulationSettings, name: str, *, seed: int) -> Instrument:
-    """Draw the board of this name as its captures did, and a chip beside it that differs from its design as much."""
-    design, rig, chip = of.main_boards.design, of.rig, of.chip
-    lone = BoardDesign(chips_xy_mm=((REFERENCE_ASIDE_MM, 0.0),), chips_turn_deg=(0.0,), gap_mm=design.gap_mm)
-    # Both readings that make a change of field are means.
-    noise = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
-    return Instrument(
-        board=draw_board(design, of.spreads, seed=seed, name=name),
-        aside=draw_board(lone, of.spreads, seed=seed, name=f"{name}-aside"),
-        turn=Rotation.from_euler("z", np.array(design.chips_turn_deg)[:, None], degrees=True).as_matrix(),
-        noise_uT=noise * np.sqrt(1 / rig.readings_n + 1 / rig.noload_frames_n),
-    )
-
-
-def seen_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarray, "f ch"]:
-    """Give by how much the board's readings change when a field comes up, noise aside."""
-    to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
-    return np.einsum("kij,fkj->fki", to_chip, b_T).reshape(len(b_T), -1) / micro
-
-
-def guessed_uT(
-    own: Instrument, aside_T: Float[np.ndarray, "f 3"], rng: np.random.Generator
-) -> Float[np.ndarray, "f ch"]:
-    """Give what the chip aside makes one subtract: its noisy reading, turned as the design turns each chip."""
-    read_uT = seen_uT(own.aside, aside_T[:, None]) + own.noise_uT * rng.standard_normal((len(aside_T), 3))
-    return np.einsum("kji,fj->fki", own.turn, read_uT).reshape(len(read_uT), -1)
-
-
-def without_common_part(turn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "ch ch"]:
-    """Give the matrix that takes the uniform field of least squares off a reading, by the design's turns."""
-    seen = turn.transpose(0, 2, 1).reshape(-1, 3)  # what the chips read of a uniform field
-    return np.eye(len(seen)) - seen @ np.linalg.pinv(seen)
-
-
-def iron_fields(
-    own: Instrument, skin: Skin, *, radius_mm: float, distance_mm: float
-) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "1 3"]]:
-    """Give what a ball right above the skin's middle adds at the chips, and at the chip aside, in tesla.
-
-    The earth and the skin at rest magnetise it; `distance_mm` is from the skin's top to the ball's surface.
-    """
-    above_m = skin.thickness_m + (distance_mm + radius_mm) * milli
-    centre_m = np.append(skin.seat_m, above_m)
-    chips_m = np.concatenate([own.board.chips_m, own.aside.chips_m])
-    added_T = ball_field(chips_m, EARTH_T, centre_m=centre_m, radius_m=radius_mm * milli)
-    added_T += ball_images(chips_m, (skin.nodes_m, skin.moments_A_m2), centre_m=centre_m, radius_m=radius_mm * milli)
-    return added_T[:-1], added_T[-1:]
-
-
 @dataclass(frozen=True)
-class Case:
-    """One field from outside: its place on an axis, what it adds to each row, what the chip aside makes of it."""
+class Disturbance:
+    """One ambient field: its strength or distance, what it adds to each row, and what the reference chip subtracts."""
 
-    words: Mapping[str, float]
+    keys: Mapping[str, float]
     added_uT: Float[np.ndarray, "f ch"]
-    guessed_uT: Float[np.ndarray, "f ch"]
+    reference_uT: Float[np.ndarray, "f ch"]
 
 
-def uniform_cases(
-    own: Instrument, fields_uT: Sequence[float], *, rows_n: int, rng: np.random.Generator
-) -> Iterator[Case]:
-    """Let no field and uniform ones come up, each row's in a random direction of its own, whatever the strength."""
-    along = random_directions(rows_n, rng)
-    for field_uT in sorted({0.0, *fields_uT}):
-        b_T = field_uT * micro * along
-        added_uT = seen_uT(own.board, np.repeat(b_T[:, None], len(own.turn), axis=1))
-        yield Case({"field_uT": field_uT}, added_uT, guessed_uT(own, b_T, rng))
-
-
-def iron_cases(
-    own: Instrument, skins: Sequence[Skin], which: Int64[np.ndarray, " f"], *, radius_mm: float,
-    distances_mm: Sequence[float], rng: np.random.Generator,
-) -> Iterator[Case]:  # fmt: skip
-    """Put the ball at every distance over the skin of each row, which `which` names."""
-    for distance_mm in sorted(distances_mm):
-        both = [iron_fields(own, skin, radius_mm=radius_mm, distance_mm=distance_mm) for skin in skins]
-        chips_T, aside_T = np.stack([one for one, _ in both]), np.concatenate([other for _, other in both])
-        words = {"distance_mm": distance_mm, "rms_uT": rms_uT(chips_T), "aside_rms_uT": rms_uT(aside_T)}
-        yield Case(words, seen_uT(own.board, chips_T)[which], guessed_uT(own, aside_T[which], rng))
-
-
-def one_a_poke(
-    indentation: Int64[np.ndarray, " f"], own: Int64[np.ndarray, " a"], rng: np.random.Generator
-) -> Int64[np.ndarray, " b"]:
-    """Keep one row of every indentation, drawn."""
-    drawn = rng.permutation(own)
-    return np.sort(drawn[np.unique(indentation[drawn], return_index=True)[1]])
-
-
-def by_step(points: Sequence[dict[str, Any]], case: str, boards: Sequence[str]) -> list[dict[str, Any]]:
-    """Summarise scores over boards: a row a step of the `case`, in it each arm (of the boards that it was tried on).
-
-    Each point is one network's; `sd_seeds` is the standard deviation over the networks of one board, mean over boards.
-    """
-    of_case = [point for point in points if case in point and point["board"] in boards]
-    rows = []
-    for step in sorted({point[case] for point in of_case}):
-        here = [point for point in of_case if point[case] == step]
-        row: dict[str, Any] = {case: step}
-        for size, name in (("rms_uT", "field_uT"), ("aside_rms_uT", "aside_field_uT")):
-            if size in here[0]:
-                row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in here])))
-        for arm in dict.fromkeys(point["arm"] for point in here):
-            own = pd.DataFrame([{"board": point["board"], **point["scores"]} for point in here if point["arm"] == arm])
-            row[arm] = add_seed_sd(summarise(own.groupby("board").mean(), boards=True), own, "board")
-        rows.append(row)
-    return rows
-
-
-def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
-    """Give the root of the mean square of fields' sizes."""
-    return float(np.sqrt((b_T**2).sum(axis=-1).mean())) / micro
-
-
-def project(db_uT: Float32[np.ndarray, "f ch"], matrix: Float[np.ndarray, "ch ch"]) -> Float32[np.ndarray, "f ch"]:
-    """Apply a matrix to every change of field."""
-    return (db_uT @ matrix.T).astype(np.float32)
-
-
-class Iron(Strict):
-    """A ball of soft iron near the skin, right above its middle."""
-
-    radius_mm: Annotated[float, Field(gt=0, le=100)]
-    distances_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]  # skin's top to its surface
-
-
-class Ambient(Strict):
-    """What a field from outside that comes up after the no-load reading does (paper section 7)."""
-
-    fields_uT: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
-    iron: Iron
-
-
-AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
-Networks = Mapping[str, Sequence[Network]]  # by arm
-
-
-def networks_of_common_part(
+def train_without_common_part(
     data: SceneData, fold: Fold, training: Training, instrument: Instrument
 ) -> tuple[list[Network], dict[str, int]]:
-    """Train the headline recipe anew on inputs whose common part is taken off, as in use; count what collapsed."""
-    without = project(data.rows.db_uT, without_common_part(instrument.turn))
+    """Train the headline recipe on inputs without their common part; also count collapsed trainings."""
+    without = project(data.rows.db_uT, remove_common_part(instrument.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
     jobs = make_jobs(data, headline, [fold], experiment="ambient")
     trained = train_jobs(replace(data, rows=replace(data.rows, db_uT=without)), jobs, "ambient")
@@ -195,105 +131,175 @@ def networks_of_common_part(
     return networks, tally(map(collapse_record, trained))
 
 
-def on_board(
-    data: SceneData, fold: Fold, section: Ambient, *, of: SimulationSettings, instrument: Instrument, networks: Networks
+def score_board(
+    data: SceneData,
+    fold: Fold,
+    section: Ambient,
+    synthesis: SimulationSettings,
+    instrument: Instrument,
+    networks: Networks,
 ) -> Iterator[dict[str, Any]]:
-    """Score every network of every arm in every field, on one reading of each of the board's held-out pokes."""
-    test = one_a_poke(data.rows.indentation, fold.test, rng_for(data.settings.seed, "ambient", fold.name, "pokes"))
-    db_uT, true = data.rows.db_uT[test], data.rows.target[test]
-    off = without_common_part(instrument.turn)
-    arms: dict[str, Callable[[Case], np.ndarray]] = {
-        AS_IT_IS: lambda case: db_uT + case.added_uT,
-        ASIDE: lambda case: db_uT + case.added_uT - case.guessed_uT,
-        OWN: lambda case: project((db_uT + case.added_uT).astype(np.float32), off),
+    """Score every network of every method in every field, on one reading of each of the board's held-out pokes."""
+    rows, seed = data.rows, data.settings.seed
+    test = one_row_per_poke(rows.indentation, fold.test, rng_for(seed, "ambient", fold.name, "pokes"))
+    db_uT, true = rows.db_uT[test], rows.target[test]
+    without_common = remove_common_part(instrument.turn)
+    methods: dict[str, Callable[[Disturbance], np.ndarray]] = {
+        AS_IT_IS: lambda field: db_uT + field.added_uT,
+        ASIDE: lambda field: db_uT + field.added_uT - field.reference_uT,
+        OWN: lambda field: project((db_uT + field.added_uT).astype(np.float32), without_common),
     }
-    rng = rng_for(data.settings.seed, "ambient", fold.name, "uniform")
-    for case in (
-        *uniform_cases(instrument, section.fields_uT, rows_n=len(test), rng=rng),
-        *_iron(data, fold, test, section, of, instrument),
+    names, which = np.unique(rows.skin[test], return_inverse=True)
+    rule = synthesis.main_boards.quadrature.in_si()
+    skins = [draw_skin(synthesis.skin, synthesis.spreads, seed=seed, name=str(name), rule=rule) for name in names]
+    uniform_rng, iron_rng = (rng_for(seed, "ambient", fold.name, kind) for kind in ("uniform", "iron"))
+    for field in (
+        *uniform_fields(instrument, section.fields_uT, rows_n=len(test), rng=uniform_rng),
+        *iron_balls(instrument, skins, which, section.iron, rng=iron_rng),
     ):
-        for arm, trained in networks.items():
-            shown = arms[arm](case).astype(np.float32)
+        for method, trained in networks.items():
+            inputs_uT = methods[method](field).astype(np.float32)
             for network in trained:
-                yield {"board": fold.name, "arm": arm, **case.words, "scores": score(true, network(shown))}
+                yield {"board": fold.name, "arm": method, **field.keys, "scores": score(true, network(inputs_uT))}
 
 
-def _iron(
-    data: SceneData, fold: Fold, test: np.ndarray, section: Ambient, of: SimulationSettings, instrument: Instrument
-) -> Iterator[Case]:
-    names, which = np.unique(data.rows.skin[test], return_inverse=True)
-    rule = of.main_boards.quadrature.in_si()
-    skins = [draw_skin(of.skin, of.spreads, seed=data.settings.seed, name=str(name), rule=rule) for name in names]
-    rng = rng_for(data.settings.seed, "ambient", fold.name, "iron")
-    return iron_cases(
-        instrument, skins, which, radius_mm=section.iron.radius_mm, distances_mm=section.iron.distances_mm, rng=rng
+def one_row_per_poke(
+    indentation: Int64[np.ndarray, " f"], own: Int64[np.ndarray, " a"], rng: np.random.Generator
+) -> Int64[np.ndarray, " b"]:
+    """Draw one row of every indentation."""
+    drawn = rng.permutation(own)
+    return np.sort(drawn[np.unique(indentation[drawn], return_index=True)[1]])
+
+
+def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequence[str]) -> list[dict[str, Any]]:
+    """Summarise scores over boards: a row for each value of the axis, with each method tested on these boards.
+
+    Each point is one network's; `sd_seeds` is the standard deviation over the networks of one board, mean over boards.
+    """
+    of_axis = [point for point in points if axis in point and point["board"] in boards]
+    rows = []
+    for step in sorted({point[axis] for point in of_axis}):
+        here = [point for point in of_axis if point[axis] == step]
+        row: dict[str, Any] = {axis: step}
+        for size, name in (("rms_uT", "field_uT"), ("aside_rms_uT", "aside_field_uT")):
+            if size in here[0]:
+                row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in here])))
+        for method in dict.fromkeys(point["arm"] for point in here):
+            own = pd.DataFrame(
+                [{"board": point["board"], **point["scores"]} for point in here if point["arm"] == method]
+            )
+            row[method] = add_seed_sd(summarise(own.groupby("board").mean(), boards=True), own, "board")
+        rows.append(row)
+    return rows
+
+
+def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
+    """Give the root of the mean square of fields' sizes."""
+    return float(np.sqrt((b_T**2).sum(axis=-1).mean())) / micro
+
+
+# --- Fields at the chips ---
+
+
+def draw_instrument(of: SimulationSettings, name: str, *, seed: int) -> Instrument:
+    """Draw the board of this name as in its captures, and a reference chip with as large manufacturing errors."""
+    design, rig, chip = of.main_boards.design, of.rig, of.chip
+    lone = BoardDesign(chips_xy_mm=((REFERENCE_ASIDE_MM, 0.0),), chips_turn_deg=(0.0,), gap_mm=design.gap_mm)
+    noise = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
+    return Instrument(
+        board=draw_board(design, of.spreads, seed=seed, name=name),
+        aside=draw_board(lone, of.spreads, seed=seed, name=f"{name}-aside"),
+        turn=Rotation.from_euler("z", np.array(design.chips_turn_deg)[:, None], degrees=True).as_matrix(),
+        noise_uT=noise * np.sqrt(1 / rig.readings_n + 1 / rig.noload_frames_n),
     )
 
 
-def read(settings: Settings) -> Ambient:
-    """Read section ambient."""
-    return settings.section(Ambient, "ambient")
+def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarray, "f ch"]:
+    """Give the change of the board's readings by a field in tesla at its chips, without noise."""
+    to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
+    return np.einsum("kij,fkj->fki", to_chip, b_T).reshape(len(b_T), -1) / micro
 
 
-def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
-    """Test every held-out board in fields that came up after its no-load readings; train one arm on the last board."""
-    data = read_data(settings, indentations, folds)
-    of, seed = simulation_settings(data.settings), data.settings.seed
-    section, trained = read(data.settings), data.settings.training("train_multi")
-    held_out = data.folds_of("lobo")
-    boards = [fold.name for fold in held_out]
-    points: list[dict[str, Any]] = []
-    for fold in held_out:
-        instrument = take_board(of, fold.name, seed=seed)
-        networks = {arm: networks_held_out(models, fold.name) for arm in (AS_IT_IS, ASIDE)}
-        if fold is held_out[-1]:
-            networks[OWN], trainings = networks_of_common_part(data, fold, trained, instrument)
-        points += on_board(data, fold, section, of=of, instrument=instrument, networks=networks)
-    last = boards[-1:]
-    numbers = {
-        "arms": {
-            AS_IT_IS: "the paper's network",
-            ASIDE: f"a chip {REFERENCE_ASIDE_MM:g} mm aside reads the ambient field, and its mean reading is taken off",
-            OWN: "the uniform field that fits a board's own chips best is taken off, in training as in use",
-        },
-        "boards_n": len(boards),
-        "seeds_n": trained.seeds_n,
-        "directions": "a random one for each poke",
-        "earth_uT": EARTH_SIZE_T / micro,
-        "earth_dip_deg": EARTH_DIP_DEG,
-        "iron_radius_mm": section.iron.radius_mm,
-        "uniform": by_step(points, "field_uT", boards),
-        "iron": by_step(points, "distance_mm", boards),
-        "last_board": {
-            "board": boards[-1],
-            "uniform": by_step(points, "field_uT", last),
-            "iron": by_step(points, "distance_mm", last),
-        },
-    }
-    write_results(results, numbers, {}, trainings=trainings)
+def reference_uT(
+    own: Instrument, aside_T: Float[np.ndarray, "f 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "f ch"]:
+    """Give what is subtracted: the noisy reading of the reference chip, rotated as the design rotates each chip."""
+    read_uT = readings_uT(own.aside, aside_T[:, None]) + own.noise_uT * rng.standard_normal((len(aside_T), 3))
+    return np.einsum("kji,fj->fki", own.turn, read_uT).reshape(len(read_uT), -1)
 
+
+def remove_common_part(turn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "ch ch"]:
+    """Give the matrix that removes the best uniform field (least squares) from a reading, by the design's rotations."""
+    uniform = turn.transpose(0, 2, 1).reshape(-1, 3)  # readings of unit fields along x, y, z
+    return np.eye(len(uniform)) - uniform @ np.linalg.pinv(uniform)
+
+
+def project(db_uT: Float32[np.ndarray, "f ch"], matrix: Float[np.ndarray, "ch ch"]) -> Float32[np.ndarray, "f ch"]:
+    """Apply a matrix to every change of field."""
+    return (db_uT @ matrix.T).astype(np.float32)
+
+
+def uniform_fields(
+    own: Instrument, fields_uT: Sequence[float], *, rows_n: int, rng: np.random.Generator
+) -> Iterator[Disturbance]:
+    """Give no field and uniform ones; each row has a random direction, the same at all strengths."""
+    along = random_directions(rows_n, rng)
+    for field_uT in sorted({0.0, *fields_uT}):
+        b_T = field_uT * micro * along
+        added_uT = readings_uT(own.board, np.repeat(b_T[:, None], len(own.turn), axis=1))
+        yield Disturbance({"field_uT": field_uT}, added_uT, reference_uT(own, b_T, rng))
+
+
+def iron_balls(
+    own: Instrument, skins: Sequence[Skin], which: Int64[np.ndarray, " f"], iron: Iron, *, rng: np.random.Generator
+) -> Iterator[Disturbance]:
+    """Give a ball at every distance over the skin of each row; `which` is the number of a row's skin."""
+    for distance_mm in sorted(iron.distances_mm):
+        both = [iron_fields(own, skin, radius_mm=iron.radius_mm, distance_mm=distance_mm) for skin in skins]
+        chips_T, aside_T = np.stack([chips for chips, _ in both]), np.concatenate([aside for _, aside in both])
+        keys = {"distance_mm": distance_mm, "rms_uT": rms_uT(chips_T), "aside_rms_uT": rms_uT(aside_T)}
+        added_uT = readings_uT(own.board, chips_T)[which]
+        yield Disturbance(keys, added_uT, reference_uT(own, aside_T[which], rng))
+
+
+def iron_fields(
+    own: Instrument, skin: Skin, *, radius_mm: float, distance_mm: float
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "1 3"]]:
+    """Give the field that a ball right above the skin's middle adds at the chips, and at the reference chip, in tesla.
+
+    It is magnetised by the earth and the skin at rest; `distance_mm` is from the skin's top to the ball's surface.
+    """
+    above_m = skin.thickness_m + (distance_mm + radius_mm) * milli
+    centre_m = np.append(skin.seat_m, above_m)
+    chips_m = np.concatenate([own.board.chips_m, own.aside.chips_m])
+    added_T = ball_field(chips_m, EARTH_T, centre_m=centre_m, radius_m=radius_mm * milli)
+    added_T += ball_images(chips_m, (skin.nodes_m, skin.moments_A_m2), centre_m=centre_m, radius_m=radius_mm * milli)
+    return added_T[:-1], added_T[-1:]
+
+
+# --- Tables and figures ---
 
 COLUMNS = {
     "accuracy_pct": ("accuracy, %", 1), "mse_xy_mm2": ("MSE_xy, mm²", 2), "mse_f_N2": ("MSE_F, N²", 3),
 }  # fmt: skip
-DASHES = ("-", "--", "-.")  # two arms lie on each other where nothing is regained
+DASHES = ("-", "--", "-.")  # two lines coincide where nothing is recovered
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate every arm in every field, over held-out boards and on the last one, where every arm was tried."""
+    """Tabulate every method in every field, over held-out boards and on the last one, which has all methods."""
     last = numbers["last_board"]
     parts = (("all held out", numbers), (str(last["board"]), last))
     rows = [
-        {"field": words, "boards": boards, "method": arm} | _scores(row[arm]) | {"source": source}
+        {"field": field, "boards": boards, "method": method} | _scores(row[method]) | {"source": source}
         for boards, part in parts
         for kind in ("uniform", "iron")
         for row in part[kind]
-        for words in [_field(kind, row)]
-        for arm in numbers["arms"]
-        if arm in row and (boards == last["board"] or row[arm]["mse_xy_mm2"]["n"] == numbers["boards_n"])
+        for field in [_field(kind, row)]
+        for method in numbers["arms"]
+        if method in row and (boards == last["board"] or row[method]["mse_xy_mm2"]["n"] == numbers["boards_n"])
     ]
     table = pd.DataFrame(rows)
-    meanings = "; ".join(f"{arm}: {words}" for arm, words in numbers["arms"].items())
+    meanings = "; ".join(f"{method}: {text}" for method, text in numbers["arms"].items())
     table.attrs["meaning"] = (
         "The field comes up after the no-load reading, so it stays in the change of field. The direction of a uniform "
         f"field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, "
@@ -308,11 +314,11 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw accuracy against the strength of a uniform field and the distance of the iron, on the last board."""
-    last, arms = numbers["last_board"], list(numbers["arms"])
+    last, methods = numbers["last_board"], list(numbers["arms"])
     with drawing(7.8, 4.6) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
-        _draw(left, last["uniform"], "field_uT", arms)
-        _draw(right, last["iron"], "distance_mm", arms)
+        _draw(left, last["uniform"], "field_uT", methods)
+        _draw(right, last["iron"], "distance_mm", methods)
         left.axvline(numbers["earth_uT"], color="0.5", linestyle=":")
         left.annotate(
             "earth", (numbers["earth_uT"], 98), xytext=(3, 0), textcoords="offset points", va="top", fontsize=9
@@ -324,15 +330,15 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         right.minorticks_off()
         handles, labels = left.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", frameon=False, fontsize=9, ncols=2)
-        words = f"Fields from outside, board {last['board']} never seen ({source})"
-        figure.suptitle(words, x=0.01, ha="left", fontsize=11)
+        title = f"Fields from outside, board {last['board']} never seen ({source})"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"ambient.svg": svg(figure)}
 
 
-def _draw(axes: Any, rows: Sequence[Mapping[str, Any]], axis: str, arms: Sequence[str]) -> None:
-    for i, arm in enumerate(arms):
-        shown = [(row[axis], row[arm]["accuracy_pct"]["mean"]) for row in rows]
-        axes.plot(*zip(*shown, strict=True), color=COLOURS[i], marker=MARKERS[i], linestyle=DASHES[i], label=arm)
+def _draw(axes: Any, rows: Sequence[Mapping[str, Any]], axis: str, methods: Sequence[str]) -> None:
+    for i, method in enumerate(methods):
+        shown = [(row[axis], row[method]["accuracy_pct"]["mean"]) for row in rows]
+        axes.plot(*zip(*shown, strict=True), color=COLOURS[i], marker=MARKERS[i], linestyle=DASHES[i], label=method)
     axes.grid(alpha=0.25)
 
 
@@ -343,4 +349,4 @@ def _field(kind: str, row: Mapping[str, Any]) -> str:
 
 
 def _scores(stats: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    return {words: show_digits(stats[name], digits) for name, (words, digits) in COLUMNS.items() if name in stats}
+    return {title: show_digits(stats[name], digits) for name, (title, digits) in COLUMNS.items() if name in stats}

@@ -1,4 +1,7 @@
-"""How well the chips' noise lets one sensor be read, beside how well a network reads it (paper section 4)."""
+"""Bound: how well the chips' noise allows a contact to be estimated, beside a network's scores (paper section 4).
+
+Cramér-Rao bound of place and force from one row of a simulated skin that is known.
+"""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,7 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.constants import milli
 from scipy.special import owens_t
 
-from pipeline.experiments.ambient import seen_uT
+from pipeline.experiments.ambient import readings_uT
 from pipeline.experiments.results import write_results
 from pipeline.report.formatting import COLUMNS, n_of, show, tabulate
 from pipeline.settings import Settings
@@ -32,29 +35,73 @@ ROW_READINGS_N = 1  # of a row that a network sees (dataset.rows)
 STEP_MM = 0.01  # of the differences; 0.002 to 0.05 mm give the same bound within 2 %
 NETWORK = "single_pass"  # the experiment whose networks never saw a reading of the presses that they are tested on
 
-Read = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # x, y and depth in mm -> anything
+Measure = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # of x, y and depth in mm
+
+
+def bound(settings: Settings, models: Path, results: Path) -> None:
+    """Bound the errors of estimates from one row, and compare with those of the paper's network."""
+    numbers = bound_errors(simulation_settings(settings), seed=settings.seed)
+    write_results(results, numbers | {"network": score_network(models, numbers["skin"])}, {})
+    least = numbers["all"]["with_label_errors"]
+    say(f"{settings.scene}: noise and labels allow {least['accuracy_pct']:.4g} % and {least['mse_xy_mm2']:.3g} mm2")
+
+
+def bound_errors(of: SimulationSettings, *, seed: int) -> dict[str, Any]:
+    """Bound the errors at every place and depth of the main protocol, on its first skin; count those above the skin."""
+    kind, (board_name, skin_name) = of.main_boards, list_captures(of, MAIN)[0]
+    board = draw_board(kind.design, of.spreads, seed=seed, name=board_name)
+    rule = kind.quadrature.in_si()
+    skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
+    places_mm = points_mm() - CENTRE_MM
+    depths_mm = np.repeat(of.main.depths_mm, len(places_mm))
+    pokes_mm = np.column_stack([np.tile(places_mm, (len(of.main.depths_mm), 1)), depths_mm])
+    touched = reach_skin(skin, depths_mm)
+    pokes_mm = pokes_mm[touched]
+    var_uT2 = noise_var_uT2(
+        of.chip, len(board.chips_m), readings_n=ROW_READINGS_N, noload_frames_n=of.rig.noload_frames_n
+    )
+    covariance = least_covariance(
+        slopes(lambda mm: readings_uT(board, changes_of_field(board, skin, mm * milli)[1]), pokes_mm),
+        slopes(lambda mm: forces(skin, mm[:, 2] * milli)[:, None], pokes_mm)[:, 0],
+        var_uT2,
+    )
+    labels = {"place_sd_mm": of.rig.robot_place_sd_mm, "force_sd_N": of.rig.force_noise_N}
+    return {
+        "board": board_name, "skin": skin_name, "places_n": len(places_mm), "above_the_skin_n": int((~touched).sum()),
+        "readings_n": ROW_READINGS_N, "noload_frames_n": of.rig.noload_frames_n, "labels": labels,
+        **by_depth(pokes_mm[:, 2], covariance, labels),
+    }  # fmt: skip
+
+
+def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Mark commanded depths that press a skin by more than a step of the differences; raise if none does."""
+    touched = depths_mm - STEP_MM + skin.depth_zero_m / milli > 0
+    if not touched.any():
+        got = f"{depths_mm.max():g} mm at most, the skin {-skin.depth_zero_m / milli:.2g} mm below zero"
+        raise ParamsError(f"skin {skin.name}", "depths_mm", "deep enough to touch it", got, "Poke deeper.")
+    return touched
 
 
 def noise_var_uT2(chip: ChipDesign, chips_n: int, *, readings_n: int, noload_frames_n: int) -> Float[np.ndarray, " ch"]:
-    """Give the variance of one row's change of field: the mean of its readings less that of its no-load frames."""
+    """Give the variance of one row's change of field: the mean of its readings minus that of its no-load frames."""
     noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     frame_uT2 = noise_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12  # rounding, spread by noise of more than a step
     return np.tile(frame_uT2 * (1 / readings_n + 1 / noload_frames_n), chips_n)
 
 
-def slopes(read: Read, pokes_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n ch 3"]:
-    """Differentiate what is read by x, y and depth, per mm, by central differences."""
+def slopes(measure: Measure, pokes_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n ch 3"]:
+    """Differentiate a measurement by x, y and depth, per mm, by central differences."""
     steps_mm = STEP_MM * np.concatenate([np.eye(3), -np.eye(3)])
-    values = read((pokes_mm + steps_mm[:, None]).reshape(-1, 3)).reshape(2, 3, len(pokes_mm), -1)
+    values = measure((pokes_mm + steps_mm[:, None]).reshape(-1, 3)).reshape(2, 3, len(pokes_mm), -1)
     return np.moveaxis((values[0] - values[1]) / (2 * STEP_MM), 0, -1)
 
 
 def least_covariance(
     db_slopes: Float[np.ndarray, "n ch 3"], force_slopes: Float[np.ndarray, "n 3"], var_uT2: Float[np.ndarray, " ch"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Bound the covariance of x, y (mm) and force (N): Fisher's information of x, y and depth, inverted.
+    """Bound the covariance of x, y (mm) and force (N) by the inverse of the Fisher information of x, y and depth.
 
-    Slopes by x, y and depth in uT/mm and N/mm; the bound of the force follows from how it depends on them.
+    Slopes are by x, y and depth, in uT/mm and N/mm; those of the force transform the bound to it.
     """
     information = np.einsum("nci,c,ncj->nij", db_slopes, 1 / var_uT2, db_slopes)
     to_force = np.broadcast_to(np.eye(3), information.shape).copy()
@@ -65,7 +112,7 @@ def least_covariance(
 def expected_scores(
     covariance: Float[np.ndarray, "n 3 3"], *, place_sd_mm: float, force_sd_N: float
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Give the scores of normal errors of this covariance, against labels with independent errors of their own."""
+    """Give the expected scores of normal errors of this covariance, with independent errors of the labels added."""
     variance = np.diagonal(covariance, axis1=1, axis2=2) + np.array([place_sd_mm, place_sd_mm, force_sd_N]) ** 2
     correlation = covariance[:, 0, 1] / np.sqrt(variance[:, 0] * variance[:, 1])
     within = probability_within(ACCURACY_LIMIT_MM / np.sqrt(variance[:, :2]), correlation)
@@ -87,50 +134,14 @@ def probability_within(
     return 1 - 2 * outside
 
 
-def bound_of(of: SimulationSettings, *, seed: int) -> dict[str, Any]:
-    """Bound the errors at every place and depth of the main protocol, on its first skin; those above it are counted."""
-    kind, (board_name, skin_name) = of.main_boards, list_captures(of, MAIN)[0]
-    board = draw_board(kind.design, of.spreads, seed=seed, name=board_name)
-    rule = kind.quadrature.in_si()
-    skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
-    places_mm = points_mm() - CENTRE_MM
-    depths_mm = np.repeat(of.main.depths_mm, len(places_mm))
-    pokes_mm = np.column_stack([np.tile(places_mm, (len(of.main.depths_mm), 1)), depths_mm])
-    touched = touches(skin, depths_mm)
-    pokes_mm = pokes_mm[touched]
-    var_uT2 = noise_var_uT2(
-        of.chip, len(board.chips_m), readings_n=ROW_READINGS_N, noload_frames_n=of.rig.noload_frames_n
-    )
-    covariance = least_covariance(
-        slopes(lambda mm: seen_uT(board, changes_of_field(board, skin, mm * milli)[1]), pokes_mm),
-        slopes(lambda mm: forces(skin, mm[:, 2] * milli)[:, None], pokes_mm)[:, 0],
-        var_uT2,
-    )
-    labels = {"place_sd_mm": of.rig.robot_place_sd_mm, "force_sd_N": of.rig.force_noise_N}
-    return {
-        "board": board_name, "skin": skin_name, "places_n": len(places_mm), "above_the_skin_n": int((~touched).sum()),
-        "readings_n": ROW_READINGS_N, "noload_frames_n": of.rig.noload_frames_n, "labels": labels,
-        **by_depth(pokes_mm[:, 2], covariance, labels),
-    }  # fmt: skip
-
-
-def touches(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Mark commanded depths that press a skin, a step of the differences and more; raise if none does."""
-    touched = depths_mm - STEP_MM + skin.depth_zero_m / milli > 0
-    if not touched.any():
-        got = f"{depths_mm.max():g} mm at most, the skin {-skin.depth_zero_m / milli:.2g} mm below zero"
-        raise ParamsError(f"skin {skin.name}", "depths_mm", "deep enough to touch it", got, "Poke deeper.")
-    return touched
-
-
 def by_depth(
     depth_mm: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n 3 3"], labels: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Average over places, depth by depth and in all: of the signal alone, and scored by labels with errors."""
-    exact = dict.fromkeys(labels, 0.0)
+    """Average expected scores over places, by depth and in all, without and with errors of the labels."""
+    no_errors = dict.fromkeys(labels, 0.0)
     scores = {
         name: pd.DataFrame(expected_scores(covariance, **sds))
-        for name, sds in (("signal", exact), ("with_label_errors", labels))
+        for name, sds in (("signal", no_errors), ("with_label_errors", labels))
     }
     rows = [
         {"depth_mm": float(depth)} | {name: table[depth_mm == depth].mean().to_dict() for name, table in scores.items()}
@@ -139,7 +150,7 @@ def by_depth(
     return {"by_depth": rows, "all": {name: table.mean().to_dict() for name, table in scores.items()}}
 
 
-def network_scores(models: Path, skin: str) -> dict[str, Any]:
+def score_network(models: Path, skin: str) -> dict[str, Any]:
     """Summarise the scores of the paper's network on a skin, over its folds; raise if it was trained on another."""
     cards = [io.read_json(file) for file in sorted(models.glob("*.json"))]
     cards = [card for card in cards if (card["question"], card["recipe_name"]) == (NETWORK, HEADLINE)]
@@ -150,27 +161,19 @@ def network_scores(models: Path, skin: str) -> dict[str, Any]:
     return {metric: scores[metric] for metric in METRICS if metric in scores}
 
 
-def bound(settings: Settings, models: Path, results: Path) -> None:
-    """Bound what one row tells of a poke, and put the paper's network beside it."""
-    numbers = bound_of(simulation_settings(settings), seed=settings.seed)
-    write_results(results, numbers | {"network": network_scores(models, numbers["skin"])}, {})
-    least = numbers["all"]["with_label_errors"]
-    say(f"{settings.scene}: noise and labels allow {least['accuracy_pct']:.4g} % and {least['mse_xy_mm2']:.3g} mm2")
-
-
 SIDES = {"signal": "bound", "with_label_errors": "bound, labels' errors added"}
 NONE = "–"
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show the bound depth by depth, and in all beside the network, which is scored on all depths together."""
+    """Tabulate the bound by depth, and in all beside the network, which is scored on all depths together."""
     lines = [_line(f"{row['depth_mm']:g}", row, {}, source) for row in numbers["by_depth"]]
     lines.append(_line("all", numbers["all"], numbers["network"], source))
     return {"bound": tabulate(lines, meaning=_meaning(numbers), spread="± is the sd over n folds of the network.")}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Nothing: a table says it all."""
+    """Draw nothing."""
     return {}
 
 
@@ -178,21 +181,21 @@ def _line(depth: str, row: Mapping[str, Any], network: Mapping[str, Any], source
     line = {"depth, mm": depth, "source": source}
     for metric, title in COLUMNS.items():
         if metric in row[next(iter(SIDES))]:  # R^2 is bounded by nothing here
-            line |= {f"{title} ({words})": f"{row[side][metric]:.3g}" for side, words in SIDES.items()}
+            line |= {f"{title} ({name})": f"{row[side][metric]:.3g}" for side, name in SIDES.items()}
         line[f"{title} (network)"] = show(network.get(metric)) if network else NONE
     return line | {"n": n_of(network) if network else NONE}
 
 
 def _meaning(numbers: Mapping[str, Any]) -> str:
     labels, above_n = numbers["labels"], numbers["above_the_skin_n"]
-    left_out = f" {above_n} pokes that do not touch the skin are left out." if above_n else ""
+    above = f" {above_n} pokes that do not touch the skin are left out." if above_n else ""
     return (
         f"Bound (Cramér-Rao): the least error of an unbiased estimate from the change of field of one row, "
         f"{numbers['readings_n']} reading less the mean of {numbers['noload_frames_n']} no-load ones, at the "
         f"{numbers['places_n']} places of skin {numbers['skin']}; its accuracy is that of normal errors. Only the "
         "chips' noise and steps count: the skin, its board and what earlier pokes left are taken as known. Labels' "
         f"errors: the robot's place, {labels['place_sd_mm']:g} mm an axis, and the force sensor, "
-        f"{labels['force_sd_N']:.2g} N, which reads the true depth's force.{left_out} Network: random passes of the "
+        f"{labels['force_sd_N']:.2g} N, which reads the true depth's force.{above} Network: random passes of the "
         "same skin held out. Places lie on a grid; a network that learns the grid is biased towards it and may have "
         "less error than the bound."
     )

@@ -1,4 +1,7 @@
-"""Presses that never rest (paper section 7)."""
+"""Dynamic presses: readings of presses that never rest, at the full rate (paper section 7, future work).
+
+Each reading is estimated alone, and as the mean of the last five, which is the paper's protocol at rest.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,12 +26,12 @@ from reskin.metrics import score
 from reskin.models.trained import networks_held_out
 
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
-FORCE_MIN_N = 0.2  # assumed: below it there is little contact to place, and a press's first and last readings lie there
+FORCE_MIN_N = 0.2  # assumed: the first and last readings of a press are below, with little contact to place
 BINS_N = 5
-LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # that are tried
-WAYS = ("one", "mean5", "mean5_of_middle")
+LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # candidates
+METHODS = ("one", "mean5", "mean5_of_middle")
 
-Answers = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
+Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 
 
 @dataclass(frozen=True)
@@ -46,13 +49,24 @@ class Presses:
         return len(self.t_s)
 
 
-def presses_of(
+def dynamics(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
+    """Score the networks of train_multi that never saw the board of the pressed skin."""
+    one = only(read_captures(indentations), indentations)
+    true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
+    presses = find_presses(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
+    numbers = score_presses(presses, networks_held_out(models, one.board), board=one.board)
+    write_results(results, numbers, {}, read_losses(indentations, {}))
+    of_presses = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
+    say(f"{settings.scene}: {numbers['readings_n']} readings of {of_presses}")
+
+
+def find_presses(
     db_uT: Float32[np.ndarray, "f ch"],
     true: Float[np.ndarray, "f 3"],
     t_s: Float64[np.ndarray, " f"],
     indentation: Int32[np.ndarray, " f"],
 ) -> Presses:
-    """Tell the presses apart; each lasts from half a frame before its first reading to half one after its last."""
+    """Find the presses; each lasts from half a frame before its first reading to half a frame after its last."""
     _, first_i, press_i, frames_n = np.unique(indentation, return_index=True, return_inverse=True, return_counts=True)
     duration_s = (t_s[first_i + frames_n - 1] - t_s[first_i]) + 1 / rate_of(t_s, press_i)
     place = np.arange(len(t_s)) - first_i[press_i]
@@ -73,22 +87,22 @@ def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]
     return (total[end] - total[start]) / (end - start)[:, None]
 
 
-def compare(of: Presses, networks: Sequence[Answers], *, board: str) -> dict[str, Any]:
-    """Score each reading alone, the mean of the last five, and that mean against the middle one's truth.
+def score_presses(of: Presses, networks: Sequence[Predict], *, board: str) -> dict[str, Any]:
+    """Score each reading alone, the mean of the last five, and that mean against the truth of the middle one.
 
-    All presses are on one skin of this `board`: `paired` compares both ways that answer at once, and has no interval.
+    All presses are on one skin of this `board`, so `paired`, which compares the first two, has no interval.
     """
     mean_uT = running_mean(of.db_uT).astype(np.float32)
     alone, meant = ([network(one) for network in networks] for one in (of.db_uT, mean_uT))
-    answers = {"one": alone, "mean5": meant, "mean5_of_middle": meant}
+    predictions = {"one": alone, "mean5": meant, "mean5_of_middle": meant}
     edges_s = np.geomspace(of.duration_s.min(), of.duration_s.max() * (1 + 1e-9), BINS_N + 1)
     by_duration = []
     for low_s, high_s in pairwise(edges_s):
         own = of.scored & (of.duration_s >= low_s) & (of.duration_s < high_s)
         if own.any():
             presses_n = len(np.unique(of.press_i[own]))
-            words = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(own.sum()), "presses_n": presses_n}
-            by_duration.append(words | _scores(of, answers, own, board))
+            keys = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(own.sum()), "presses_n": presses_n}
+            by_duration.append(keys | _scores(of, predictions, own, board))
     return {
         "readings_n": int(of.scored.sum()),
         "presses_n": len(np.unique(of.press_i[of.scored])),
@@ -96,55 +110,44 @@ def compare(of: Presses, networks: Sequence[Answers], *, board: str) -> dict[str
         "window_n": WINDOW_N,
         "force_min_N": FORCE_MIN_N,
         "by_duration": by_duration,
-        "all": _scores(of, answers, of.scored, board),
-        "lag_ms": {way: lags(of, [one[:, 2] for one in answers[way]]) for way in ("one", "mean5")},
+        "all": _scores(of, predictions, of.scored, board),
+        "lag_ms": {name: lags(of, [one[:, 2] for one in predictions[name]]) for name in ("one", "mean5")},
     }
 
 
+def _scores(
+    of: Presses, predictions: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
+) -> dict[str, Any]:
+    # The middle of the last five readings is two before the last, and in the same press where a row is scored.
+    middle = np.flatnonzero(rows) - WINDOW_N // 2
+    true = {"one": of.true[rows], "mean5": of.true[rows], "mean5_of_middle": of.true[middle]}
+    scores = {name: pd.DataFrame([score(true[name], one[rows]) for one in predictions[name]]) for name in METHODS}
+    sides = (scores[name].assign(board=board, skin="") for name in ("mean5", "one"))
+    return {name: summarise(own) for name, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}
+
+
 def lags(of: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, float]:
-    """Find by how many ms the answered forces lag behind the true ones, over presses and networks."""
+    """Find by how many ms the predicted forces lag behind the true ones, over presses and networks."""
     found_ms = [
-        lag_ms(of.t_s[rows], answer_N[rows], of.t_s[own], of.true[own, 2])
+        lag_ms(of.t_s[rows], predicted_N[rows], of.t_s[own], of.true[own, 2])
         for own in (of.press_i == press_i for press_i in np.unique(of.press_i[of.scored]))
         for rows in [own & of.scored]
         if rows.sum() > WINDOW_N
-        for answer_N in force_N
+        for predicted_N in force_N
     ]
     return statistic(found_ms) if found_ms else {"n": 0}
 
 
 def lag_ms(
     t_s: Float64[np.ndarray, " f"],
-    answer_N: Float[np.ndarray, " f"],
+    predicted_N: Float[np.ndarray, " f"],
     true_t_s: Float64[np.ndarray, " g"],
     true_N: Float64[np.ndarray, " g"],
 ) -> float:
-    """Give the delay of the true force, times whatever factor, that lies nearest to the answers (least squares)."""
+    """Give the delay at which the true force, times any factor, is nearest to the predictions (least squares)."""
     delayed_N = np.interp(t_s[None] - LAGS_MS[:, None] / 1e3, true_t_s, true_N)
-    explained = (delayed_N @ answer_N) ** 2 / (delayed_N**2).sum(axis=1)
+    explained = (delayed_N @ predicted_N) ** 2 / (delayed_N**2).sum(axis=1)
     return float(LAGS_MS[int(np.argmax(explained))])
-
-
-def _scores(
-    of: Presses, answers: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
-) -> dict[str, Any]:
-    # The middle of the last five readings is two before the last, and in the same press where a row is scored.
-    middle = np.flatnonzero(rows) - WINDOW_N // 2
-    true = {"one": of.true[rows], "mean5": of.true[rows], "mean5_of_middle": of.true[middle]}
-    scores = {way: pd.DataFrame([score(true[way], one[rows]) for one in answers[way]]) for way in WAYS}
-    sides = (scores[way].assign(board=board, skin="") for way in ("mean5", "one"))
-    return {way: summarise(own) for way, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}
-
-
-def dynamics(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
-    """Ask the networks of train_multi that never saw the pressed skin's board."""
-    one = only(read_captures(indentations), indentations)
-    true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
-    presses = presses_of(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
-    numbers = compare(presses, networks_held_out(models, one.board), board=one.board)
-    write_results(results, numbers, {}, read_losses(indentations, {}))
-    of_presses = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
-    say(f"{settings.scene}: {numbers['readings_n']} readings of {of_presses}")
 
 
 MEANING = (
@@ -155,7 +158,7 @@ MEANING = (
     "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
     f"± is the sd over network seeds; all presses are on one board. {VERDICTS}"
 )
-WAY_NAMES = {
+TITLES = {
     "one": "each reading alone",
     "mean5": "mean of the last five",
     "mean5_of_middle": "the same, two frames late",
@@ -166,7 +169,7 @@ METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show the errors of each way by duration of the press, and over all presses; the paper has none."""
+    """Tabulate the errors of each method by duration of the press, and over all presses; the paper has none."""
     rows = [(f"{one['duration_s']:.2g}", one) for one in numbers["by_duration"]]
     rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
     table = pd.DataFrame(
@@ -174,15 +177,15 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             "press lasts about, s": label,
             "presses": one["presses_n"],
             "readings": one["n"],
-            "answered by": words,
-            **{title: _show(one[way].get(name)) for name, title in METRICS.items()},
-            "lag / ms": _show(_lag(numbers, way)) if label == "all" else "",
-            LESS: _less(one) if way == "mean5" else "",
-            "paper": paper.DYNAMICS if label == "all" and way == "one" else "",
+            "answered by": title,
+            **{column: _show(one[method].get(name)) for name, column in METRICS.items()},
+            "lag / ms": _show(_lag(numbers, method)) if label == "all" else "",
+            LESS: _less(one) if method == "mean5" else "",
+            "paper": paper.DYNAMICS if label == "all" and method == "one" else "",
             "source": source,
         }
         for label, one in rows
-        for way, words in WAY_NAMES.items()
+        for method, title in TITLES.items()
     )
     table.attrs["meaning"] = MEANING
     return {"dynamics": table}
@@ -193,14 +196,14 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     with drawing(7.6, 3.8) as figure:
         panels = figure.subplots(1, 2)
         # A press stays where it is: against the middle's place the mean is as good as against the last one's.
-        for axes, name, ways_n in zip(panels, ("mse_f_N2", "mse_xy_mm2"), (3, 2), strict=True):
-            for i, (way, words) in enumerate(list(WAY_NAMES.items())[:ways_n]):
-                points = [(one["duration_s"], one[way][name]) for one in numbers["by_duration"] if name in one[way]]
-                duration_s = [where for where, _ in points]
-                mean, sd = ([one.get(part, 0.0) for _, one in points] for part in ("mean", "sd"))
+        for axes, name, methods_n in zip(panels, ("mse_f_N2", "mse_xy_mm2"), (3, 2), strict=True):
+            for i, (method, title) in enumerate(list(TITLES.items())[:methods_n]):
+                known = [one for one in numbers["by_duration"] if name in one[method]]
+                duration_s = [one["duration_s"] for one in known]
+                mean, sd = ([one[method][name].get(part, 0.0) for one in known] for part in ("mean", "sd"))
                 axes.errorbar(
                     duration_s, mean, sd, color=COLOURS[i], marker=MARKERS[i], markersize=4.5, linewidth=1.2,
-                    capsize=2, label=words,
+                    capsize=2, label=title,
                 )  # fmt: skip
             axes.set(xscale="log", xlabel="duration of the press / s", ylabel=METRICS[name])
             axes.set_xticks(TICKS_S, [f"{one:g}" for one in TICKS_S])
@@ -220,8 +223,8 @@ def _less(one: Mapping[str, Any]) -> str:
     return f"{verdict(negate(difference))}: {show_difference(difference)}"
 
 
-def _lag(numbers: Mapping[str, Any], way: str) -> Mapping[str, float] | None:
-    lag: Mapping[str, float] = numbers["lag_ms"].get(way, {})
+def _lag(numbers: Mapping[str, Any], method: str) -> Mapping[str, float] | None:
+    lag: Mapping[str, float] = numbers["lag_ms"].get(method, {})
     return lag if "mean" in lag else None
 
 

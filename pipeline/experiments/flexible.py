@@ -1,4 +1,4 @@
-"""Networks of rigid boards on flexible ones (paper section 5)."""
+"""Flexible boards: networks of rigid boards, adapted to flexible ones (paper section 5)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -35,55 +35,10 @@ from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
-DEPTH_DECIMALS = 2  # of a commanded depth in mm: nearer ones are one
-DRAWN_N = 400  # more points than these are not told apart in a panel
-FORCE_DECIMALS = 3  # in newtons: more than are seen
-
-ByDepth = Mapping[float, Float[np.ndarray, " d"]]  # |dB| in uT by commanded depth in mm
-
-
-def by_depth(depth_mm: Float[np.ndarray, " f"], db_uT: Float[np.ndarray, "f ch"]) -> dict[float, np.ndarray]:
-    """Sort the lengths of changes of field by commanded depth."""
-    length_uT, depth_mm = np.linalg.norm(db_uT, axis=1), np.round(depth_mm.astype(float), DEPTH_DECIMALS)
-    return {float(depth): length_uT[depth_mm == depth] for depth in np.unique(depth_mm)}
-
-
-def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
-    """Median |dB| of flexible boards' captures over that of rigid ones, at each depth that both have, over depths."""
-    both = set().union(*flexible) & set().union(*rigid)
-    return statistic([_median_uT(flexible, depth) / _median_uT(rigid, depth) for depth in sorted(both)])
-
-
-def gap_less_pct(gap_mm: Mapping[str, float]) -> float:
-    """By how much nearer chips of flexible boards are to their skins than those of rigid ones, in % of the latter."""
-    return 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])
-
-
-def answer_flexible(answers: Sequence[VariantPrediction]) -> dict[str, Any]:
-    """Summarise over boards, by arm; the force bias and the gain by adaptation apart."""
-    differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(answers, AFTER, BEFORE)}
-    return summarise_variants(answers) | force_biases(answers) | {"paired": differences}
-
-
-def forces_drawn(answers: Sequence[VariantPrediction], rng: np.random.Generator) -> dict[str, dict[str, list[float]]]:
-    """Choose equal readings of both arms' first networks at random: true and predicted force, in newtons."""
-    arms = {arm: [one for one in answers if one.variant == arm and one.seed_i == 0] for arm in (BEFORE, AFTER)}
-    shown = rng.permutation(sum(len(one.true) for one in arms[BEFORE]))[:DRAWN_N]
-    return {
-        arm: {
-            f"{side}_N": np.round(np.concatenate([getattr(one, side)[:, FORCE] for one in own])[shown], FORCE_DECIMALS)
-            .astype(float).round(FORCE_DECIMALS).tolist()
-            for side in ("true", "predicted")
-        }
-        for arm, own in arms.items()
-    }  # fmt: skip
-
-
-def _median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
-    return float(np.median(np.concatenate([one[depth_mm] for one in captures if depth_mm in one])))
-
-
-SHAPE = "shape"  # the recipe on directions, if the scene has one: it ought to care less about the gap
+DEPTH_DECIMALS = 2  # of a commanded depth in mm
+DRAWN_N = 400  # points in a panel
+FORCE_DECIMALS = 3  # of a newton that is drawn
+SHAPE = "shape"  # recipe on directions, if the scene has one: it should depend less on the gap
 
 
 def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
@@ -96,58 +51,97 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
     data = replace(data, rows=stack(data.rows, poked))
     sides = (first.train, np.arange(trained_n, len(data.rows)))
     fold = hold_out_skins(data.rows, "flexible", first.name, sides, data.settings.section(Split, "split"))
-    arms = {
-        name: arm for name, arm in ((HEADLINE, AFTER), (CONTROL, CONTROL), (SHAPE, SHAPE)) if name in adapting.recipes
-    }
+    variants = {HEADLINE: AFTER, CONTROL: CONTROL, SHAPE: SHAPE}  # by recipe
+    recipes = {name: adapting.recipes[name] for name in variants if name in adapting.recipes}
     jobs = [
-        (arm, job)
-        for name, arm in arms.items()
-        for job in adaptation_jobs(
-            data, fold, (name, adapting.recipes[name]), starts, experiment="flexible", pokes_n=adapting.pokes_n
-        )
+        (variants[name], job)
+        for name, recipe in recipes.items()
+        for job in adaptation_jobs(data, fold, (name, recipe), starts, experiment="flexible", pokes_n=adapting.pokes_n)
     ]
     skins = [str(skin) for skin in np.unique(data.rows.skin[fold.test])]
     before = {
-        name: [one for skin in skins for one in predict_before(data, fold, adapting.recipes[name], starts, skin)]
-        for name in arms if name != CONTROL
-    }  # fmt: skip
+        name: [one for skin in skins for one in predict_before(data, fold, recipe, starts, skin)]
+        for name, recipe in recipes.items()
+        if name != CONTROL
+    }
     after, trainings = adapt_and_predict(data, jobs, "flexible")
     own = before[HEADLINE] + [one for one in after if one.variant != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),
         "seeds_n": len({one.seed_i for one in own}), "pokes_n": adapting.pokes_n, "fold": first.name,
         "trained_on_skins_n": len(np.unique(data.rows.skin[fold.train])),
-        "strength_ratio": strength_ratio(_by_depth(captures), _by_depth(read_captures(main))),
-    } | _gaps(data) | answer_flexible(own)  # fmt: skip
-    if SHAPE in arms:
-        numbers[SHAPE] = answer_flexible(
+        "strength_ratio": strength_ratio(
+            [sizes_by_depth(one) for one in captures], [sizes_by_depth(one) for one in read_captures(main)]
+        ),
+    } | gaps(data) | summarise_flexible(own)  # fmt: skip
+    if SHAPE in recipes:
+        numbers[SHAPE] = summarise_flexible(
             before[SHAPE] + [replace(one, variant=AFTER) for one in after if one.variant == SHAPE]
         )
-    drawn = forces_drawn(own, rng_for(data.settings.seed, "flexible", "drawn"))
+    drawn = draw_forces(own, rng_for(data.settings.seed, "flexible", "drawn"))
     write_results(results, numbers, drawn, read_losses(indentations, poked.dropped), trainings)
 
 
-def _by_depth(captures: Sequence[Readings]) -> list[dict[float, np.ndarray]]:
-    return [by_depth(one.depth_mm, one.b_uT - one.noload_uT) for one in captures]
+ByDepth = Mapping[float, Float[np.ndarray, " d"]]  # |dB| in uT by commanded depth in mm
 
 
-def _gaps(data: SceneData) -> dict[str, Any]:
-    """Tell the gaps between skin and chips of both kinds of boards, and by how much one is less."""
-    kinds = {"rigid": "grid", "flexible": "flexible"}
+def sizes_by_depth(readings: Readings) -> dict[float, np.ndarray]:
+    """Group the sizes |dB| of a capture by commanded depth."""
+    length_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
+    depth_mm = np.round(readings.depth_mm.astype(float), DEPTH_DECIMALS)
+    return {float(depth): length_uT[depth_mm == depth] for depth in np.unique(depth_mm)}
+
+
+def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
+    """Give the median |dB| of flexible boards over that of rigid ones, at each common depth, over depths."""
+
+    def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
+        return float(np.median(np.concatenate([one[depth_mm] for one in captures if depth_mm in one])))
+
+    both = set().union(*flexible) & set().union(*rigid)
+    return statistic([median_uT(flexible, depth) / median_uT(rigid, depth) for depth in sorted(both)])
+
+
+def gaps(data: SceneData) -> dict[str, Any]:
+    """Give the gap between skin and chips of both kinds of boards, and by how many percent one is smaller."""
     of = simulation_settings(data.settings)
-    gap_mm = {kind: of.boards[of.protocols[name].boards].design.gap_mm for kind, name in kinds.items()}
-    return {"gap_mm": gap_mm, "gap_less_pct": gap_less_pct(gap_mm)}
+    protocols = {"rigid": "grid", "flexible": "flexible"}
+    gap_mm = {kind: of.boards[of.protocols[name].boards].design.gap_mm for kind, name in protocols.items()}
+    return {"gap_mm": gap_mm, "gap_less_pct": 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])}
 
 
-ARMS = {"before": "before", "after": "adapted", "control": "as long, without pokes"}
+def summarise_flexible(predictions: Sequence[VariantPrediction]) -> dict[str, Any]:
+    """Summarise scores and force bias of each variant over boards, and the gain by adaptation."""
+    differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(predictions, AFTER, BEFORE)}
+    return summarise_variants(predictions) | force_biases(predictions) | {"paired": differences}
+
+
+def draw_forces(
+    predictions: Sequence[VariantPrediction], rng: np.random.Generator
+) -> dict[str, dict[str, list[float]]]:
+    """Draw equal readings of the first networks before and after: true and predicted force, in newtons."""
+    first = {name: [one for one in predictions if one.variant == name and one.seed_i == 0] for name in (BEFORE, AFTER)}
+    shown = rng.permutation(sum(len(one.true) for one in first[BEFORE]))[:DRAWN_N]
+    return {
+        name: {
+            f"{side}_N": np.round(np.concatenate([getattr(one, side)[:, FORCE] for one in own])[shown], FORCE_DECIMALS)
+            .astype(float).round(FORCE_DECIMALS).tolist()
+            for side in ("true", "predicted")
+        }
+        for name, own in first.items()
+    }  # fmt: skip
+
+
+VARIANTS = {"before": "before", "after": "adapted", "control": "as long, without pokes"}
 OF_SHAPE = "direction and length of the change of field (ours): "
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show the arms of the paper's recipe, then those of ours on directions where there is one."""
-    lines = [_line(ARMS[arm], numbers, arm, source) for arm in ARMS if arm in numbers]
-    if "shape" in numbers:
-        lines += [_line(OF_SHAPE + ARMS[arm], numbers["shape"], arm, source) for arm in ARMS if arm in numbers["shape"]]
+    """Tabulate the variants of the paper's recipe, and those of ours on directions if there is one."""
+    lines = [_line(title, numbers, name, source) for name, title in VARIANTS.items() if name in numbers]
+    if SHAPE in numbers:
+        own = numbers[SHAPE]
+        lines += [_line(OF_SHAPE + title, own, name, source) for name, title in VARIANTS.items() if name in own]
     spread = (
         f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks; one "
         "fold's networks answer for all these boards, so it says nothing of other training boards. ± (seeds) is the "
@@ -158,15 +152,15 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw predicted against true force before and after adaptation, with the diagonal and the bias."""
-    every_N = [value for arm in drawn.values() for side in arm.values() for value in side]
+    every_N = [value for forces in drawn.values() for side in forces.values() for value in side]
     ends_N = [min(every_N), max(every_N)]
     with drawing(6.4, 3.7) as figure:
         panels = figure.subplots(1, len(drawn), sharex=True, sharey=True)
-        for axes, (arm, forces), colour in zip(panels, drawn.items(), COLOURS[1:], strict=False):
+        for axes, (name, forces), colour in zip(panels, drawn.items(), COLOURS[1:], strict=False):
             axes.plot(ends_N, ends_N, color=COLOURS[0], linewidth=0.8)
             axes.scatter(forces["true_N"], forces["predicted_N"], s=7, color=colour, alpha=0.6, linewidths=0)
-            bias = f"bias {show_difference(numbers['bias_f_N'][arm])} N"
-            axes.set_title(f"{ARMS[arm]}:\n{bias}", loc="left", fontsize=9)
+            bias = f"bias {show_difference(numbers['bias_f_N'][name])} N"
+            axes.set_title(f"{VARIANTS[name]}:\n{bias}", loc="left", fontsize=9)
             axes.set(xlabel="true force / N")
         panels[0].set_ylabel("predicted force / N")
         title = (
@@ -190,13 +184,13 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
     )
 
 
-def _line(name: str, numbers: Mapping[str, Any], arm: str, source: str) -> dict[str, str]:
-    line = {"networks": name, "source": source}
-    paper = FLEXIBLE if arm == "after" else {}
-    for metric, title in COLUMNS.items():
-        line[f"{title} (ours)"] = show(numbers[arm].get(metric))
+def _line(title: str, numbers: Mapping[str, Any], name: str, source: str) -> dict[str, str]:
+    line = {"networks": title, "source": source}
+    paper = FLEXIBLE if name == "after" else {}
+    for metric, column in COLUMNS.items():
+        line[f"{column} (ours)"] = show(numbers[name].get(metric))
         if metric in OF_PAPER:
-            line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
-    line |= {"bias of F, N": show_difference(numbers["bias_f_N"][arm])}
-    line |= {"bias of F, %": show_difference(numbers["bias_f_pct"][arm])}
-    return line | {"n": str(numbers[arm]["accuracy_pct"]["n"])}
+            line[f"{column} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
+    line |= {"bias of F, N": show_difference(numbers["bias_f_N"][name])}
+    line |= {"bias of F, %": show_difference(numbers["bias_f_pct"][name])}
+    return line | {"n": str(numbers[name]["accuracy_pct"]["n"])}

@@ -1,4 +1,8 @@
-"""A gripper that holds a force by our estimate of it."""
+"""Gripper: hold a force by the estimate of networks or of the universal model (paper section 6).
+
+A simulated gripper squeezes objects of several stiffnesses; the true force is judged, without and with one press whose
+force is known.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,17 +32,17 @@ from reskin.simulation.protocols import load_steps_N
 from reskin.universal.model import Universal, load_universal
 
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; from SETTLED_S on the force is judged
-SWING = 3.0  # by which an object stiffens, and gives way, about its own stiffness, once
-DEPTH_OF_1_N_MM = 0.8  # assumed, of a round tip (Hertz); it sets how fast a force is reached, and not which one
+SWING = 3.0  # factor by which an object becomes stiffer, and softer, than its own stiffness
+DEPTH_OF_1_N_MM = 0.8  # assumed, of a round tip (Hertz); it sets how fast a force is reached, not which
 READINGS_N = 5  # of the known press, as of each indentation (paper section 3)
 WITHIN = 0.1  # of the aim (paper section 6 lets a gripper hold a blueberry; the share is ours)
-Forces = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]
-Answers = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]
+Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
+Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # of changes of field: x, y in mm, F in N
 Positive = Annotated[float, Field(gt=0, le=100)]
 
 
 class Gripper(Strict):
-    """Forces to hold, objects, and the controller's gain."""
+    """Section gripper: forces to hold, stiffness of objects, and the gain of the controller."""
 
     aims_N: tuple[Positive, ...]
     stiffness_N_mm: tuple[Positive, ...]
@@ -47,7 +51,7 @@ class Gripper(Strict):
 
 @dataclass(frozen=True)
 class Finger:
-    """What a skin reads under each force at its middle, and how deep it is then; the first force is none."""
+    """Readings and depth of a skin under each force at its middle; the first force is 0."""
 
     board: str
     force_N: Float64[np.ndarray, " p"]
@@ -57,13 +61,14 @@ class Finger:
     noise_uT: float
 
     def read(self, force_N: Float64[np.ndarray, " r"], rng: np.random.Generator) -> Float64[np.ndarray, "r ch"]:
+        """Read the skin under some forces, with noise."""
         clean_uT = np.stack([np.interp(force_N, self.force_N, column) for column in self.change_uT.T], axis=1)
         return self.noload_uT + clean_uT + self.noise_uT * rng.standard_normal(clean_uT.shape)
 
     def squeezed_N(
         self, closed_mm: Float64[np.ndarray, " r"], stiffness_N_mm: Float64[np.ndarray, " r"]
     ) -> Float64[np.ndarray, " r"]:
-        """Find the force that skin and object, one after the other, bear when the gripper has closed so far."""
+        """Find the force of skin and object in series, when the gripper has closed by `closed_mm`."""
         return np.array([
             np.interp(closed, self.depth_mm + self.force_N / stiffness, self.force_N)
             for closed, stiffness in zip(closed_mm, stiffness_N_mm, strict=True)
@@ -77,8 +82,28 @@ class Press(NamedTuple):
     b_uT: Float64[np.ndarray, " ch"]
 
 
-def finger_of(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finger:
-    """Average a capture's readings under each weight; the noise is what is left about these averages."""
+def read(settings: Settings) -> Gripper:
+    """Read section gripper."""
+    return settings.section(Gripper, "gripper")
+
+
+def gripper(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
+    """Hold objects by the estimated force on the skin of a gripper's finger."""
+    load = load_protocol(settings, "grip")
+    weight_N = load_steps_N(load.force_max_N, load.step_N)
+    fingers = [make_finger(capture, weight_N) for capture in read_captures(indentations)]
+    networks = {finger.board: networks_held_out(models, finger.board) for finger in fingers}
+    numbers, drawn = hold_all(fingers, networks, read(settings), seed=settings.seed)
+    write_results(results, numbers, drawn, read_losses(indentations, {}))
+    best = max(numbers["rows"], key=lambda row: row["held_pct"])
+    say(
+        f"{settings.scene}: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs by {best['feedback']}, "
+        f"{best['press']}"
+    )
+
+
+def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finger:
+    """Average a capture's readings under each weight; the noise is the standard deviation about these averages."""
     change_uT = subtract(capture.b_uT, capture.noload_uT)
     levels_uT = group_by_level(
         change_uT, capture.indentation, capture.Fz_N, levels_n=len(weight_N), where=capture.capture
@@ -90,36 +115,37 @@ def finger_of(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finger:
     return Finger(capture.board, weight_N, depth_mm, mean_uT - mean_uT[0], noload_uT, noise_uT)
 
 
-def feedbacks(finger: Finger, networks: Sequence[Answers], press: Press) -> Iterator[tuple[str, str, Forces]]:
-    """Name who estimates the force, what was done with the known press, and the estimate; each network by itself."""
+def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Iterator[tuple[str, str, Estimate]]:
+    """Give every estimate of force: the model's name, how the known press is used, and the function."""
     nothing = load_universal().zero(finger.noload_uT[None])
     labelled = load_universal().zero(finger.noload_uT[None])
     labelled.label(np.full((1, 2), CENTRE_MM), np.array([press.force_N]), press.b_uT[None])
 
-    by_networks = [("networks", _by_network(network, finger.noload_uT)) for network in networks]
-    for who, forces in (*by_networks, ("map", _by_map(nothing))):
-        yield who, "none", forces
-        yield who, "factor", _scaled(forces, press)
-    yield "map", "label", _by_map(labelled)
+    def by_network(network: Predict) -> Estimate:
+        return lambda b_uT: network((b_uT - finger.noload_uT).astype(np.float32))[:, 2].astype(np.float64)
+
+    def by_universal(universal: Universal) -> Estimate:
+        return lambda b_uT: universal.estimate(b_uT).force_N
+
+    for name, estimate in (
+        *(("networks", by_network(network)) for network in networks),
+        ("map", by_universal(nothing)),
+    ):
+        yield name, "none", estimate
+        yield name, "factor", scale_to_press(estimate, press)
+    yield "map", "label", by_universal(labelled)
 
 
-def _by_network(network: Answers, noload_uT: Float64[np.ndarray, " ch"]) -> Forces:
-    return lambda b_uT: network((b_uT - noload_uT).astype(np.float32))[:, 2].astype(np.float64)
+def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
+    """Scale estimates so that the known press is estimated correctly."""
+    factor = press.force_N / max(float(estimate(press.b_uT[None])[0]), 1e-3)  # networks may predict 0 or less
+    return lambda b_uT: factor * estimate(b_uT)
 
 
-def _by_map(universal: Universal) -> Forces:
-    return lambda b_uT: universal.estimate(b_uT).force_N
-
-
-def _scaled(forces: Forces, press: Press) -> Forces:
-    factor = press.force_N / max(float(forces(press.b_uT[None])[0]), 1e-3)  # networks may say none, or less
-    return lambda b_uT: factor * forces(b_uT)
-
-
-def grip(
-    finger: Finger, forces: Forces, aim_N: float, how: Gripper, rng: np.random.Generator
+def hold(
+    finger: Finger, estimate: Estimate, aim_N: float, how: Gripper, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f r"]:
-    """Hold objects of all stiffnesses side by side; give the true force of each step."""
+    """Hold objects of all stiffnesses, each by itself; give the true force of each step."""
     own_N_mm = np.array(how.stiffness_N_mm)
     closed_mm, force_N = np.zeros(len(own_N_mm)), np.zeros(len(own_N_mm))
     touch_uT = finger.noise_uT * (np.sqrt(len(finger.noload_uT)) + CONTACT_SDS)
@@ -127,7 +153,7 @@ def grip(
     for step in range(round(SECONDS * RATE_HZ)):
         b_uT = finger.read(force_N, rng)
         touched = np.linalg.norm(b_uT - finger.noload_uT, axis=1) > touch_uT
-        estimate_N = np.where(touched, forces(b_uT), 0.0)
+        estimate_N = np.where(touched, estimate(b_uT), 0.0)
         closed_mm = np.maximum(closed_mm + how.gain_mm_N * (aim_N - estimate_N), 0.0)  # the controller
         stiffness_N_mm = own_N_mm * SWING ** np.sin(2 * np.pi * step / RATE_HZ / SECONDS)
         force_N = finger.squeezed_N(closed_mm, stiffness_N_mm)
@@ -135,8 +161,38 @@ def grip(
     return np.array(held_N)
 
 
+def hold_all(
+    fingers: Sequence[Finger], networks: Mapping[str, Sequence[Predict]], how: Gripper, *, seed: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Hold each force by every estimate, on every skin; return the numbers, and what the figure draws."""
+    rows, drawn = [], []
+    for aim_N in how.aims_N:
+        runs: dict[tuple[str, str], dict[str, list[Float64[np.ndarray, "f r"]]]] = {}
+        for finger in fingers:
+            rng = rng_for(seed, "gripper", finger.board, f"{aim_N:g}")
+            known_uT = finger.read(np.full(READINGS_N, aim_N), rng).mean(axis=0)
+            for model, press, estimate in estimators(finger, networks[finger.board], Press(aim_N, known_uT)):
+                held_N = hold(finger, estimate, aim_N, how, rng)
+                runs.setdefault((model, press), {}).setdefault(finger.board, []).append(held_N)
+        for (model, press), by_board in runs.items():
+            keys = {"aim_N": aim_N, "feedback": model, "press": press}
+            rows.append(keys | judge(by_board, aim_N))
+            mean_N = np.concatenate(
+                [held_N[round(SETTLED_S * RATE_HZ) :].mean(axis=0) for own in by_board.values() for held_N in own]
+            )
+            drawn.append(keys | {"off_pct": np.round(100 * (mean_N / aim_N - 1), 2).tolist()})
+    return {
+        "rows": rows,
+        "within_pct": 100 * WITHIN,
+        "skins_n": len(fingers),
+        "seeds_n": max(len(own) for own in networks.values()),
+        "rate_hz": RATE_HZ,
+        **how.model_dump(mode="json"),
+    }, {"rows": drawn}
+
+
 def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float) -> dict[str, Any]:
-    """Say how far true forces were from the aim, over the runs of all boards and estimators, once settled.
+    """Score how far true forces are from the aim once settled, over the runs of all boards and estimators.
 
     `runs` are those of each estimator (network seed) on each board; `sd_seeds` is the standard deviation over the
     estimators of one board, mean over boards.
@@ -157,56 +213,6 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
     }
 
 
-def analyse_levels(
-    fingers: Sequence[Finger], networks: Mapping[str, Sequence[Answers]], how: Gripper, *, seed: int
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Hold each force with each feedback, on every skin."""
-    rows, drawn = [], []
-    for aim_N in how.aims_N:
-        runs: dict[tuple[str, str], dict[str, list[Float64[np.ndarray, "f r"]]]] = {}
-        for finger in fingers:
-            rng = rng_for(seed, "gripper", finger.board, f"{aim_N:g}")
-            known_uT = finger.read(np.full(READINGS_N, aim_N), rng).mean(axis=0)
-            for who, press, forces in feedbacks(finger, networks[finger.board], Press(aim_N, known_uT)):
-                held_N = grip(finger, forces, aim_N, how, rng)
-                runs.setdefault((who, press), {}).setdefault(finger.board, []).append(held_N)
-        for (who, press), by_board in runs.items():
-            words = {"aim_N": aim_N, "feedback": who, "press": press}
-            rows.append(words | judge(by_board, aim_N))
-            mean_N = np.concatenate(
-                [held_N[round(SETTLED_S * RATE_HZ) :].mean(axis=0) for own in by_board.values() for held_N in own]
-            )
-            drawn.append(words | {"off_pct": np.round(100 * (mean_N / aim_N - 1), 2).tolist()})
-    return {
-        "rows": rows,
-        "within_pct": 100 * WITHIN,
-        "skins_n": len(fingers),
-        "seeds_n": max(len(own) for own in networks.values()),
-        "rate_hz": RATE_HZ,
-        **how.model_dump(mode="json"),
-    }, {"rows": drawn}
-
-
-def read(settings: Settings) -> Gripper:
-    """Read section gripper."""
-    return settings.section(Gripper, "gripper")
-
-
-def gripper(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
-    """Let a gripper hold objects by the force that is estimated of its finger's skin."""
-    load = load_protocol(settings, "grip")
-    weight_N = load_steps_N(load.force_max_N, load.step_N)
-    fingers = [finger_of(capture, weight_N) for capture in read_captures(indentations)]
-    networks = {finger.board: networks_held_out(models, finger.board) for finger in fingers}
-    numbers, drawn = analyse_levels(fingers, networks, read(settings), seed=settings.seed)
-    write_results(results, numbers, drawn, read_losses(indentations, {}))
-    best = max(numbers["rows"], key=lambda row: row["held_pct"])
-    say(
-        f"{settings.scene}: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs by {best['feedback']}, "
-        f"{best['press']}"
-    )
-
-
 MEANING = (
     "One line of a controller closes a gripper until the estimated force is the aimed one, "
     "`closed_mm += {gain_mm_N:g} * (aim_N - estimate_N)`, {rate_hz:g} times a second, while the object stiffens "
@@ -222,7 +228,7 @@ PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show how often, and how nearly, each force was held with each feedback."""
+    """Tabulate how often, and how nearly, each force was held by each estimate."""
     table = pd.DataFrame(
         {
             "aim, N": f"{row['aim_N']:g}",
@@ -239,8 +245,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         for row in numbers["rows"]
     )
     objects = numbers["stiffness_N_mm"]
-    words = {"soft": min(objects), "hard": max(objects), "objects_n": len(objects)}
-    table.attrs["meaning"] = MEANING.format(**{**numbers, **words})
+    stiffness = {"soft": min(objects), "hard": max(objects), "objects_n": len(objects)}
+    table.attrs["meaning"] = MEANING.format(**numbers, **stiffness)
     return {"gripper": table}
 
 
@@ -260,8 +266,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.set_xticks(range(len(rows)), labels, fontsize=8, rotation=45)
             axes.set_title(f"{aim_N:g} N", fontsize=10)
         panels[0].set_ylabel("mean force off the aim / %")
-        words = f"A force is held by its estimate; below, who estimates, and the known press ({source})"
-        figure.suptitle(words, x=0.01, ha="left", fontsize=11)
+        title = f"A force is held by its estimate; below, who estimates, and the known press ({source})"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"gripper.svg": svg(figure)}
 
 

@@ -1,4 +1,8 @@
-"""Force and place from an SD card's log (paper section 6)."""
+"""Logs: force and place over time from the log of an SD card, as of a dog shoe or a glove (paper section 6).
+
+Networks that never saw the board read the log; a simulated one is scored, also as if its board turned in the earth's
+field.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from scipy.constants import micro
 from scipy.spatial.transform import Rotation
 
-from pipeline.experiments.ambient import Instrument, guessed_uT, seen_uT, take_board
+from pipeline.experiments.ambient import Instrument, draw_instrument, readings_uT, reference_uT
 from pipeline.experiments.results import only, write_results
 from pipeline.report import paper
 from pipeline.report.drawing import COLOURS, drawing, svg
@@ -36,81 +40,13 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 
-PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side, once a step
+PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side in each step
 PERIOD_S = 1.0  # assumed, for a log with fewer than two contacts
-TOLD = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
-
-
-@dataclass(frozen=True)
-class Log:
-    """A log of a board that keeps its place, its quiet start, and what was true of it."""
-
-    t_s: Float64[np.ndarray, " f"]
-    b_uT: Float32[np.ndarray, "f ch"]
-    true: Float64[np.ndarray, "f 3"]  # NaN where nothing touches
-    quiet_n: int
-
-
-def turn_log(
-    log: Log, own: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
-) -> list[dict[str, Any]]:
-    """Let the board pitch by more and more after its quiet start; score it as it is, and less what a chip aside reads.
-
-    `own.noise_uT` is that of one reading of the chip aside.
-    """
-    period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
-    told = []
-    for pitch_deg in PITCHES_DEG:
-        swing_rad = np.radians(pitch_deg) * swing(log.t_s, start_s=float(log.t_s[log.quiet_n - 1]), period_s=period_s)
-        field_T = earth_T(swing_rad)
-        added_uT = seen_uT(own.board, np.repeat(field_T[:, None], len(own.turn), axis=1))
-        less_uT = added_uT - guessed_uT(own, field_T, rng)
-        told.append(
-            {"pitch_deg": pitch_deg} | _told(log, added_uT, networks)
-            | {"reference_chip": _told(log, less_uT, networks)}
-        )  # fmt: skip
-    return told
-
-
-def step_period_s(t_s: Float64[np.ndarray, " f"], touched: Bool[np.ndarray, " f"]) -> float:
-    """Give the usual time from the start of one contact to that of the next."""
-    starts_s = t_s[np.flatnonzero(np.diff(touched.astype(int), prepend=0) == 1)]
-    return float(np.median(np.diff(starts_s))) if len(starts_s) > 1 else PERIOD_S
-
-
-def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) -> Float64[np.ndarray, " f"]:
-    """Give a sine that begins at `start_s`, and rest before."""
-    return np.sin(2 * np.pi * np.maximum(t_s - start_s, 0) / period_s)
-
-
-def earth_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
-    """Give the earth's field in the axes of a board that is turned about its y axis; at rest its x axis points north.
-
-    Assumed: walking north, so that the whole field lies in the plane of turning. It is the worst way to go.
-    """
-    return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
-
-
-def _told(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Estimator]) -> dict[str, Any]:
-    found = estimate_after(log.quiet_n, log.t_s, (log.b_uT + added_uT).astype(np.float32), networks)
-    scores = score_contacts(found, log.true)
-    return {"contacts_n": contacts_n(found.contact)} | {name: scores[name] for name in TOLD if name in scores}
-
-
-def turned(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
-    """Tell what the networks find in the log if its board turns in the earth's field."""
-    of, seed = simulation_settings(settings), settings.seed
-    noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # a log's readings are single
-    own = replace(take_board(of, board, seed=seed), noise_uT=noise_uT)
-    return {
-        "turning": turn_log(log, own, networks, rng_for(seed, "logs", board, "aside")),
-        "turning_period_s": step_period_s(log.t_s, np.isfinite(log.true[:, 2])),
-        "earth_uT": EARTH_SIZE_T / micro,
-    }
+SCORES = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
 
 
 def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
-    """Read a folder's walk with networks that never saw its board; score it where its truth is kept, and turn it."""
+    """Estimate contacts of a log with networks that never saw its board; score them where their truth is known."""
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board
@@ -122,11 +58,85 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
         known = np.stack([log.x_mm, log.y_mm, log.Fz_N], axis=1)
         known[~log.contact] = np.nan
         true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
-        numbers |= score_contacts(found, true) | turned(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
+        numbers |= score_contacts(found, true)
+        numbers |= score_turning(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
     losses = {"accounts": [numbers["account"]], "left_out": {}}
     write_results(results, numbers, thin(found, true), losses)
     say(f"{settings.scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
 
+
+# --- A board that turns in the earth's field ---
+
+
+@dataclass(frozen=True)
+class Log:
+    """A log of a board that keeps its orientation, the length of its quiet start, and its true contacts."""
+
+    t_s: Float64[np.ndarray, " f"]
+    b_uT: Float32[np.ndarray, "f ch"]
+    true: Float64[np.ndarray, "f 3"]  # NaN where nothing touches
+    quiet_n: int
+
+
+def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
+    """Score the networks on the log as if its board turned in the earth's field, with a reference chip and without."""
+    of, seed = simulation_settings(settings), settings.seed
+    noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # a log's readings are single
+    own = replace(draw_instrument(of, board, seed=seed), noise_uT=noise_uT)
+    return {
+        "turning": score_pitches(log, own, networks, rng_for(seed, "logs", board, "aside")),
+        "turning_period_s": step_period_s(log.t_s, np.isfinite(log.true[:, 2])),
+        "earth_uT": EARTH_SIZE_T / micro,
+    }
+
+
+def score_pitches(
+    log: Log, own: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """Score the log with the board pitching after its quiet start, as it is and less the reading of a reference chip.
+
+    `own.noise_uT` is that of one reading of the reference chip.
+    """
+    period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
+    rows = []
+    for pitch_deg in PITCHES_DEG:
+        swing_rad = np.radians(pitch_deg) * swing(log.t_s, start_s=float(log.t_s[log.quiet_n - 1]), period_s=period_s)
+        field_T = earth_in_board_T(swing_rad)
+        added_uT = readings_uT(own.board, np.repeat(field_T[:, None], len(own.turn), axis=1))
+        less_uT = added_uT - reference_uT(own, field_T, rng)
+        rows.append(
+            {"pitch_deg": pitch_deg} | _score(log, added_uT, networks)
+            | {"reference_chip": _score(log, less_uT, networks)}
+        )  # fmt: skip
+    return rows
+
+
+def step_period_s(t_s: Float64[np.ndarray, " f"], touched: Bool[np.ndarray, " f"]) -> float:
+    """Give the median time from the start of one contact to that of the next."""
+    starts_s = t_s[np.flatnonzero(np.diff(touched.astype(int), prepend=0) == 1)]
+    return float(np.median(np.diff(starts_s))) if len(starts_s) > 1 else PERIOD_S
+
+
+def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) -> Float64[np.ndarray, " f"]:
+    """Give a sine that begins at `start_s`, and is 0 before."""
+    return np.sin(2 * np.pi * np.maximum(t_s - start_s, 0) / period_s)
+
+
+def earth_in_board_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
+    """Give the earth's field in the axes of a board that pitches about its y axis; at rest its x axis points north.
+
+    Assumed: walking north, so that the whole field lies in the plane of the pitch, which is the worst direction.
+    """
+    return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
+
+
+def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Estimator]) -> dict[str, Any]:
+    found = estimate_after(log.quiet_n, log.t_s, (log.b_uT + added_uT).astype(np.float32), networks)
+    scores = score_contacts(found, log.true)
+    return {"contacts_n": contacts_n(found.contact)} | {name: scores[name] for name in SCORES if name in scores}
+
+
+# --- Tables and figures ---
 
 MEANING = (  # {rate_hz} comes from the numbers
     "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "
@@ -144,11 +154,11 @@ TURNING = (
     "over the readings found in contact that are: where more weak ones are found, the mean error of force falls. ± is "
     "the standard deviation over network seeds."
 )
-WAYS = {"as logged": None, "a chip's aside taken off": "reference_chip"}
+VARIANTS = {"as logged": None, "a chip's aside taken off": "reference_chip"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show what was found in the log, and how well where that is known; the paper shows its logs as videos."""
+    """Tabulate contacts of the log, with their scores where the truth is known; the paper shows its logs as videos."""
     account = numbers["account"]
     rows = [
         ("rate, Hz", f"{numbers['rate_hz']:.0f}", f"{paper.LOG_RATE_HZ:.0f}"),
@@ -176,15 +186,15 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """Show what is found in the log of a board that turns, by its largest pitch."""
+    """Tabulate the scores of a board that turns, by its largest pitch."""
     rows = []
     for row in numbers["turning"]:
-        for words, name in WAYS.items():
+        for title, name in VARIANTS.items():
             own = row if name is None else row[name]
             rows.append(
                 {
                     "pitch / °": f"± {row['pitch_deg']:g}",
-                    "readings": words,
+                    "readings": title,
                     "contacts found": _show(own, "contacts_n"),
                     "contacts made": _show(numbers, "contacts_true_n"),
                     "readings without contact taken for one": _show(own, "false_readings_n"),
@@ -204,15 +214,15 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     t_s = np.array(drawn["t_s"])
     with drawing(7.0, 5.0) as figure:
         panels = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
-        for axes, name, label in zip(panels, ("F_N", "x_mm", "y_mm"), ("F / N", "x / mm", "y / mm"), strict=True):
+        for axes, name, quantity in zip(panels, ("F_N", "x_mm", "y_mm"), ("F / N", "x / mm", "y / mm"), strict=True):
             for which, colour, width in (("estimated", COLOURS[1], 1.8), ("true", COLOURS[2], 0.9)):
                 if which in drawn:
                     axes.plot(t_s, np.array(drawn[which][name], float), color=colour, linewidth=width, label=which)
             if "low" in drawn:
                 low, high = (np.array(drawn[which][name], float) for which in ("low", "high"))
-                words = f"range over {numbers['networks_n']} network seeds"
-                axes.fill_between(t_s, low, high, color=COLOURS[1], alpha=0.3, linewidth=0, label=words)
-            axes.set_ylabel(label)
+                label = f"range over {numbers['networks_n']} network seeds"
+                axes.fill_between(t_s, low, high, color=COLOURS[1], alpha=0.3, linewidth=0, label=label)
+            axes.set_ylabel(quantity)
         panels[0].set_ylim(bottom=0)
         panels[1].set_ylim(-2, 18)  # the grid is 16 mm wide
         panels[2].set_ylim(-2, 18)

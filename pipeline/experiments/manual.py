@@ -1,4 +1,7 @@
-"""Networks adapted by hand pokes (paper section 5)."""
+"""Manual: networks adapted by pokes by hand, whose places are unknown (paper section 5).
+
+Tested on the robot's grid of the same skin, beside adaptation by as many pokes of the robot and a control.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -44,26 +47,6 @@ from reskin.models.recipe import HEADLINE
 GRID = "grid"  # as many pokes, by the robot
 
 
-def answer_manual(
-    answers: Sequence[VariantPrediction], *, pokes_n: Sequence[int], lines_n: Sequence[int]
-) -> dict[str, Any]:
-    """Summarise over boards; `pokes_n` and `lines_n` are those of each skin, and what is told is their mean."""
-    arms = summarise_variants(answers)
-    counts = {
-        "pokes_n": round(np.mean(pokes_n)),
-        "lines_n": round(np.mean(lines_n)),
-        "skins_n": len({one.skin for one in answers}),
-        "boards_n": len({one.board for one in answers}),
-        "seeds_n": len({one.seed_i for one in answers}),
-    }
-    differences = {
-        f"{AFTER}_minus_{other}": compare_variants(answers, AFTER, other)
-        for other in (BEFORE, CONTROL, GRID)
-        if other in arms
-    }
-    return counts | arms | {"paired": differences}
-
-
 def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
     """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
     preload_training()
@@ -74,24 +57,25 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pret
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))
     jobs: list[tuple[str, TrainingJob]] = []
-    answers: list[VariantPrediction] = []
+    predictions: list[VariantPrediction] = []
     for skin, own in lines.items():
-        fold = _fold_without(data, str(poked.board[poked.skin == skin][0]))
-        answers += predict_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
-        jobs += _jobs(data, fold, adapting, starts, (skin, own))
+        fold = fold_without(data, str(poked.board[poked.skin == skin][0]))
+        predictions += predict_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
+        jobs += make_jobs(data, fold, adapting, starts, skin, own)
     after, trainings = adapt_and_predict(data, jobs, "manual")
-    pokes_n, lines_n = zip(*((_pokes_n(data, own), len(np.unique(own.line_i))) for own in lines.values()), strict=True)
-    numbers = answer_manual([*answers, *after], pokes_n=pokes_n, lines_n=lines_n)
+    pokes_n = [count_pokes(data, own) for own in lines.values()]
+    lines_n = [len(np.unique(own.line_i)) for own in lines.values()]
+    numbers = summarise_manual([*predictions, *after], pokes_n=pokes_n, lines_n=lines_n)
     write_results(results, numbers, {}, read_losses(indentations, poked.dropped), trainings)
 
 
-def _jobs(
-    data: SceneData, fold: Fold, adapting: Adaptations, starts: PretrainedNetworks, poked: tuple[str, Lines]
+def make_jobs(
+    data: SceneData, fold: Fold, adapting: Adaptations, starts: PretrainedNetworks, skin: str, by_hand: Lines
 ) -> Iterator[tuple[str, TrainingJob]]:
-    """Make the arms of one skin: by hand, by the robot, and as long without pokes if there is such a recipe."""
-    (skin, by_hand), headline = poked, (HEADLINE, adapting.recipes[HEADLINE])
+    """Make the adaptations of one skin: by hand, by the robot, and the control if the scene has such a recipe."""
+    headline = HEADLINE, adapting.recipes[HEADLINE]
     for seed_i in select_pretrained(starts, headline[1].base, fold):
-        by_robot = pool_lines(data, fold, skin, pokes_n=_pokes_n(data, by_hand), seed_i=seed_i)
+        by_robot = pool_lines(data, fold, skin, pokes_n=count_pokes(data, by_hand), seed_i=seed_i)
         pokes = AdaptationPokes("manual", skin, seed_i, "hand", by_hand)
         yield AFTER, adaptation_job(data, fold, headline, starts, pokes)
         yield GRID, adaptation_job(data, fold, headline, starts, replace(pokes, what="grid", lines=by_robot))
@@ -99,45 +83,71 @@ def _jobs(
             yield CONTROL, adaptation_job(data, fold, (CONTROL, adapting.recipes[CONTROL]), starts, pokes)
 
 
-def _pokes_n(data: SceneData, lines: Lines) -> int:
+def count_pokes(data: SceneData, lines: Lines) -> int:
+    """Count the pokes of lines."""
     return len(np.unique(data.rows.indentation[lines.row]))
 
 
-def _fold_without(data: SceneData, board: str) -> Fold:
+def fold_without(data: SceneData, board: str) -> Fold:
+    """Return the fold of `lobo` that holds out a board."""
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
-        remedy = "Poke skins by hand that the grid knows too."
+        remedy = "Poke skins by hand that the main captures have too."
         raise SchemaError("experiment manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy)
     return folds[board]
 
 
-ARMS = {
+def summarise_manual(
+    predictions: Sequence[VariantPrediction], *, pokes_n: Sequence[int], lines_n: Sequence[int]
+) -> dict[str, Any]:
+    """Summarise predictions over boards; `pokes_n` and `lines_n` are those of each skin, and averaged."""
+    variants = summarise_variants(predictions)
+    counts = {
+        "pokes_n": round(np.mean(pokes_n)),
+        "lines_n": round(np.mean(lines_n)),
+        "skins_n": len({one.skin for one in predictions}),
+        "boards_n": len({one.board for one in predictions}),
+        "seeds_n": len({one.seed_i for one in predictions}),
+    }
+    differences = {
+        f"{AFTER}_minus_{other}": compare_variants(predictions, AFTER, other)
+        for other in (BEFORE, CONTROL, GRID)
+        if other in variants
+    }
+    return counts | variants | {"paired": differences}
+
+
+VARIANTS = {
     "before": "before",
     "after": "adapted by hand",
     "control": "as long, without pokes",
     "grid": "adapted by as many pokes of the robot",
 }
-GAINED = {"after_minus_before": GAINS["by_hand"]}
-PAIRED = {
+DIFFERENCES = {
     "after_minus_before": "by hand less before, on the same skin",
     "after_minus_control": "by hand less without pokes, on the same skin",
     "after_minus_grid": "by hand less by the robot, on the same skin",
 }
+PAPER_DIFFERENCES = {"after_minus_before": GAINS["by_hand"]}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show the arms, then their differences skin by skin."""
-    shown = [(ARMS[arm], numbers[arm], MANUAL.get(arm, {}), _shown) for arm in ARMS if arm in numbers]
-    differences = numbers["paired"]
-    shown += [(PAIRED[one], differences[one], GAINED.get(one, {}), _judged) for one in PAIRED if one in differences]
+    """Tabulate the variants, then their differences on equal skins."""
+
+    def judge(difference: Stat | None, metric: str) -> str:
+        """Show whether a difference is a gain, and its size."""
+        return "–" if difference is None else f"{verdict(gain(difference, metric))}: {show_difference(difference)}"
+
     lines = []
-    for name, ours, paper, words in shown:
-        line = {"networks": name, "source": source}
-        for metric, title in COLUMNS.items():
-            line[f"{title} (ours)"] = words(ours.get(metric), metric)
-            if metric in OF_PAPER:
-                line[f"{title} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
-        lines.append(line | {"n": str(ours["accuracy_pct"]["n"])})
+    for name, title in VARIANTS.items():
+        if name in numbers:
+            cells = {metric: show(numbers[name].get(metric)) for metric in COLUMNS}
+            lines.append(_line(title, numbers[name], cells, MANUAL.get(name, {}), source))
+    for name, title in DIFFERENCES.items():
+        if name in numbers["paired"]:
+            difference = numbers["paired"][name]
+            cells = {metric: judge(difference.get(metric), metric) for metric in COLUMNS}
+            lines.append(_line(title, difference, cells, PAPER_DIFFERENCES.get(name, {}), source))
     meaning = (
         f"{numbers['pokes_n']} pokes by hand a skin, along {numbers['lines_n']} lines of which only the order is known "
         f"(paper: {MANUAL_POKES_N}); tested on the robot's grid of the same skin, by networks that never saw its "
@@ -151,15 +161,17 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
 
 
-def _shown(stat: Stat | None, metric: str) -> str:
-    return show(stat)
-
-
-def _judged(stat: Stat | None, metric: str) -> str:
-    """Say whether a difference is a gain, before its size."""
-    return "–" if stat is None else f"{verdict(gain(stat, metric))}: {show_difference(stat)}"
+def _line(
+    title: str, ours: Mapping[str, Any], cells: Mapping[str, str], paper: Mapping[str, float], source: str
+) -> dict[str, str]:
+    line = {"networks": title, "source": source}
+    for metric, column in COLUMNS.items():
+        line[f"{column} (ours)"] = cells[metric]
+        if metric in OF_PAPER:
+            line[f"{column} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
+    return line | {"n": str(ours["accuracy_pct"]["n"])}
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Nothing: a table says it all."""
+    """Draw nothing."""
     return {}

@@ -1,4 +1,7 @@
-"""Place and all three forces of dragged lines (paper section 4)."""
+"""Shear: place and all three force components of dragged lines (paper section 4).
+
+Two splits of every skin: random readings held out, and whole lines held out.
+"""
 
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
@@ -22,65 +25,18 @@ from reskin.data.splits import NO_POOL, Fold, draw_sides
 from reskin.metrics import ACCURACY_LIMIT_MM
 from reskin.seeds import rng_for, seed_for
 
-Count = Annotated[int, Field(ge=1)]
-Fraction = Annotated[float, Field(gt=0, lt=1)]
+PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
+PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
+DRAWN_N = 400  # points in a panel
+FORCE_DECIMALS = 3  # of a newton that is drawn
 
 
 class Shear(Strict):
-    """Dragged lines: place and all three forces (paper section 4)."""
+    """Section shear: the splits of dragged lines, and the training."""
 
-    test_fraction: Fraction
-    repeats_n: Count
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]
+    repeats_n: Annotated[int, Field(ge=1)]
     training: Training
-
-
-PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
-PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
-
-
-def score5(true: Float[np.ndarray, "f 5"], predicted: Float[np.ndarray, "f 5"]) -> dict[str, float]:
-    """Score predictions of (x_mm, y_mm, Fx_N, Fy_N, Fz_N).
-
-    `explained_*` is 1 - MSE / variance of the truth: 1 is perfect, 0 is no better than the mean. It stands beside the
-    errors because forces of another size than the paper's have errors of another size.
-    """
-    error = predicted.astype(float) - true
-    near = np.abs(error[:, PLACE]) <= ACCURACY_LIMIT_MM
-    numbers = {"accuracy_pct": 100.0 * float(near.all(axis=1).mean())}
-    numbers |= {mse: float((error[:, part] ** 2).mean()) for part, mse in PARTS.values()}
-    for name, (part, mse) in PARTS.items():
-        numbers[f"explained_{name}"] = 1 - numbers[mse] / float(true[:, part].astype(float).var(axis=0).mean())
-    return numbers
-
-
-def answer_shear(
-    by_reading: Sequence[tuple[Hashable, Mapping[str, float]]],
-    by_line: Sequence[tuple[Hashable, Mapping[str, float]]],
-    *,
-    target: Float[np.ndarray, "f 5"],
-    lines_n: int,
-    passes_n: int,
-    seeds_n: int,
-) -> dict[str, Any]:
-    """Summarise (fold, score) pairs of both splits over folds, each the mean of its seeds, with the forces' size.
-
-    Of `lines_n` dragged lines in all, each place and depth was dragged along in each of `passes_n`. `sd_seeds` is the
-    standard deviation over the `seeds_n` networks of one fold, mean over folds.
-    """
-    rms_N = np.sqrt((target.astype(float) ** 2).mean(axis=0))
-    sizes = {"fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4])}
-    return _over_folds(by_reading) | {
-        "by_line": _over_folds(by_line), "seeds_n": seeds_n,
-        "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
-    }  # fmt: skip
-
-
-DRAWN_N = 400  # more points than these are not told apart in a panel
-MILLI = 3  # decimals of a force in the figure: more than are seen
-
-
-def _over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
-    return over_units(pd.DataFrame([{"fold": fold, **scores} for fold, scores in scored]), "fold")
 
 
 def read(settings: Settings) -> Shear:
@@ -93,8 +49,8 @@ def shear(settings: Settings, indentations: Path, results: Path) -> None:
     preload_training()
     section = read(settings)
     rows = gather(read_captures(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
-    by_reading = _folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
-    by_line = _folds(rows, rows.indentation, "line", section, settings.seed)
+    by_reading = make_folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
+    by_line = make_folds(rows, rows.indentation, "line", section, settings.seed)
     data = SceneData(settings.scene, settings, rows, [*by_reading, *by_line])
     jobs = make_jobs(data, section.training, data.folds)
     trained = train_jobs(data, jobs, "shear")
@@ -103,7 +59,7 @@ def shear(settings: Settings, indentations: Path, results: Path) -> None:
         (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(jobs, trained, strict=True)
     ]
     names = {fold.name for fold in by_line}
-    numbers = answer_shear(
+    numbers = summarise_shear(
         [one for one in scores if one[0] not in names], [one for one in scores if one[0] in names],
         target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
         seeds_n=section.training.seeds_n,
@@ -111,14 +67,17 @@ def shear(settings: Settings, indentations: Path, results: Path) -> None:
     first_i = next(i for i, job in enumerate(jobs) if job.fold in names)
     shown = rng_for(settings.seed, "shear", "drawn").permutation(len(jobs[first_i].test))[:DRAWN_N]
     true, predicted = rows.target[jobs[first_i].test], trained[first_i].predicted
-    drawn = {"true": _forces(true[shown]), "predicted": _forces(predicted[shown])}
+    drawn = {
+        side: [np.round(forces[shown, i].astype(float), FORCE_DECIMALS).tolist() for i in range(2, 5)]
+        for side, forces in (("true", true), ("predicted", predicted))
+    }
     write_results(
         results, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained))
     )
 
 
-def _folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
-    """Draw the folds of every skin by itself; rows of equal `group` stay together."""
+def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
+    """Draw the folds of every skin; rows of equal `group` stay together."""
     folds = []
     for skin in np.unique(rows.skin):
         own = np.flatnonzero(rows.skin == skin)
@@ -132,9 +91,45 @@ def _folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) ->
     return folds
 
 
-def _forces(target: np.ndarray) -> list[list[float]]:
-    """Give Fx, Fy, Fz as three lists."""
-    return [np.round(target[:, i].astype(float), MILLI).tolist() for i in range(2, 5)]
+def score5(true: Float[np.ndarray, "f 5"], predicted: Float[np.ndarray, "f 5"]) -> dict[str, float]:
+    """Score predictions of (x_mm, y_mm, Fx_N, Fy_N, Fz_N).
+
+    `explained_*` is 1 - MSE / variance of the truth: 1 is perfect, 0 is no better than the mean. Unlike the errors, it
+    does not grow with the size of the forces.
+    """
+    error = predicted.astype(float) - true
+    near = np.abs(error[:, PLACE]) <= ACCURACY_LIMIT_MM
+    numbers = {"accuracy_pct": 100.0 * float(near.all(axis=1).mean())}
+    numbers |= {mse: float((error[:, part] ** 2).mean()) for part, mse in PARTS.values()}
+    for name, (part, mse) in PARTS.items():
+        numbers[f"explained_{name}"] = 1 - numbers[mse] / float(true[:, part].astype(float).var(axis=0).mean())
+    return numbers
+
+
+def summarise_shear(
+    by_reading: Sequence[tuple[Hashable, Mapping[str, float]]],
+    by_line: Sequence[tuple[Hashable, Mapping[str, float]]],
+    *,
+    target: Float[np.ndarray, "f 5"],
+    lines_n: int,
+    passes_n: int,
+    seeds_n: int,
+) -> dict[str, Any]:
+    """Summarise (fold, score) pairs of both splits over folds, each the mean of its seeds, with the forces' size.
+
+    Of `lines_n` dragged lines in all, each place and depth was dragged along in each of `passes_n`. `sd_seeds` is the
+    standard deviation over the `seeds_n` networks of one fold, mean over folds.
+    """
+
+    def over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
+        return over_units(pd.DataFrame([{"fold": fold, **scores} for fold, scores in scored]), "fold")
+
+    rms_N = np.sqrt((target.astype(float) ** 2).mean(axis=0))
+    sizes = {"fx_rms_N": float(rms_N[2]), "fy_rms_N": float(rms_N[3]), "fz_rms_N": float(rms_N[4])}
+    return over_folds(by_reading) | {
+        "by_line": over_folds(by_line), "seeds_n": seeds_n,
+        "readings_n": len(target), "lines_n": lines_n, "passes_n": passes_n, **sizes,
+    }  # fmt: skip
 
 
 TITLES = {
@@ -145,14 +140,14 @@ FORCES = ("Fx", "Fy", "Fz")
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Show both splits, the paper's numbers beside each: it names none."""
-    ways = {
+    """Tabulate both splits beside the paper's numbers, which are of an unnamed split."""
+    splits = {
         "random readings held out (ours; the paper names no split)": numbers,
         "whole lines held out": numbers["by_line"],
     }
     lines = []
-    for way, own in ways.items():
-        line = {"split": way, "source": source}
+    for split, own in splits.items():
+        line = {"split": split, "source": source}
         for metric, title in TITLES.items():
             line[f"{title} (ours)"] = show(own[metric])
             if metric in SHEAR:
@@ -173,7 +168,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw predicted against true force of lines that were held out whole, a panel a direction."""
+    """Draw predicted against true force of lines that were held out whole, a panel for each component."""
     with drawing(7.6, 3.1) as figure:
         panels = figure.subplots(1, len(FORCES))
         for axes, name, true_N, predicted_N in zip(panels, FORCES, drawn["true"], drawn["predicted"], strict=True):
@@ -182,7 +177,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.scatter(true_N, predicted_N, s=7, color=COLOURS[1], alpha=0.6, linewidths=0)
             axes.set(xlabel=f"true {name} / N", ylabel=f"predicted {name} / N")
             axes.locator_params(nbins=4)
-        explained = {part: _explained(numbers["by_line"][f"explained_{part}"]) for part in ("fxy", "fz")}
+        explained = {part: _show_explained(numbers["by_line"][f"explained_{part}"]) for part in ("fxy", "fz")}
         title = (
             f"Forces of dragged lines held out whole ({source}); points of the first of {numbers['seeds_n']} networks\n"
             f"explained variance: {explained['fxy']} sideways, {explained['fz']} normal"
@@ -191,5 +186,5 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         return {"shear.svg": svg(figure)}
 
 
-def _explained(stat: Mapping[str, float]) -> str:
+def _show_explained(stat: Mapping[str, float]) -> str:
     return f"{stat['mean']:.3f}" + (f" ± {stat['sd_seeds']:.3f} (seeds)" if "sd_seeds" in stat else "")

@@ -1,4 +1,7 @@
-"""Many boards under one skin (paper section 6)."""
+"""Sleeve: place estimates over the whole area of many boards under one skin (paper section 6).
+
+Networks and nearest neighbours learn from the first pokes and are tested on the last ones.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,20 +32,21 @@ from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
-Count = Annotated[int, Field(ge=1)]
-Fraction = Annotated[float, Field(gt=0, lt=1)]
+NEAR_MM = 4.0  # near a border between two boards: about twice the skin's thickness, assumed
+Stats = dict[str, dict[str, float]]
 
 
 class Sleeve(Strict):
-    """Many boards under one skin (paper section 6); the last part of the pokes is held out."""
+    """Section sleeve: the share of pokes held out, k nearest neighbours, and the training."""
 
-    test_fraction: Fraction
-    neighbours_n: Count  # of the k nearest neighbours that stand beside the networks
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # the last pokes of each capture
+    neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
 
 
-NEAR_MM = 4.0  # what counts as near a border between two boards: about twice the skin's thickness, assumed
-Stats = dict[str, dict[str, float]]
+def read(settings: Settings) -> Sleeve:
+    """Read section sleeve."""
+    return settings.with_training(Sleeve, "sleeve")
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,44 @@ class Area:
         return near
 
 
+def sleeve(settings: Settings, indentations: Path, results: Path) -> None:
+    """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
+    preload_training()
+    section, captures, area = read(settings), read_captures(indentations), area_of(settings)
+    data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
+    train, test = hold_out_last(data.rows, section.test_fraction)
+    jobs = [
+        TrainingJob("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
+        for name, recipe in section.training.recipes.items()
+        for seed_i in range(section.training.seeds_n)
+    ]
+    trained = train_jobs(data, jobs, "sleeve")
+    write_timings(settings.scene, "sleeve", jobs, trained)
+    predictions = {name: [one.predicted for job, one in zip(jobs, trained, strict=True) if job.recipe_name == name]
+               for name in section.training.recipes}  # fmt: skip
+    predictions |= predict_by_neighbours(data, section, train, test)
+    true, indentation = data.rows.target[test], data.rows.indentation[test]
+    scored = {name: score_places(true, own, indentation, area) for name, own in predictions.items()}
+    trained_n, tested_n = (len(np.unique(data.rows.indentation[part])) for part in (train, test))
+    numbers = {
+        "chips_n": captures[0].chips_n, "rate_hz": rate_hz(captures), "area_mm": list(area.sides_mm),
+        "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": NEAR_MM,
+        **scored.pop(HEADLINE), "variants": scored,
+    }  # fmt: skip
+    drawn = draw_errors(area, true, errors_mm(true, predictions[HEADLINE][0]), indentation)
+    losses = read_losses(indentations, data.rows.dropped)
+    write_results(results, numbers, drawn, losses, tally(map(collapse_record, trained)))
+
+
+def area_of(settings: Settings) -> Area:
+    """Lay out the simulated sleeve."""
+    of = simulation_settings(settings)
+    kind = of.boards[of.protocols["sleeve"].boards]
+    tiles = kind.design.tiles
+    boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)
+    return lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)
+
+
 def lay_out(
     sides_mm: tuple[float, float],
     chips_mm: Sequence[tuple[float, float]],
@@ -69,7 +111,7 @@ def lay_out(
     boards_n: tuple[int, int],
     pitch_mm: float,
 ) -> Area:
-    """Move chips from the frame of the skin's middle to labels, and draw the borders between boards on a lattice."""
+    """Convert chips from the skin's middle to labels, and lay the borders between boards on a lattice."""
     middle_mm = np.array(sides_mm) / 2
     x_mm, y_mm = (
         tuple(float(m + pitch_mm * (i - n / 2)) for i in range(1, n)) for m, n in zip(middle_mm, boards_n, strict=True)
@@ -78,7 +120,7 @@ def lay_out(
 
 
 def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]:
-    """Give the rows of the first indentations of each capture, and of its last ones, which no training sees."""
+    """Split rows into those of the first indentations of each capture, and those of its last ones."""
     held = np.zeros(len(rows), bool)
     for capture in np.unique(rows.capture):
         own = rows.capture == capture
@@ -92,8 +134,23 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
     return np.flatnonzero(~held), np.flatnonzero(held)
 
 
+def predict_by_neighbours(
+    data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray
+) -> dict[str, list[np.ndarray]]:
+    """Predict the test rows by k nearest neighbours, on fields and on their shape."""
+    none = np.zeros(0, np.int64)
+    tasks = [
+        ClassicalJob(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
+             train, test, none, len(train), data.settings.seed)
+        for inputs in ("raw", "shape")
+    ]  # fmt: skip
+    rows = TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin)
+    done = run_classical_jobs(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
+    return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
+
+
 def rate_hz(captures: Sequence[Readings]) -> float:
-    """Measure how often frames came, from the times of readings that follow each other in one indentation."""
+    """Measure the rate of frames, from the times of successive readings of an indentation."""
     steps_n, steps_s = 0, 0.0
     for one in captures:
         same = (np.diff(one.indentation) == 0) & (np.diff(one.reading_i) == 1)
@@ -112,28 +169,28 @@ def errors_mm(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"
 
 def score_places(
     true: Float[np.ndarray, "f 3"],
-    answers: Sequence[Float[np.ndarray, "f 3"]],
+    predictions: Sequence[Float[np.ndarray, "f 3"]],
     indentation: Int[np.ndarray, " f"],
     area: Area,
 ) -> dict[str, Any]:
-    """Score one method's answers, one a seed, on the same readings: overall, near borders between boards, elsewhere."""
+    """Score a method's predictions, one for each seed: overall, near borders between boards, and elsewhere."""
     near = area.near_border(true[:, :2])
-    each_mm = [errors_mm(true, predicted) for predicted in answers]
-    words: dict[str, Any] = over_seeds(
+    each_mm = [errors_mm(true, predicted) for predicted in predictions]
+    scores: dict[str, Any] = over_seeds(
         [
             {
                 **score(true, predicted),
                 "median_error_mm": float(np.median(error_mm)),
                 "p95_error_mm": float(np.percentile(error_mm, 95)),
             }
-            for predicted, error_mm in zip(answers, each_mm, strict=True)
+            for predicted, error_mm in zip(predictions, each_mm, strict=True)
         ]
     )
     for name, part in (("near_seam", near), ("inside", ~near)):
         if part.any():
             medians = [{"median_error_mm": float(np.median(error_mm[part]))} for error_mm in each_mm]
-            words[name] = {**over_seeds(medians), "pokes_n": len(np.unique(indentation[part]))}
-    return words
+            scores[name] = {**over_seeds(medians), "pokes_n": len(np.unique(indentation[part]))}
+    return scores
 
 
 def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
@@ -147,10 +204,10 @@ def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
     return stats
 
 
-def to_draw(
+def draw_errors(
     area: Area, true: Float[np.ndarray, "f 3"], error_mm: Shaped[np.ndarray, " f"], indentation: Int[np.ndarray, " f"]
 ) -> dict[str, Any]:
-    """List every tested indentation with the mean error of its readings, and what lies under the skin."""
+    """List every tested indentation with the mean error of its readings, and the chips and borders under the skin."""
     _, first, which = np.unique(indentation, return_index=True, return_inverse=True)
     mean_mm = np.bincount(which, error_mm) / np.bincount(which)
     (x_mm, y_mm), (chips_x_mm, chips_y_mm) = true[first, :2].T, area.chips_mm.T
@@ -160,72 +217,16 @@ def to_draw(
     return rounded | borders | {"area_mm": list(area.sides_mm)}
 
 
-def read(settings: Settings) -> Sleeve:
-    """Read section sleeve."""
-    return settings.with_training(Sleeve, "sleeve")
-
-
-def sleeve(settings: Settings, indentations: Path, results: Path) -> None:
-    """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
-    preload_training()
-    section, captures, area = read(settings), read_captures(indentations), _area(settings)
-    data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
-    train, test = hold_out_last(data.rows, section.test_fraction)
-    jobs = [
-        TrainingJob("sleeve", name, recipe, "last", data.settings.seed, seed_i, train, test)
-        for name, recipe in section.training.recipes.items()
-        for seed_i in range(section.training.seeds_n)
-    ]
-    trained = train_jobs(data, jobs, "sleeve")
-    write_timings(settings.scene, "sleeve", jobs, trained)
-    answers = {name: [o.predicted for c, o in zip(jobs, trained, strict=True) if c.recipe_name == name]
-               for name in section.training.recipes}  # fmt: skip
-    answers |= _neighbours(data, section, train, test)
-    true, indentation = data.rows.target[test], data.rows.indentation[test]
-    scored = {name: score_places(true, own, indentation, area) for name, own in answers.items()}
-    trained_n, tested_n = (len(np.unique(data.rows.indentation[part])) for part in (train, test))
-    numbers = {
-        "chips_n": captures[0].chips_n, "rate_hz": rate_hz(captures), "area_mm": list(area.sides_mm),
-        "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": NEAR_MM,
-        **scored.pop(HEADLINE), "variants": scored,
-    }  # fmt: skip
-    error_mm = errors_mm(true, answers[HEADLINE][0])
-    drawn = to_draw(area, true, error_mm, indentation)
-    losses = read_losses(indentations, data.rows.dropped)
-    write_results(results, numbers, drawn, losses, tally(map(collapse_record, trained)))
-
-
-def _area(settings: Settings) -> Area:
-    of = simulation_settings(settings)
-    kind = of.boards[of.protocols["sleeve"].boards]
-    tiles = kind.design.tiles
-    boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)
-    return lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)
-
-
-def _neighbours(data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray) -> dict[str, list[np.ndarray]]:
-    none = np.zeros(0, np.int64)
-    tasks = [
-        ClassicalJob(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
-             train, test, none, len(train), data.settings.seed)
-        for inputs in ("raw", "shape")
-    ]  # fmt: skip
-    rows = TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin)
-    done = run_classical_jobs(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
-    return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
-
-
 PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % within, mm"}
 PARTS = {"near_seam": "median near a border of boards, mm", "inside": "median elsewhere, mm"}
 NO_NUMBER = "none: a demonstration"
 SPREAD = "± is the standard deviation over the network seeds that column `seeds` counts."
 NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}
-NETWORK = "the paper's network"
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Put every method's places beside each other, and the set-up beside the paper's."""
-    lines = [_line(NETWORK, numbers, source)]
+    """Tabulate the scores of every method, and the set-up beside the paper's."""
+    lines = [_line("the paper's network", numbers, source)]
     lines += [
         _line(NAMES.get(name, f"network, recipe {name}"), one, source) for name, one in numbers["variants"].items()
     ]
@@ -239,13 +240,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Map the whole skin: every tested poke, coloured by its error, over chips and borders of boards."""
+    """Draw a map of the skin: every tested poke, coloured by its error, over chips and borders of boards."""
     with drawing(6.2, 3.5) as figure:
         axes = figure.subplots()
-        _under_the_skin(axes, drawn)
+        _draw_boards(axes, drawn)
         most_mm = numbers["p95_error_mm"]["mean"]
         size = float(np.clip(12_000 / len(drawn["x_mm"]), 10, 60))
-        # The long side lies: y runs to the right.
+        # The long side is horizontal: y runs to the right.
         points = axes.scatter(
             drawn["y_mm"], drawn["x_mm"], c=drawn["error_mm"], s=size, cmap="viridis", vmin=0.0, vmax=most_mm,
             edgecolors="white", linewidths=0.3, zorder=3,
@@ -261,7 +262,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         return {"sleeve.svg": svg(figure)}
 
 
-def _under_the_skin(axes: Any, drawn: Mapping[str, Any]) -> None:
+def _draw_boards(axes: Any, drawn: Mapping[str, Any]) -> None:
     x_mm, y_mm = drawn["area_mm"]
     thin = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
     axes.vlines(drawn["borders_y_mm"], 0, x_mm, **thin, label="border of two boards")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.experiments import gripper
-from pipeline.experiments.gripper import Finger, Gripper, Press, _scaled, answer_of, grip, judge
+from pipeline.experiments.gripper import Finger, Gripper, Press, hold, hold_all, judge, scale_to_press
 from reskin.seeds import rng_for
 
 FORCE_N = np.linspace(0, 3, 31)
@@ -32,7 +32,7 @@ def test_skin_and_object_bear_the_same_force_one_after_the_other():
 
 @pytest.mark.parametrize(("factor", "held"), [(1.0, 100.0), (1.3, 0.0)])
 def test_what_is_held_is_the_estimate(factor, held):
-    held_N = grip(finger(), lambda b_uT: factor * right(b_uT), 1.0, HOW, rng_for(0, "grip"))
+    held_N = hold(finger(), lambda b_uT: factor * right(b_uT), 1.0, HOW, rng_for(0, "hold"))
     np.testing.assert_allclose(held_N[50:].mean(), 1 / factor, rtol=0.05)
     assert judge({"b0": [held_N]}, 1.0)["held_pct"] == held
 
@@ -40,17 +40,17 @@ def test_what_is_held_is_the_estimate(factor, held):
 def test_one_known_press_as_a_factor_mends_what_is_wrong_by_a_factor():
     skin = finger(noise_uT=1.0)
     press = Press(1.0, skin.read(np.ones(5), rng_for(0, "press")).mean(axis=0))
-    forces = _scaled(lambda b_uT: 1.3 * right(b_uT), press)
-    assert judge({"b0": [grip(skin, forces, 1.0, HOW, rng_for(0, "grip"))]}, 1.0)["held_pct"] == 100.0
+    forces = scale_to_press(lambda b_uT: 1.3 * right(b_uT), press)
+    assert judge({"b0": [hold(skin, forces, 1.0, HOW, rng_for(0, "hold"))]}, 1.0)["held_pct"] == 100.0
 
 
 def test_two_networks_that_err_to_either_side_hold_nothing_though_their_mean_is_right():
     how = HOW.model_copy(update={"aims_N": (1.0,)})
     networks = [lambda db_uT, by=by: by * right(db_uT + 50.0)[:, None] + np.zeros(3) for by in (0.7, 1.3)]
-    numbers, _ = answer_of([finger()], {"b0": networks}, how, seed=1)
+    numbers, _ = hold_all([finger()], {"b0": networks}, how, seed=1)
     row = numbers["rows"][0]
     assert (row["feedback"], row["press"], row["held_pct"], row["runs_n"]) == ("networks", "none", 0.0, 4)
-    alone = [answer_of([finger()], {"b0": [one]}, how, seed=1)[0]["rows"][0]["error_pct"] for one in networks]
+    alone = [hold_all([finger()], {"b0": [one]}, how, seed=1)[0]["rows"][0]["error_pct"] for one in networks]
     assert row["error_pct"]["mean"] == pytest.approx(np.mean([one["mean"] for one in alone]))
     assert row["error_pct"]["sd_seeds"] == pytest.approx(np.std([one["mean"] for one in alone], ddof=1))
     assert "sd_seeds" not in alone[0]
@@ -63,7 +63,7 @@ def test_two_networks_that_err_to_either_side_hold_nothing_though_their_mean_is_
 def test_each_aim_is_held_by_each_feedback_and_shown():
     how = HOW.model_copy(update={"aims_N": (0.5,)})
     networks = {"b0": [lambda db_uT: right(db_uT + 50.0)[:, None] + np.zeros(3)]}
-    numbers, drawn = answer_of([finger(noise_uT=1.0)], networks, how, seed=1)
+    numbers, drawn = hold_all([finger(noise_uT=1.0)], networks, how, seed=1)
     assert [(row["aim_N"], row["feedback"], row["press"]) for row in numbers["rows"]] == [
         (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "map", "none"), (0.5, "map", "factor"),
         (0.5, "map", "label"),

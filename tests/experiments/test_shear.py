@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.metrics import mean_squared_error, r2_score
 
-from pipeline.experiments.shear import answer_shear, score5
+from pipeline.experiments.shear import score5, summarise_shear
 from reskin.seeds import rng_for
 
 
@@ -47,7 +47,7 @@ def test_the_truth_explains_all_and_its_mean_nothing():
 
 def test_seeds_are_averaged_within_a_fold_before_folds_are():
     scores = [("a", {"mse": 1.0}), ("a", {"mse": 3.0}), ("b", {"mse": 6.0})]
-    answer = answer_shear(scores, scores[:1], target=drawn(0)[0], lines_n=3, passes_n=1, seeds_n=2)
+    answer = summarise_shear(scores, scores[:1], target=drawn(0)[0], lines_n=3, passes_n=1, seeds_n=2)
     assert answer["mse"] == {"mean": 4.0, "n": 2, "sd": pytest.approx(8**0.5), "sd_seeds": pytest.approx(2**0.5)}
     assert "sd_seeds" not in answer["by_line"]["mse"]
     assert answer["seeds_n"] == 2
@@ -56,7 +56,7 @@ def test_seeds_are_averaged_within_a_fold_before_folds_are():
 def test_both_ways_stand_beside_each_other_with_the_size_of_the_forces():
     true, predicted = drawn(1)
     score = score5(true, predicted)
-    answer = answer_shear(
+    answer = summarise_shear(
         [("a", score)], [("b", {**score, "accuracy_pct": 7.0})], target=true, lines_n=3, passes_n=1, seeds_n=1
     )
     assert answer["accuracy_pct"]["mean"] == score["accuracy_pct"]

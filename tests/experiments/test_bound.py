@@ -1,4 +1,4 @@
-"""The bound against what chips and a linear estimate do, its slopes against a dipole's own, and how it scales."""
+"""The bound against simulated chips and a linear estimate, its slopes against those of a dipole, and its scaling."""
 
 import math
 from dataclasses import replace
@@ -10,14 +10,16 @@ from hypothesis import strategies as st
 
 from pipeline.experiments.bound import (
     NETWORK,
-    bound_of,
+    bound_errors,
     expected_scores,
+    figures,
     least_covariance,
-    network_scores,
     noise_var_uT2,
     probability_within,
+    reach_skin,
+    score_network,
     slopes,
-    touches,
+    tables,
 )
 from reskin import io
 from reskin.errors import ParamsError, SchemaError
@@ -26,6 +28,7 @@ from reskin.physics.board import draw_board
 from reskin.physics.chip import ChipDesign, read_field
 from reskin.physics.skin import draw_skin
 from reskin.seeds import rng_for
+from tests.report.synthetic import scores
 from tests.simulation.scene import synthesis
 
 ROWS_N = 40_000
@@ -115,7 +118,7 @@ def test_the_bound_falls_with_the_noise_and_as_one_over_the_square_root_of_the_r
 
 
 def test_every_place_is_bounded_and_deeper_presses_and_exact_labels_are_told_better():
-    numbers = bound_of(SCENE, seed=1)
+    numbers = bound_errors(SCENE, seed=1)
     assert [row["depth_mm"] for row in numbers["by_depth"]] == sorted(SCENE.main.depths_mm)
     assert (numbers["places_n"], numbers["above_the_skin_n"]) == (65, 0)
     errors = [row["signal"]["mse_xy_mm2"] for row in numbers["by_depth"]]
@@ -125,16 +128,41 @@ def test_every_place_is_bounded_and_deeper_presses_and_exact_labels_are_told_bet
     assert scored["mse_f_N2"] - signal["mse_f_N2"] == pytest.approx(SCENE.rig.force_noise_N**2)
 
 
-def test_pokes_above_the_skin_are_marked_and_a_skin_that_none_touches_is_refused():
+def test_pokes_above_the_skin_are_marked_and_a_skin_out_of_reach_is_an_error():
     skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
     depths_mm = np.array([0.2, 0.6])
-    assert touches(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
+    assert reach_skin(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
     with pytest.raises(ParamsError, match="depths_mm must be deep enough to touch it; got 0.6 mm at most"):
-        touches(replace(skin, depth_zero_m=-0.7e-3), depths_mm)
+        reach_skin(replace(skin, depth_zero_m=-0.7e-3), depths_mm)
 
 
 def test_networks_of_another_skin_are_refused(tmp_path):
     card = {"question": NETWORK, "recipe_name": "paper", "train_skins": ["b0_s1"]}
     io.write_json(tmp_path / "one.json", card)
     with pytest.raises(SchemaError, match="skin of single_pass must be b0_s0, as bounded; got"):
-        network_scores(tmp_path, "b0_s0")
+        score_network(tmp_path, "b0_s0")
+
+
+BOUND = {"accuracy_pct": 99.5, "mse_xy_mm2": 0.01, "mse_f_N2": 0.002}
+ROW = {"signal": BOUND, "with_label_errors": BOUND | {"mse_xy_mm2": 0.04}}
+NUMBERS = {
+    "board": "b0", "skin": "b0_s0", "places_n": 65, "above_the_skin_n": 0, "readings_n": 1, "noload_frames_n": 10,
+    "labels": {"place_sd_mm": 0.05, "force_sd_N": 0.00625},
+    "by_depth": [{"depth_mm": 0.2, **ROW}, {"depth_mm": 1.2, **ROW}], "all": ROW, "network": scores(),
+}  # fmt: skip
+
+
+def test_the_network_stands_beside_the_bound_over_all_depths():
+    table = tables(NUMBERS, "simulated")["bound"]
+    assert table["depth, mm"].tolist() == ["0.2", "1.2", "all"]
+    assert table["MSE_xy, mm² (bound)"].tolist() == ["0.01"] * 3
+    assert table["MSE_xy, mm² (bound, labels' errors added)"].tolist() == ["0.04"] * 3
+    assert table["MSE_xy, mm² (network)"].tolist() == ["–", "–", "1 ± 0.5"]
+    assert set(table["source"]) == {"simulated"}
+    assert figures(NUMBERS, {}, "simulated") == {}
+
+
+def test_pokes_that_touch_nothing_are_told_of():
+    assert "left out" not in tables(NUMBERS, "simulated")["bound"].attrs["meaning"]
+    told = tables(NUMBERS | {"above_the_skin_n": 65}, "simulated")["bound"].attrs["meaning"]
+    assert "65 pokes that do not touch the skin are left out" in told
