@@ -8,7 +8,7 @@ from pipeline import FLOW, PARAMS, PLAN, SCENES, plan
 from pipeline.manage.registry import Entry, Registry
 from pipeline.plan import make_plan
 from pipeline.scenes import ANALYSES, Plan, Scene, parse_scene
-from pipeline.stages.report import read_experiments
+from pipeline.stages.report import planned_scene
 from reskin.config import parse
 from reskin.errors import ParamsError
 from reskin.simulation.defaults import SHARED as SIMULATED
@@ -81,10 +81,10 @@ def test_the_report_refuses_a_plan_that_lacks_an_experiment_of_the_scene(tmp_pat
     Path("pipeline").mkdir()
     Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
     own = settings(asking("lobo", "baselines"))
-    assert read_experiments(own).experiments == ("lobo", "baselines")
+    assert planned_scene(own).experiments == ("lobo", "baselines")
     Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
     with pytest.raises(ParamsError, match="baselines only in one. Try: reskin scenes use tiny"):
-        read_experiments(own)
+        planned_scene(own)
 
 
 def test_every_recorded_capture_has_an_ingest_of_its_own():

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -33,34 +34,57 @@ from pipeline.statistics import (
 )
 from reskin.metrics import METRICS
 
+Row = Mapping[str, Any]
 Points = Mapping[str, Sequence[dict[str, Any]]]
-Seconds = Sequence[Mapping[str, Any]]
+Seconds = Sequence[Row]  # of trainings: name, train_s, one_reading_s
+
 CONTROL = "control"  # the recipe of adaptation that fine-tunes as long, without the new skin's pokes
 PAIRS = (
     ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
     ("adapted", "multi"),
 )  # fmt: skip
-PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these stands beside the paper's numbers
-HONEST = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # the same skin, more of it held out
+PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these is compared with the paper's numbers
+STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # the same skin, more of it held out
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # by method
 OWN_POKES = "its own"  # of experiment reference_methods: the unlabelled pokes that a method is given
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
+SINGLE = {
+    "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
+    "by_time": "single_temporal",
+}  # fmt: skip
+POLICIES = ("initial", "regular", "each")
+HOVER = ("hover", "hover_network")  # predictors of the place of a tip that does not touch
+SEEN_PCT = 25.0  # assumed: chips sense the tip itself if it is placed so often without touching
+OF_DRIFT = ("accuracy_pct", "mse_f_N2")
+OF_TOUCHES = ("single_touches_pct", "mean_left_over_pct")
+SETTINGS = ("scene", "source", "seed")  # of the provenance: equal between equal runs
+TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # of a row below `runtime`
+ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # name a row below `runtime`
+OF_SHEAR = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
 
-def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
-    """Compose what the scores say; `headline` names the recipe that stands beside the paper's numbers."""
+def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
+    """Compute the numbers of all trainings from the table of scores.
+
+    `headline` is the recipe that is compared with the paper's numbers.
+    """
     recipes = {row: (experiment, headline) for row, experiment in TABLE_2.items()} | {CONTROL: ("adapt", CONTROL)}
     models = {row: select(table, question=experiment, recipe=recipe) for row, (experiment, recipe) in recipes.items()}
     models = {row: group for row, group in models.items() if len(group)}
     table2 = {row: over_pairs(group) if row == "single" else over_boards(group) for row, group in models.items()}
     control = table2.pop(CONTROL, None)
+    adapt: dict[str, Any] = {}
+    if "adapted" in models:
+        adapt = {"pokes_n": int(models["adapted"]["pokes_n"].iloc[0])} | ({"control": control} if control else {})
+    tested = {"table2": models.get("multi", table[:0]), "labels": select(table, question="labels")}
+    constant_force = {name: _constant_force(rows) for name, rows in tested.items()}
     numbers: dict[str, Any] = {
         "table2": table2,
         "lobo": _lobo(models["multi"]) if "multi" in models else {},
-        "adapt": _adapt(models["adapted"], control) if "adapted" in models else {},
-        "constant_force": _constants(table, models),
+        "adapt": adapt,
+        "constant_force": {name: row for name, row in constant_force.items() if row},
         "paired": [
             {"of": of, "over": over}
             | (paired_with_single if over == "single" else paired)(by_skin(models[of]), by_skin(models[over]))
@@ -70,32 +94,23 @@ def learned(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
         **_single(table, headline),
     }
     numbers = {name: value for name, value in numbers.items() if value}
-    return numbers | _curves(table) | {"variants": _variants(table)}
+    return numbers | _sweeps(table) | {"variants": _variants(table)}
 
 
-def _constants(table: pd.DataFrame, models: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
-    tested = {"table2": models.get("multi", table[:0]), "labels": select(table, question="labels")}
-    found = {name: _constant_force(rows) for name, rows in tested.items()}
-    return {name: row for name, row in found.items() if row}
+def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
+    """Return the points of sweeps as curves, by experiment: the method, the step on its axis, the mean scores."""
+    numbers = _sweeps(tidy([], points))
+    curves: dict[str, list[tuple[str, int, dict[str, float]]]] = {}
+    for experiment, (key, axis) in AXES.items():
+        for row in numbers.get(key, ()):
+            name = "_".join(part for part in (row.get("method", "adapted"), row.get("inputs", "")) if part)
+            name = name.replace(", ", "_").replace(" ", "_").replace("+", "and")
+            curves.setdefault(experiment, []).append((name, row[axis], _means(row.get(AS_LABELLED, row))))
+    return curves
 
 
-def _adapt(adapted: pd.DataFrame, control: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Say how many indentations networks were adapted with, and what as much training without them gives."""
-    return {"pokes_n": int(adapted["pokes_n"].iloc[0])} | ({"control": control} if control else {})
-
-
-def curves_of(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
-    """Give the points of sweeps as curves: by experiment, the method, the step on its axis, the mean of each score."""
-    numbers = _curves(tidy([], points))
-    return {
-        experiment: [(_curve_name(row), row[axis], _score_means(row)) for row in numbers[key]]
-        for experiment, (key, axis) in AXES.items()
-        if key in numbers
-    }
-
-
-def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Put what was timed here, by stage and name of a training, beside the errors; what was not has no time."""
+def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
+    """Join errors of methods with the times of trainings on this machine, by stage; untimed methods have no time."""
     joined: dict[str, Any] = {}
     if "baselines" in numbers:
         joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
@@ -109,17 +124,14 @@ def timed_learning(numbers: Mapping[str, Any], seconds: Mapping[str, Seconds]) -
         took = seconds.get("reference_methods", [])
         joined["rivals_costs"] = [
             {"method": row["method"]} | row[AS_LABELLED] | _median_times(took, f"{row['method']}.")
-            for row in _told(numbers["rivals"])
+            for row in numbers["rivals"]["methods"]
+            if row["pokes"] == OWN_POKES
         ]
     return joined
 
 
-def _told(rivals: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Take of each method the row with the skin's own pokes."""
-    return [row for row in rivals["methods"] if row["pokes"] == OWN_POKES]
-
-
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
+    """Summarise networks of the leave-one-board-out experiment, registered and board by board."""
     by_board = {
         str(board): {
             "trained_on_skins_n": int(group["trained_on_skins_n"].iloc[0]),
@@ -128,32 +140,32 @@ def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
                 for places in (AS_LABELLED, REGISTERED)
             },
         }
-        for board, group in _parts(rows, "fold", sort=False)
+        for board, group in _groups(rows, "fold", sort=False)
     }
     return {REGISTERED: over_boards(rows, REGISTERED), "by_board": by_board}
 
 
 def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
-    """Summarise one skin by how it was split; `single_sensor` is what stands beside the paper's numbers."""
-    experiments = (*PAPERS_SPLITS, *HONEST.values())
+    """Summarise one skin by how it was split; `single_sensor` is compared with the paper's numbers."""
+    experiments = (*PAPERS_SPLITS, *STRICTER.values())
     numbers = {
         experiment: over_folds(select(table, question=experiment, recipe=headline)) for experiment in experiments
     }
     numbers = {experiment: group for experiment, group in numbers.items() if group}
-    papers = next(
+    like_paper = next(
         ({"split": experiment} | numbers[experiment] for experiment in PAPERS_SPLITS if experiment in numbers), {}
     )
-    honest = {name: numbers[experiment] for name, experiment in HONEST.items() if experiment in numbers}
+    stricter = {name: numbers[experiment] for name, experiment in STRICTER.items() if experiment in numbers}
     by_skin = whole(select(table, question="single_temporal", recipe=headline)).groupby("fold")[list(METRICS)].mean()
     skins = {"single_skins": records(by_skin)} if len(by_skin) > 1 else {}
-    return numbers | {"single_sensor": papers | honest} | skins
+    return numbers | {"single_sensor": like_paper | stricter} | skins
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise every recipe of every experiment that leaves models; repeats on one skin are no boards."""
+    """Summarise every recipe of every experiment with models; repeats on one skin are no boards."""
     numbers: dict[str, dict[str, Any]] = {}
     models = table[table["question"].isin([one.name for one in EXPERIMENTS.values() if one.kind == "models"])]
-    for (experiment, recipe), group in _parts(models, ["question", "recipe"], sort=False):
+    for (experiment, recipe), group in _groups(models, ["question", "recipe"], sort=False):
         summarise = (
             over_pairs if experiment == "transfer" else over_folds if experiment.startswith("single_") else over_boards
         )
@@ -161,20 +173,21 @@ def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
     return numbers
 
 
-def _curves(table: pd.DataFrame) -> dict[str, Any]:
+def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
+    """Summarise sweeps over pokes, training skins and labels, and classical methods."""
     pokes, sensors, classical, labels = (
         select(table, question=name) for name in ("pokes", "sensors", "baselines", "labels")
     )
     labels = pd.concat([labels, select(table, question="universal")])
     numbers: dict[str, Any] = {}
     if len(pokes):
-        numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(group)} for n, group in _parts(pokes, "pokes_n")]
+        numbers["sweep_pokes"] = [{"pokes_n": int(n), **over_boards(group)} for n, group in _groups(pokes, "pokes_n")]
         numbers["contrasts"] = contrasts_of_pokes(pokes)
     if len(sensors):
         numbers["sweep_sensors"] = [
             {"method": method, "skins_n": int(n), **over_boards(group)}
             for method in SWEPT
-            for n, group in _parts(select(sensors, method=method), "trained_on_skins_n")
+            for n, group in _groups(select(sensors, method=method), "trained_on_skins_n")
         ]
         numbers["contrasts"] = numbers.get("contrasts", {}) | contrasts_of_sensors(sensors)
     if len(classical):
@@ -189,9 +202,9 @@ def _curves(table: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
     """Compare none with the fewest pokes, with those where the paper sees its plateau, and these with the most.
 
-    What the paper says of its figure 6a, as paired differences a board.
+    These are the paper's statements on its figure 6a, as paired differences over boards.
     """
-    at = {int(n): group for n, group in _parts(by_skin(rows), "pokes_n")}
+    at = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
     if 0 not in at or len(at) < 2:
         return {}
     known = sorted(at)
@@ -207,9 +220,9 @@ def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     """Compare most with fewest training skins, adapted networks with others, and their gain with few and many skins.
 
-    What the paper says of its figure 6b, as paired differences a board.
+    These are the paper's statements on its figure 6b, as paired differences over boards.
     """
-    at = {(method, int(n)): group for (method, n), group in _parts(by_skin(rows), ["method", "trained_on_skins_n"])}
+    at = {(method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])}
     counts = sorted({skins_n for _, skins_n in at})
     adapted = {
         f"sensors_adapted_over_{method}": [
@@ -220,30 +233,30 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     if len(counts) < 2:
         return adapted
     few, many = counts[0], counts[-1]
-    words = {"from_skins_n": few, "to_skins_n": many}
-    more = {f"sensors_more_{method}": words | paired(at[method, many], at[method, few]) for method in SWEPT}
+    counts_n = {"from_skins_n": few, "to_skins_n": many}
+    more = {f"sensors_more_{method}": counts_n | paired(at[method, many], at[method, few]) for method in SWEPT}
     gain_few, gain_many = (differences(at["adapted", n], at["triplet", n]) for n in (few, many))
-    return adapted | more | {"sensors_gain_fewer": words | summarise_differences(gain_few - gain_many)}
+    return adapted | more | {"sensors_gain_fewer": counts_n | summarise_differences(gain_few - gain_many)}
 
 
 def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    for (_, recipe), group in _parts(rows, ["question", "recipe"], sort=False):
+    for (_, recipe), group in _groups(rows, ["question", "recipe"], sort=False):
         first = group.iloc[0]
-        words = {"method": first["method"], "inputs": first["inputs"], "name": recipe}
-        words |= {"base": first["base"]} if first["base"] else {}
-        yield {**words, "rows_n": int(first["trained_on_rows_n"]), **over_boards(group)}
+        names = {"method": first["method"], "inputs": first["inputs"], "name": recipe}
+        names |= {"base": first["base"]} if first["base"] else {}
+        yield {**names, "rows_n": int(first["trained_on_rows_n"]), **over_boards(group)}
 
 
 def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    for (method, inputs), group in _parts(rows, ["method", "inputs"], sort=False):
-        for labels_n, scored in _parts(group, "labels_n"):
+    for (method, inputs), group in _groups(rows, ["method", "inputs"], sort=False):
+        for labels_n, scored in _groups(group, "labels_n"):
             parts = {places: over_boards(scored, places) for places in (AS_LABELLED, REGISTERED)}
             by_board = records(whole(scored).groupby("board")[list(METRICS)].mean())
             yield {"method": method, "inputs": inputs, "labels_n": int(labels_n), **parts, "by_board": by_board}
 
 
 def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
-    """Score the mean of the tested forces as a constant answer: its MSE is their variance, MSE_F / (1 - R^2)."""
+    """Score the mean of the tested forces as a constant prediction: its MSE is their variance, MSE_F / (1 - R^2)."""
     tested = whole(rows).dropna(subset=["r2_f"])
     tested = tested[tested["r2_f"] < 1]
     variance_N2 = (tested["mse_f_N2"] / (1 - tested["r2_f"])).groupby(tested["board"]).mean()
@@ -251,23 +264,13 @@ def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
     return summarise(scores, boards=True) if len(scores) else {}
 
 
-def _curve_name(row: Mapping[str, Any]) -> str:
-    words = (row.get("method", "adapted"), row.get("inputs", ""))
-    return "_".join(word for word in words if word).replace(", ", "_").replace(" ", "_").replace("+", "and")
-
-
-def _score_means(row: Mapping[str, Any]) -> dict[str, float]:
-    scores = row.get(AS_LABELLED, row)
-    return {name: scores[name]["mean"] for name in METRICS if name in scores}
-
-
-def _parts(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> Iterator[tuple[Any, pd.DataFrame]]:
-    """Part rows by what columns say; unsorted ones come as they appear."""
+def _groups(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """Group rows by columns; unsorted groups come in the order of their first rows."""
     yield from rows.groupby(by, sort=sort)
 
 
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
-    """Give the median seconds of a method's trainings; an adapted network was also trained before."""
+    """Return the median seconds of a method's trainings; those of an adapted network include the one before."""
     experiment = NETWORKS.get(row["method"])
     if experiment is None:
         return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
@@ -288,33 +291,8 @@ def _median_times(took: Seconds, start: str) -> dict[str, float]:
     }
 
 
-SINGLE = {
-    "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
-    "by_time": "single_temporal",
-}  # fmt: skip
-POLICIES = ("initial", "regular", "each")
-HOVER = ("hover", "hover_network")  # what tells the place of a tip that does not touch
-LENGTHS, PLACE = ("hover_uT", "touch_uT"), ("accuracy_pct", "mse_xy_mm2")
-SEEN_PCT = 25.0  # assumed: chips see a tip itself that is placed so often without touching
-OF_DRIFT = ("accuracy_pct", "mse_f_N2")
-OF_TOUCHES = ("single_touches_pct", "mean_left_over_pct")
-SETTINGS = ("scene", "source", "seed")  # of the provenance: equal between equal runs
-TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # of a row below `runtime`
-ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # name a row below `runtime`
-OF_SHEAR = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
-
-Row = Mapping[str, Any]
-
-
-def compose(
-    table: pd.DataFrame, accounts: Iterable[Mapping[str, int]], dropped: Mapping[str, int], *, headline: str
-) -> dict[str, Any]:
-    """Compose what follows from the data alone; `headline` names the recipe that stands beside the paper's numbers."""
-    return {"capture": add_up(accounts) | {"left_out": dict(dropped)}, **learned(table, headline=headline)}
-
-
 def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Add the counts of all captures; a quality of one capture's clock is no count."""
+    """Add the counts of all captures (keys that end in `_n`), and all skipped bytes as `lost_bytes_n`."""
     total = Counter({"captures_n": 0})
     for account in accounts:
         total.update({"captures_n": 1} | {name: count for name, count in account.items() if name.endswith("_n")})
@@ -322,28 +300,31 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)
 
 
-def foretold(tables: Iterable[pa.Table]) -> dict[str, Any]:
-    """Summarise over folds how well places are told before their touch: by experiment, and by what tells them."""
-    found: dict[str, dict[str, Any]] = {}
+def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
+    """Summarise predictions of places from readings before the touch, over folds: by experiment and predictor.
+
+    Hover rows, of a tip that does not touch, are kept by fold (skin), with whether the tip itself is sensed.
+    """
+    before: dict[str, dict[str, Any]] = {}
     hover: dict[str, dict[str, Any]] = {}
     for table in tables:
-        for (experiment, told_by), rows in table.to_pandas().groupby(["question", "told_by"], sort=False):
-            if told_by not in HOVER:
-                scored = {name: statistic(rows[name].to_list()) for name in METRICS if name in rows}
-                found.setdefault(experiment, {})[told_by] = scored
+        for (experiment, predictor), rows in table.to_pandas().groupby(["question", "told_by"], sort=False):
+            if predictor not in HOVER:
+                scores = {name: statistic(rows[name].to_list()) for name in METRICS if name in rows}
+                before.setdefault(experiment, {})[predictor] = scores
                 continue
             for row in rows.to_dict("records"):
-                own = hover.setdefault(str(row["fold"]), {name: row[name] for name in LENGTHS})
-                own[told_by] = {name: row[name] for name in PLACE}
-                if told_by == "hover":
+                own = hover.setdefault(str(row["fold"]), {name: row[name] for name in ("hover_uT", "touch_uT")})
+                own[predictor] = {name: row[name] for name in ("accuracy_pct", "mse_xy_mm2")}
+                if predictor == "hover":
                     own["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
-    return ({"before_touch": found} if found else {}) | ({"hover": hover} if hover else {})
+    return ({"before_touch": before} if before else {}) | ({"hover": hover} if hover else {})
 
 
 def count_trainings(
     cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
-    """Count networks by experiment: trainings in all, those that collapsed, and those of them that had to be kept."""
+    """Count trainings by experiment: all, those that collapsed, and those of them that had to be kept."""
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)
@@ -354,7 +335,7 @@ def count_trainings(
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
-    """Add the counts of each further protocol's captures, and what experiments of it left out of their rows."""
+    """Add the counts of each further protocol's captures, and of rows that its experiments left out."""
     found: dict[str, dict[str, Any]] = {}
     for experiment, lost in losses.items():
         protocol = EXPERIMENTS[experiment].protocol
@@ -365,13 +346,25 @@ def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def runtime(trainings_n: int, costs: Mapping[str, Row]) -> dict[str, Any]:
-    """What it cost, where it ran here: seconds and memory a stage, and networks trained."""
-    return {"stages": {stage: _cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n}
+def runtime_numbers(
+    trainings_n: int, costs: Mapping[str, Row], study: Row | None, seconds: Sequence[Row]
+) -> dict[str, Any]:
+    """Give what each stage cost, and the results of experiment runtime (`study`) with times of this machine."""
+    numbers: dict[str, Any] = {
+        "stages": {stage: _stage_cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n,
+    }  # fmt: skip
+    if study is None:
+        return numbers
+    key = itemgetter("study", "method", "setting")
+    times = {key(timed): timed for timed in seconds}
+    numbers["choice"] = study["choice"]
+    for name in ("quadratures", "integrators"):
+        numbers[name] = [row | times.get(key(row), {}) for row in study[name]]
+    return numbers
 
 
-def _cost(cost: Row) -> dict[str, float]:
-    """Tell what a stage cost when it was computed, its trainings added up, from what its last run took."""
+def _stage_cost(cost: Row) -> dict[str, float]:
+    """Return what a stage cost when it was computed, its trainings added up, and what its last run took."""
     trainings_s = cost["trainings_s"].values()
     return {
         "computed_s": cost["other_s"] + sum(trainings_s),
@@ -380,27 +373,8 @@ def _cost(cost: Row) -> dict[str, float]:
     }
 
 
-def answered(studied: Mapping[str, Any], cost: Row, seconds: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
-    """Put the answers to experiments about physics beside each other; those about run time stand with what all cost."""
-    others = {experiment: answer for experiment, answer in studied.items() if experiment != "runtime"}
-    studies = timed(studied["runtime"], seconds.get("runtime", [])) if "runtime" in studied else {}
-    return others | {"runtime": {**cost, **studies}}
-
-
-def timed(answer: Row, seconds: Sequence[Row]) -> dict[str, Any]:
-    """Put what was timed here beside the errors of the studies of run time; what was not timed has no time."""
-
-    def key(row: Row) -> tuple[Any, ...]:
-        return row["study"], row["method"], row["setting"]
-
-    times = {key(took): took for took in seconds}
-    studies = ("quadratures", "integrators")
-    joined = {study: [row | times.get(key(row), {}) for row in answer[study]] for study in studies}
-    return {"choice": answer["choice"], **joined}
-
-
 def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split the numbers of a run into numbers.json, which equal runs share, and provenance.json, of this run alone."""
+    """Split the numbers of a run into numbers.json, equal in equal runs, and provenance.json, of this run alone."""
     own = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
     costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
     studies: dict[str, Any] = {}
@@ -415,40 +389,37 @@ def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def join(numbers: Row, provenance: Row) -> dict[str, Any]:
-    """Put numbers.json and provenance.json of a run together again: the inverse of `split`."""
+    """Join numbers.json and provenance.json of a run: the inverse of `split`."""
     own = {name: value for name, value in provenance.items() if name != "runtime"}
-    return {
-        **numbers,
-        "provenance": {**numbers["provenance"], **own},
-        "runtime": _overlay(numbers["runtime"], provenance["runtime"]),
-    }
-
-
-def _overlay(numbers: Row, costs: Row) -> dict[str, Any]:
-    joined = {**numbers, **costs}
-    for name in joined:
-        if isinstance(joined[name], list):
-            joined[name] = [row | times for row, times in zip(numbers[name], costs[name], strict=True)]
-    return joined
+    costs = provenance["runtime"]
+    runtime = {**numbers["runtime"], **costs}
+    for name, value in runtime.items():
+        if isinstance(value, list):
+            runtime[name] = [row | times for row, times in zip(numbers["runtime"][name], costs[name], strict=True)]
+    return {**numbers, "provenance": {**numbers["provenance"], **own}, "runtime": runtime}
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:
-    """Take a scene's headline scores, nested by experiment: means, a place's and a force's, with units in their names.
+    """Select a scene's headline scores, nested by experiment: means with units in their names.
 
     Nothing that differs between identical runs: no seconds, no commit, no machine.
     """
     recorded = {
         name for name in ("lobo", "labels") if name in numbers and numbers["provenance"]["source"] == "recorded"
     }
-    table2 = numbers.get("table2", {}) | control_of(numbers)
-    parts = {
+    table2, drift = numbers.get("table2", {}) | control_of(numbers), numbers.get("drift", {})
+    parts: dict[str, Any] = {
         "table2": {name: _means(row) for name, row in table2.items()},
         "lobo": {"registered": _means(numbers["lobo"]["registered"])} if "lobo" in recorded else {},
         "labels": _best_of_labels(numbers["labels"]) if "labels" in recorded else {},
         "single_sensor": {
             name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
         },
-        "drift_end": _drift_end(numbers.get("drift", {})),
+        "drift_end": {  # the last window of each policy, a mean over networks already
+            policy: {name: drift[policy][-1][name] for name in OF_DRIFT if name in drift[policy][-1]}
+            for policy in POLICIES
+            if policy in drift
+        },
         "shear": _means(numbers["shear"], OF_SHEAR) if "shear" in numbers else {},
         "touches": _means(numbers.get("touches", {}).get("superposition", {}), OF_TOUCHES),
     }
@@ -459,14 +430,8 @@ def _means(row: Row, names: Sequence[str] = METRICS) -> dict[str, float]:
     return {name: row[name]["mean"] for name in names if name in row}
 
 
-def _drift_end(drift: Row) -> dict[str, Any]:
-    """Take the last window of each policy, which is a mean over networks already."""
-    last = {policy: drift[policy][-1] for policy in POLICIES if policy in drift}
-    return {policy: {name: row[name] for name in OF_DRIFT if name in row} for policy, row in last.items()}
-
-
 def _best_of_labels(rows: Sequence[Row]) -> dict[str, Any]:
-    """Take the most accurate method without labels of the new board, and with the most of them."""
+    """Select the most accurate method without labels of the new board, and with the most labels."""
     found = {}
     counts = [row["labels_n"] for row in rows]
     for labels_n in sorted({min(counts), max(counts)}):

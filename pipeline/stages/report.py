@@ -1,11 +1,12 @@
 """Stages that show results: table2 (early), report (numbers, tables, figures, pages), publish (MLflow)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import pyarrow as pa
 
 from pipeline import PLAN
 from pipeline.executors import make_executor
@@ -27,17 +28,16 @@ from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
 from pipeline.report.figures import error_grids, headline_figures, learning_figures
 from pipeline.report.formatting import rounded, to_markdown
 from pipeline.report.numbers import (
-    answered,
-    compose,
+    add_up,
+    before_touch_numbers,
     count_trainings,
-    curves_of,
-    foretold,
     headline_scores,
-    learned,
+    learning_numbers,
+    learning_times,
     lost_by_protocol,
-    runtime,
+    runtime_numbers,
     split,
-    timed_learning,
+    sweep_curves,
 )
 from pipeline.report.page import index, page, run_page
 from pipeline.report.tables import make_tables, table_2_summary, table_texts
@@ -58,143 +58,160 @@ from reskin.simulation.fingerprint import fingerprint
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
     """Write table 2 of the paper and its figure as soon as its networks are trained; the report shows them again."""
-    source, scene = settings["source"], settings.scene
-    variants = stages(TABLE_2.values(), "models")
-    cards = [io.read_json(file) for variant in variants for file in sorted((models / variant).glob("*.json"))]
-    numbers = rounded({"provenance": {"scene": scene, "source": source}, **learned(tidy(cards, {}), headline=HEADLINE)})
+    source, name = settings["source"], settings.scene
+    scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
+    numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
+    numbers = rounded(numbers)
     table = to_markdown(table_2_summary(numbers))
     io.write_texts(tables, {"table2.md": table, **headline_figures(numbers, source)})
-    say(f"{scene} ({source})\n{table}\n{scene}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
+    say(f"{name} ({source})\n{table}\n{name}: {', '.join(str(file) for file in sorted(tables.iterdir()))}")
 
 
 def report(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path, reports: Path) -> None:
     """Write the numbers, tables, figures and the page of a scene."""
-    scene = settings.scene
-    asked = read_experiments(settings)
-    numbers, drawn, scores = read_numbers(settings, asked, Places(indentations, folds, models, results))
-    if "choice" in asked.experiments:
-        record = to_record(
-            numbers["chosen"], read_cards(asked, models), source=asked.source, seed=settings.seed,
-            physics=fingerprint(settings.shared),
-        )  # fmt: skip
+    name, scene = settings.scene, planned_scene(settings)
+    source, inputs = scene.source, read_inputs(scene, indentations, folds, models, results)
+    scores = tidy(inputs.cards, inputs.points)
+    numbers = rounded(compute_numbers(settings, scene, inputs, scores))
+    drawn = {EXPERIMENTS[one].key: result["drawn"] for one, result in inputs.analyses.items()}
+    if "choice" in scene.experiments:
+        physics = fingerprint(settings.shared)
+        record = to_record(numbers["chosen"], inputs.cards, source=source, seed=settings.seed, physics=physics)
         io.write_json(reports / "choice.json", record)
     shared, of_this_run = split(numbers)
-    files_of = {"numbers": shared, "provenance": of_this_run, "scores": headline_scores(numbers)}
-    for name, content in files_of.items():
-        io.write_json(reports / f"{name}.json", content)
-    with make_executor(imports="pipeline.report.experiments") as executor:  # to draw takes most of the time
-        of_experiments = executor.submit(experiment_figures, numbers, drawn, asked.source)
-        of_costs = executor.submit(cost_pages, numbers["runtime"], asked.source)
+    io.write_json(reports / "numbers.json", shared)
+    io.write_json(reports / "provenance.json", of_this_run)
+    io.write_json(reports / "scores.json", headline_scores(numbers))
+    with make_executor(imports="pipeline.report.experiments") as executor:  # drawing takes most of the time
+        of_experiments = executor.submit(experiment_figures, numbers, drawn, source)
+        of_costs = executor.submit(cost_pages, numbers["runtime"], source)
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
-        predictions = [io.read_table(models / stage / "predictions.parquet") for stage in asked.model_stages]
-        figures = dict(error_grids(predictions, HEADLINE, f"{scene} ({asked.source})"))
-        figures |= headline_figures(numbers, asked.source) | dict(learning_figures(numbers, asked.source))
+        predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
+        figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})"))
+        figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
         figures |= of_experiments.result()
         costs = of_costs.result()
     io.write_texts(reports / "figures", figures)
     # Seconds, commit and machine differ between equal runs: they are in a folder that is no output of DVC.
     io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
-    of_scenes = (io.read_json(file) for file in sorted(reports.parent.glob("*/numbers.json")))
-    files = reports.parent.glob(f"*/figures/{HEADLINE_FIGURE}")
-    headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
-    described = [numbers for numbers in of_scenes if "described" in numbers]
-    io.write_text(reports.parent / "index.html", index(described, headlines))
+    write_index(reports.parent)
     if numbers.get("table2"):
-        say(f"{scene} ({asked.source})\n{to_markdown(table_2_summary(numbers))}")
-    say(f"{scene}: {reports}/index.html, numbers.json, provenance.json, scores.json, tables, figures, runtime")
+        say(f"{name} ({source})\n{to_markdown(table_2_summary(numbers))}")
+    say(f"{name}: {reports}/index.html, numbers.json, provenance.json, scores.json, tables, figures, runtime")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What the stage report reads: results of trainings and experiments by name, and accounts of captures."""
+
+    cards: list[dict[str, Any]]
+    points: dict[str, Any]
+    analyses: dict[str, Any]
+    studies: dict[str, Any]
+    audit: dict[str, Any]
+    described: dict[str, Any]
+    before_touch: list[pa.Table]
+    accounts: list[dict[str, Any]]
+    dropped: dict[str, int]
+
+
+def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, results: Path) -> Inputs:
+    """Read the results of all stages that the scene runs."""
+
+    def read(names: Iterable[str]) -> dict[str, Any]:
+        return {name: io.read_json(results / f"{name}.json") for name in names}
+
+    split_of_scene = io.read_json(folds)
+    return Inputs(
+        cards=read_cards(models, scene.model_stages),
+        points={experiment: read([stage])[stage] for experiment, stage in scene.curves.items()},
+        analyses=read(scene.analyses),
+        studies=read(scene.studies),
+        audit=read(["audit"] if "audit" in scene.experiments else []),
+        described={scene.described: io.read_json(results / "described.json")},
+        before_touch=[io.read_table(models / one / SCORED) for one in scene.model_stages if one == "train_single"],
+        accounts=[io.read_account(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
+        dropped=split_of_scene["dropped"],
+    )
+
+
+def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd.DataFrame) -> dict[str, Any]:
+    """Compute the content of numbers.json and provenance.json."""
+    analyses = {EXPERIMENTS[name].key: result for name, result in inputs.analyses.items()}
+    studies = {EXPERIMENTS[name].key: result for name, result in inputs.studies.items()}
+    costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
+    seconds = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
+    runtime = runtime_numbers(len(inputs.cards), costs, studies.pop("runtime", None), seconds.get("runtime", []))
+    numbers = {
+        "provenance": {
+            "scene": settings.scene, "source": scene.source, "git": code_version(), "seed": settings.seed,
+            "trained": ", ".join(sorted({card["git"] for card in inputs.cards})), "versions": versions(),
+            "device": f"{machine()}, networks on {trained_on()}", "seconds": round(total_cost_s(costs.values()), 1),
+        },
+        "capture": add_up(inputs.accounts) | {"left_out": dict(inputs.dropped)},
+        **learning_numbers(scores, headline=HEADLINE),
+        **before_touch_numbers(inputs.before_touch),
+        "trainings": count_trainings(inputs.cards, inputs.points, analyses),
+        "described": inputs.described,
+        **inputs.audit,
+        **{key: result["numbers"] for key, result in analyses.items()},
+        **studies,
+        "runtime": runtime,
+    }  # fmt: skip
+    if scene.source == "simulated":
+        losses = {name: result["losses"] for name, result in inputs.analyses.items()}
+        numbers["capture_by_protocol"] = lost_by_protocol(losses)
+    if "choice" in scene.experiments:
+        numbers["chosen"] = choose(inputs.cards)
+    runtime |= learning_times(numbers, seconds)
+    return numbers
+
+
+def write_index(reports: Path) -> None:
+    """Write the page of all scenes that have reports."""
+    results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
+    files = reports.glob(f"*/figures/{HEADLINE_FIGURE}")
+    headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
+    io.write_text(reports / "index.html", index([one for one in results if "described" in one], headlines))
 
 
 def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
     """Write every training of a scene and its report to MLflow once; if the server is away, warn and go on."""
-    asked, scene = read_experiments(settings), settings.scene
-    variants = {variant: models / variant for variant in asked.model_stages}
-    name = f"{scene} (dvc exp)" if is_experiment() else scene  # beside the checkout's own results, not in their place
+    scene, name = planned_scene(settings), settings.scene
+    folders = {stage: models / stage for stage in scene.model_stages}
+    experiment = f"{name} (dvc exp)" if is_experiment() else name  # next to the checkout's own results
     try:
-        counts = write_runs(variants, read_curves(asked, results), reports, scene=name, root=home())
-        say(f"{name}: MLflow runs {counts}")
+        counts = write_runs(folders, read_curves(scene, results), reports, scene=experiment, root=home())
+        say(f"{experiment}: MLflow runs {counts}")
     except TrackingAway as away:
-        say(f"warning: {scene} is not in MLflow: {away}")
+        say(f"warning: {name} is not in MLflow: {away}")
 
 
-def read_curves(asked: Scene, results: Path) -> Curves:
+def read_curves(scene: Scene, results: Path) -> Curves:
     """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
-    stages = asked.curves
-    points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in stages.items()}
+    points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in scene.curves.items()}
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]
-    curves = {stages[experiment]: rows for experiment, rows in curves_of(points).items()}
-    for experiment in asked.analyses:
+    curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(points).items()}
+    for experiment in scene.analyses:
         numbers = io.read_json(results / f"{experiment}.json")["numbers"]
         named = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]
         curves[experiment] = [(head, step, {tail: value}) for (head, _, tail), value, step in named]
     return curves
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where a scene's results lie."""
-
-    indentations: Path
-    folds: Path
-    models: Path
-    results: Path
-
-
-def read_experiments(settings: Settings) -> Scene:
-    """Read which experiments the scene runs; raise if it was edited since the plan was made."""
-    asked = parse_scene(settings.of_scene, settings.where)
+def planned_scene(settings: Settings) -> Scene:
+    """Parse the scene; raise if its experiments were edited since the plan was made."""
+    scene = parse_scene(settings.of_scene, settings.where)
     planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
-    if list(asked.experiments) != list(planned):
-        differing = ", ".join(sorted(set(asked.experiments) ^ set(planned))) or "another order"
+    if list(scene.experiments) != list(planned):
+        differing = ", ".join(sorted(set(scene.experiments) ^ set(planned))) or "another order"
         remedy = f"Try: reskin scenes use {settings.scene}, beside the others that run."
         raise ParamsError(settings.where, "experiments", f"those of {PLAN}", f"{differing} only in one", remedy)
-    return asked
+    return scene
 
 
-def read_cards(asked: Scene, models: Path) -> list[dict[str, Any]]:
-    """Read the cards of all models that the scene keeps."""
-    return [io.read_json(file) for arm in asked.model_stages for file in sorted((models / arm).glob("*.json"))]
-
-
-def read_numbers(settings: Settings, asked: Scene, at: Places) -> tuple[dict[str, Any], dict[str, Any], pd.DataFrame]:
-    """Read the content of numbers.json, what only figures show (by key in numbers.json), and the table of scores."""
-    folds, cards = io.read_json(at.folds), read_cards(asked, at.models)
-    accounts = [io.read_account(at.indentations / f"{name}.parquet") for name in folds["captures"]]
-
-    def read(names: Sequence[str]) -> dict[str, Any]:
-        return {name: io.read_json(at.results / f"{name}.json") for name in names}
-
-    points = {experiment: read([stage])[stage] for experiment, stage in asked.curves.items()}
-    results, table = read(asked.analyses), tidy(cards, points)
-    by_key = {EXPERIMENTS[name].key: result for name, result in results.items()}
-    studies = {EXPERIMENTS[name].key: result for name, result in read(asked.studies).items()}
-    costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if asked.runs(unit)}
-    took = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
-    numbers = {
-        "provenance": _provenance(settings, asked, cards, costs),
-        **compose(table, accounts, folds["dropped"], headline=HEADLINE),
-        **foretold([io.read_table(at.models / arm / SCORED) for arm in asked.model_stages if arm == "train_single"]),
-        "trainings": count_trainings(cards, points, by_key),
-        "described": {asked.described: io.read_json(at.results / "described.json")},
-        **read([experiment for experiment in ("audit",) if experiment in asked.experiments]),
-        **{key: result["numbers"] for key, result in by_key.items()},
-        **answered(studies, runtime(len(cards), costs), took),
-    }
-    if asked.source == "simulated":
-        numbers["capture_by_protocol"] = lost_by_protocol({name: result["losses"] for name, result in results.items()})
-    if "choice" in asked.experiments:
-        numbers["chosen"] = choose(cards)
-    numbers["runtime"] |= timed_learning(numbers, took)
-    return rounded(numbers), {key: result["drawn"] for key, result in by_key.items()}, table
-
-
-def _provenance(
-    settings: Settings, asked: Scene, cards: Sequence[Mapping[str, Any]], costs: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Say where a result came from; a stage whose experiment was switched off costs nothing any more."""
-    return {
-        "scene": settings.scene, "source": asked.source, "git": code_version(), "seed": settings.seed,
-        "trained": ", ".join(sorted({card["git"] for card in cards})), "versions": versions(),
-        "device": f"{machine()}, networks on {trained_on()}", "seconds": round(total_cost_s(costs.values()), 1),
-    }  # fmt: skip
+def read_cards(models: Path, stages: Iterable[str]) -> list[dict[str, Any]]:
+    """Read the cards of all models of these stages."""
+    return [io.read_json(file) for stage in stages for file in sorted((models / stage).glob("*.json"))]

@@ -4,7 +4,7 @@ import pytest
 
 from pipeline.report import numbers
 from pipeline.statistics import tidy
-from tests.report.test_learned import HELD_OUT, point
+from tests.report.test_learning_numbers import HELD_OUT, point
 
 
 def points(key: str, by_count: dict[int, tuple[float, float]], **words: str) -> list[dict]:

@@ -23,7 +23,7 @@ from pipeline.report.costs import (
     trade_off_points,
 )
 from pipeline.report.drawing import COLOURS, MARKERS
-from pipeline.report.numbers import timed_learning
+from pipeline.report.numbers import learning_times
 from reskin.physics.magnet import DEFAULT_QUADRATURE
 from tests.report.synthetic import cost, texts_of
 
@@ -298,7 +298,7 @@ def test_reference_methods_have_their_errors_beside_their_seconds():
         for method, pokes, accuracy_pct in (("map", "none", 20.0), ("map", "its own", 40.0), ("ridge", "its own", 30.0))
     ]
     took = [{"name": f"map.b{i}-draw0", "train_s": 2.0 + i, "one_reading_s": 5e-5} for i in range(3)]
-    found = timed_learning({"rivals": {"methods": methods}}, {"reference_methods": took})
+    found = learning_times({"rivals": {"methods": methods}}, {"reference_methods": took})
     (line,) = cost_tables(found, "recorded")["rivals_costs"].to_dict("records")
     assert (line["method"], line["accuracy, %"]) == ("map", "40 ± 0.1")
     assert (line["until ready, s"], line["one reading, µs"]) == ("3", "50")

@@ -5,7 +5,7 @@ import copy
 import pytest
 
 from pipeline.manage.compare import leaves
-from pipeline.report.numbers import TIMES, join, split, timed_learning
+from pipeline.report.numbers import TIMES, join, learning_times, split
 from reskin.io import read_json
 from tests.report.synthetic import all_experiments, cost, scores
 from tests.stages.checkout import ROOT
@@ -26,7 +26,7 @@ def run(seconds: float) -> dict:
     numbers["runtime"] = {
         "trainings_n": 1, "stages": {"report": cost(seconds)}, "choice": {"setting": "1 mm x 5"},
         "quadratures": [STUDY | {"median_s": seconds, "repeats_n": 3}, STUDY | {"method": "reference"}],
-        **timed_learning(numbers, took),
+        **learning_times(numbers, took),
     }  # fmt: skip
     return numbers
 

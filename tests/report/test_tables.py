@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.report.figures import HEADLINE, headline_figures
 from pipeline.report.formatting import CONTROL, OF_PAPER, models, rounded, show, show_digits, to_markdown
-from pipeline.report.numbers import add_up, compose, foretold, lost_by_protocol
+from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbers, lost_by_protocol
 from pipeline.report.paper import TABLE_2
 from pipeline.report.readme import fill
 from pipeline.report.tables import (
@@ -60,7 +60,8 @@ ACCOUNTS = [
 
 def numbers(made: list[dict] = CARDS, source: str = "recorded") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
-    return {"provenance": provenance, **compose(tidy(made), ACCOUNTS, {"low_force_rows_n": 3}, headline="paper")}
+    capture = add_up(ACCOUNTS) | {"left_out": {"low_force_rows_n": 3}}
+    return {"provenance": provenance, "capture": capture, **learning_numbers(tidy(made), headline="paper")}
 
 
 def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
@@ -73,9 +74,9 @@ def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
 
 def test_places_predicted_without_any_change_of_field_stand_below_the_split_that_it_was_scored_on():
     columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
-    told = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
+    predicted = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
     shown = numbers([card("single_temporal", "s0", 95.0)])
-    table = make_tables(shown | foretold([told]))["single_sensor"]
+    table = make_tables(shown | before_touch_numbers([predicted]))["single_sensor"]
     assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15", "98"]
     assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
     assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}

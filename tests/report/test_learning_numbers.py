@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pipeline.report.numbers import PAIRS, learned, timed_learning
+from pipeline.report.numbers import PAIRS, learning_numbers, learning_times
 from pipeline.statistics import tidy
 from tests.report import cards
 
@@ -51,7 +51,7 @@ CARDS = [
 
 
 def numbers(made: list[dict] = CARDS, **points: list[dict]) -> dict:
-    return learned(tidy(made, points), headline="paper")
+    return learning_numbers(tidy(made, points), headline="paper")
 
 
 def paired(of: str, over: str) -> dict:
@@ -163,7 +163,7 @@ def test_a_method_has_its_own_times_and_an_adapted_network_those_of_its_base_too
         "train_triplet": [took("triplet.paper.b0.seed0", 30), took("triplet.other.b0.seed0", 999)],
         "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
     }
-    timed = timed_learning({"baselines": rows}, seconds)["learning"]
+    timed = learning_times({"baselines": rows}, seconds)["learning"]
     assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; what was not timed has no time
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 
@@ -171,4 +171,4 @@ def test_a_method_has_its_own_times_and_an_adapted_network_those_of_its_base_too
 def test_an_adaptation_is_timed_by_its_number_of_pokes():
     numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
     seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
-    assert [row.get("seconds") for row in timed_learning(numbers, seconds)["adaptation"]] == [None, 6.0, 65.0]
+    assert [row.get("seconds") for row in learning_times(numbers, seconds)["adaptation"]] == [None, 6.0, 65.0]
