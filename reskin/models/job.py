@@ -146,12 +146,12 @@ class TrainingJob:
 
     @property
     def loss_weights(self) -> LossWeights:
-        match self.tuning:
-            case Adaptation(settings=settings):
-                return LossWeights(self.recipe.triplet_weight, unlabelled=settings.unlabelled_weight)
-            case FineTuning(settings=settings):
-                return LossWeights(self.recipe.triplet_weight, few_labels=settings.own_weight)
-        return LossWeights(self.recipe.triplet_weight)
+        tuning = self.tuning
+        return LossWeights(
+            triplet=self.recipe.triplet_weight,
+            unlabelled=tuning.settings.unlabelled_weight if isinstance(tuning, Adaptation) else 0.0,
+            few_labels=tuning.settings.own_weight if isinstance(tuning, FineTuning) else 0.0,
+        )
 
 
 class JobKeys:
