@@ -290,7 +290,7 @@ class Model:
         """
         from reskin.models import trained
 
-        trained.write(self._network, Path(file))
+        trained.write_onnx(self._network, Path(file))
 
     def _rows(self, b_uT: ArrayLike) -> np.ndarray:
         rows_uT, channels_n = np.atleast_2d(np.asarray(b_uT, np.float32)), self.card["input"]["channels_n"]

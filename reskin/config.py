@@ -1,6 +1,6 @@
-"""Settings: YAML files, and strict models that check what they hold.
+"""Settings: YAML files, and strict pydantic models that validate them.
 
-A model of settings is frozen, knows no extra keys and has few defaults; it is defined beside what it steers.
+A model of settings is frozen, allows no unknown keys and has few defaults; it is defined beside the code that uses it.
 """
 
 import json
@@ -16,7 +16,7 @@ from reskin.errors import ParamsError
 
 
 class Strict(BaseModel):
-    """Base of all models of settings: a key that is missing is an error, and so is one that is not known."""
+    """Base of all models of settings: missing keys and unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -41,11 +41,11 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         # Through JSON, so that a YAML list may fill a tuple while "3" still does not become 3.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
-        # A misspelt name is also a missing one: name what was written first.
+        # A misspelt key is also a missing one: report the unknown key first.
         faults = error.errors(include_url=False)
         first = min(faults, key=lambda found: found["type"] != "extra_forbidden")
         beside = [found for found in faults if found["type"] == "missing" and found["loc"][:-1] == first["loc"][:-1]]
-        names = [".".join(_written(found["loc"], value)) for found in (beside if first in beside else [first])]
+        names = [".".join(_path_in_file(found["loc"], value)) for found in (beside if first in beside else [first])]
         name = ", ".join(names) or "the file"
         got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])
@@ -56,8 +56,8 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         raise ParamsError(where, name, rule, got, "Mend it there.") from None
 
 
-def _written(loc: Sequence[int | str], value: Any) -> list[str]:
-    """Keep of a place what a file can say: pydantic also names the kind of section that it tried."""
+def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:
+    """Return the keys of a location that are in the file: pydantic also names the types that it tried."""
     kept = []
     for i, part in enumerate(loc):
         known = part in value if isinstance(value, dict) else isinstance(value, list | tuple) and isinstance(part, int)

@@ -1,7 +1,4 @@
-"""Read and write files: Parquet, safetensors, JSON, CSV and text, each written whole or not at all.
-
-Also keeps arrays that take seconds to compute beside compiled code, as a cache.
-"""
+"""Read and write files: Parquet, safetensors, JSON and text, each written whole or not at all; a cache of arrays."""
 
 import errno
 import hashlib
@@ -26,8 +23,8 @@ from reskin.errors import DISK_REMEDIES, SchemaError
 from reskin.numerics import signature
 from reskin.schema import Readings, arrow_schema, from_table, to_table
 
-ACCOUNT_KEY = b"reskin.account"
-DIGEST = "digest"  # of a file of arrays, among its words
+COUNTS_KEY = b"reskin.account"
+DIGEST = "digest"  # in the metadata of a safetensors file
 HEADER_AT = 8  # bytes of a safetensors file before its header: the header's length
 MEND = "It was cut or changed. In a checkout: delete it, then `reskin check-cache` and `dvc repro`; else copy it again."
 OF_MACHINE = {
@@ -41,7 +38,7 @@ OF_MACHINE = {
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary sibling of `path` to write (a file or a folder); rename it when the block ends well."""
+    """Yield a temporary sibling of `path` to write (a file or a folder), and rename it when the block succeeds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -54,15 +51,15 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     except BaseException as error:
         if isinstance(error, OSError) and error.errno in DISK_REMEDIES and _is_written(error, temporary):
-            error.filename = str(path)  # not the temporary name, which nobody knows
-        with suppress(OSError):  # what the disk refuses here, too, is told by the first error
+            error.filename = str(path)  # not the temporary name
+        with suppress(OSError):  # the first error is reported
             remove(temporary)
         raise
 
 
 def _is_written(error: OSError, temporary: Path) -> bool:
-    """Tell whether a disk refused what is being written; it may have refused a file that is read for it."""
-    if error.filename is None:  # an open stream's own; of EIO nobody knows whether it was read or written
+    """Return whether an error concerns the file that is written, and not one that is read for it."""
+    if error.filename is None:  # from an open stream; EIO may be of reading or of writing
         return error.errno != errno.EIO
     names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)  # copyfile gives both
     return any(str(temporary) in str(name) for name in names)
@@ -70,7 +67,7 @@ def _is_written(error: OSError, temporary: Path) -> bool:
 
 @contextmanager
 def restoring(*files: Path) -> Iterator[None]:
-    """Give files their old content back if the block fails, Ctrl-C included."""
+    """Restore the content of files if the block fails or is interrupted."""
     before = {file: file.read_bytes() for file in files}
     try:
         yield
@@ -83,7 +80,7 @@ def restoring(*files: Path) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Delete a file or a folder, if it is there."""
+    """Delete a file or a folder, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -97,7 +94,7 @@ def sha256(path: Path) -> str:
 
 def read_bytes(path: Path) -> bytes:
     """Read a whole file; raise `SchemaError` if it is not one."""
-    _need(path)
+    _check_is_file(path)
     try:
         return path.read_bytes()
     except OSError as error:
@@ -110,7 +107,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write a folder of texts by file name, in place of what it held."""
+    """Write a folder of texts by file name; what it held before is deleted."""
     with replacing(folder) as temporary:
         temporary.mkdir()
         for name, text in texts.items():
@@ -118,13 +115,13 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON with two-space indent; NaN and infinity are refused, as JSON has neither."""
+    """Write JSON with two-space indent; NaN and infinity are errors, because JSON has neither."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:
     """Read JSON; raise `SchemaError` with the place of the first fault."""
-    _need(path)
+    _check_is_file(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
@@ -132,29 +129,29 @@ def read_json(path: Path) -> Any:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Write named arrays and a few words about them as safetensors, with a digest of all of it."""
+    """Write named arrays and metadata as safetensors, with a digest of both."""
     dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
-    words = {**metadata, DIGEST: _digest(dense, metadata)}
-    content = safetensors.numpy.save(dense, words)
-    with replacing(path) as temporary, temporary.open("wb") as stream:  # save_file hides what a disk refused
-        stream.write(content[:HEADER_AT] + _in_order(content, words))
+    metadata = {**metadata, DIGEST: _digest(dense, metadata)}
+    content = safetensors.numpy.save(dense, metadata)
+    with replacing(path) as temporary, temporary.open("wb") as stream:  # save_file hides errors of the disk
+        stream.write(content[:HEADER_AT] + _sorted_header(content, metadata))
         stream.write(memoryview(content)[stream.tell() :])
 
 
 def read_tensors(
     path: Path, names: Sequence[str] = (), *, digest_needed: bool = False
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read what `write_tensors` wrote; no pickle is ever opened.
+    """Read arrays and metadata that `write_tensors` wrote; no pickle is ever opened.
 
-    All of it is held against its digest, which files of older code need not have; of single arrays, nothing is.
+    A whole file is compared with its digest, which files of older code need not have; single arrays are not.
     """
-    _need(path)
+    _check_is_file(path)
     try:
         with safetensors.safe_open(path, framework="numpy") as file:
             tensors = {name: file.get_tensor(name) for name in names or file.keys()}
             metadata: dict[str, str] = file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
-        _pass_on(error)
+        _raise_if_of_machine(error)
         raise SchemaError(path, "the file", "safetensors", error, f"Is it a trained model? {MEND}") from None
     written = metadata.pop(DIGEST, None)
     allowed = {_digest(tensors, metadata), *([] if digest_needed else [None])} if not names else {written}
@@ -171,10 +168,10 @@ def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> s
     return found.hexdigest()[:32]
 
 
-def _in_order(content: bytes, words: Mapping[str, str]) -> bytes:
-    # The header of a safetensors file with its words sorted: the library's order changes from one process to the next.
+def _sorted_header(content: bytes, metadata: Mapping[str, str]) -> bytes:
+    # The library's order of the metadata differs from process to process.
     length = int.from_bytes(content[:HEADER_AT], "little")
-    header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(words.items()))}
+    header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(metadata.items()))}
     return json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(length)
 
 
@@ -188,8 +185,8 @@ def read_table(path: Path) -> pa.Table:
         return file.read()
 
 
-def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block; `account` may still fill while blocks arrive."""
+def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
+    """Write the readings of one capture block by block; `counts` may still fill while blocks arrive."""
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:
@@ -199,7 +196,7 @@ def write_readings(path: Path, blocks: Iterable[Readings], account: Mapping[str,
             writer.write_table(to_table(block))
         if writer is None:
             raise SchemaError(path, "a capture", "at least one reading", "none", "See what was dropped, and why.")
-        writer.add_key_value_metadata({ACCOUNT_KEY.decode(): json.dumps(dict(account), sort_keys=True)})
+        writer.add_key_value_metadata({COUNTS_KEY.decode(): json.dumps(dict(counts), sort_keys=True)})
         writer.close()
 
 
@@ -207,34 +204,34 @@ def read_readings(path: Path) -> Readings:
     return from_table(read_table(path), str(path))
 
 
-def read_account(path: Path) -> dict[str, int]:
+def read_ingest_counts(path: Path) -> dict[str, int]:
     """Read what ingest counted for one capture: bytes, frames, rows, and what was dropped, by reason."""
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
-    if ACCOUNT_KEY not in metadata:
+    if COUNTS_KEY not in metadata:
         raise SchemaError(path, "the file's metadata", "an account of losses", "none", "Ingest it again.")
-    account: dict[str, int] = json.loads(metadata[ACCOUNT_KEY])
-    return account
+    counts: dict[str, int] = json.loads(metadata[COUNTS_KEY])
+    return counts
 
 
-def _need(path: Path) -> None:
+def _check_is_file(path: Path) -> None:
     if not path.exists():
         raise SchemaError(path, "the file", "there", "nothing", "Check the path, or run the stage that writes it.")
 
 
-def _pass_on(error: Exception) -> None:
-    """Raise what says nothing of the file: a disk, a right or a limit of the machine."""
+def _raise_if_of_machine(error: Exception) -> None:
+    """Raise an error of the disk, of permissions or of limits, which does not mean that the file is damaged."""
     if isinstance(error, OSError) and error.errno in OF_MACHINE:
         raise error
 
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
-    _need(path)
+    _check_is_file(path)
     try:
         yield pq.ParquetFile(path, page_checksum_verification=True)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, OSError) as error:
-        _pass_on(error)
+        _raise_if_of_machine(error)
         got = " ".join(str(error).split()).rstrip(".")
         raise SchemaError(path, "the file", "readable Parquet", got, MEND) from None
 

@@ -1,7 +1,4 @@
-"""The paper's three numbers, from predictions, and R^2 of the force. In: true and predicted x, y, F.
-
-Refuses to know models, folds and files. NaN in the truth means unknown, and is left out of that number.
-"""
+"""Metrics of predictions: the paper's three, and R^2 of the force. A true value of NaN is unknown and not counted."""
 
 from typing import Any
 
@@ -10,15 +7,15 @@ from jaxtyping import Float
 
 ACCURACY_LIMIT_MM = 1.0  # paper section 4: both |dx| and |dy| within 1 mm
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
-TRUTH = ("force_mean_N", "force_var_N2")  # of the rows that are scored, so that scores of parts can be put together
+TRUTH = ("force_mean_N", "force_var_N2")  # of the scored rows, so that scores of parts can be combined
 
 
 def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
     """Score predictions of (x_mm, y_mm, F_N).
 
     MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages). R^2 of the force is
-    1 - MSE_F over the variance of the true forces: 0 is what their mean as a constant answer reaches. Force has no
-    score where none is known, and no R^2 where it does not vary.
+    1 - MSE_F over the variance of the true forces; predicting their mean has 0. Force has no score where none is known,
+    and no R^2 where it does not vary.
     """
     error = predicted.astype(float) - true
     known = ~np.isnan(error[:, 2])
@@ -31,7 +28,7 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
         numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
         force_N = true[known, 2].astype(float)
         numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
-        # The variance of equal forces may be off zero by rounding, that of nearly equal ones vanish.
+        # By rounding, the variance of equal forces may not be zero, and that of nearly equal ones may.
         if np.ptp(force_N) > 0 and numbers["force_var_N2"] > 0:
             numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
     return numbers
@@ -40,8 +37,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Shift predicted places by one constant offset, so that their mean error is zero.
 
-    Each rig's origin was set by hand; this tells what of the error is registration. It uses the true places, so it is a
-    diagnosis and no result.
+    Each rig's origin was set by hand; this shows which part of the error is registration. It uses the true places, so
+    it is a diagnosis and not a result.
     """
     shifted = predicted.astype(float)
     shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)

@@ -1,9 +1,8 @@
-"""What a row means: column, dtype, unit, axis. In: arrays. Out: the Arrow schema of `data/indentations`.
+"""The table of readings, `data/indentations`: columns, types and units, and its Arrow schema.
 
 Axis letters, used in every array annotation: n indentations, f readings (frames), ch = 3 k channels
 (Bx, By, Bz of chip 0, then of chip 1, ...), k chips, s sources, o observers, b batch, d dwells of the robot,
 c chunks of a stream, g steps of a time grid.
-Refuses to know where a reading came from or what will be learned from it.
 """
 
 from dataclasses import dataclass, fields
@@ -59,7 +58,7 @@ class Readings:
 
 
 LABELS = ("capture", "board", "skin", "source")
-# Of every column of numbers: the suffix of its name where that is a unit.
+# Unit of every numeric column: the suffix of its name, if that is a unit.
 UNITS = {
     field.name: suffix if (suffix := field.name.rpartition("_")[2]) in ("mm", "N", "uT", "degC", "s") else "1"
     for field in fields(Readings)
@@ -70,7 +69,7 @@ _PER_CHIP_N = {"b_uT": AXES_PER_CHIP_N, "noload_uT": AXES_PER_CHIP_N, "temperatu
 
 
 def arrow_schema(chips_n: int) -> pa.Schema:
-    """Give the Arrow schema of a readings table; the unit stands in each field's metadata."""
+    """Return the Arrow schema of a table of readings; each field's metadata holds its unit."""
     rows = [pa.field(name, pa.string(), False, {"unit": ""}) for name in LABELS]
     for name, unit in UNITS.items():
         rows.append(pa.field(name, _arrow_type(name, chips_n), True, {"unit": unit}))

@@ -1,7 +1,6 @@
-"""The one place where random generators are made.
+"""Random generators by name.
 
-Generators are *named*, not ordered: `rng_for(seed, "skin", "b3_s1")` stays the same when
-another board, skin or fold is added before it. Refuses to know what is drawn.
+`rng_for(seed, "skin", "b3_s1")` stays the same when another board, skin or fold is added before it.
 """
 
 from __future__ import annotations
@@ -19,5 +18,5 @@ def seed_for(seed: int, *names: str | int) -> int:
 
 
 def rng_for(seed: int, *names: str | int) -> np.random.Generator:
-    """Make the generator that belongs to `names` under `seed` (PCG64)."""
+    """Return the generator of `names` under `seed` (PCG64)."""
     return np.random.Generator(np.random.PCG64(seed_for(seed, *names)))

@@ -23,7 +23,7 @@ def test_readings_come_back_as_they_were_written(tmp_path):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
         assert getattr(after, name).dtype == getattr(before, name).dtype
     assert (after.capture, after.board, after.skin, after.source) == ("c0", "b0", "s0", "recorded")
-    assert io.read_account(tmp_path / "c0.parquet") == {"rows_n": 6}
+    assert io.read_ingest_counts(tmp_path / "c0.parquet") == {"rows_n": 6}
 
 
 def test_every_column_of_the_file_has_its_unit_and_the_file_its_schema_version(tmp_path):

@@ -30,7 +30,7 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
     """Read how many readings each capture of a folder lost, and add what was left out of its rows by reason."""
-    accounts = [io.read_account(file) for file in sorted(indentations.glob("*.parquet"))]
+    accounts = [io.read_ingest_counts(file) for file in sorted(indentations.glob("*.parquet"))]
     return {"accounts": accounts, "left_out": dict(left_out)}
 
 

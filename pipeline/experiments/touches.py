@@ -74,7 +74,9 @@ def touches(settings: Settings, indentations: Path, results: Path) -> None:
     """Evaluate touches at numbered places."""
     section, selection = read(settings), settings.section(Selection, "selection")
     sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
-    found = sort_recordings(touched_rows(io.read_readings(file), io.read_account(file), selection) for file in sources)
+    found = sort_recordings(
+        touched_rows(io.read_readings(file), io.read_ingest_counts(file), selection) for file in sources
+    )
     single, double = found.single, found.double
     counts = {
         "force_min_N": selection.force_min_N,

@@ -88,7 +88,7 @@ def _cache_key(capture: Path, rest_on: bytes) -> str:
 def describe(settings: Settings, indentations: Path, description: Path) -> None:
     """Describe the recordings of a scene: fields, noise, steps and forces, over its skins."""
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in settings.captures_in(indentations)]
-    accounts = {one.capture: io.read_account(indentations / f"{one.capture}.parquet") for one in captures}
+    accounts = {one.capture: io.read_ingest_counts(indentations / f"{one.capture}.parquet") for one in captures}
     described = {one.capture: describe_capture(one) for one in captures}
     described |= {
         name: without_rest(described[name])

@@ -132,7 +132,7 @@ def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, res
         audit=read(["audit"] if "audit" in scene.experiments else []),
         described={scene.described: io.read_json(results / "described.json")},
         before_touch=[io.read_table(models / one / SCORED) for one in scene.model_stages if one == "train_single"],
-        accounts=[io.read_account(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
+        accounts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
         dropped=split_of_scene["dropped"],
     )
 

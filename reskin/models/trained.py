@@ -1,4 +1,4 @@
-"""Trained networks from disk: predictions, and export as ONNX."""
+"""Trained networks: read from disk, predict, and export as ONNX."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -25,27 +25,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Network:
-    """A finished network: call it with changes of field in uT, and it answers x and y in mm and F in N."""
+    """A trained network with its card: changes of field in uT -> x, y in mm and F in N."""
 
     card: Mapping[str, Any]
     tensors: Mapping[str, np.ndarray]
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
-        """Answer for changes of field, row by row."""
+        """Predict row by row."""
         scaler, view = Scaler.of_arrays(self.tensors), VIEW[self.card["recipe"]["inputs"]](db_uT)
         return scaler.decode(self._predictor(scaler.encode(view)))
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        """Put the network together once: a controller asks it for every frame."""
-        from reskin.models.network import Predictor  # torch, late: only a stage that answers pays for it
+        """Built once: a controller predicts for every frame."""
+        from reskin.models.network import Predictor  # imports torch: only a process that predicts needs it
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
         return Predictor(weights, self.card["recipe"]["architecture"], device())
 
 
 def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
-    """Read the networks of train_multi that never saw this board, one a seed."""
+    """Read the networks of train_multi with this board held out, one a seed."""
     found = []
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -58,7 +58,7 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
 
 
 def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Read the networks of an experiment by fold, one a seed; none where it was not asked."""
+    """Read the networks of an experiment by fold, one a seed; empty if the scene does not run it."""
     found: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -68,30 +68,38 @@ def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -
     return found
 
 
-OPSET, IR = 17, 8  # of 2022, which runtimes of today still read
+# --- ONNX ---
+
+OPSET, IR = 17, 8  # of 2022, which current runtimes read
 INPUT, OUTPUT = "db_uT", "x_mm y_mm F_N"
 Node = tuple[str, tuple[str, ...], str]  # operator, inputs, output
 
 
-def write(network: Network, file: Path) -> None:
-    """Write a network; an existing file is replaced."""
-    file.write_bytes(build(network).SerializeToString())
+def write_onnx(network: Network, file: Path) -> None:
+    """Write a network as ONNX; an existing file is replaced."""
+    file.write_bytes(build_onnx(network).SerializeToString())
 
 
-def build(network: Network) -> "ModelProto":
-    """Put the graph together."""
+def build_onnx(network: Network) -> "ModelProto":
+    """Build the ONNX graph of a network: view, scaling, layers, units."""
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
         raise missing_package("onnx", "export_onnx") from None
-    from reskin.models.network import LAYERS  # late: imports torch
+    from reskin.models.network import LAYERS  # imported late: imports torch
 
     card, scaler = network.card, dict(network.tensors)
     channels_n = card["input"]["channels_n"]
     layers = LAYERS[card["recipe"]["architecture"]](scaler["input_shift"].size)
-    nodes = [*VIEWS[card["recipe"]["inputs"]](), *_scaled(), *_layers([layer.relu for layer in layers]), *_answers()]
+    nodes = [
+        *VIEW_NODES[card["recipe"]["inputs"]](),
+        *_scale_inputs(),
+        *_layers([layer.relu for layer in layers]),
+        *_scale_outputs(),
+    ]
     made = [
-        helper.make_node(kind, list(inputs), [output], **ATTRIBUTES.get(kind, {})) for kind, inputs, output in nodes
+        helper.make_node(operator, list(inputs), [output], **ATTRIBUTES.get(operator, {}))
+        for operator, inputs, output in nodes
     ]
     constants = {name: np.asarray(value, np.float32) for name, value in scaler.items()}
     constants["floor_uT"] = np.array([DB_FLOOR_uT], np.float32)
@@ -116,7 +124,7 @@ def _raw() -> Iterator[Node]:
 
 
 def _shape() -> Iterator[Node]:
-    """The direction and the natural log of the length, as `learning.inputs.shape`."""
+    """The direction and the natural log of the length, as `reskin.models.inputs.shape`."""
     yield "ReduceL2", (INPUT,), "length_uT"
     yield "Max", ("length_uT", "floor_uT"), "floored_uT"
     yield "Div", (INPUT, "floored_uT"), "direction"
@@ -124,10 +132,10 @@ def _shape() -> Iterator[Node]:
     yield "Concat", ("direction", "log_length"), "view"
 
 
-VIEWS = {"raw": _raw, "shape": _shape}
+VIEW_NODES = {"raw": _raw, "shape": _shape}
 
 
-def _scaled() -> Iterator[Node]:
+def _scale_inputs() -> Iterator[Node]:
     yield "Sub", ("view", "input_shift"), "shifted"
     yield "Div", ("shifted", "input_scale"), "features0"
 
@@ -139,6 +147,6 @@ def _layers(relus: list[bool]) -> Iterator[Node]:
     yield "Identity", (f"features{len(relus)}",), "encoded"
 
 
-def _answers() -> Iterator[Node]:
+def _scale_outputs() -> Iterator[Node]:
     yield "Mul", ("encoded", "target_scale"), "scaled"
     yield "Add", ("scaled", "target_shift"), OUTPUT

@@ -226,7 +226,7 @@ def test_readings_and_account_go_to_parquet_and_back(tmp_path: Path) -> None:
     blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"), AS_USUAL)
     io.write_readings(tmp_path / "c.parquet", blocks, account)
     assert len(io.read_readings(tmp_path / "c.parquet")) == INDENTATIONS_N * CONTACT_N
-    assert io.read_account(tmp_path / "c.parquet")["indentations_n"] == INDENTATIONS_N
+    assert io.read_ingest_counts(tmp_path / "c.parquet")["indentations_n"] == INDENTATIONS_N
 
 
 @pytest.mark.parametrize(

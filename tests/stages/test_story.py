@@ -253,7 +253,7 @@ def test_losses_of_all_protocols_are_counted(story, numbers):
         account = numbers["capture_by_protocol"][protocol]
         files = list((story / f"data/indentations/ci-{protocol}").glob("*.parquet"))
         assert account["captures_n"] == len(files)
-        assert account["frames_n"] == sum(io.read_account(file)["frames_n"] for file in files)
+        assert account["frames_n"] == sum(io.read_ingest_counts(file)["frames_n"] for file in files)
 
 
 def test_a_model_of_the_scene_predicts_an_sd_card_log(story):

@@ -56,4 +56,4 @@ def test_onnxruntime_answers_as_a_trained_network_under_torch_within_1e_5(tmp_pa
 def test_without_the_package_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(ParamsError, match=r"pip install.*\[onnx\]"):
-        onnx_file.build(Network({}, {}))
+        onnx_file.build_onnx(Network({}, {}))
