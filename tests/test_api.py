@@ -32,13 +32,13 @@ def test_examples_in_docstrings_run(name):
     assert (done.failed, done.attempted > 0) == (0, True)
 
 
-def test_the_import_is_cheap_and_finds_no_torch():
+def test_import_is_cheap():
     code = "import sys, reskin; print([name for name in ('torch', 'scipy', 'pandas', 'mlflow') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
 
-def test_rows_are_those_that_stages_read(tmp_path):
+def test_load_rows_equals_the_pipeline(tmp_path):
     files = [tmp_path / f"data/indentations/small/c{i}.parquet" for i in range(2)]
     for file in files:
         io.write_readings(file, [readings()], {})
@@ -48,7 +48,7 @@ def test_rows_are_those_that_stages_read(tmp_path):
         np.testing.assert_array_equal(getattr(rows, name), getattr(expected, name))
 
 
-def test_pokes_are_read_as_a_simulated_capture_without_noise_is():
+def test_simulate_pokes_equals_a_simulated_capture_without_noise():
     simulate = read_yaml(ROOT / "pipeline/scenes/quick.yaml")["simulate"]
     simulate["protocols"] = {"grid": simulate["protocols"]["grid"] | {"passes_n": 1, "depths_mm": [1.0], "terms": []}}
     exact = {name: 0.0 for name in ("robot_place_sd_mm", "robot_depth_sd_mm", "place_offset_sd_mm", "force_noise_N")}
@@ -71,7 +71,7 @@ def test_pokes_are_read_as_a_simulated_capture_without_noise_is():
     np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)  # the sensor's own steps
 
 
-def test_a_design_is_changed_with_plain_values_and_a_wrong_one_is_a_sentence():
+def test_designs_take_plain_values_and_wrong_ones_raise():
     spreads = {"chip_offset_uT": 0.0}
     board = reskin.draw_board(chips_xy_mm=[[0, 0], [7, 0]], chips_turn_deg=[0, 90], spreads=spreads)
     assert board.chips_m.shape == (2, 3)
@@ -82,7 +82,7 @@ def test_a_design_is_changed_with_plain_values_and_a_wrong_one_is_a_sentence():
         reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
 
 
-def test_a_zeroed_model_answers_as_the_stages_network_does(model):  # noqa: F811
+def test_model_predicts_as_the_network(model):  # noqa: F811
     b_uT = rng_for(0, "api").normal(500, 100, (4, 15)).astype(np.float32)
 
     loaded = reskin.load_model(str(model)).zero(b_uT[:2].tolist())

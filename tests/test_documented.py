@@ -42,7 +42,7 @@ def keys(words: Any, depth: int = 0) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("file", SETTINGS, ids=lambda file: file.stem)
-def test_every_parameter_is_documented(file):
+def test_parameters_are_documented(file):
     assert sorted(set(keys(read_yaml(file))) - words_of("docs/parameters.md")) == []
 
 

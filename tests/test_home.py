@@ -5,7 +5,7 @@ from pathlib import Path
 from pipeline.provenance import home, is_experiment
 
 
-def test_a_checkout_keeps_its_caches_itself_and_a_copy_of_dvc_in_the_checkout_around_it(tmp_path, monkeypatch):
+def test_caches_lie_in_the_checkout_even_for_dvc_experiments(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert (home(), is_experiment()) == (Path(), False)
     copy = tmp_path / ".dvc/tmp/exps/standard/tmpx1"

@@ -24,7 +24,7 @@ from reskin.errors import MachineError, SchemaError, explaining
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "split: out of memory: .*Cannot allocate memory"),
     ],
 )
-def test_what_the_machine_refuses_is_one_sentence(error, sentence):
+def test_errors_of_the_machine_become_one_sentence(error, sentence):
     with pytest.raises(MachineError, match=f"^{sentence}") as found, explaining("split"):
         raise error
     assert str(found.value).endswith("Run it again: finished work is kept.")
@@ -33,14 +33,14 @@ def test_what_the_machine_refuses_is_one_sentence(error, sentence):
 @pytest.mark.parametrize(
     "error", [FileNotFoundError(errno.ENOENT, "No such file", "x"), ValueError("ours"), KeyError(1)]
 )
-def test_other_errors_pass_as_they_are(error):
+def test_other_errors_pass_unchanged(error):
     with pytest.raises(type(error)), explaining("split"):
         raise error
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk without room, on Linux only")
 @pytest.mark.parametrize("write", [io.write_json, io.write_table, io.write_tensors])
-def test_a_full_disk_is_told_by_the_name_of_the_target_whatever_writes(tmp_path, write):
+def test_a_full_disk_names_the_target(tmp_path, write):
     target, (temporary,) = tmp_path / "out", [tmp_path / f".out.{os.getpid()}.tmp"]
     content = {io.write_table: pa.table({"a": np.zeros(9)}), io.write_tensors: {"a": np.zeros(9)}}.get(write, [1])
     with pytest.MonkeyPatch.context() as patch:
@@ -54,7 +54,7 @@ def test_a_full_disk_is_told_by_the_name_of_the_target_whatever_writes(tmp_path,
     assert not target.exists()
 
 
-def test_a_table_that_was_cut_or_changed_is_one_sentence(tmp_path):
+def test_a_damaged_table_raises_one_sentence(tmp_path):
     io.write_table(tmp_path / "t.parquet", pa.table({"a": np.random.default_rng(0).normal(size=9999)}))
     content = (tmp_path / "t.parquet").read_bytes()
     for damaged in (content[:-20], bytes(500) + content[500:], b""):
@@ -63,7 +63,7 @@ def test_a_table_that_was_cut_or_changed_is_one_sentence(tmp_path):
             io.read_table(tmp_path / "t.parquet")
 
 
-def test_a_stage_that_the_machine_stops_ends_with_a_sentence_and_a_status(tmp_path, monkeypatch, capsys):
+def test_a_stage_prints_the_error_and_exits_with_its_status(tmp_path, monkeypatch, capsys):
     def split(folds: str) -> None:
         raise OSError(errno.EROFS, "Read-only file system", folds)
 

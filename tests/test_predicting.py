@@ -69,7 +69,7 @@ def write_stream(folder, wire):
 
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt"])
-def test_a_recorded_stream_and_its_decoded_table_give_what_the_same_log_gives(tmp_path, model, wire):
+def test_stream_decoded_table_and_log_give_the_same_csv(tmp_path, model, wire):
     folder, table = write_stream(tmp_path, wire), tmp_path / "frames.parquet"
     io.write_table(table, decode_dump((folder / STREAM_FILE).read_bytes(), wire, 5, "stream")[0])
     outs = [tmp_path / f"{name}.csv" for name in ("log_out", "folder_out", "table_out")]
@@ -84,7 +84,7 @@ def test_fields_in_mT_are_refused(tmp_path, model):
         predict(write_log(tmp_path, scale=1e-3), model, tmp_path / "out.csv")
 
 
-def test_a_table_of_something_else_and_a_recording_with_labels_are_refused(tmp_path, model):
+def test_other_tables_and_labelled_recordings_raise(tmp_path, model):
     io.write_table(tmp_path / "x.parquet", pa.table({"x": [1.0]}))
     with pytest.raises(CaptureError, match="columns must be those of reskin decode; got x"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
@@ -93,7 +93,7 @@ def test_a_table_of_something_else_and_a_recording_with_labels_are_refused(tmp_p
         predict(tmp_path / "c0", model, tmp_path / "out.csv")
 
 
-def test_every_line_is_answered_and_only_contacts_have_places_and_forces(tmp_path, model):
+def test_every_line_has_a_row_and_contacts_have_estimates(tmp_path, model):
     counts = predict(write_log(tmp_path), model, tmp_path / "out.csv")
     names, *rows = [line.split(",") for line in (tmp_path / "out.csv").read_text().splitlines()]
     assert names == ["t_s", "x_mm", "y_mm", "F_N", "contact"]
@@ -105,14 +105,14 @@ def test_every_line_is_answered_and_only_contacts_have_places_and_forces(tmp_pat
     np.testing.assert_allclose([float(row[0]) for row in rows], (1 + np.arange(len(rows))) / RATE_HZ)
 
 
-def test_a_model_that_answers_one_place_to_any_input_is_refused_and_nothing_is_written(tmp_path, model):
+def test_a_collapsed_model_raises(tmp_path, model):
     io.write_json(model.with_suffix(".json"), CARD | {"collapsed": True})
     with pytest.raises(ReskinError, match="the model has collapsed"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
     assert not (tmp_path / "out.csv").exists()
 
 
-def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
+def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
     log, out = write_log(tmp_path), tmp_path / "out.csv"
     four = tmp_path / "four"
     four.mkdir()
@@ -157,7 +157,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path, model):
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture must be given; got nothing"),
     ],
 )
-def test_a_card_that_says_otherwise_is_refused(tmp_path, model, change, message):
+def test_a_wrong_card_raises(tmp_path, model, change, message):
     model.with_suffix(".json").write_text(json.dumps(CARD | change))
     with pytest.raises(ReskinError, match=message) as refused:
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
@@ -165,19 +165,19 @@ def test_a_card_that_says_otherwise_is_refused(tmp_path, model, change, message)
 
 
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
-def test_a_card_that_says_too_little_is_refused(tmp_path, model, lacking):
+def test_an_incomplete_card_raises(tmp_path, model, lacking):
     model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
     with pytest.raises(ReskinError, match=f"{lacking} (must be given|None is not supported)"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
-def test_a_card_that_is_no_card_is_refused(tmp_path, model):
+def test_a_card_that_is_no_mapping_raises(tmp_path, model):
     model.with_suffix(".json").write_text("[1]")
     with pytest.raises(ReskinError, match="format None is not supported"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
-def test_a_model_without_its_card_is_refused(tmp_path, model):
+def test_a_model_without_its_card_raises(tmp_path, model):
     model.with_suffix(".json").unlink()
     with pytest.raises(ReskinError, match=r"model\.json: card of the model not found"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
@@ -193,12 +193,12 @@ def test_a_model_without_its_card_is_refused(tmp_path, model):
         ("mine/one.safetensors", "Give the path of a trained"),
     ],
 )
-def test_a_model_that_is_missing_says_which_scene_writes_it(tmp_path, path, remedy):
+def test_a_missing_model_names_the_scene_that_trains_it(tmp_path, path, remedy):
     with pytest.raises(ReskinError, match=f"model file not found.*{remedy}"):
         load_model(tmp_path / path)
 
 
-def test_a_log_that_begins_in_contact_is_refused(tmp_path, model):
+def test_a_log_that_starts_in_contact_raises(tmp_path, model):
     log = write_log(tmp_path)
     first, *rows = log.read_text().splitlines(keepends=True)
     log.write_text("".join([first, *rows[QUIET_N - 50 :]]))
@@ -206,7 +206,7 @@ def test_a_log_that_begins_in_contact_is_refused(tmp_path, model):
         predict(log, model, tmp_path / "out.csv")
 
 
-def test_without_a_model_the_map_of_simulated_skins_answers(tmp_path):
+def test_without_a_model_the_universal_model_is_used(tmp_path):
     predict(write_log(tmp_path), None, tmp_path / "out.csv")
     rows = [line.split(",") for line in (tmp_path / "out.csv").read_text().splitlines()[1:]]
     touched = [row for row in rows if row[-1] == "1"]

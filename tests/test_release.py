@@ -54,7 +54,7 @@ def wheel(tmp_path_factory) -> Path:
     return folder / "lib"
 
 
-def test_the_wheel_holds_the_library_and_what_it_reads_and_nothing_else(wheel):
+def test_wheel_holds_the_library_only(wheel):
     names = {str(file.relative_to(wheel)) for file in wheel.rglob("*") if file.is_file()}
     files = [file.relative_to(ROOT) for file in (ROOT / "reskin").rglob("*.*")]
     assert names == {str(file) for file in files if not any(part.startswith((".", "__pyc")) for part in file.parts)}
@@ -65,19 +65,19 @@ def test_the_wheel_holds_the_library_and_what_it_reads_and_nothing_else(wheel):
     } <= names
 
 
-def test_every_script_of_a_page_is_ours_or_says_its_licence(wheel):
+def test_foreign_scripts_have_a_licence(wheel):
     foreign = [file for file in wheel.rglob("*.js") if len(max(file.read_text().splitlines(), key=len)) > 500]
     assert [file.name for file in foreign if not list(file.parent.glob(f"{file.name}.LICENSE*"))] == []
 
 
-def test_what_runs_outside_a_checkout_imports_the_core_alone():
+def test_library_imports_only_required_packages():
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT.format(core=CORE, away=AWAY)], cwd=ROOT, capture_output=True, text=True
     )
     assert done.stdout == "(1, 3)\n", done.stderr
 
 
-def test_a_package_that_is_not_there_is_one_sentence_with_the_extra_that_brings_it():
+def test_a_missing_package_names_its_extra():
     with pytest.raises(ParamsError, match=r"model.safetensors: package nowhere is not installed.*\[pipeline\]"):
         require("nowhere", "model.safetensors")
     with pytest.raises(ParamsError, match=r"package torch is not installed.*'\.\[train\]'"), explaining("reskin"):
@@ -86,7 +86,7 @@ def test_a_package_that_is_not_there_is_one_sentence_with_the_extra_that_brings_
         raise ModuleNotFoundError("", name="pipeline.gone")
 
 
-def test_every_package_that_the_code_imports_is_asked_for():
+def test_imported_packages_are_declared():
     sources = [*(ROOT / "pipeline").rglob("*.py"), *(ROOT / "reskin").rglob("*.py")]
     texts = [file.read_text(encoding="utf-8") for file in sources]
     names = {
@@ -99,14 +99,14 @@ def test_every_package_that_the_code_imports_is_asked_for():
     assert {known.get(name, name) for name in imported} <= asked
 
 
-def test_one_version_stands_in_the_project_its_citation_and_its_changelog():
+def test_version_is_the_same_everywhere():
     citation = read_yaml(ROOT / "CITATION.cff")
     top = re.search(r"^## (\S+) \((\S+)\)", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert (citation["version"], citation["date-released"]) == top.groups()
     assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
 
 
-def test_all_licences_are_compatible_and_those_of_the_core_without_exception():
+def test_licences_are_compatible():
     assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # none is tolerated that need not be
     assert closure(wanted()).keys() & TOLERATED.keys() == set()
 
@@ -125,7 +125,7 @@ def test_a_licence_is_compatible_if_one_alternative_is(licence, fits):
     assert is_compatible(licence) is fits
 
 
-def test_constraints_are_written_beside_the_old_ones_which_they_replace_whole(tmp_path, monkeypatch):
+def test_constraints_are_replaced_atomically(tmp_path, monkeypatch):
     file, old = tmp_path / "constraints.txt", tmp_path / "old"
     file.write_text("torch==1.0\n")
     old.hardlink_to(file)
@@ -136,18 +136,18 @@ def test_constraints_are_written_beside_the_old_ones_which_they_replace_whole(tm
     assert old.read_text() == "torch==1.0\n"
 
 
-def test_constraints_name_no_project_of_ours_and_no_package_of_one_graphics_card():
+def test_constraints_leave_out_reskin_and_gpu_packages():
     lines = render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin": "0.1"}).splitlines()
     assert lines[1:] == ["Attrs==1.0", "torch==2.0"]
 
 
-def test_the_command_of_the_library_knows_which_commands_a_checkout_adds():
+def test_checkout_commands_are_all_named():
     names = {one.name or one.callback.__name__.replace("_", "-") for one in checkout.registered_commands}
     assert {"scenes", *names} == {*CHECKOUT_COMMANDS}
 
 
 @pytest.mark.parametrize("name", CHECKOUT_COMMANDS)
-def test_outside_a_checkout_its_commands_say_where_they_work(tmp_path, monkeypatch, name):
+def test_outside_a_checkout_its_commands_raise(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["reskin", name, "any.csv"])
     with pytest.raises(ParamsError, match=f"reskin {name} works in a checkout of the project"):

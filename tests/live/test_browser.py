@@ -133,7 +133,7 @@ def in_browser(folder: Path, act: Callable) -> Callable:
     return shown
 
 
-def test_a_poke_is_drawn_at_its_place_and_zero_and_record_work(tmp_path, monkeypatch):
+def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     asked = zeros_asked(monkeypatch)
 
@@ -171,7 +171,7 @@ def test_a_poke_is_drawn_at_its_place_and_zero_and_record_work(tmp_path, monkeyp
     assert (folder / HEADER_FILE).is_file()
 
 
-def test_a_dozen_pokes_adapt_the_map_and_its_ellipse_is_drawn(tmp_path, simulated):  # noqa: F811
+def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, simulated):  # noqa: F811
     async def act(tab: Tab) -> None:
         await tab.until(
             "boards[0].last && boards[0].last.contact && boards[0].last.sdX > .1 && boards[0].last.sdY > .1"
@@ -186,7 +186,7 @@ def test_a_dozen_pokes_adapt_the_map_and_its_ellipse_is_drawn(tmp_path, simulate
         serve(name, load_universal(), in_browser(tmp_path, act))
 
 
-def test_presses_at_the_crosses_adapt_the_map_and_errors_before_and_after_are_shown(tmp_path, pressed):  # noqa: F811
+def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, pressed):  # noqa: F811
     quiet = poked(pressed)
     late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)  # in which the button is pressed, before the first place
     script = replace(quiet, t_s=quiet.t_s + late_s)
@@ -207,7 +207,7 @@ def test_presses_at_the_crosses_adapt_the_map_and_errors_before_and_after_are_sh
         serve(name, load_universal(), in_browser(tmp_path, act))
 
 
-def test_several_boards_are_drawn_each_with_its_own_dot_rate_and_losses(tmp_path):
+def test_page_draws_several_boards(tmp_path):
     async def act(tab: Tab) -> None:
         await tab.until("boards.length === 8 && boards.every(({state}) => state.zeroed)")
         for i in range(1, 8):  # the map is of five chips; the sleeve is drawn without a dot

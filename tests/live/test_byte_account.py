@@ -81,7 +81,7 @@ def in_portions(data: bytes, rng: np.random.Generator) -> list[bytes]:
     return [data[first:last] for first, last in pairwise([0, *cuts, len(data)])]
 
 
-def test_frames_and_lost_bytes_are_all_that_was_sent_and_each_reason_is_right():
+def test_every_byte_is_in_a_frame_or_counted_under_the_right_reason():
     total: Counter[str] = Counter()
     for seed in range(SEEDS_N):
         script, clean, finite, rng = draw(seed)

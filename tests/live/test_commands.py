@@ -25,7 +25,7 @@ def clock(tmp_path, monkeypatch):
     monkeypatch.setattr("reskin.board.port.time", SimpleNamespace(monotonic=monotonic, time=time.time))
 
 
-def test_a_recording_needs_no_option_when_one_board_is_there(tmp_path, monkeypatch, capsys):
+def test_record_without_options_finds_the_only_board(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with plugged_in(make_script(chips_n=4, wire="text-txyz"), loop=True) as name:
         monkeypatch.setattr(find, "port_names", lambda: [name])
@@ -37,14 +37,14 @@ def test_a_recording_needs_no_option_when_one_board_is_there(tmp_path, monkeypat
     assert (header.wire, header.chips_n, header.capture) == ("text-txyz", 4, folder.name)
 
 
-def test_a_recording_says_which_chip_was_broken(tmp_path, monkeypatch, capsys):
+def test_record_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with plugged_in(inject(make_script(), parse_fault("failed-read@0+99")), loop=True) as name:
         commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **UNTOLD)
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 
 
-def test_a_page_without_options_is_that_of_all_boards_that_are_there(monkeypatch):
+def test_live_without_options_shows_all_boards(monkeypatch):
     shown = {}
     monkeypatch.setattr("reskin.live.server.serve", lambda sessions, **words: shown.update(words, sessions=sessions))
     monkeypatch.setattr(

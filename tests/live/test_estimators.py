@@ -37,7 +37,7 @@ def poked(simulated, chips_on_n: int = 0):
     return Script("simulated", "binary", script.frames, encode_pieces(script.frames, "binary"), script.t_s)
 
 
-def test_without_a_model_the_map_answers_and_says_how_sure_it_is(simulated):
+def test_universal_model_estimates_places_and_their_standard_deviation(simulated):
     skin, readings = played(poked(simulated), load_universal())
     answers = np.concatenate([each.target[each.contact] for each in readings])
     sd_mm = np.concatenate([each.sd_mm[each.contact] for each in readings])
@@ -49,12 +49,12 @@ def test_without_a_model_the_map_answers_and_says_how_sure_it_is(simulated):
     assert skin.health.alarms == {}
 
 
-def test_a_board_with_its_chips_in_another_order_is_none_that_it_knows(simulated):
+def test_chips_in_another_order_are_an_unknown_skin(simulated):
     skin, _ = played(poked(simulated, chips_on_n=1), load_universal())
     assert skin.health.alarms[UNKNOWN_SKIN].count_n > 0.5 * POKED_N * PRESSES_N
 
 
-def test_a_dozen_pokes_are_gathered_one_a_contact_and_the_map_learns_from_them(simulated):
+def test_presses_are_collected_and_adapted_to(simulated):
     _, readings = played(poked(simulated), load_universal())
     pokes = Presses()
     for each in readings:
@@ -70,7 +70,7 @@ def test_a_dozen_pokes_are_gathered_one_a_contact_and_the_map_learns_from_them(s
     np.testing.assert_allclose(answers(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
 
 
-def test_a_dozen_pokes_that_went_wrong_are_mended_by_another(simulated):
+def test_new_presses_replace_wrong_ones(simulated):
     db_uT = simulated[1] - simulated[0].mean(axis=0)
     mended, once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
     for answers in (mended, once):
@@ -92,7 +92,7 @@ def pressed():
     return noload_uT, b_uT, places[:, :2], force_N
 
 
-def test_presses_at_shown_places_are_learnt_from_and_judged_at_those_in_between(pressed):
+def test_guided_presses_calibrate_and_test_the_model(pressed):
     _, readings = played(poked(pressed), load_universal())
     pokes, crosses = GuidedPresses(), []
     for each in readings:
@@ -114,7 +114,7 @@ def test_presses_at_shown_places_are_learnt_from_and_judged_at_those_in_between(
     np.testing.assert_allclose(answers(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6)
 
 
-def test_shown_places_are_learnt_beside_the_labels_that_a_model_has(pressed):
+def test_guided_presses_add_to_the_labels_of_a_calibration(pressed):
     noload_uT, b_uT, place_mm, force_N = pressed
     kept, rest_uT = GuidedPresses().held_out, noload_uT.mean(axis=0)
     learnt = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
@@ -127,21 +127,21 @@ def test_shown_places_are_learnt_beside_the_labels_that_a_model_has(pressed):
     assert learnt.presses_n == kept.sum()
 
 
-def test_a_knock_is_no_poke():
+def test_a_knock_is_no_press():
     pokes, db_uT = Presses(), np.full((6, 15), 100.0, np.float32)
     contact = np.array([True, True, False, True, False, False])
     pokes.add(Estimates(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), contact))
     assert len(pokes) == 0
 
 
-def test_on_a_board_of_other_chips_it_says_that_it_cannot_answer():
+def test_universal_model_is_not_used_for_boards_of_other_chips():
     skin, readings = played(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
     assert "no place and force: the universal model is for five chips. Give a model of this board." in skin.alarms()
     assert all(np.isnan(each.target).all() for each in readings)
 
 
-def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_opened(simulated, tmp_path):
+def test_a_calibrated_model_keeps_its_calibration_when_the_board_is_opened(simulated, tmp_path):
     noload_uT, b_uT, place_mm, force_N = simulated
     learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     learnt.save(tmp_path / "s3.safetensors")
@@ -157,7 +157,7 @@ def test_a_model_that_learnt_the_skin_keeps_what_it_learnt_when_its_board_is_ope
     np.testing.assert_array_equal(learnt.skin.mean, number)
 
 
-def test_one_skin_does_not_answer_for_several_boards(simulated, tmp_path):
+def test_a_calibration_is_refused_for_several_boards(simulated, tmp_path):
     noload_uT, b_uT, place_mm, force_N = simulated
     learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):

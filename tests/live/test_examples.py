@@ -41,7 +41,7 @@ def run(monkeypatch):
     return run
 
 
-def test_a_ros_2_node_publishes_each_contact_with_its_time(run):
+def test_ros_2_example(run):
     published = []
     node = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=published.append))
 
@@ -61,7 +61,7 @@ def test_a_ros_2_node_publishes_each_contact_with_its_time(run):
     assert (told.header.stamp.sec, told.header.stamp.nanosec) == (12, 500_000_000)
 
 
-def test_a_lerobot_dataset_gets_a_feature_of_field_and_estimate(run):
+def test_lerobot_example(run):
     frames, saved = [], []
 
     class Dataset:
@@ -76,7 +76,7 @@ def test_a_lerobot_dataset_gets_a_feature_of_field_and_estimate(run):
     assert saved == [30]
 
 
-def test_a_robots_program_labels_what_is_recorded(monkeypatch):
+def test_robot_example(monkeypatch):
     did, said = [], []
     robot = SimpleNamespace(
         places_in_random_order=lambda: [(4.0, 8.0), (0.0, 2.0)], lift_and_go_to=lambda *place: did.append(place),

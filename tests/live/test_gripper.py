@@ -8,7 +8,7 @@ from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit,
 SEEDS = range(3)  # each a skin and its network
 
 
-def test_half_a_newton_is_held_by_a_network_of_the_skin():
+def test_a_controller_holds_half_a_newton():
     """Over 12 seeds (mean and standard deviation) the estimate is held at 0.512 +- 0.002 N.
 
     The true force is off by 15 +- 9 % of the aim, so the mean of three seeds by 15 +- 5 %, and is 0.7 N at most.

@@ -76,7 +76,7 @@ def wait_until(is_so: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def test_a_board_is_found_recorded_and_seen_at_work_and_its_faults_are_told(shell, tmp_path):
+def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=4), tmp_path / "c0"), tmp_path / "board"
     board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "crlf@1+1")
     wait_until(link.is_symlink)
@@ -140,7 +140,7 @@ class connect:
         await self._socket.close()
 
 
-def test_what_a_killed_recorder_had_read_of_an_emulated_board_can_be_added(shell, tmp_path):
+def test_a_killed_recording_can_be_added(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
     shell.start("emulate", capture, "--port", link, "--loop")
     wait_until(link.is_symlink)
@@ -155,7 +155,7 @@ def test_what_a_killed_recorder_had_read_of_an_emulated_board_can_be_added(shell
     assert files["stream.bin"].stat().st_size > 8200
 
 
-def test_an_unplugged_board_ends_a_recording_that_is_whole(shell, tmp_path):
+def test_unplugging_ends_a_recording_that_is_complete(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
     shell.start("emulate", capture, "--port", link, "--loop", "--fault", "unplug@3+99")
     wait_until(link.is_symlink)
@@ -163,7 +163,7 @@ def test_an_unplugged_board_ends_a_recording_that_is_whole(shell, tmp_path):
     assert (tmp_path / "run1" / HEADER_FILE).is_file()
 
 
-def test_without_a_board_the_words_are_one_sentence(shell):
+def test_wrong_options_print_one_sentence(shell):
     process = shell.start("live", "--port", "x", "--replay", "y")
     _, complained = process.communicate(timeout=LONG_S)
     assert process.returncode == 2

@@ -67,7 +67,7 @@ def places_of(blocks):
     return {(float(x), float(y)) for block in blocks for x, y in zip(block.x_mm, block.y_mm, strict=True)}
 
 
-def test_what_a_program_labels_is_added_without_another_word(tmp_path, held, capsys):
+def test_a_program_labels_a_recording(tmp_path, held, capsys):
     with plugged_in(make_script(pokes_n=2), loop=True) as port:
         folder = reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.3, board="b0", scan="random")
     assert "2 touches labelled" in capsys.readouterr().err
@@ -87,7 +87,7 @@ def test_what_a_program_labels_is_added_without_another_word(tmp_path, held, cap
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # Python 3.12: there are threads
-def test_a_recording_that_is_killed_has_the_labels_that_had_come(tmp_path):
+def test_a_killed_recording_keeps_its_labels(tmp_path):
     """The recorder is a child of this process, so that no interpreter has to start."""
     robot = tmp_path / "robot.csv"
     with plugged_in(make_script(pokes_n=1), loop=True) as port:
@@ -120,7 +120,7 @@ def write_robots_log(robot, part):
                 return
 
 
-def test_a_full_disk_ends_it_and_what_came_can_be_added(tmp_path, monkeypatch, held):
+def test_a_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
     from errno import ENOSPC
 
     from reskin.recordings import labels
@@ -147,12 +147,12 @@ def test_a_full_disk_ends_it_and_what_came_can_be_added(tmp_path, monkeypatch, h
     [("robot.txt", None, None, "--labels: robot.txt is none of"), ("grid:2x2:4", None, "spiral", "--scan: prompts"),
      (None, "/dev/x@fast", None, "--gauge: /dev/x@fast is not PORT"), ("robot.csv", "/dev/x", None, "--labels")],
 )  # fmt: skip
-def test_what_is_no_source_is_refused(labels, gauge, scan, told):
+def test_invalid_label_sources_raise(labels, gauge, scan, told):
     with pytest.raises(ParamsError, match=told):
         label_source(labels, gauge, scan, dwell_s=1.0, say=print)
 
 
-def test_prompts_come_in_random_order_unless_told_and_nothing_is_asked_for_nothing():
+def test_prompts_are_random_by_default():
     assert label_source("grid:2x2:4", None, None, dwell_s=1.0, say=print).scan == "random"
     assert label_source("line:5:2", "/dev/x@9600", "snake", dwell_s=1.0, say=print).scan == "snake"
     assert label_source(None, "/dev/x", None, dwell_s=1.0, say=print).name == "gauge"

@@ -70,7 +70,7 @@ async def until(socket, wanted: Callable[[dict], bool]) -> dict:
     raise AssertionError("it was never told")
 
 
-def test_a_poke_its_place_force_and_rate_are_on_the_page_and_buttons_zero_and_record(tmp_path, monkeypatch):
+def test_page_gets_estimates_and_buttons_zero_and_record(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     asked = zeros_asked(monkeypatch)
     models = [read_network(write_model(tmp_path))]
@@ -105,7 +105,7 @@ def test_a_poke_its_place_force_and_rate_are_on_the_page_and_buttons_zero_and_re
         serve(name, models, act)
 
 
-def test_a_page_waits_for_a_board_that_is_not_there(tmp_path):
+def test_page_waits_for_a_missing_board(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         async with client.ws_connect(f"{address}/live") as socket:
             state = await until(socket, lambda told: "not open" in " ".join(told.get("alarms", [])))
@@ -125,7 +125,7 @@ def test_a_page_waits_for_a_board_that_is_not_there(tmp_path):
     serve(str(tmp_path / "none"), [], act)
 
 
-def test_strangers_are_sent_away(tmp_path):
+def test_requests_of_other_hosts_and_sites_are_forbidden(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         own = address.removeprefix("http://")
         for headers, status in (
@@ -145,7 +145,7 @@ def test_strangers_are_sent_away(tmp_path):
     serve(str(tmp_path / "none"), [], act)
 
 
-def test_elsewhere_than_here_nothing_is_given_without_the_token(tmp_path):
+def test_other_machines_need_the_token(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         for query, status in (("", 403), ("?token=guess", 403), ("?token=\u00e9", 403), ("?token=secret", 200)):
             async with client.get(f"{address}/{query}", headers={"Host": "lab-pc:8765"}) as page:
@@ -158,7 +158,7 @@ def test_elsewhere_than_here_nothing_is_given_without_the_token(tmp_path):
     serve(str(tmp_path / "none"), [], act, token="secret")
 
 
-def test_junk_does_nothing_and_what_is_too_long_or_too_many_is_refused(tmp_path, monkeypatch):
+def test_junk_is_ignored_and_long_messages_and_crowds_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     async def act(address: str, client: aiohttp.ClientSession) -> None:

@@ -39,7 +39,7 @@ def plug_in_all(stack: ExitStack, goes: ExitStack, folder, boards) -> list[str]:
     return names
 
 
-def test_a_page_shows_eight_boards_and_the_unplugging_of_one_is_told_in_its_place_alone(tmp_path):
+def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
     async def look(address: str, client: aiohttp.ClientSession, i: int) -> None:
         async with client.ws_connect(f"{address}/live?board={i}") as page:
             state = await until(page, lambda told: told.get("zeroed") is True)
@@ -73,7 +73,7 @@ def test_a_page_shows_eight_boards_and_the_unplugging_of_one_is_told_in_its_plac
         serve(plug_in_all(stack, goes, tmp_path, range(len(CHIPS_N))), load_universal(), act)
 
 
-def test_a_controller_has_the_latest_of_all_and_waits_for_none_that_is_unplugged(tmp_path):
+def test_an_unplugged_board_does_not_hold_up_the_others(tmp_path):
     with ExitStack() as stack, ExitStack() as goes:
         names = plug_in_all(stack, goes, tmp_path, (1, 2, GOES))
         with reskin.open(names, model=write_model(tmp_path)) as skins:
@@ -97,7 +97,7 @@ def played_at(port: str) -> LiveSkin:
     return skin
 
 
-def test_an_error_of_a_model_is_raised_where_somebody_iterates_over_the_boards():
+def test_an_error_of_a_model_is_raised_to_the_caller():
     dying, well = played_at("dying"), played_at("well")
     dying.estimator = Dying()
     with LiveSkins([dying, well]) as skins:
@@ -106,7 +106,7 @@ def test_an_error_of_a_model_is_raised_where_somebody_iterates_over_the_boards()
             next(iter(skins))
 
 
-def test_an_error_of_a_model_is_told_on_the_page():
+def test_an_error_of_a_model_is_an_alarm_on_the_page():
     live = Session("played", [], "a board")
     live.skin = played_at("played")
     live.skin.estimator = Dying()
@@ -114,7 +114,7 @@ def test_an_error_of_a_model_is_told_on_the_page():
     assert "estimates ended: RuntimeError('out of memory')" in live.state()["alarms"]
 
 
-def test_ports_that_are_named_twice_or_too_many_or_not_there_are_refused(tmp_path):
+def test_invalid_lists_of_ports_raise(tmp_path):
     for ports in (["a", "a"], [f"p{i}" for i in range(BOARDS_MAX_N + 1)], []):
         with pytest.raises(ReskinError, match="--port: ports must be 1 to 16, each named once"):
             open_sessions(ports, [], "a board")

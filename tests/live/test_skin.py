@@ -34,7 +34,7 @@ SCRIPT = make_script(pokes_n=2)
 LATE = {"no data", "slower than it was: frames are missing"}  # what a busy machine makes of a healthy board
 
 
-def test_every_reading_has_its_time_place_and_force_in_contact_and_none_off_it(tmp_path):
+def test_every_reading_has_time_place_and_force(tmp_path):
     script = make_script(pokes_n=3, quiet_s=QUIET_S + 2.5)
     unread_n = 1000  # frames at most that a pseudo-terminal keeps, and throws away when a late reader opens it
     with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -53,7 +53,7 @@ def test_every_reading_has_its_time_place_and_force_in_contact_and_none_off_it(t
     assert all(math.isnan(contact.sd_mm[0]) for contact in contacts)
 
 
-def test_several_models_say_how_far_they_are_apart(tmp_path):
+def test_several_models_give_mean_and_standard_deviation(tmp_path):
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
@@ -62,7 +62,7 @@ def test_several_models_say_how_far_they_are_apart(tmp_path):
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
 
 
-def test_who_is_slow_gets_the_latest_and_no_byte_is_lost(tmp_path):
+def test_a_slow_caller_gets_the_latest_reading_and_no_byte_is_lost(tmp_path):
     def frame_i(contact) -> int:
         return int(np.flatnonzero((SCRIPT.frames.b_uT == contact.b_uT).all(axis=1))[0])
 
@@ -81,7 +81,7 @@ def test_who_is_slow_gets_the_latest_and_no_byte_is_lost(tmp_path):
         assert skin.reader.missed_bytes_n == skin.lost_bytes_n == 0
 
 
-def test_a_stall_and_an_unplugging_are_told_while_they_last_and_it_goes_on_after(tmp_path):
+def test_stalls_and_unplugging_are_alarms_and_it_continues(tmp_path):
     script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
     link, told = str(tmp_path / "board"), []
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -94,7 +94,7 @@ def test_a_stall_and_an_unplugging_are_told_while_they_last_and_it_goes_on_after
     assert "unplugged" in words
 
 
-def test_a_failed_read_is_no_contact(tmp_path):
+def test_failed_reads_have_no_estimate(tmp_path):
     skin, readings = played(inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))])
     failed = [row for each in readings for row in each.target[each.b_uT[:, 3] == np.float32(8028.16)]]
     assert len(failed) == 200
@@ -102,7 +102,7 @@ def test_a_failed_read_is_no_contact(tmp_path):
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
 
 
-def test_a_port_that_is_opened_inside_a_frame_loses_nothing_and_raises_no_alarm_and_a_hole_does():
+def test_opening_a_port_within_a_frame_is_no_loss():
     whole = make_script(pokes_n=0)
     for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):  # a line feed alone begins no frame
         pieces = [piece[-left_n:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
@@ -113,7 +113,7 @@ def test_a_port_that_is_opened_inside_a_frame_loses_nothing_and_raises_no_alarm_
 
 
 @pytest.mark.parametrize("chunk_n", [20, 3280])
-def test_garbage_behind_a_replug_is_lost_and_told(chunk_n):
+def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
     skin, _ = played(make_script(pokes_n=0))
     garbage = np.random.default_rng(0).bytes(40 * 3280)
     skin._start_stream(skin.detected)
@@ -123,12 +123,12 @@ def test_garbage_behind_a_replug_is_lost_and_told(chunk_n):
     assert {"bytes lost between frames", "no frames in what comes: wrong baud rate?"} <= set(skin.health.alarms)
 
 
-def test_a_magnet_is_a_field_from_outside_and_nothing_else(tmp_path):
+def test_a_magnet_raises_only_the_alarm_of_an_outside_field(tmp_path):
     skin, _ = played(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"field from outside"}
 
 
-def test_a_second_in_which_something_moves_is_no_no_load_reading():
+def test_no_load_reading_waits_until_nothing_moves():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = played(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
@@ -137,7 +137,7 @@ def test_a_second_in_which_something_moves_is_no_no_load_reading():
     assert not played(moving)[0].zeroed
 
 
-def test_a_no_load_reading_that_is_asked_for_again_by_another_thread_is_begun_anew():
+def test_zero_from_another_thread_restarts_the_no_load_reading():
     class Pressed(list):
         def append(self, frames):  # between what two statements of the thread that polls do
             super().append(frames)
@@ -154,7 +154,7 @@ def test_a_no_load_reading_that_is_asked_for_again_by_another_thread_is_begun_an
 
 
 @pytest.mark.timeout(3600)
-def test_every_byte_that_was_sent_is_a_frames_or_lost_and_counted():
+def test_every_byte_is_in_a_frame_or_counted_as_lost():
     minutes_n = int(os.environ.get("RESKIN_MINUTES", "1"))
     script, rng = make_script(pokes_n=20), rng_for(0, "faults")
     for fault in ("torn", "dropped", "repeated", "wrong-baud", "crlf", "failed-read", "torn"):
@@ -183,7 +183,7 @@ def test_every_byte_that_was_sent_is_a_frames_or_lost_and_counted():
     print(f"\n{sum(sent)} bytes sent: {dict(account)}, {waiting_n} bytes wait for more")
 
 
-def test_the_forty_chips_of_a_sleeve_are_drawn_where_they_lie_and_answered_for(tmp_path):
+def test_sleeve_of_forty_chips_has_layout_and_estimates(tmp_path):
     model = read_network(write_model(tmp_path, chips_n=40))
     skin, readings = played(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
     assert skin.layout.known
@@ -195,7 +195,7 @@ def test_the_forty_chips_of_a_sleeve_are_drawn_where_they_lie_and_answered_for(t
     assert skin.health.alarms == {}
 
 
-def test_eight_boards_on_eight_ports_are_each_their_own():
+def test_eight_boards_at_once():
     chips_n = range(1, 9)
 
     def look(name: str) -> int:
@@ -210,7 +210,7 @@ def test_eight_boards_on_eight_ports_are_each_their_own():
         assert list(pool.map(look, names)) == list(chips_n)
 
 
-def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
+def test_a_model_of_other_boards_and_a_missing_port_raise(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
         with pytest.raises(ReskinError, match="the board has 12 channels, but the model 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
@@ -218,7 +218,7 @@ def test_a_model_of_other_boards_and_a_port_without_one_are_refused(tmp_path):
         pass
 
 
-def test_a_port_that_another_program_holds_is_called_not_open_and_not_unplugged():
+def test_a_port_held_by_another_program_is_not_open():
     with plugged_in(SCRIPT, loop=True) as name, open_port(name, 115200):
         skin = LiveSkin(name)
         skin.reader.start(there=False)

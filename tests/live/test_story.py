@@ -72,7 +72,7 @@ def let_arrive_in_time(folder: Path, sent: Script) -> None:
     seal(folder, header)
 
 
-def test_a_board_that_was_recorded_becomes_a_table_and_a_model_that_sees_it_live(tmp_path):
+def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     script, log = make_poked()
     root, link = copy_checkout(tmp_path / "checkout"), tmp_path / "board"
     (root / "robot.csv").write_text(probe.render(log))

@@ -1,4 +1,4 @@
-"""What is played is what is read: every byte, over a pseudo-terminal and a socket, at its rate or faster."""
+"""Scripts of the emulator hold what was recorded, and every byte of them arrives, in time; injected faults."""
 
 import math
 import threading
@@ -11,12 +11,16 @@ import pytest
 
 from reskin.board.port import open_port, read_waiting
 from reskin.board.stream import decode_all
-from reskin.errors import CaptureError, ParamsError
-from reskin.live.emulator import LATE_MAX_S, inject, make_port, parse_fault, play
-from tests.live.boards import RATE_HZ, make_script
+from reskin.errors import CaptureError, ParamsError, ReskinError
+from reskin.live.emulator import LATE_MAX_S, inject, make_port, parse_fault, play, read_script
+from reskin.recordings.header import LOG_FILE, Clock, write_capture
+from reskin.recordings.readers.sd_card import render
+from tests.live.boards import RATE_HZ, make_script, write_script
+from tests.recordings.headers import make_header
+from tests.stages.checkout import ROOT
 
 LONG_S = 120.0
-SCRIPT = make_script(pokes_n=0)
+SCRIPT, POKED = make_script(pokes_n=0), make_script(pokes_n=1)
 
 
 class Times:
@@ -59,7 +63,7 @@ def times(monkeypatch):
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
-def test_every_byte_arrives_as_fast_as_it_is_taken_and_no_reader_is_no_loss(port):
+def test_no_byte_is_lost_while_nobody_reads(port):
     sent = b"".join(SCRIPT.pieces)
     end, stop, told = make_port(port), threading.Event(), []
     player = threading.Thread(target=lambda: told.append(play(SCRIPT, end, stop, speed=math.inf)))
@@ -76,7 +80,7 @@ def test_every_byte_arrives_as_fast_as_it_is_taken_and_no_reader_is_no_loss(port
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
-def test_what_is_played_over_and_over_begins_again_when_its_port_is_opened_again(port):
+def test_loop_starts_again_when_the_port_is_opened_again(port):
     # Who opens a port throws away what waits there, so that of the first frames some may not come.
     script = make_script(pokes_n=2)
     end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
@@ -97,13 +101,13 @@ def test_what_is_played_over_and_over_begins_again_when_its_port_is_opened_again
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
-def test_a_script_is_played_at_its_own_rate_or_as_many_times_faster(times, speed):
+def test_speed_multiplies_the_rate_of_the_script(times, speed):
     taker = Taker(times)
     assert play(SCRIPT, taker, times, speed=speed) == len(b"".join(SCRIPT.pieces))
     np.testing.assert_allclose(taker.came_s, SCRIPT.t_s / speed, atol=1e-8)
 
 
-def test_a_reader_that_keeps_the_board_waiting_is_given_a_tenth_of_a_second_at_once_and_no_more(times):
+def test_a_late_reader_gets_at_most_a_tenth_of_a_second_at_once(times):
     taker = Taker(times, late_i=100, late_s=2.0)
     play(SCRIPT, taker, times)
     late_s = np.array(taker.came_s) - SCRIPT.t_s
@@ -112,7 +116,7 @@ def test_a_reader_that_keeps_the_board_waiting_is_given_a_tenth_of_a_second_at_o
     assert max(Counter(taker.came_s).values()) <= LATE_MAX_S * RATE_HZ + 1
 
 
-def test_a_link_keeps_its_name_when_the_board_is_unplugged_and_plugged_in_again(tmp_path):
+def test_link_keeps_its_name_over_unplugging(tmp_path):
     link, stop = tmp_path / "board", threading.Event()
     end = make_port(str(link))
     player = threading.Thread(target=play, args=[inject(SCRIPT, parse_fault("unplug@0.5+99")), end, stop])
@@ -128,7 +132,7 @@ def test_a_link_keeps_its_name_when_the_board_is_unplugged_and_plugged_in_again(
     end.unplug()
 
 
-def test_a_port_that_is_no_port_is_refused(tmp_path):
+def test_invalid_ports_raise(tmp_path):
     (tmp_path / "file").touch()
     for port in ("usb", "tcp:x", str(tmp_path / "file")):
         with pytest.raises(ParamsError, match="--port: "):
@@ -139,7 +143,7 @@ def test_a_port_that_is_no_port_is_refused(tmp_path):
 
 
 class TestFaults:
-    def test_values_change_inside_the_fault_and_bytes_outside_stay(self):
+    def test_value_faults_change_only_the_frames_inside(self):
         for name in ("failed-read", "chip-reset", "stuck", "saturated", "int16-wrap", "magnet", "too-hot", "crlf"):
             changed = inject(SCRIPT, parse_fault(f"{name}@0.5+0.25"))
             inside = (SCRIPT.t_s >= 0.5) & (SCRIPT.t_s < 0.75)
@@ -148,7 +152,7 @@ class TestFaults:
             assert differs[inside].mean() > 0.4, name
             assert [len(piece) for piece in changed.pieces] == [len(piece) for piece in SCRIPT.pieces]
 
-    def test_dropped_repeated_and_torn_frames_are_so_many_less_or_more(self):
+    def test_byte_faults_change_the_number_of_frames(self):
         def frames_n(name: str) -> int:
             return len(
                 decode_all(b"".join(inject(SCRIPT, parse_fault(f"{name}@0.5+0.25")).pieces), "binary", 5, name)[0]
@@ -158,7 +162,7 @@ class TestFaults:
         assert frames_n("repeated") == len(SCRIPT) + 100
         assert frames_n("torn") == len(SCRIPT) - 2 * 10  # with its end goes the start of the next
 
-    def test_a_clock_can_jump_only_where_there_is_one(self):
+    def test_clock_jump_needs_frames_with_a_clock(self):
         with pytest.raises(ParamsError, match="Take binary-clock"):
             inject(
                 replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),
@@ -167,6 +171,41 @@ class TestFaults:
         assert len(inject(make_script(pokes_n=0, wire="binary-clock"), parse_fault("clock-jump@0.5"))) == len(SCRIPT)
 
     @pytest.mark.parametrize("text", ["", "stick", "stuck@", "stuck@-1", "stuck@1+", "stuck@99", "stuck@1e9"])
-    def test_a_fault_that_is_none_or_never_happens_is_refused(self, text):
+    def test_invalid_faults_raise(self, text):
         with pytest.raises(ParamsError, match="--fault: "):
             inject(SCRIPT, parse_fault(text))
+
+
+@pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
+def test_script_of_a_capture_has_its_bytes_and_times(tmp_path, wire):
+    sent = make_script(pokes_n=1, wire=wire)
+    write_script(sent, tmp_path / "c0")
+    script = read_script(str(tmp_path / "c0"))
+    assert script.pieces == sent.pieces
+    np.testing.assert_allclose(script.t_s, POKED.t_s, atol=1e-6)
+    assert script.duration_s == pytest.approx(len(script) / 400)
+
+
+def test_script_of_an_sd_card_log_has_its_frames(tmp_path):
+    frames = POKED.frames
+    log = render(1 + POKED.t_s, frames.b_uT, frames.temperature_degC)
+    header = make_header(capture="c0", layout="sd-card", clock=Clock(kind="recording", rate_hz=None, marks=()))
+    write_capture(tmp_path / "c0", header, {LOG_FILE: log.encode()})
+    script = read_script(str(tmp_path / "c0"))
+    np.testing.assert_allclose(script.frames.b_uT, frames.b_uT, atol=0.006)  # two decimals
+    np.testing.assert_allclose(script.t_s, POKED.t_s, atol=1e-4)
+
+
+@pytest.mark.parametrize("source", ["nominal", str(ROOT / "pipeline/scenes/ci.yaml")])
+def test_script_of_a_simulation_has_contacts(source):
+    script = read_script(source)
+    assert script.frames.b_uT.shape == (len(script), 15)
+    assert np.all(np.diff(script.t_s) >= 0)
+    assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # uT
+
+
+def test_invalid_sources_raise(tmp_path):
+    for source in (str(tmp_path), "nowhere", str(ROOT / "pipeline/scenes/lab.yaml"), "../scenes/quick"):
+        with pytest.raises(ReskinError, match="not the folder of a capture|not a simulated scene") as told:
+            read_script(source)
+        assert "Traceback" not in str(told.value)

@@ -20,7 +20,7 @@ def forces(data):
     return start_s, traces[0, :, 0], traces[1, :, 0]
 
 
-def test_a_peak_of_one_frame_is_in_its_bin_and_minutes_of_frames_are_ten_seconds_of_bins():
+def test_bins_keep_peaks_and_only_ten_seconds():
     traces, peak_s = Traces(layout_of(5), 0.0), 115.0
     for first in range(0, 48_000, 40):  # two minutes at 400 Hz
         t_s = (first + np.arange(40)) / 400
@@ -34,7 +34,7 @@ def test_a_peak_of_one_frame_is_in_its_bin_and_minutes_of_frames_are_ten_seconds
     assert len(traces.message(traces.newest_bin, rate_hz=400.0, lost_bytes_n=0)) < 300
 
 
-def test_a_gap_is_left_out_and_a_page_that_has_some_bins_gets_the_others():
+def test_messages_skip_gaps_and_known_bins():
     traces = Traces(layout_of(5), 0.0)
     for t_s in (np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)):
         traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
@@ -44,14 +44,14 @@ def test_a_gap_is_left_out_and_a_page_that_has_some_bins_gets_the_others():
     np.testing.assert_allclose(later_s, start_s[start_s >= 5.5 - 1e-6], atol=1e-5)
 
 
-def test_after_a_fortnight_bins_lie_as_far_apart_as_in_the_first_minute():
+def test_bin_times_stay_precise_after_two_weeks():
     traces, t_s = Traces(layout_of(5), 0.0), 14 * 86_400 + np.arange(0, 2, 0.005)
     traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
     start_s, _, _ = forces(traces.message(0, rate_hz=200.0, lost_bytes_n=0))
     np.testing.assert_allclose(np.diff(start_s), BIN_S, atol=1e-5)
 
 
-def test_the_time_to_a_screen_is_that_of_the_message_that_it_shows():
+def test_time_to_screen_is_that_of_the_confirmed_message():
     traces = Traces(layout_of(5), 0.0)
     traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
     number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
