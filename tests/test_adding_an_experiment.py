@@ -1,4 +1,4 @@
-"""What an edit re-runs, by DVC's own index and hashes and without running a stage: no more than what rests on it."""
+"""An edit re-runs only the stages that depend on it, by DVC's own index and hashes; no stage is run here."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,11 +47,6 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Show a row for each capture."""
     lines = [{"capture": name, "sd of force, N": f"{sd_N:.3g}", "source": source} for name, sd_N in numbers.items()]
     return {"repeat": pd.DataFrame(lines)}
-
-
-def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw nothing."""
-    return {}
 ''',
 }
 
@@ -162,13 +157,13 @@ def test_a_new_caption_runs_the_report_and_the_code_of_an_experiment_its_stage_t
     assert run_again(before, after) == {"shear@ci", "table2@ci", "report@ci", "publish@ci"}
 
 
-def test_words_in_a_module_that_every_stage_imports_run_nothing(root, before):
+def test_comments_in_a_module_that_every_stage_imports_run_nothing(root, before):
     io = "reskin/io.py"
     with edited(root, {io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1)}):
         assert run_again(before, state(root)) == set()
 
 
-def test_words_in_the_code_of_learning_change_no_key_of_a_training_and_code_does(tmp_path, monkeypatch):
+def test_comments_in_the_code_of_training_change_no_cache_key_and_code_does(tmp_path, monkeypatch):
     files = {name: f"{name.replace('.', '/')}.py" for name in CODE_MODULES}
     sources = {name: (ROOT / file).read_text() for name, file in files.items()}
     (tmp_path / "reskin/models").mkdir(parents=True)

@@ -172,10 +172,6 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     return {"bound": tabulate(lines, meaning=_meaning(numbers), spread="± is the sd over n folds of the network.")}
 
 
-def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw nothing."""
-    return {}
-
 
 def _line(depth: str, row: Mapping[str, Any], network: Mapping[str, Any], source: str) -> dict[str, str]:
     line = {"depth, mm": depth, "source": source}

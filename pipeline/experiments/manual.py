@@ -170,8 +170,3 @@ def _line(
         if metric in OF_PAPER:
             line[f"{column} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
     return line | {"n": str(ours["accuracy_pct"]["n"])}
-
-
-def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw nothing."""
-    return {}

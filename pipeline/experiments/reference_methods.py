@@ -621,8 +621,3 @@ def _flagged_line(row: Mapping[str, Any], source: str) -> dict[str, str]:
         for name, readings in (("flagged", "flagged"), ("others", "all others")):
             line[f"{COLUMNS[metric]} ({readings})"] = show(row.get(f"{metric}_{name}"))
     return line | {"n": str(row["flagged_pct"]["n"]), "source": source}
-
-
-def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw nothing."""
-    return {}

@@ -383,10 +383,6 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     return found
 
 
-def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw nothing."""
-    return {}
-
 
 def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
     place, force = numbers["place"], numbers["force"]

@@ -21,13 +21,14 @@ def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.D
 
 
 def experiment_figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the figures of every experiment that the numbers hold: SVG text by file name.
+    """Draw the figures of every experiment that the numbers hold, if it has any: SVG text by file name.
 
     `drawn` holds, by key in numbers.json, the data that only its figures show.
     """
     figures: dict[str, str] = {}
     for key, module in _modules(numbers).items():
-        figures |= module.figures(numbers[key], drawn[key], source)
+        if hasattr(module, "figures"):
+            figures |= module.figures(numbers[key], drawn[key], source)
     return figures
 
 

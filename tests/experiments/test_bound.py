@@ -12,7 +12,6 @@ from pipeline.experiments.bound import (
     NETWORK,
     bound_errors,
     expected_scores,
-    figures,
     least_covariance,
     noise_var_uT2,
     probability_within,
@@ -159,7 +158,6 @@ def test_the_network_stands_beside_the_bound_over_all_depths():
     assert table["MSE_xy, mm² (bound, labels' errors added)"].tolist() == ["0.04"] * 3
     assert table["MSE_xy, mm² (network)"].tolist() == ["–", "–", "1 ± 0.5"]
     assert set(table["source"]) == {"simulated"}
-    assert figures(NUMBERS, {}, "simulated") == {}
 
 
 def test_pokes_that_touch_nothing_are_told_of():
