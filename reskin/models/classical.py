@@ -1,4 +1,4 @@
-"""Classical regression methods on the folds of the networks."""
+"""Classical regression methods, the reference methods for the networks on the same folds."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ from reskin.seeds import rng_for
 
 
 class _Method(Strict):
-    """What all methods share: the view (reskin.models.inputs) that they are to be given."""
+    """Base of all methods: the view of the inputs (`reskin.models.inputs`)."""
 
     inputs: Literal["raw", "shape"]
 
@@ -40,7 +40,7 @@ class Ridge(_Method):
 
 
 class CubicRidge(_Method):
-    """Ridge on all products of up to three inputs: 815 of 15, 968 of 16."""
+    """Ridge on all products of up to three inputs: 815 of 15 inputs, 968 of 16."""
 
     title: ClassVar[str] = "cubic ridge"
     method: Literal["cubic_ridge"]
@@ -48,7 +48,7 @@ class CubicRidge(_Method):
 
 
 class Neighbours(_Method):
-    """The mean of the nearest training rows, each counting its weight over its distance."""
+    """Mean of the nearest training rows, weighted by row weight over distance."""
 
     title: ClassVar[str] = "k nearest neighbours"
     method: Literal["knn"]
@@ -56,7 +56,7 @@ class Neighbours(_Method):
 
 
 class RbfRidge(_Method):
-    """exp(-gamma d^2) around each of at most `rows_max_n` rows; d^2 is 2 an input on average."""
+    """Kernel ridge with exp(-gamma d^2) around at most `rows_max_n` rows; d^2 is on average 2 for each input."""
 
     title: ClassVar[str] = "RBF kernel ridge"
     method: Literal["rbf_ridge"]
@@ -66,7 +66,7 @@ class RbfRidge(_Method):
 
 
 class Boosting(_Method):
-    """Trees on binned inputs, one row of trees a target; no early stop, whose hold-out would split indentations."""
+    """Gradient-boosted trees, one model a target; without early stopping, whose hold-out would split indentations."""
 
     title: ClassVar[str] = "gradient boosting"
     method: Literal["boosting"]
@@ -80,7 +80,7 @@ Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Fie
 
 @dataclass(frozen=True)
 class _Part:
-    """A regressor of those targets (0, 1, 2) that are known in the same training rows."""
+    """A regressor of the targets (columns 0, 1, 2) that are known in the same training rows."""
 
     targets: list[int]
     regressor: Any  # fit(inputs, target, weight), predict(inputs)
@@ -96,12 +96,11 @@ class FittedRegressor:
 
     @property
     def rows_n(self) -> int:
-        """Training rows that were used, by the target that is known in most of them."""
+        """Number of training rows, of the target that is known in most of them."""
         return max(part.rows_n for part in self.parts)
 
     def predict(self, inputs: Float32[np.ndarray, "f c"]) -> Float32[np.ndarray, "f 3"]:
-        """Predict x_mm, y_mm and F_N; NaN where no training row knew the target."""
-
+        """Predict x_mm, y_mm and F_N; NaN if the target was unknown in all training rows."""
         predicted = np.full((len(inputs), 3), np.nan, np.float32)
         encoded = self.scaler.encode(inputs).astype(np.float64)
         with one_thread():
@@ -120,19 +119,19 @@ def fit(
     *,
     weight: Float32[np.ndarray, " n"] | None,
 ) -> FittedRegressor:
-    """Fit to the rows that know a target (mm, mm, N), each target by itself where they differ.
+    """Fit a method to the rows with a known target (mm, mm, N).
 
-    `weight` counts a row as so many in the loss (in a vote, of neighbours); the scaler does not know it.
+    Targets that are known in different rows are fitted separately. `weight` is the weight of each row in the loss (for
+    neighbours, in the mean); the scaler ignores it.
     """
-
     assert weight is None or (weight > 0).all()
-    _check(settings, inputs, target)
-    scaler = _without_constant_channels(fit_standard(inputs, target))
+    _check_rows(settings, inputs, target)
+    scaler = _ignore_constant_inputs(fit_standard(inputs, target))
     encoded = scaler.encode(inputs).astype(np.float64)
     encoded_target = scaler.encode_target(target).astype(np.float64)
     weights = None if weight is None else weight.astype(np.float64)
     parts = []
-    for targets, rows in _known_together(target):
+    for targets, rows in _group_targets(target):
         row_weights = None if weights is None else weights[rows]
         if isinstance(settings, RbfRidge) and len(rows) > settings.rows_max_n:
             kept, row_weights = _thin(len(rows), settings.rows_max_n, row_weights, rng)
@@ -144,14 +143,14 @@ def fit(
     return FittedRegressor(scaler, tuple(parts))
 
 
-def _without_constant_channels(scaler: Scaler) -> Scaler:
-    """Scale an input that is constant in training to 0: at the floor's scale it would dominate all others in use."""
+def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
+    """Scale inputs that are constant in training to 0: at the floor of the scale they would dominate all others."""
     constant = scaler.input_scale <= SCALE_FLOOR
     return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
 
 
-def _known_together(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
-    """Gather the targets that are known in the same rows, with these rows."""
+def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
+    """Group the targets that are known in the same rows, with these rows."""
     known = ~np.isnan(target)
     together: dict[bytes, list[int]] = {}
     for i in np.flatnonzero(known.any(axis=0)):
@@ -164,8 +163,8 @@ def _thin(
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
     """Draw `most_n` of more rows without replacement.
 
-    Rows above the least weight all stay, or few labelled rows of a new skin would be lost among all others; their
-    weight is lowered as the others' number is, so that they keep their share.
+    Rows above the least weight are all kept: they are the few labelled rows of a new skin. Their weight is reduced as
+    the number of the others is, so that they keep their share.
     """
     if weight is None:
         return np.sort(rng.choice(rows_n, most_n, replace=False)), None
@@ -180,7 +179,7 @@ def _thin(
     return kept, np.where(heavy, weight * left_n / len(light), weight)[kept]
 
 
-def _check(settings: Classical, inputs: Float32[np.ndarray, "n c"], target: Float32[np.ndarray, "n 3"]) -> None:
+def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target: Float32[np.ndarray, "n 3"]) -> None:
     known_n = (~np.isnan(target)).sum(axis=0)
     fewest_n = min((int(n) for n in known_n if n), default=0)
     least_n = settings.neighbours_n if isinstance(settings, Neighbours) else 1
@@ -192,25 +191,25 @@ def _check(settings: Classical, inputs: Float32[np.ndarray, "n c"], target: Floa
         raise TrainingError(settings.method, "inputs", "finite", f"{broken_n} rows that are not", "Drop them.")
 
 
-BLOCK_ROWS_N = 4096  # handled at once, to bound memory: a kernel of them and 6000 rows is 200 MB
-_THREADS = ThreadpoolController()  # of the libraries above: finding them takes 3 ms, limiting them 15 us
+BLOCK_ROWS_N = 4096  # computed at once, to bound memory: their kernel with 6000 rows is 200 MB
+_THREADS = ThreadpoolController()  # made once: finding the libraries takes 3 ms, limiting them 15 us
 
 
 def one_thread() -> Any:
-    """Limit the libraries of linear algebra to one thread, as a context."""
+    """Context in which linear algebra uses one thread."""
     return _THREADS.limit(limits=1)
 
 
 def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
-    """Make what fits by these settings: fit(inputs, target, weight), predict(inputs)."""
+    """Make the regressor of these settings, with fit(inputs, target, weight) and predict(inputs)."""
     match settings:
         case Ridge():
             return LinearRidge(settings.alpha)
         case CubicRidge():
-            return _Cubic(settings.alpha)
+            return _BlockwiseCubicRidge(settings.alpha)
         case Neighbours(neighbours_n=k):
-            # A tree, as few of the 15 directions are ever taken; scikit-learn's choice is brute force from 16 on.
-            return _Voting(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
+            # A k-d tree: readings lie near few of the 15 directions. scikit-learn's default is brute force from 16 on.
+            return _WeightedNeighbours(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
         case RbfRidge():
             return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
         case Boosting():
@@ -224,12 +223,12 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
             return MultiOutputRegressor(trees)
 
 
-class _Cubic:
-    """Ridge on products, its sums gathered a block at a time: all products of the paper's rows would be 5 GB."""
+class _BlockwiseCubicRidge:
+    """Ridge on products, summed block by block: all products of the paper's rows would be 5 GB."""
 
     def __init__(self, alpha: float) -> None:
         self.alpha = alpha
-        self.lift = PolynomialFeatures(3)  # the first product is 1, whose factor is free
+        self.lift = PolynomialFeatures(3)  # the first product is 1, and its factor is not penalised
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
         c = self.lift.fit(inputs[:1]).n_output_features_
@@ -246,30 +245,30 @@ class _Cubic:
 
 
 @dataclass(frozen=True)
-class _Voting:
-    """scikit-learn's neighbours take no weights: sum(w y / d) / sum(w / d) is the ratio of two of its answers."""
+class _WeightedNeighbours:
+    """scikit-learn has no weights here: sum(w y / d) / sum(w / d) is the ratio of two of its predictions."""
 
     neighbours: KNeighborsRegressor
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
-        votes = np.ones(len(inputs)) if weight is None else weight
-        self.neighbours.fit(inputs, np.column_stack([votes[:, None] * target, votes]))
+        weights = np.ones(len(inputs)) if weight is None else weight
+        self.neighbours.fit(inputs, np.column_stack([weights[:, None] * target, weights]))
 
     def predict(self, inputs: np.ndarray, /) -> np.ndarray:
-        voted = self.neighbours.predict(inputs)
-        return voted[:, :-1] / voted[:, -1:]
+        summed = self.neighbours.predict(inputs)
+        return summed[:, :-1] / summed[:, -1:]
 
 
 def blocks(rows_n: int) -> list[slice]:
-    """Cut rows into blocks that fit into memory."""
+    """Split rows into blocks that fit into memory."""
     return [slice(i, i + BLOCK_ROWS_N) for i in range(0, rows_n, BLOCK_ROWS_N)]
 
 
 @dataclass(frozen=True)
 class ClassicalJob:
-    """A method on one fold; `few_labels` are labelled rows of a new skin, which together weigh as much as all others.
+    """A method on one fold, on at most `rows_max_n` training rows, drawn at random.
 
-    More than `rows_max_n` training rows are thinned to this number at random.
+    `few_labels` are labelled rows of a new skin, which together weigh as much as all others.
     """
 
     name: str
@@ -283,7 +282,7 @@ class ClassicalJob:
 
 @dataclass(frozen=True)
 class ClassicalResult:
-    """Predictions (mm, mm, N) for the test rows, the number of training rows, and times of fit and prediction."""
+    """Predictions (mm, mm, N) of the test rows, number of training rows, and seconds of fit and of one prediction."""
 
     predicted: Float32[np.ndarray, "b 3"]
     rows_n: int
@@ -292,8 +291,8 @@ class ClassicalResult:
 
 
 @dataclass(frozen=True)
-class _Inputs:
-    """The rows of one task, as its method sees them: small enough for another process."""
+class _JobRows:
+    """The rows of one job, small enough to send to another process."""
 
     train: Float32[np.ndarray, "a c"]
     target: Float32[np.ndarray, "a 3"]
@@ -302,31 +301,32 @@ class _Inputs:
 
 
 def run_classical_jobs(
-    tasks: Sequence[ClassicalJob], rows: TrainingData, executor: Executor, tell: Callable[[str], None]
+    jobs: Sequence[ClassicalJob], data: TrainingData, executor: Executor, log: Callable[[str], None]
 ) -> list[ClassicalResult]:
-    running = [executor.submit(_fit, task.method, task.name, task.seed, _inputs(task, rows)) for task in tasks]
-    fits = []
-    for task, future in zip(tasks, running, strict=True):
-        fits.append(future.result())
-        tell(f"{len(fits)}/{len(tasks)} {task.name}")
-    return fits
+    """Fit every job in the executor, and return the results in their order."""
+    running = [executor.submit(_fit, job.method, job.name, job.seed, _rows_of(job, data)) for job in jobs]
+    results = []
+    for job, future in zip(jobs, running, strict=True):
+        results.append(future.result())
+        log(f"{len(results)}/{len(jobs)} {job.name}")
+    return results
 
 
-def _inputs(task: ClassicalJob, rows: TrainingData) -> _Inputs:
-    train, weight, view = task.train, None, VIEW[task.method.inputs]
-    if len(train) > task.rows_max_n:
-        kept = rng_for(task.seed, "thin", task.name).choice(len(train), task.rows_max_n, replace=False)
+def _rows_of(job: ClassicalJob, data: TrainingData) -> _JobRows:
+    train, weight, view = job.train, None, VIEW[job.method.inputs]
+    if len(train) > job.rows_max_n:
+        kept = rng_for(job.seed, "thin", job.name).choice(len(train), job.rows_max_n, replace=False)
         train = train[np.sort(kept)]
-    if len(task.few_labels):
-        share = len(train) / len(task.few_labels)
-        weight = np.concatenate([np.ones(len(train)), np.full(len(task.few_labels), share)]).astype(np.float32)
-        train = np.concatenate([train, task.few_labels])
-    return _Inputs(view(rows.db_uT[train]), rows.target[train], weight, view(rows.db_uT[task.test]))
+    if len(job.few_labels):
+        share = len(train) / len(job.few_labels)
+        weight = np.concatenate([np.ones(len(train)), np.full(len(job.few_labels), share)]).astype(np.float32)
+        train = np.concatenate([train, job.few_labels])
+    return _JobRows(view(data.db_uT[train]), data.target[train], weight, view(data.db_uT[job.test]))
 
 
-def _fit(method: Classical, name: str, seed: int, inputs: _Inputs) -> ClassicalResult:
+def _fit(method: Classical, name: str, seed: int, rows: _JobRows) -> ClassicalResult:
     start_s = time.monotonic()
-    fitted = fit(method, inputs.train, inputs.target, rng_for(seed, "baseline", name), weight=inputs.weight)
+    fitted = fit(method, rows.train, rows.target, rng_for(seed, "baseline", name), weight=rows.weight)
     seconds = time.monotonic() - start_s
-    one_reading_s = median_call_s(partial(fitted.predict, inputs.test[:1]))
-    return ClassicalResult(fitted.predict(inputs.test), fitted.rows_n, seconds, one_reading_s)
+    one_reading_s = median_call_s(partial(fitted.predict, rows.test[:1]))
+    return ClassicalResult(fitted.predict(rows.test), fitted.rows_n, seconds, one_reading_s)
