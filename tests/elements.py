@@ -1,7 +1,7 @@
-"""A layer and a plate by finite elements (scikit-fem): truth for waves, shear, slide. In: loads. Out: motions.
+"""A layer and a plate by finite elements (scikit-fem): references for the layer, its shear and rigid sliding.
 
-Taylor & Hood's elements: displacement of order 2, pressure of order 1. A load that knows no direction needs the plane
-(r, z) alone, and so does one along x. The shear modulus is 1. Knows nothing of `pipeline`: no wave, no compliance.
+Taylor & Hood's elements: displacement of order 2, pressure of order 1. Axisymmetric loads and loads along x need only
+the (r, z) plane. The shear modulus is 1.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Solved:
-    """The layer, its base, its top, and the mean over the load of the displacement of the loaded part."""
+    """The layer, its base, its top, and the mean displacement of the loaded part, weighted with the load."""
 
     inside: Motion
     base: Motion
@@ -38,14 +38,14 @@ class Solved:
     under_load_m: float
 
 
-def round_strains(u, r):
-    """Give the strains of the parts u_r, u_z: those of length, then those of angle."""
+def axisymmetric_strains(u, r):
+    """Return the strains of u_r, u_z: normal strains, then shear strains."""
     (r_r, r_z), (z_r, z_z) = u.grad
     return (r_r, u[0] / r, z_z), (r_z + z_r,)
 
 
 def along_x_strains(u, r):
-    """Give those of A, B, C of `ShearMap`: u_r = (A + B) cos f, u_f = (B - A) sin f, u_z = C cos f."""
+    """Return those of A, B, C of `ShearMap`: u_r = (A + B) cos f, u_f = (B - A) sin f, u_z = C cos f."""
     (a_r, a_z), (b_r, b_z), (c_r, c_z) = u.grad
     return (a_r + b_r, 2 * u[1] / r, c_z), (b_r - a_r - 2 * u[1] / r, a_z + b_z + c_r, b_z - a_z - u[2] / r)
 
@@ -58,7 +58,7 @@ class Layer:
     fine_m: float
     end_m: float
     cells_n: int  # over the thickness
-    strains: Callable = round_strains
+    strains: Callable = axisymmetric_strains
 
     @cached_property
     def basis(self) -> Basis:
@@ -69,7 +69,7 @@ class Layer:
         mesh = MeshQuad.init_tensor(r_m, np.linspace(0, self.thickness_m, self.cells_n + 1))
         edges = {"axis": lambda x: x[0] == 0, "far": lambda x: x[0] == r_m[-1]}
         edges |= {"base": lambda x: x[1] == 0, "top": lambda x: np.isclose(x[1], self.thickness_m)}
-        parts_n = 2 if self.strains is round_strains else 3
+        parts_n = 2 if self.strains is axisymmetric_strains else 3
         return Basis(mesh.with_boundaries(edges), ElementVector(ElementQuad2(), parts_n), intorder=5)
 
     @cached_property
@@ -85,7 +85,7 @@ class Layer:
         return asm(BilinearForm(work), self.basis), squeezed
 
     def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solved:
-        """Solve for a load(r) on one part of the top, parts held at edges, and a drag(r) there per displacement u_r."""
+        """Solve for a load(r) on one component at the top, components held at edges, and springs(r) on u_r there."""
         (work, swelling), at = self.matrices, self.basis
         push = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), at.boundary("top"))
         for edge, of in drag.items():
@@ -101,7 +101,7 @@ class Layer:
         return Solved(*motions, push @ parts[0] / total.sum())
 
     def with_friction(self, load: Callable, friction: float, *, steps_n: int = 4, **edges) -> Solved:
-        """Solve for a pressure on top of a base that holds back with Coulomb's friction, by repeated solving.
+        """Solve for a pressure on top with Coulomb friction at the base, by fixed-point iteration.
 
         t = -friction p u / (|u| + u0), p and u of the solution before: sticks where p is large, slides elsewhere.
         """
@@ -120,7 +120,7 @@ def _motion(at: Basis, displacement: np.ndarray, pressure: np.ndarray) -> Motion
 
 
 def plate(sides_m, place_m, taken_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
-    """Pull a plate in plane stress, dragged alike everywhere, so that the mean over a patch goes as far as it is taken.
+    """Displace a patch of a plate in plane stress that is held by even springs.
 
     `stiffness` is E t over the drag per area, in areas of the plate. Returns the patch's middle, the mean motion, spin.
     """

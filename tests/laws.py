@@ -1,6 +1,6 @@
-"""Laws that a stage tabulates (`Check`, `Case`), held to here for other inputs."""
+"""Helper for tests of the checks and cases that experiments tabulate."""
 
 
 def broken(rows):
-    """Keep the rows that do not hold; pytest shows their error, tolerance and reason."""
+    """Return the rows that do not hold; pytest shows their error, tolerance and reason."""
     return [row for row in rows if not row.holds]

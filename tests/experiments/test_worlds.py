@@ -15,7 +15,7 @@ from reskin.config import parse, read_yaml
 from reskin.metrics import METRICS
 from tests.report.synthetic import texts_of
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 HOW = Residual(sizes=(0.4,), length_mm=3.5, length_log_N=1.2, own_share=0.5)
 GRID_MM = np.stack(np.meshgrid(np.linspace(-8, 8, 33), np.linspace(-8, 8, 33)), axis=-1).reshape(-1, 2)
 AT = np.column_stack([GRID_MM, np.zeros(len(GRID_MM))])
@@ -62,8 +62,8 @@ def files() -> Settings:
 
 
 def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, tmp_path):
-    worlds(files, answer=tmp_path / "answer.json")
-    numbers = io.read_json(tmp_path / "answer.json")["numbers"]
+    worlds(files, results=tmp_path / "results.json")
+    numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [(one["factor"], one["value"]) for one in numbers["by_world"]] == [("default", 1.0), ("residual", 0.42)]
     for one in numbers["by_world"]:
         for row in ("single", "multi", "triplet", "adapted"):
