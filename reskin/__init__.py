@@ -1,12 +1,22 @@
 """Learning for magnetic tactile skins: boards, recordings, simulation, models and calibration.
 
+=====================================  ==========================================================
+`open`                                 read contacts from a board while they happen
+`record`, `lifted`, `touch`            record a board while a program moves a robot
+`load_universal`                       the universal model, to be calibrated to any skin
+`load_model`, `Model`                  a trained network
+`load_rows`                            ingested readings, as networks are trained on them
+`draw_skin`, `draw_board`              simulated skins and boards
+`simulate_pokes`, `Pokes`              indentations of a simulated skin
+=====================================  ==========================================================
+
     >>> import reskin
     >>> skin = reskin.draw_skin(seed=1)
     >>> noload_uT, b_uT, force_N = reskin.simulate_pokes(skin, [[8.0, 8.0, 1.0]])
     >>> b_uT.shape
     (1, 15)
 
-Public names are imported when they are first used, so that `import reskin` costs little.
+Public names are imported when they are first used, so that `import reskin` is quick.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,4 @@
-"""Every use of `import reskin` in at most three lines, from plain values, beside what the pipeline itself gives."""
+"""The public functions of `reskin` equal what the pipeline computes, and their examples run."""
 
 import doctest
 import importlib

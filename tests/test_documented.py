@@ -1,4 +1,4 @@
-"""What a person may set or read has its place in docs: parameters, columns, numbers."""
+"""Docs name all parameters, columns and numbers, and only files that exist."""
 
 import re
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Where caches lie: in the checkout, also for an experiment that DVC runs in a copy of it."""
+"""Caches lie in the checkout, also for an experiment that DVC runs in a copy of it."""
 
 from pathlib import Path
 

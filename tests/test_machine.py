@@ -1,4 +1,4 @@
-"""What the machine refuses is one sentence that names the file a user knows; our own mistakes stay as they are."""
+"""Errors of the machine become one sentence; programming errors pass unchanged."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""From a log and a model to a CSV of places and forces; a network of zeros, whose answer is known; refusals."""
+"""A log and a model give a CSV of places and forces; a network whose prediction is known; errors."""
 
 import json
 

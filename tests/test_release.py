@@ -1,4 +1,4 @@
-"""What is released: the files of the wheel, one version, licences, and a core that runs without the rest."""
+"""The release: files of the wheel, version, licences, and a library that needs no optional package."""
 
 import re
 import subprocess

@@ -1,1 +1,1 @@
-"""A board at work: ports, contacts while they happen, a page, and boards that are not there. Refuses to train."""
+"""Boards while they run: contacts, alarms, the page of `reskin live`, recording, and emulated boards."""

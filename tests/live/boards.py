@@ -1,4 +1,4 @@
-"""Boards for tests: scripts of a quiet second and of pokes, and a model that knows their places and forces."""
+"""Helpers: scripts of boards, a model that is right for their two presses, and readers that play scripts."""
 
 import threading
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What a board or a page may take at most is for healthy machines: on one that starves, tests wait for longer."""
+"""Longer time limits: they are meant for quiet machines, and tests also run on busy ones."""
 
 import pytest
 

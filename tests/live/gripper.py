@@ -1,7 +1,6 @@
-"""A gripper with a simulated skin on its finger: it closes on a spring, and one line holds the force that we estimate.
+"""A gripper with a simulated skin on its finger that closes on a spring, to hold a force by its estimate.
 
-Frames go through the wire format, the no-load reading and the estimate, as a board's do. In: a skin, a spring. Out: the
-true force and the estimate, step by step.
+Frames pass through the wire format, the no-load reading and the estimate, as those of a board do.
 """
 
 import warnings
@@ -74,7 +73,7 @@ class Finger:
         return self.noload_uT + np.array([np.interp(force_N, self._force_N, column) for column in self._change_uT.T])
 
 
-class Wire:
+class FingerReader:
     """A reader whose next frame is of the force now."""
 
     plugged_in, problem, missed_bytes_n = True, "", 0
@@ -102,7 +101,7 @@ def grip(
     finger: Finger, models: Models, rng: np.random.Generator, *, aim_N: float = AIM_N, seconds: float = PERIOD_S
 ) -> np.ndarray:
     """Hold an object that stiffens tenfold and gives way; give true and estimated force in N of every step [f 2]."""
-    skin, wire, closed_mm, held = LiveSkin("gripper", models), Wire(finger, rng), 0.0, []
+    skin, wire, closed_mm, held = LiveSkin("gripper", models), FingerReader(finger, rng), 0.0, []
     skin.reader = wire
     while len(held) < seconds * RATE_HZ:
         estimates = skin.poll(0.0, latest=True)

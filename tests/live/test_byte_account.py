@@ -1,4 +1,4 @@
-"""Every byte of a faulty board is a frame's or counted as lost for the right reason, exactly, whatever the faults."""
+"""Every byte of a faulty board is in a frame or counted as lost for the right reason, for random faults."""
 
 from collections import Counter
 from dataclasses import replace

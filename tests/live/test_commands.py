@@ -1,4 +1,4 @@
-"""Commands without options: the one board that is there is found, and recorded in its own format."""
+"""Commands without options find the boards that are plugged in."""
 
 import time
 from types import SimpleNamespace

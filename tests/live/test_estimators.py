@@ -1,4 +1,4 @@
-"""The map that comes with the project answers when no model is named, learns from pokes, and knows a stranger."""
+"""The estimators of a live board, their calibration on the page, and unknown skins."""
 
 import re
 

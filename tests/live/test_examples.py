@@ -1,4 +1,4 @@
-"""The examples of docs/live.md and add-a-skin.md run as they stand, with stand-ins for packages that are not ours."""
+"""The examples of docs/live.md and docs/add-a-skin.md run, with stand-ins for foreign packages."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""One line of a controller holds half a newton by our estimate, though what it holds stiffens."""
+"""A one-line controller holds half a newton by the estimated force, while the object stiffens."""
 
 import numpy as np
 

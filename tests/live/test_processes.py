@@ -1,4 +1,4 @@
-"""A new user's way with a board that is not there, in real processes: emulate, ports, record, decode, live."""
+"""Commands in real processes, with an emulated board: emulate, ports, record, decode, live."""
 
 import asyncio
 import os

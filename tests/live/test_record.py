@@ -1,4 +1,4 @@
-"""From a board and a source of labels to a capture that is added as it is, whatever ends it."""
+"""Recordings with labels can be added, however they end."""
 
 import os
 import signal

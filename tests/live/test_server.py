@@ -1,4 +1,4 @@
-"""The page and its websocket: what a board does is on it; strangers, junk and crowds get nothing."""
+"""The page and its websocket: estimates and buttons, access, and limits."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""Eight boards on eight ports, one of them the sleeve's forty chips: each its own, and one that goes disturbs none."""
+"""Eight boards on eight ports, one of them a sleeve of forty chips: independent, also when one is unplugged."""
 
 import asyncio
 import math

@@ -1,4 +1,4 @@
-"""A controller's view: the place and force of what touches, within a second of plugging in, and what is wrong."""
+"""`LiveSkin`: estimates, no-load reading, alarms, and the account of bytes."""
 
 import itertools
 import math

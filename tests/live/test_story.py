@@ -1,4 +1,4 @@
-"""From a board that is not there to a table: emulate, record, add, repro; its own model sees it at work."""
+"""From an emulated board to a trained model: emulate, record, add, dvc repro, and estimate live."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What a page is sent is bounded, and a peak of one frame is never lost in it."""
+"""Messages to a page have a limited size and keep peaks."""
 
 import numpy as np
 
