@@ -1,7 +1,7 @@
 """Inject every fault for real, and write the table: python -m tests.faults [--only WORD] [--work FOLDER] [--out FILE].
 
-Clones the last commit, runs a small scene of a few experiments there once, and lets each fault hit a copy of it. Linux;
-faults that need mounts need root, and are marked where it lacks.
+Clones the last commit, runs a small scene of a few experiments there once, and injects each fault into a copy of it.
+Needs Linux; faults that mount file systems need root.
 """
 
 import argparse
@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from reskin import io
-from tests.faults import files, kills, together, tracking  # noqa: F401 (each enters its faults)
-from tests.faults.place import ROOT, Checkout, copy, make_template
-from tests.faults.row import CASES, Row, line, not_run, table
+from tests.faults import files, kills, together, tracking  # noqa: F401 (each adds its faults)
+from tests.faults.harness import CASES, Checkout, Row, copy, line, make_template, not_run, table
 from tests.repositories import git
+from tests.stages.checkout import ROOT
 
 OUT = ROOT / "docs/faults.md"
 
@@ -31,8 +31,8 @@ def main() -> None:
         "--work", type=Path, help="a folder that is kept, with the finished checkout and the rows in it"
     )
     parser.add_argument("--out", type=Path, default=OUT)
-    asked = parser.parse_args()
-    work = (asked.work or Path(tempfile.mkdtemp())).resolve()
+    arguments = parser.parse_args()
+    work = (arguments.work or Path(tempfile.mkdtemp())).resolve()
     work.mkdir(parents=True, exist_ok=True)
     start_s, template = time.monotonic(), Checkout(work / "template")
     if not template.folder.exists():
@@ -41,23 +41,23 @@ def main() -> None:
     rows_file, code = work / "rows.json", git(template.folder, "rev-parse", "--short=12", "HEAD~1:pipeline")
     rows = io.read_json(rows_file) if rows_file.exists() else {}
     for name, (how, case) in CASES.items():
-        if any(word in name for word in asked.only) if asked.only else rows.get(name, {}).get("code") != code:
+        if any(word in name for word in arguments.only) if arguments.only else rows.get(name, {}).get("code") != code:
             row, seconds = hit(case, template, work / "case")
             rows[name] = {"line": line(name, how, row, seconds), "red": bool(row.faults), "code": code, "s": seconds}
             print(rows[name]["line"], flush=True)
             io.write_json(rows_file, rows)
-    if not asked.work:
+    if not arguments.work:
         shutil.rmtree(work)
-    asked.out.write_text(page(rows))
+    arguments.out.write_text(page(rows))
 
 
 def hit(case, template: Checkout, folder: Path) -> tuple[Row, float]:
-    """Let a fault hit a fresh copy."""
+    """Inject a fault into a fresh copy; return its row and the seconds that it took."""
     shutil.rmtree(folder, ignore_errors=True)
     at, start_s = copy(template, folder), time.monotonic()
     try:
         row = case(at)
-    except Exception as error:  # the table tells of it, and goes on
+    except Exception as error:  # the table shows it
         traceback.print_exc()
         row = Row(
             "", None, "not known", "–", [f"the fault could not be injected ({type(error).__name__} {error})"[:300]]
@@ -66,7 +66,7 @@ def hit(case, template: Checkout, folder: Path) -> tuple[Row, float]:
 
 
 def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Write the page; a fault that was not injected yet stands there as such."""
+    """Write the page; it marks faults that have not been injected yet."""
     ran = [rows[name] for name in CASES if name in rows]
     lines = [rows[name]["line"] if name in rows else not_run(name, how) for name, (how, _) in CASES.items()]
     return INTRODUCTION.format(
@@ -80,16 +80,17 @@ INTRODUCTION = """\
 # Faults, and what becomes of them
 
 Written by `make faults` (`python -m tests.faults`), which injects each fault for real into a copy of a checkout whose
-stages have finished, and then runs `dvc repro` once more. Green: the fault is told in a sentence without a traceback
-and within ten minutes, finished stages and trainings are not computed again, and the hashes of all outputs in dvc.lock
+stages have finished, and then runs `dvc repro` once more. Green: the message is one sentence without a traceback,
+within ten minutes; finished stages and trainings are not computed again, and the hashes of all outputs in dvc.lock
 are those of the undisturbed run. The scene is a part of scene `ci`, with the stages that `kill -9` names below; every
 other stage is an experiment, which starts, writes and fails through the same code (`pipeline/stage.py` and
 `reskin/io.py`).
 
-What DVC restores from its cache it does not read: an object that is read-only passes for whole. So arrays (safetensors)
-and tables (Parquet) carry checksums, and a stage, a controller or a page that reads one that was changed stops and says
-so. `reskin check-cache` holds every object against its name, JSON and CSV too; it sets aside what was changed and its
-copies among the outputs, and the next `dvc repro` makes that again. Run it when a disk is in doubt, or a stage says so.
+DVC restores outputs from its cache without reading them: a read-only object counts as intact. So arrays (safetensors)
+and tables (Parquet) carry checksums, and a stage, a controller or a page that reads a damaged one stops with a message.
+`reskin check-cache` compares every object with its name, JSON and CSV too; it sets damaged objects aside and removes
+their copies among the outputs, and the next `dvc repro` makes these again. Run it if you doubt a disk, or if a stage
+says so.
 
 {green_n} of {faults_n} green, {not_run_n} not run yet. Code (`git rev-parse HEAD:pipeline`) {code};
 {cores_n} cores, load {load:.0f} at the end, Python {python}; {minutes:.0f} min.

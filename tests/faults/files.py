@@ -6,9 +6,8 @@ import subprocess
 from pathlib import Path
 
 from reskin import io
+from tests.faults.harness import NOT_RUN, SCENE, Checkout, Row, fault, judge
 from tests.faults.kills import address
-from tests.faults.place import SCENE, Checkout
-from tests.faults.row import NOT_RUN, Row, fault, judge
 
 TRIPLET = address("train_triplet")
 IN_NAMESPACE = ("unshare", "--mount", "--propagation", "private", "sh", "-c")  # what is mounted there, ends there
@@ -19,7 +18,7 @@ IN_NAMESPACE = ("unshare", "--mount", "--propagation", "private", "sh", "-c")  #
     "a tmpfs of 300 kB mounted over `.reskin`; `train_triplet` trains",
 )
 def full_cells(at: Checkout) -> Row:
-    at.forget(TRIPLET)
+    at.reset(TRIPLET)
     script = f"mount -t tmpfs -o size=300k none .reskin && exec dvc repro {TRIPLET}"
     return judge(at, at.run(*IN_NAMESPACE, script), at.run("dvc", "repro"), may_run=[TRIPLET])
 
@@ -29,7 +28,7 @@ def full_cells(at: Checkout) -> Row:
     "the checkout on a tmpfs, filled but for 150 kB; room again for the next run",
 )
 def full_disk(at: Checkout) -> Row:
-    at.forget(TRIPLET)
+    at.reset(TRIPLET)
     disk = at.folder.with_name("disk")
     disk.mkdir(exist_ok=True)
     size = subprocess.run(["du", "-sm", str(at.folder)], capture_output=True, text=True, check=True).stdout
@@ -39,9 +38,9 @@ def full_disk(at: Checkout) -> Row:
         subprocess.run(["cp", "-r", "--preserve=all", str(at.folder), str(disk / "case")], check=True)
         small = Checkout(disk / "case", template=at.template)
         _fill(disk, but_kB=150)
-        said = small.run("dvc", "repro")
+        result = small.run("dvc", "repro")
         (disk / "ballast").unlink()
-        return judge(small, said, small.run("dvc", "repro"), may_run=[TRIPLET])
+        return judge(small, result, small.run("dvc", "repro"), may_run=[TRIPLET])
     finally:
         subprocess.run(["umount", str(disk)], check=True)
 
@@ -68,7 +67,7 @@ def read_only_new_reports(at: Checkout) -> Row:
 def _read_only(at: Checkout, *, keep: bool) -> Row:
     kept = at.folder / "kept"
     shutil.copytree(at.folder / "reports", kept)
-    at.forget(address("report"))
+    at.reset(address("report"))
     if keep:
         shutil.rmtree(at.folder / "reports")
         shutil.copytree(kept, at.folder / "reports")
@@ -105,14 +104,14 @@ def cut_all(at: Checkout) -> Row:
         _cut(_first(at.folder / folder, pattern))
     first = at.run("dvc", "repro")
     row = judge(at, first, at.run("dvc", "repro"), may_run=[], fails=False)
-    row.said = row.said or f"ran {', '.join(first.ran) or 'no stage: the files are restored from DVC’s cache'}"
+    row.message = row.message or f"ran {', '.join(first.ran) or 'no stage: the files are restored from DVC’s cache'}"
     row.faults += ["finished stages ran again"] if first.ran else []
     row.faults += [] if first.status == 0 else ["it fails"]
     return row
 
 
 def cut(what: str, folder: str, pattern: str, reader: str) -> None:
-    """Enter a file that was cut and is read past DVC."""
+    """Add the fault of a truncated file that is read without DVC."""
 
     @fault(f"truncated {what}, read", f"a third cut from a `{pattern}` of `{folder}`; stage `{reader}` alone reads it")
     def read(at: Checkout) -> Row:
@@ -157,7 +156,7 @@ def _restored(at: Checkout, out: str, pattern: str = "") -> tuple[Path, bytes]:
 
 
 def cached(what: str, folder: str, pattern: str, writer: str, reader: str) -> None:
-    """Enter an object of DVC's cache that was changed, and is restored for a stage that reads it."""
+    """Add the fault of a damaged object of DVC's cache that is restored for a stage."""
 
     @fault(
         f"corrupted DVC cache entry, {what}",
@@ -166,13 +165,13 @@ def cached(what: str, folder: str, pattern: str, writer: str, reader: str) -> No
     )
     def case(at: Checkout) -> Row:
         file, content = _restored(at, folder, pattern)
-        at.forget(reader, cells=False)
-        first, cells = at.run("dvc", "repro"), at.cells()
+        at.reset(reader, trainings=False)
+        first, cells = at.run("dvc", "repro"), at.trainings()
         checked = at.run(*CHECK)
         row = judge(at, first, at.run("dvc", "repro"), may_run=[writer, reader], finished=cells)
-        row.faults += [] if "check-cache" in row.said else ["the remedy is not told"]
+        row.faults += [] if "check-cache" in row.message else ["the remedy is not told"]
         row.faults += (
-            [] if (checked.status, str(file.relative_to(at.folder)) in checked.text) == (1, True) else ["not found"]
+            [] if (checked.status, str(file.relative_to(at.folder)) in checked.output) == (1, True) else ["not found"]
         )
         row.faults += [] if file.read_bytes() == content else ["the changed file is in use"]
         return row
@@ -209,7 +208,7 @@ def cache_folder(at: Checkout) -> Row:
     entry.chmod(0o444)
     shutil.rmtree(at.folder / f"data/models/{SCENE}/train_triplet")
     before, checked, after = (at.run(*words) for words in (("dvc", "repro"), CHECK, ("dvc", "repro")))
-    row = judge(at, checked, at.run("dvc", "repro"), may_run=[], finished=at.cells())
+    row = judge(at, checked, at.run("dvc", "repro"), may_run=[], finished=at.trainings())
     row.faults += [] if before.ran == after.ran == [TRIPLET] else [f"ran {before.ran}, {after.ran}"]
     row.known = (
         "DVC says nothing, and runs the stage at every `dvc repro` until the cache is checked; no training is repeated"
@@ -218,21 +217,21 @@ def cache_folder(at: Checkout) -> Row:
 
 
 def damaged_cell(name: str, how: str, damage) -> None:
-    """Enter a finished training that was damaged."""
+    """Add the fault of a damaged finished training."""
 
     @fault(f"corrupted finished training, {name}", f"{how}, of a file in `.reskin/cells`; `train_triplet` runs again")
     def case(at: Checkout) -> Row:
-        cells = at.cells()
-        at.forget(TRIPLET, cells=False)
+        cells = at.trainings()
+        at.reset(TRIPLET, trainings=False)
         card = io.read_json(_first(at.template.folder / f"data/models/{SCENE}/train_triplet", "*.json"))
         damage(at.folder / f".reskin/cells/{card['key']}.safetensors")
-        whole = {cell: written for cell, written in at.cells().items() if written == cells[cell]}
+        whole = {cell: written for cell, written in at.trainings().items() if written == cells[cell]}
         first = at.run("dvc", "repro")
-        fresh_n = sum(at.cells()[cell] != written for cell, written in cells.items())
-        row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.cells(), fails=False)
+        fresh_n = sum(at.trainings()[cell] != written for cell, written in cells.items())
+        row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.trainings(), fails=False)
         row.lost = f"{len(cells) - len(whole)} training and those of its stack: {fresh_n} trained again"
         row.faults += [] if 1 <= fresh_n <= 3 else ["not its stack alone is trained again"]
-        row.faults += [] if "is damaged" in row.said else ["nothing is said"]
+        row.faults += [] if "is damaged" in row.message else ["no message"]
         return row
 
 

@@ -6,8 +6,7 @@ import time
 import psutil
 
 from reskin import io
-from tests.faults.place import SCENE, Checkout, Said, alive
-from tests.faults.row import Row, fault, judge
+from tests.faults.harness import SCENE, Checkout, Result, Row, alive, fault, judge
 
 TRAINS = ("train_single", "train_multi", "train_triplet", "adapt")
 STAGES = (
@@ -23,7 +22,7 @@ def address(stage: str) -> str:
     return stage if stage == "code" else f"{stage}@{SCENE}"
 
 
-def killed(at: Checkout, stage: str, part: float) -> Said | None:
+def killed(at: Checkout, stage: str, part: float) -> Result | None:
     """Run a stage through DVC, and kill its process after a part of what it took before; None if it ended first."""
     cost = at.folder / ".reskin/costs" / SCENE / f"{stage}.json"
     wait_s = part * (io.read_json(cost)["seconds"] if cost.exists() else 2.0)
@@ -33,19 +32,19 @@ def killed(at: Checkout, stage: str, part: float) -> Said | None:
     repro = at.start("dvc", "repro", address(stage))
     process = at.stage(stage)
     if stage in TRAINS:
-        at.until(lambda: bool(at.cells()), process)
+        at.until(lambda: bool(at.trainings()), process)
     else:
-        at.until(lambda: f"{stage}: stage " in at.said() or stage == "code", process)
+        at.until(lambda: f"{stage}: stage " in at.output() or stage == "code", process)
         kill_s = time.monotonic() + wait_s
         at.until(lambda: time.monotonic() > kill_s, process)
     if alive(process):
         process.kill()
-    said = at.end(repro, start_s)
-    return said if said.status else None
+    result = at.end(repro, start_s)
+    return result if result.status else None
 
 
 def kill_in(stage: str) -> None:
-    """Enter the kill of a stage."""
+    """Add the fault of a killed stage."""
 
     @fault(
         f"kill -9 in `{stage}`",
@@ -53,13 +52,13 @@ def kill_in(stage: str) -> None:
     )
     def case(at: Checkout) -> Row:
         for i in range(ATTEMPTS_N):
-            at.forget(address(stage))
-            if said := killed(at, stage, 0.5 / 2**i):
+            at.reset(address(stage))
+            if result := killed(at, stage, 0.5 / 2**i):
                 break
         else:
             raise AssertionError(f"{stage} ended before it could be killed")
-        finished = at.cells() if stage in TRAINS else None
-        return judge(at, said, at.run("dvc", "repro"), may_run=[address(stage)], finished=finished)
+        finished = at.trainings() if stage in TRAINS else None
+        return judge(at, result, at.run("dvc", "repro"), may_run=[address(stage)], finished=finished)
 
 
 for name in STAGES:
@@ -72,22 +71,22 @@ for name in STAGES:
 )
 def kill_dvc(at: Checkout) -> Row:
     stage = address("train_triplet")
-    at.forget(stage)
+    at.reset(stage)
     start_s = time.monotonic()
     repro = at.start("dvc", "repro", stage)
     process = at.stage("train_triplet")
-    at.until(lambda: bool(at.cells()), process)
+    at.until(lambda: bool(at.trainings()), process)
     repro.send_signal(signal.SIGKILL)
-    said, finished = at.end(repro, start_s), at.cells()
+    result, finished = at.end(repro, start_s), at.trainings()
     again = at.run("dvc", "repro")
     at.until(lambda: False, process, 60.0)  # what is left alone ends
-    return judge(at, said, again, may_run=[stage], finished=finished)
+    return judge(at, result, again, may_run=[stage], finished=finished)
 
 
 def _worker(at: Checkout, stage: str) -> tuple[psutil.Process, psutil.Process]:
-    """Give a stage's process and one of its workers that has finished a training."""
+    """Return a stage's process and one of its workers that has finished a training."""
     process = at.stage(stage)
-    at.until(lambda: bool(at.cells()), process)
+    at.until(lambda: bool(at.trainings()), process)
     workers = [child for child in process.children(recursive=True) if _is_worker(child)]
     return process, max(workers, key=lambda child: child.memory_info().rss)
 
@@ -106,12 +105,12 @@ def _is_worker(process: psutil.Process) -> bool:
 )
 def kill_worker(at: Checkout) -> Row:
     stage = address("train_triplet")
-    at.forget(stage)
+    at.reset(stage)
     start_s = time.monotonic()
     repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
     _worker(at, "train_triplet")[1].kill()
-    said, finished = at.end(repro, start_s), at.cells()
-    return judge(at, said, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+    result, finished = at.end(repro, start_s), at.trainings()
+    return judge(at, result, at.run("dvc", "repro"), may_run=[stage], finished=finished)
 
 
 @fault(
@@ -120,13 +119,13 @@ def kill_worker(at: Checkout) -> Row:
 )
 def starve_worker(at: Checkout) -> Row:
     stage = address("train_triplet")
-    at.forget(stage)
+    at.reset(stage)
     start_s = time.monotonic()
     repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
     worker = _worker(at, "train_triplet")[1]
     worker.rlimit(psutil.RLIMIT_AS, (AS_MAX, AS_MAX))
-    said, finished = at.end(repro, start_s), at.cells()
-    return judge(at, said, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+    result, finished = at.end(repro, start_s), at.trainings()
+    return judge(at, result, at.run("dvc", "repro"), may_run=[stage], finished=finished)
 
 
 @fault(
@@ -135,15 +134,15 @@ def starve_worker(at: Checkout) -> Row:
 )
 def kill_parent(at: Checkout) -> Row:
     stage = address("train_triplet")
-    at.forget(stage)
+    at.reset(stage)
     start_s = time.monotonic()
     repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:2")
     process, _ = _worker(at, "train_triplet")
     workers = process.children(recursive=True)
     process.kill()
-    said = at.end(repro, start_s)
+    result = at.end(repro, start_s)
     _, left = psutil.wait_procs(workers, 10)
-    finished = at.cells()
-    row = judge(at, said, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+    finished = at.trainings()
+    row = judge(at, result, at.run("dvc", "repro"), may_run=[stage], finished=finished)
     row.faults += [f"{len(left)} workers outlive their stage"] if any(alive(one) for one in left) else []
     return row

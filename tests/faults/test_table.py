@@ -1,9 +1,8 @@
-"""The table of faults that is committed has a row for every fault; what a row says is what was found."""
+"""The committed table of faults has a row for every fault, and a row states what was found."""
 
 from tests.faults import files, kills, together, tracking  # noqa: F401 (each enters its faults)
 from tests.faults.__main__ import OUT
-from tests.faults.place import sentence_of
-from tests.faults.row import CASES, Row, line
+from tests.faults.harness import CASES, Row, line, message_of
 
 
 def test_the_committed_table_has_a_row_for_every_fault():
@@ -11,20 +10,20 @@ def test_the_committed_table_has_a_row_for_every_fault():
     assert rows == ["fault", *CASES]
 
 
-def test_what_went_wrong_is_red_and_says_why():
+def test_a_failed_check_makes_a_row_red_with_its_reason():
     row = Row("error: no room", None, "nothing", "ran adapt", ["a hang"], "Known: DVC waits.")
     cells = "| “error: no room” | hang | nothing | ran adapt | 3 | red: a hang. Known: DVC waits. |"
     assert line("f", "h", row, 3.2).endswith(cells)
 
 
-def test_the_sentence_of_a_stage_goes_before_that_of_dvc():
-    said = ["x: stage 2 of 3", "error: split: a must b; got c.", "ERROR: failed to reproduce 'split@a'"]
-    assert sentence_of(said) == said[1]
-    assert sentence_of(said[2:]) == said[2]
+def test_the_message_of_a_stage_comes_before_that_of_dvc():
+    lines = ["x: stage 2 of 3", "error: split: a must b; got c.", "ERROR: failed to reproduce 'split@a'"]
+    assert message_of(lines) == lines[1]
+    assert message_of(lines[2:]) == lines[2]
     lock = "'./dvc.lock' is invalid (possible merge conflicts)."
-    assert sentence_of([lock, "", "Mapping values are not allowed"]) == lock
+    assert message_of([lock, "", "Mapping values are not allowed"]) == lock
 
 
-def test_only_the_machines_own_folders_are_left_out():
+def test_only_paths_of_this_machine_are_shortened():
     row = Row("error: /tmp/x1/case/data must be; delete .dvc/tmp/rwlock", 2, "nothing", "ran adapt")
     assert "“error: …/data must be; delete .dvc/tmp/rwlock”" in line("f", "h", row, 1.0)

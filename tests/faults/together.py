@@ -9,9 +9,8 @@ from pathlib import Path
 from ruamel.yaml import YAML
 
 from tests.faults.files import _cut
+from tests.faults.harness import Checkout, Result, Row, fault, judge
 from tests.faults.kills import address
-from tests.faults.place import Checkout, Said
-from tests.faults.row import Row, fault, judge
 from tests.recordings.readers.test_lab import PRESSES, write
 from tests.repositories import git
 from tests.scenes import recorded
@@ -25,12 +24,12 @@ RAW = f"data/raw/rig/{CAPTURE}"
 
 @fault("two `dvc repro` at once", "the second begins while `train_triplet` of the first trains")
 def two(at: Checkout) -> Row:
-    at.forget(TRIPLET)
+    at.reset(TRIPLET)
     start_s = time.monotonic()
     first, other = at.start("dvc", "repro"), Checkout(at.folder, at.folder.with_suffix(".other"))
-    at.until(lambda: bool(at.cells()), at.stage("train_triplet"))
+    at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
     second = other.run("dvc", "repro")
-    one, finished = at.end(first, start_s), at.cells()
+    one, finished = at.end(first, start_s), at.trainings()
     row = judge(at, second, at.run("dvc", "repro"), may_run=[], finished=finished)
     row.faults += [] if one.status == 0 else ["the first fails"]
     return row
@@ -41,17 +40,17 @@ def two(at: Checkout) -> Row:
     "the second is asked for `sensitivity` while `train_triplet` of the first trains",
 )
 def two_stages(at: Checkout) -> Row:
-    at.forget(TRIPLET, address("sensitivity"))
+    at.reset(TRIPLET, address("sensitivity"))
     start_s = time.monotonic()
     first, other = at.start("dvc", "repro", TRIPLET), Checkout(at.folder, at.folder.with_suffix(".other"))
-    at.until(lambda: bool(at.cells()), at.stage("train_triplet"))
+    at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
     second = other.run("dvc", "repro", address("sensitivity"))
-    one, finished = at.end(first, start_s), at.cells()
+    one, finished = at.end(first, start_s), at.trainings()
     yet_to_run = [address("sensitivity")] if second.status else []  # one that was refused has run nothing
     row = judge(at, second, at.run("dvc", "repro"), may_run=yet_to_run, finished=finished, fails=False)
     row.faults += [] if one.status == 0 else ["the first fails"]
     row.faults += ["refused, and it ran"] if second.status and second.ran else []
-    row.said = row.said or "nothing: both run to their end"
+    row.message = row.message or "nothing: both run to their end"
     return row
 
 
@@ -66,7 +65,7 @@ def _add(at: Checkout) -> list[str]:
     return ["python", "-m", "pipeline", "add", str(recording / "readings.csv"), *labels]
 
 
-def _ingest(at: Checkout) -> Said:
+def _ingest(at: Checkout) -> Result:
     return at.run("dvc", "repro", INGEST)
 
 
@@ -75,10 +74,10 @@ def _ingest(at: Checkout) -> Said:
     "a recording is added while `train_triplet` trains, and once more after its end",
 )
 def add_beside(at: Checkout) -> Row:
-    at.forget(TRIPLET)
+    at.reset(TRIPLET)
     words, start_s = _add(at), time.monotonic()
     first, other = at.start("dvc", "repro"), Checkout(at.folder, at.folder.with_suffix(".other"))
-    at.until(lambda: bool(at.cells()), at.stage("train_triplet"))
+    at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
     added = other.run(*words)
     one = at.end(first, start_s)
     later = at.run(*words)
@@ -104,7 +103,9 @@ def kill_add(at: Checkout) -> Row:
     shutil.rmtree(at.folder / RAW)
     later = at.run(*words)
     row = judge(at, again, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
-    row.faults += [] if (still.status, still.ran, later.status) == (0, [], 0) else [f"{still.ran}, {later.text[-200:]}"]
+    row.faults += (
+        [] if (still.status, still.ran, later.status) == (0, [], 0) else [f"{still.ran}, {later.output[-200:]}"]
+    )
     return row
 
 
@@ -116,12 +117,12 @@ def kill_ingest(at: Checkout) -> Row:
     at.run(*_add(at))
     undisturbed = _ingest(at)
     expected = at.lock()[INGEST]
-    at.forget(INGEST, cells=False)
+    at.reset(INGEST, trainings=False)
     start_s = time.monotonic()
     repro = at.start("dvc", "repro", INGEST)
     at.stage("ingest").kill()
-    said = at.end(repro, start_s)
-    row = judge(at, said, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    result = at.end(repro, start_s)
+    row = judge(at, result, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += [] if (undisturbed.status, at.lock()[INGEST]) == (0, expected) else ["other readings"]
     return row
 
@@ -138,12 +139,12 @@ def cut_recording(at: Checkout) -> Row:
     git(at.folder, "add", "--all")
     git(at.folder, "commit", "--quiet", "--message", "added")
     _cut(at.folder / RAW / "readings.csv")
-    said = _ingest(at)
+    result = _ingest(at)
     git(at.folder, "restore", f"{RAW}.dvc")
     restored = at.run("dvc", "checkout", "--force", f"{RAW}.dvc")
-    row = judge(at, said, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row = judge(at, result, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += (
-        [] if restored.status == 0 and at.lock()[INGEST] == expected else [f"not restored: {restored.text[-300:]}"]
+        [] if restored.status == 0 and at.lock()[INGEST] == expected else [f"not restored: {restored.output[-300:]}"]
     )
     return row
 
@@ -166,16 +167,16 @@ _set_back("time_ns", 86400 * 10**9)
 )
 def clock(at: Checkout) -> Row:
     stages = [TRIPLET, address("adapt"), address("report"), address("publish")]
-    at.forget(*stages)
+    at.reset(*stages)
     shim = at.folder.with_name("shim")
     shim.mkdir(exist_ok=True)
     (shim / "sitecustomize.py").write_text(BACK)
     for file in (at.folder / "data/indentations").rglob("*.parquet"):
         subprocess.run(["touch", "--date", "tomorrow", str(file)], check=True)
     first = at.run("dvc", "repro", PYTHONPATH=f"{shim}:{at.folder}")
-    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.cells(), fails=False)
+    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.trainings(), fails=False)
     row.faults += [] if set(first.ran) == set(stages) else [f"ran {first.ran}"]
-    row.said = row.said or "nothing"
+    row.message = row.message or "nothing"
     return row
 
 
@@ -183,9 +184,9 @@ def _damaged_then_restored(
     at: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True
 ) -> Row:
     (at.folder / file).write_text(content)
-    said = at.run(*command)
+    result = at.run(*command)
     git(at.folder, "restore", file)
-    return judge(at, said, at.run("dvc", "repro"), may_run=[], fails=fails)
+    return judge(at, result, at.run("dvc", "repro"), may_run=[], fails=fails)
 
 
 MARKS = "<<<<<<< HEAD\n{}=======\n{}>>>>>>> other\n"
@@ -214,7 +215,7 @@ def conflict_captures(at: Checkout) -> Row:
 def cut_lock(at: Checkout) -> Row:
     text = (at.folder / "dvc.lock").read_text()
     row = _damaged_then_restored(at, "dvc.lock", text[: len(text) * 19 // 20], ("dvc", "repro"), fails=False)
-    row.said = row.said or "nothing: what is not in it is yet to run"
+    row.message = row.message or "nothing: what is not in it is yet to run"
     return row
 
 
@@ -223,11 +224,11 @@ def cut_lock(at: Checkout) -> Row:
     "`.git/index.lock` is there; `split` and what follows are run; next run without it",
 )
 def index_lock(at: Checkout) -> Row:
-    at.forget(address("split"), cells=False)
+    at.reset(address("split"), trainings=False)
     (at.folder / ".git/index.lock").touch()
     first = at.run("dvc", "repro")
     Path(at.folder / ".git/index.lock").unlink()
-    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.cells(), fails=False)
+    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.trainings(), fails=False)
     row.faults += [] if first.ran == [address("split")] else [f"ran {first.ran}"]
-    row.said = row.said or "nothing: no stage needs it"
+    row.message = row.message or "nothing: no stage needs it"
     return row

@@ -1,4 +1,4 @@
-"""The diary: a server that is away, silent, dies in mid-run; a store that another program holds."""
+"""MLflow: servers that are missing, silent or die during a run; a store that is locked."""
 
 import http.server
 import re
@@ -16,22 +16,21 @@ from pathlib import Path
 
 from pipeline.tracking import TrackingAway, probe
 from reskin import io
-from tests.faults.place import SCENE, Checkout, Said
-from tests.faults.row import NOT_RUN, Row, fault, judge
+from tests.faults.harness import NOT_RUN, SCENE, Checkout, Result, Row, fault, judge
 
 
-def _report(at: Checkout, first: Said, again: Said | None) -> Row:
-    """Judge: the stage succeeds, says once that nothing was sent, soon; then `reskin publish`, if it ran, sends all."""
-    row, warned_n = judge(at, first, again or NOT_RUN, fails=False), first.text.count("warning:")
+def _report(at: Checkout, first: Result, again: Result | None) -> Row:
+    """Check that the stage succeeds soon with one warning, and that `reskin publish`, if it ran, sends everything."""
+    row, warned_n = judge(at, first, again or NOT_RUN, fails=False), first.output.count("warning:")
     row.lost, row.next_run = "nothing", "as where it refuses"
     if again:
-        counts = re.findall(r"MLflow runs (\{.*\})", again.text)
-        row.next_run = f"`reskin publish`: {counts[-1] if counts else again.text.strip()[-200:]}"
+        counts = re.findall(r"MLflow runs (\{.*\})", again.output)
+        row.next_run = f"`reskin publish`: {counts[-1] if counts else again.output.strip()[-200:]}"
         row.faults += [] if counts else ["not sent later"]
     row.faults += [f"{warned_n} warnings"] if warned_n != 1 else []
     row.faults += [f"exit status {first.status}"] if first.status else []
     took_s, undisturbed_s = (_took_s(each) for each in (at, at.template))
-    row.said += f" (stage publish: {took_s:.0f} s; undisturbed {undisturbed_s:.0f} s)"
+    row.message += f" (stage publish: {took_s:.0f} s; undisturbed {undisturbed_s:.0f} s)"
     row.faults += ["held up"] if took_s > 2 * undisturbed_s + 60 else []
     return row
 
@@ -81,7 +80,7 @@ def silent(at: Checkout) -> Row:
 
 
 class OnlyHealth(http.server.BaseHTTPRequestHandler):
-    """Says that it is well, and answers nothing else."""
+    """Answers /health and nothing else."""
 
     def do_GET(self) -> None:
         if self.path == "/health":

@@ -1,0 +1,305 @@
+"""A checkout whose stages have finished, copies of it that faults are injected into, and the verdict on each fault."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+from ruamel.yaml import YAML
+
+from tests.repositories import git
+from tests.stages.checkout import ROOT, variables
+
+SCENE = "faults"
+EXPERIMENTS = ("single_random", "transfer", "lobo", "triplet", "adapt", "baselines", "sensitivity", "audit")
+PROTOCOLS = ("grid", "glass")  # those that these experiments need
+SECTIONS = (
+    "source",
+    "seed",
+    "selection",
+    "train_single",
+    "train_multi",
+    "train_triplet",
+    "adapt",
+    "train_classical",
+    "audit",
+)
+SPLIT = ("random_test_fraction", "random_repeats_n", "transfer_skins_n", "pool_passes_n")
+LIMIT_S = 600.0  # longer is a hang
+TRACES = "Traceback (most recent call last)"
+
+
+@dataclass(frozen=True)
+class Result:
+    """The exit status of a command (None: it took longer than the limit), its output, and how long it took."""
+
+    status: int | None
+    output: str
+    seconds: float
+
+    @property
+    def ran(self) -> list[str]:
+        """The stages that DVC ran."""
+        return re.findall(r"^Running stage '([^']+)'", self.output, re.MULTILINE)
+
+
+class Checkout:
+    """A folder in which commands run, with its own code."""
+
+    def __init__(self, folder: Path, output: Path | None = None, template: "Checkout | None" = None) -> None:
+        self.folder = folder
+        self.template = template or self  # the finished one that this is a copy of
+        self._output = output or folder.with_suffix(".output")
+
+    def start(self, *words: str, **environment: str) -> subprocess.Popen[bytes]:
+        """Start a command in a process group of its own; its output goes into a file."""
+        env = variables(self.folder, **environment)
+        env["PATH"] = f"{self.folder / '.venv/bin'}{os.pathsep}{env['PATH']}"
+        with self._output.open("wb") as output:
+            return subprocess.Popen(
+                words, cwd=self.folder, env=env, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+            )
+
+    def end(self, process: subprocess.Popen[bytes], start_s: float, limit_s: float = LIMIT_S) -> Result:
+        """Wait for a command; kill its process group if it takes too long."""
+        try:
+            status: int | None = process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            status = None
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        return Result(status, self.output(), time.monotonic() - start_s)
+
+    def run(self, *words: str, limit_s: float = LIMIT_S, **environment: str) -> Result:
+        """Run a command to its end."""
+        start_s = time.monotonic()
+        return self.end(self.start(*words, **environment), start_s, limit_s)
+
+    def output(self) -> str:
+        """Return the output of the last command so far, without the name of the folder."""
+        return self._output.read_text(errors="replace").replace(f"{self.folder}/", "")
+
+    def stage(self, name: str, find_s: float = LIMIT_S) -> psutil.Process:
+        """Wait until DVC has started a stage, and return its process."""
+        command = ["-m", "pipeline", name]
+        until_s = time.monotonic() + find_s
+        while time.monotonic() < until_s:
+            for process in psutil.process_iter(["cmdline"]):
+                if (process.info["cmdline"] or [])[1:4] == command and _cwd(process) == self.folder:
+                    return process
+            time.sleep(0.05)
+        raise AssertionError(f"stage {name} must start within {find_s:.0f} s:\n{self.output()[-2000:]}")
+
+    def until(self, happened: Callable[[], bool], process: psutil.Process, limit_s: float = LIMIT_S) -> bool:
+        """Wait for a condition; return False if the process ended before."""
+        until_s = time.monotonic() + limit_s
+        while not happened():
+            if not alive(process) or time.monotonic() > until_s:
+                return False
+            time.sleep(0.01)
+        return alive(process)
+
+    def trainings(self) -> dict[str, int]:
+        """List the finished trainings with the time at which each was written."""
+        return {file.name: file.stat().st_mtime_ns for file in (self.folder / ".reskin/cells").glob("*.safetensors")}
+
+    def lock(self) -> dict[str, dict[str, str]]:
+        """Return the hash of every output in dvc.lock, by stage."""
+        lock = YAML(typ="safe").load((self.folder / "dvc.lock").read_text())
+        return {
+            stage: {out["path"]: out["md5"] for out in entry.get("outs", [])} for stage, entry in lock["stages"].items()
+        }
+
+    def command(self, stage: str) -> list[str]:
+        """Return the command of a stage, from dvc.lock."""
+        entries = YAML(typ="safe").load((self.folder / "dvc.lock").read_text())["stages"].values()
+        return next(entry["cmd"].split() for entry in entries if f" {stage} " in entry["cmd"])
+
+    def reset(self, *names: str, trainings: bool = True) -> None:
+        """Remove the entries and outputs of stages, and finished trainings, so that the stages run again."""
+        file = self.folder / "dvc.lock"
+        words = YAML().load(file.read_text())
+        for name in names:
+            for out in words["stages"].pop(name).get("outs", []):
+                path = self.folder / out["path"]
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        with file.open("w") as stream:
+            YAML().dump(words, stream)
+        shutil.rmtree(self.folder / ".dvc/cache/runs", ignore_errors=True)  # of runs since the template was made
+        for name in self.trainings() if trainings else ():
+            (self.folder / ".reskin/cells" / name).unlink()
+
+
+def alive(process: psutil.Process) -> bool:
+    """Tell whether a process runs; a zombie does not."""
+    try:
+        return process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def _cwd(process: psutil.Process) -> Path | None:
+    try:
+        return Path(process.cwd())
+    except psutil.Error:
+        return None
+
+
+def make_template(folder: Path) -> tuple[Checkout, Result]:
+    """Clone the last commit, and run the small scene there."""
+    subprocess.run(["git", "clone", "--quiet", "--shared", str(ROOT), str(folder)], check=True)
+    (folder / ".venv").symlink_to(ROOT / ".venv")
+    scenes = folder / "pipeline/scenes"
+    with (scenes / f"{SCENE}.yaml").open("w") as stream:
+        YAML().dump(small(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)
+    (folder / "dvc.lock").unlink()
+    at = Checkout(folder)
+    for words in (["python", "-m", "pipeline", "scenes", "use", SCENE], ["dvc", "repro"]):
+        done = at.run(*words, limit_s=6 * LIMIT_S)
+        if done.status:
+            raise AssertionError(f"{' '.join(words)} failed:\n{done.output[-3000:]}")
+    git(folder, "add", "--all")
+    git(folder, "commit", "--quiet", "--message", "finished")
+    shutil.rmtree(folder / ".dvc/cache/runs")  # else DVC restores the files that a fault damages
+    return at, done
+
+
+def small(ci: dict) -> dict:
+    """Return the settings of a few experiments of scene ci."""
+    scene = {name: ci[name] for name in SECTIONS} | {"experiments": list(EXPERIMENTS)}
+    scene["split"] = {name: ci["split"][name] for name in SPLIT}
+    scene["simulate"] = {
+        "boards": {"rigid": ci["simulate"]["boards"]["rigid"]},
+        "protocols": {name: ci["simulate"]["protocols"][name] for name in PROTOCOLS},
+    }
+    return scene
+
+
+def copy(template: Checkout, folder: Path) -> Checkout:
+    """Copy a finished checkout."""
+    subprocess.run(["cp", "-r", "--preserve=all", "--reflink=auto", str(template.folder), str(folder)], check=True)
+    return Checkout(folder, template=template)
+
+
+def message_of(output: Sequence[str] | str) -> str:
+    """Return the line of an output that tells a user what went wrong: the stage's own, else DVC's."""
+    lines = output.splitlines() if isinstance(output, str) else list(output)
+    for start in (
+        "error:",
+        "warning:",
+        "ERROR:",
+        "WARNING:",
+        "is invalid",
+    ):  # the last is DVC's message on its own files
+        found = [line for line in lines if line.startswith(start) or f" {start} " in f" {line}"]
+        if found:
+            return re.sub(r"(sh pipeline/run\.sh \w+).*?(, exited|$)", r"\1 …\2", found[0])
+    return ""
+
+
+ROOTS = (tempfile.gettempdir(), str(ROOT.parent), "/var")  # paths of this machine, which the table leaves out
+TITLES = ("fault", "how injected", "what the user sees", "exit status", "lost", "the next run", "s", "verdict")
+
+
+@dataclass
+class Row:
+    """The outcome of a fault. `known` explains a shortcoming."""
+
+    message: str
+    status: int | None
+    lost: str
+    next_run: str
+    faults: list[str] = field(default_factory=list)
+    known: str = ""
+
+
+Case = Callable[[Checkout], Row]
+NOT_RUN = Result(0, "", 0.0)
+CASES: dict[str, tuple[str, Case]] = {}  # by name: how it is injected, in words and as a function
+
+
+def fault(name: str, how: str) -> Callable[[Case], Case]:
+    """Add a fault to the table."""
+
+    def enter(case: Case) -> Case:
+        CASES[name] = (how, case)
+        return case
+
+    return enter
+
+
+def judge(
+    at: Checkout, first: Result, again: Result, *, may_run: Iterable[str] | None = None,
+    finished: dict[str, int] | None = None, fails: bool = True,
+) -> Row:  # fmt: skip
+    """Compare the state after a fault, and after the next run, with the undisturbed run.
+
+    may_run: the stages that the next run may run. finished: the trainings before it. fails: the first run has to fail.
+    """
+    after, undisturbed, reused = at.lock(), at.template.lock(), _whole(finished or {}, at.trainings())
+    torn_n = len(finished or {}) - len(reused)
+    trained = sum(written != reused.get(name) for name, written in at.trainings().items())
+    again_trained = [name for name, written in at.trainings().items() if name in reused and written != reused[name]]
+    unlike = [stage for stage in undisturbed if after.get(stage) != undisturbed[stage]]
+    more = sorted(set(again.ran) - set(may_run)) if may_run is not None else []
+    checks = {
+        "a traceback": TRACES in first.output + again.output,
+        "a hang": first.status is None or again.status is None,
+        "no failure": fails and first.status == 0,
+        "no message": (first.status or 0) > 0 and not message_of(first.output),  # a killed process prints nothing
+        f"the next run fails: {message_of(again.output)}": again.status not in (0, None),
+        f"other results: {', '.join(unlike)}": bool(unlike),
+        f"finished stages ran again: {', '.join(more)}": bool(more),
+        f"{len(again_trained)} finished trainings again": bool(again_trained),
+    }
+    next_run = f"ran {', '.join(stage.partition('@')[0] for stage in again.ran) or 'no stage'}"
+    if finished is not None:
+        next_run += f"; {len(reused)} trainings reused, {trained} trained"
+    next_run += "" if unlike else "; results equal byte for byte"
+    faults = [fault for fault, is_true in checks.items() if is_true]
+    lost = f"{torn_n} trainings of a stack whose files were being written" if torn_n else "nothing finished"
+    return Row(message_of(first.output), first.status, lost, next_run, faults)
+
+
+def _whole(trainings: dict[str, int], later: dict[str, int]) -> dict[str, int]:
+    """Keep the trainings of complete stacks: those of a stack are trained together and finished as one."""
+    members = [Counter(name.rpartition("-")[0] for name in each) for each in (trainings, later)]
+    whole = {stack for stack, files_n in members[0].items() if members[1][stack] == files_n}
+    return {name: written for name, written in trainings.items() if name.rpartition("-")[0] in whole}
+
+
+def line(name: str, how: str, row: Row, seconds: float) -> str:
+    """Write a row of the table."""
+    status = "hang" if row.status is None else str(row.status)
+    verdict = "green" if not row.faults else f"red: {'; '.join(row.faults)}"
+    if row.known:
+        verdict += f". {row.known}"
+    message = f"“{_plain(row.message)}”" if row.message else "–"
+    cells = (name, how, message, status, row.lost, row.next_run, f"{seconds:.0f}", verdict)
+    return "| " + " | ".join(_plain(cell) for cell in cells) + " |"
+
+
+def not_run(name: str, how: str) -> str:
+    """Write the row of a fault that has not been injected yet."""
+    return f"| {_plain(name)} | {_plain(how)} |{' – |' * 5} not run yet |"
+
+
+def _plain(text: str) -> str:
+    return (
+        re.sub(rf"(?<!\w)({'|'.join(map(re.escape, ROOTS))})\S*/", "…/", " ".join(text.split()))
+        .replace("|", "\\|")
+        .replace("<", "&lt;")
+    )
+
+
+def table(lines: Sequence[str]) -> str:
+    """Join the rows to a table."""
+    return "\n".join(["| " + " | ".join(TITLES) + " |", "|" + "---|" * len(TITLES), *lines]) + "\n"
