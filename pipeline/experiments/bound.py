@@ -172,7 +172,6 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     return {"bound": tabulate(lines, meaning=_meaning(numbers), spread="± is the sd over n folds of the network.")}
 
 
-
 def _line(depth: str, row: Mapping[str, Any], network: Mapping[str, Any], source: str) -> dict[str, str]:
     line = {"depth, mm": depth, "source": source}
     for metric, title in COLUMNS.items():

@@ -383,7 +383,6 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     return found
 
 
-
 def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
     place, force = numbers["place"], numbers["force"]
     rows = [_row(f"place of one touch, {BY_TIME}", place["by_time"], "%", f"{place['by_time']['chance_pct']:.1f}")]

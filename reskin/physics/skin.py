@@ -106,7 +106,7 @@ def draw_skin(
 
 
 def changes_of_field(
-    board: Board, skin: Skin, pokes_m: Float[np.ndarray, "n 3"]
+    board: Board, skin: Skin, indentations_m: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
     """Return the no-load field, and its change by each indentation (x, y, depth), at the chips in T.
 
@@ -119,21 +119,21 @@ def changes_of_field(
     """
     # Chip by chip, to bound memory: a large skin over many chips has millions of pairs.
     rest_T = np.concatenate([magnet.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
-    changes_T = np.zeros((len(pokes_m), *board.chips_m.shape))
-    for poke_i, before, after in moved_dipoles(skin, pokes_m):
-        changes_T[poke_i] = change_of_field(before, after, board.chips_m)
+    changes_T = np.zeros((len(indentations_m), *board.chips_m.shape))
+    for indentation_i, before, after in moved_dipoles(skin, indentations_m):
+        changes_T[indentation_i] = change_of_field(before, after, board.chips_m)
     return rest_T, changes_T
 
 
 def moved_dipoles(
-    skin: Skin, pokes_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
+    skin: Skin, indentations_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[tuple[int, Dipoles, Dipoles]]:
     """Yield index, dipoles at rest and dipoles moved (those within reach), of each indentation in contact.
 
     `slid` is the share of the rigid motion of each press that takes place (default: all of it). Further displacements
     may be applied to the moved dipoles before `change_of_field`.
     """
-    true_m = pokes_m + np.array([0.0, 0.0, skin.depth_zero_m])
+    true_m = indentations_m + np.array([0.0, 0.0, skin.depth_zero_m])
     _check_on_skin(true_m, skin)
     contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a NaN depth goes on, to be refused
     if not contacts.size:
@@ -144,11 +144,11 @@ def moved_dipoles(
     slides = None if skin.hold is None else press_motion(skin, skin.hold, true_m[contacts])
     if slides is not None and slid is not None:
         slides = slides.scaled(slid[contacts])
-    for i, poke_i in enumerate(contacts):
-        moved = deformation.move_dipoles(table, rest, true_m[poke_i])
+    for i, indentation_i in enumerate(contacts):
+        moved = deformation.move_dipoles(table, rest, true_m[indentation_i])
         if slides is not None:
             slide.apply_in_place(slides, i, moved.after, skin.seat_m)
-        yield int(poke_i), moved.before, moved.after
+        yield int(indentation_i), moved.before, moved.after
 
 
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
@@ -188,12 +188,12 @@ def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.nd
     return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
 
 
-def _check_on_skin(pokes_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
+def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
     # The model's layer is infinite: past the skin's edge the tip would press on material that is not there.
     half_m = np.array(skin.sides_m) / 2
-    off = ~(np.abs(pokes_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
+    off = ~(np.abs(indentations_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
     if off.any():
-        x_mm, y_mm = pokes_m[np.argmax(off), :2] / milli
+        x_mm, y_mm = indentations_m[np.argmax(off), :2] / milli
         rule = "on the skin, within {:.4g} and {:.4g} mm of its middle along x and y".format(*half_m / milli)
         remedy = "Poke elsewhere, or lower skin_seat_mm."
         raise ParamsError(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy)
