@@ -304,10 +304,10 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         "The field comes up after the no-load reading, so it stays in the change of field. The direction of a uniform "
         f"field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, "
         f"lies right above the skin's middle, in the earth's field ({numbers['earth_uT']:g} µT, dipping "
-        f"{numbers['earth_dip_deg']:g}°) and the skin's own. {meanings}. The last arm is trained for board "
-        f"{last['board']} alone: compare arms there. [low, high] is the 95 % interval over held-out boards (Student's "
-        f"t); ± (seeds) the standard deviation over {numbers['seeds_n']} network seeds on one board, mean over boards. "
-        "The paper gives no number (section 7: future work)."
+        f"{numbers['earth_dip_deg']:g}°) and the skin's own. {meanings}. The last method is trained for board "
+        f"{last['board']} alone: compare methods there. [low, high] is the 95 % interval over held-out boards "
+        f"(Student's t); ± (seeds) the standard deviation over {numbers['seeds_n']} network seeds on one board, mean "
+        "over boards. The paper gives no number (section 7: future work)."
     )
     return {"ambient": table}
 

@@ -375,11 +375,11 @@ def _errors(changes_T: Float[np.ndarray, "p 4 k 3"]) -> dict[str, float]:
 
 MEANING = (
     "Two contacts are the sum of two changes of field that were read of one held-out skin, so their noise is that of "
-    "two readings. A network that knows single contacts answers one place and one force. Detected: odder, by a "
-    "detector, than all but the asked share of single contacts of training skins; of the held-out boards' single "
-    "contacts the share called so too is the realised false alarm. The networks behind residual and networks disagree "
-    "were trained on the contacts that thresholds are set on, so their thresholds may be too low. At 0 mm both pokes "
-    "are at one place: what strength and noise alone do. [low, high] is the 95 % interval over "
+    "two readings. A network of single contacts predicts one place and one force. Detected: the score of a detector is "
+    "above a threshold, which a set share of single contacts of training skins exceeds; the share of the held-out "
+    "boards' single contacts above it is the false alarm. The networks behind residual and networks disagree were "
+    "trained on the contacts that thresholds are set on, so their thresholds may be too low. At 0 mm both pokes are at "
+    "one place: the effect of strength and noise alone. [low, high] is the 95 % interval over "
     "held-out boards (Student's t). The paper gives no number (section 7: future work)."
 )
 TWO_TIPS = "Two tips cannot stand nearer than they are wide; smaller distances are sums all the same."

@@ -154,7 +154,7 @@ MEANING = (
     "Half-sine presses at random places of the grid, every frame read. The model is the paper's network, trained on "
     "readings at rest of other boards. Scored are readings with four before them in the press and some force. The mean "
     "of the last five readings is the paper's protocol at rest; in a press the five see different depths. Against the "
-    "force of its middle reading the same mean shows what of its error is lag: an answer that comes two frames late. "
+    "force of its middle reading the same mean shows how much of its error is lag: a prediction two frames late. "
     "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
     f"± is the sd over network seeds; all presses are on one board. {VERDICTS}"
 )

@@ -143,9 +143,9 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         own = numbers[SHAPE]
         lines += [_line(OF_SHAPE + title, own, name, source) for name, title in VARIANTS.items() if name in own]
     spread = (
-        f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks; one "
-        "fold's networks answer for all these boards, so it says nothing of other training boards. ± (seeds) is the "
-        f"standard deviation over {numbers['seeds_n']} network seeds on one skin, mean over skins."
+        f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks. One "
+        "fold's networks predict all these boards, so it does not include the choice of training boards. ± (seeds) is "
+        f"the standard deviation over {numbers['seeds_n']} network seeds on one skin, mean over skins."
     )
     return {"flexible": tabulate(lines, meaning=_meaning(numbers), spread=spread)}
 

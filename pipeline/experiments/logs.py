@@ -141,7 +141,7 @@ def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Est
 MEANING = (  # {rate_hz} comes from the numbers
     "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "
     "then footfalls at random places. The quiet start is the no-load reading; contact is a change of field well above "
-    "its noise; places and forces are answered by networks that never saw the board, each scored by itself: ± is the "
+    "its noise; places and forces are predicted by networks that never saw the board, each scored by itself: ± is the "
     "standard deviation over {networks_n} network seeds. Errors are over the readings "
     "found in contact, against the truth that the simulator keeps. The board keeps its place: the earth's field is "
     "part of the no-load reading and stays as it is, which it does not in a dog's shoe or on a hand."

@@ -545,7 +545,7 @@ BASELINES = (
     "Nothing else was searched."
 )
 UNLABELLED = (
-    "No label of the held-out board. Paired: difference to the same method told the skin's own pokes, board by board. "
+    "No label of the held-out board. Paired: difference to the same method with the skin's own pokes, board by board. "
     "Physics inversion: a law's eight numbers, and place and force of each poke, by least squares from nominal "
     "numbers, whose stiffness and slide are the middle of recorded boards, these included; then each reading is "
     "searched in that law. Centred: places shifted so that the pokes' mean is the middle, as maps and networks assume "
@@ -555,15 +555,15 @@ UNLABELLED = (
 ALARM = (
     "Left over: |dB - simulated| / |dB| of the best place in the law, the median over readings. The alarm is raised "
     "above the limit that {asked:g} % of readings of boards not held out exceed; limit {limit}. Area under the ROC "
-    "curve: 0.5 tells nothing, 1 all. Strangers are recorded readings of the same board with changed chips; the law is "
-    "that of the right skin, or fitted anew to the stranger's own pokes and field at rest. n boards; "
+    "curve: 0.5 is chance, 1 is perfect. Strangers are recorded readings of the same board with changed chips; the law "
+    "is that of the right skin, or fitted anew to the stranger's own pokes and field at rest. n boards; "
     "[low, high]: 95 % interval over them (Student's t, which knows no bounds)."
 )
 FLAGGED = (
-    "Each told the right skin's own unlabelled pokes and no label. Flagged: above the limit that {asked:g} % of "
-    "readings of boards not held out exceed. n boards; an error is of those that flag any reading. A misfit says that "
-    "dB is none of such a skin, a standard deviation that several places would read alike: only the latter is about "
-    "the place."
+    "Each receives the right skin's own unlabelled pokes and no label. Flagged: above the limit that {asked:g} % of "
+    "readings of boards not held out exceed. n boards; an error is of those that flag any reading. A large "
+    "misfit means that dB is unlike that of such a skin, a large standard deviation that several places read alike: "
+    "only the latter is about the place."
 )
 
 

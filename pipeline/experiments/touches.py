@@ -364,8 +364,8 @@ def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: floa
 
 BY_TIME = "later in the same recordings"
 ONCE = (
-    "Each place was recorded once, so what is tested later in the same recordings may be told by the recording as well "
-    "as by the place: only a recording of other days, or a place left out, is free of that."
+    "Each place was recorded once, so later readings of the same recording may be recognised by the recording as well "
+    "as by the place: only a recording of another day, or a place left out, excludes that."
 )
 APART = "Single touches and two at once are in different recordings; data/README.md says of which days."
 NO_MM = "The pitch of the 3 x 3 places is stated nowhere, so nothing is given in mm."
