@@ -30,8 +30,8 @@ from reskin.physics.board import BoardDesign
 from reskin.physics.skin import SkinDesign
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from reskin.universal.law import SEVEN, START, TEN, Law, Seen, Setup, beyond_n, fit, nominal_uT, simulate_uT
-from reskin.universal.presses import Pokes, cosines, explained, growth, lengths_uT, memory, pool
+from reskin.universal.law import SEVEN, START, TEN, AlignedPresses, Law, Setup, beyond_n, fit, nominal_uT, simulate_uT
+from reskin.universal.presses import RecordedPresses, cosines, explained, growth, lengths_uT, memory, pool
 
 ARROWS_N = 4  # places that the figure shows
 WALK_uT = 0.5  # of the no-load field from poke to poke, assumed, where memory is simulated
@@ -73,7 +73,7 @@ def compare(settings: Settings, indentations: Path, results: Path) -> None:
 
 
 def compare_boards(
-    boards: Mapping[str, Pokes], section: Compare, design: SkinDesign, seed: int
+    boards: Mapping[str, RecordedPresses], section: Compare, design: SkinDesign, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare every board; return the numbers, and what the figures draw."""
     setup = make_setup(section, design)
@@ -87,10 +87,10 @@ def compare_boards(
             law_of = names[(i + 1) % len(names)]
             laws["refitted"] = fit(own, setup, SEVEN, fitted[law_of])
             parameters["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
-        simulated_uT = {name: simulate_uT(law, setup, own.place_mm, own.pokes.force_N) for name, law in laws.items()}
-        simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.pokes.force_N)
+        simulated_uT = {name: simulate_uT(law, setup, own.place_mm, own.recorded.force_N) for name, law in laws.items()}
+        simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.recorded.force_N)
         agreements = {
-            name: agreement(own, fields_uT) | {"beyond_n": beyond_n(laws.get(name), setup, own.pokes.force_N)}
+            name: agreement(own, fields_uT) | {"beyond_n": beyond_n(laws.get(name), setup, own.recorded.force_N)}
             for name, fields_uT in simulated_uT.items()
         }
         frictions = fit_frictions(own, setup, fitted[board])
@@ -101,8 +101,8 @@ def compare_boards(
             | agreements
             | estimate_memory(own, simulated_uT["fitted"], section, seed)
             | {"laws": parameters, "frames": check_frames(own, setup, section)}
-            | {"noise_uT": dict(zip("xyz", own.pokes.noise_uT.tolist(), strict=True))}
-            | {"pokes_n": len(own.pokes), "left_out_n": own.pokes.left_out_n}
+            | {"noise_uT": dict(zip("xyz", own.recorded.noise_uT.tolist(), strict=True))}
+            | {"pokes_n": len(own.recorded), "left_out_n": own.recorded.excluded_n}
         )
         drawn[board] = _drawn(own, simulated_uT["fitted"]) | {"curve_uT": curves}
     numbers = {
@@ -138,17 +138,17 @@ def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, An
     return own
 
 
-def _drawn(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
+def _drawn(seen: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
     """Choose what figures show: changes of field at some places of the middle group, and sizes against force."""
-    own = np.flatnonzero(seen.pokes.group_i == len(seen.pokes.groups) // 2)
+    own = np.flatnonzero(seen.recorded.group_i == len(seen.recorded.groups) // 2)
     order = own[np.argsort(np.hypot(*seen.place_mm[own].T), kind="stable")]
     chosen = order[np.unique(np.linspace(0, len(order) - 1, ARROWS_N).round().astype(int))]
     fields = {"recorded": seen.db_uT, "simulated": simulated_uT}
     return {
-        "group": seen.pokes.groups[len(seen.pokes.groups) // 2],
+        "group": seen.recorded.groups[len(seen.recorded.groups) // 2],
         "places_mm": seen.place_mm[chosen].round(2).tolist(),
         "arrows_uT": {name: of[chosen].round(1).tolist() for name, of in fields.items()},
-        "force_N": seen.pokes.force_N.round(3).tolist(),
+        "force_N": seen.recorded.force_N.round(3).tolist(),
         "length_uT": {name: lengths_uT(of).round(1).tolist() for name, of in fields.items()},
     }
 
@@ -156,7 +156,7 @@ def _drawn(seen: Seen, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, An
 # --- Recordings in the board's axes ---
 
 
-def pool_skins(captures: Sequence[Readings]) -> dict[str, Pokes]:
+def pool_skins(captures: Sequence[Readings]) -> dict[str, RecordedPresses]:
     """Pool the captures of each skin; skins are named by their board, or by board and skin where it has several."""
     skins: dict[str, list[Readings]] = {}
     for one in captures:
@@ -177,7 +177,7 @@ def make_setup(section: Compare, design: SkinDesign) -> Setup:
     return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
 
 
-def to_board_axes(pokes: Pokes, section: Compare) -> Seen:
+def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
     """Transform labels and fields to the board's axes."""
     turn, chips_n = chip_rotations(section), pokes.db_uT.shape[1]
     if len(turn) != chips_n:
@@ -185,26 +185,26 @@ def to_board_axes(pokes: Pokes, section: Compare) -> Seen:
         raise ParamsError(f"board {pokes.board}", "chips of compare.design", rule, len(turn), remedy)
     place_mm = (pokes.place_mm - section.labels_middle_mm) * (1, -1 if section.labels_mirrored else 1)
     rest_uT = np.einsum("kij,kj->ki", turn, pokes.noload_uT.mean(axis=0))
-    return Seen(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)
+    return AlignedPresses(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)
 
 
 # --- Agreement, memory, friction ---
 
 
-def agreement(seen: Seen, simulated_uT: Fields) -> dict[str, Any]:
+def agreement(seen: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
     """Compare simulated changes with recorded ones: direction, size and growth with force."""
-    cosine, groups = cosines(simulated_uT, seen.db_uT), seen.pokes.groups
-    grown = {"recorded": growth(seen.pokes, seen.db_uT), "simulated": growth(seen.pokes, simulated_uT)}
+    cosine, groups = cosines(simulated_uT, seen.db_uT), seen.recorded.groups
+    grown = {"recorded": growth(seen.recorded, seen.db_uT), "simulated": growth(seen.recorded, simulated_uT)}
     return {
         "cosine_mean": float(cosine.mean()),
-        "cosine_by_group": {name: float(cosine[seen.pokes.group_i == i].mean()) for i, name in enumerate(groups)},
+        "cosine_by_group": {name: float(cosine[seen.recorded.group_i == i].mean()) for i, name in enumerate(groups)},
         "explained_median": float(np.median(explained(simulated_uT, seen.db_uT))),
     } | ({"growth": grown} if None not in grown.values() else {})
 
 
-def estimate_memory(seen: Seen, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
+def estimate_memory(seen: AlignedPresses, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
     """Estimate the memory of the recordings, and of simulated no-load readings that have that of the section."""
-    pokes = seen.pokes  # memory does not depend on the axes of the chips
+    pokes = seen.recorded  # memory does not depend on the axes of the chips
     rng = rng_for(seed, "compare", pokes.board)
     walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
     noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
@@ -224,7 +224,7 @@ def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"
     return np.median(length_uT, axis=0)
 
 
-def fit_frictions(seen: Seen, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
+def fit_frictions(seen: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
     """Fit the law anew with other frictions under the tip; give agreement, and the field of a light touch.
 
     `grip_N` is the force that takes two thirds of the slide in the skin's middle.
@@ -234,7 +234,7 @@ def fit_frictions(seen: Seen, setup: Setup, fitted: Law) -> list[dict[str, Any]]
         law = replace(fitted, grip_N_mm=grip_N_mm)
         if grip_N_mm != fitted.grip_N_mm:
             law = fit(seen, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
-        agreed = agreement(seen, simulate_uT(law, setup, seen.place_mm, seen.pokes.force_N))
+        agreed = agreement(seen, simulate_uT(law, setup, seen.place_mm, seen.recorded.force_N))
         length_uT = size_against_force(law, setup, seen.place_mm)
         rows.append(
             {name: agreed[name] for name in ("cosine_mean", "explained_median", "growth") if name in agreed}
@@ -324,11 +324,11 @@ def _describe_exchanges(at: Int[np.ndarray, " k"]) -> list[str]:
     return [f"chips are exchanged ({places})"] if moved else []
 
 
-def check_frames(seen: Seen, setup: Setup, section: Compare) -> dict[str, Any]:
+def check_frames(seen: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
     """Check whether labels, chips and skin lie as the scene says."""
     found = find_frames(
-        seen.place_mm, seen.pokes.db_uT, chip_rotations(section),
-        lambda at_mm: nominal_uT(setup, at_mm, seen.pokes.force_N),
+        seen.place_mm, seen.recorded.db_uT, chip_rotations(section),
+        lambda at_mm: nominal_uT(setup, at_mm, seen.recorded.force_N),
     )  # fmt: skip
     columns = zip(found.chips.tolist(), found.as_written.tolist(), found.cosines.tolist(), found.turns, strict=True)
     chips = [
@@ -402,7 +402,7 @@ def _pressed_rows(readings: Readings) -> np.ndarray:
     return np.isfinite(readings.x_mm) & np.isfinite(readings.y_mm) & (readings.Fz_N > 0)
 
 
-def _thin(pokes: Pokes) -> Pokes:
+def _thin(pokes: RecordedPresses) -> RecordedPresses:
     """Keep at most `POKES_MAX_N` pokes, evenly over the recording."""
     kept = np.unique(np.linspace(0, len(pokes) - 1, POKES_MAX_N).round().astype(int))
     names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")

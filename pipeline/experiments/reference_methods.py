@@ -60,7 +60,7 @@ from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.universal.calibration import LabelledPresses
 from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
-from reskin.universal.law import Seen, Setup
+from reskin.universal.law import AlignedPresses, Setup
 from reskin.universal.model import PriorModel
 
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method receives
@@ -430,7 +430,12 @@ class Board:
 
 
 def evaluate_alarm(
-    data: SceneData, frame: Frame, setup: Setup, seen: Mapping[str, Seen], folds: Sequence[Fold], fraction: float
+    data: SceneData,
+    frame: Frame,
+    setup: Setup,
+    seen: Mapping[str, AlignedPresses],
+    folds: Sequence[Fold],
+    fraction: float,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Evaluate the residual of inversion as an alarm for foreign boards, and as a flag of wrong estimates.
 
@@ -440,7 +445,7 @@ def evaluate_alarm(
     first = first_folds(folds)
     boards = {}
     for board, fold in first.items():
-        rest_uT = seen[board].pokes.noload_uT.mean(axis=0).reshape(1, -1)
+        rest_uT = seen[board].recorded.noload_uT.mean(axis=0).reshape(1, -1)
         tested_uT = data.rows.db_uT[fold.test[::TESTED_EVERY_N]].astype(float)
         boards[board] = Board(rest_uT, means_uT(data, pokes_of(data, fold)), tested_uT)
 

@@ -9,7 +9,7 @@ from pydantic import Field
 from pipeline.executors import make_executor
 from pipeline.settings import Adaptations, Settings, Training, take
 from pipeline.stage import say
-from pipeline.training.before_contact import BY_TIME, score_before_touch
+from pipeline.training.before_contact import BY_TIME, score_before_contact
 from pipeline.training.jobs import (
     adaptation_jobs,
     make_jobs,
@@ -49,7 +49,7 @@ def train_single(settings: Settings, indentations: Path, folds: Path, models: Pa
     jobs = make_jobs(data, read_train_single(settings), folds_of_one_skin)
     write_models(models, data, jobs, train_jobs(data, jobs, "train_single"), "train_single")
     captures, networks = io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME)
-    io.write_table(models / SCORED, score_before_touch(data, indentations, captures, networks))
+    io.write_table(models / SCORED, score_before_contact(data, indentations, captures, networks))
 
 
 def read_train_multi(settings: Settings) -> Training:

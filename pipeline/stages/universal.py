@@ -43,11 +43,11 @@ def few_labels(settings: Settings, indentations: Path, folds: Path, scores: Path
     data = read_data(settings, indentations, folds)
     study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, read_few_labels(settings))
     done: list[few.Done] = []
-    for step in (few.networks, few.adapted, few.labelled):  # each goes on from what the last ones trained
+    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each starts from earlier networks
         pairs = step(study, done)
         trained = train_jobs(data, [job for _, job in pairs], "few_labels")
-        done = [*done, *((tried, job, result) for (tried, job), result in zip(pairs, trained, strict=True))]
-    tasks = few.classical(study)
+        done = [*done, *((entry, job, result) for (entry, job), result in zip(pairs, trained, strict=True))]
+    tasks = few.classical_jobs(study)
     with make_executor(imports="reskin.models.classical") as executor:
         fitted = run_classical_jobs(
             [task for _, task in tasks],
@@ -55,15 +55,15 @@ def few_labels(settings: Settings, indentations: Path, folds: Path, scores: Path
             executor,
             lambda line: say(f"{data.scene} few_labels: {line}"),
         )
-    points = [_point(data, tried, trained.predicted) | collapse_record(trained) for tried, _, trained in done]
-    points += [_point(data, tried, answer.predicted) for (tried, _), answer in zip(tasks, fitted, strict=True)]
+    points = [_point(data, entry, trained.predicted) | collapse_record(trained) for entry, _, trained in done]
+    points += [_point(data, entry, result.predicted) for (entry, _), result in zip(tasks, fitted, strict=True)]
     io.write_json(scores, points)
 
 
-def _point(data: SceneData, tried: few.Tried, predicted: np.ndarray) -> dict[str, Any]:
-    board, draw = tried.fold.name.rsplit("-draw", 1)
-    point = {"method": tried.method, "inputs": tried.inputs, "labels_n": tried.labels_n, "fold": board}
-    return point | {"seed_i": int(draw), "scores": score_test(data, tried.fold.test, predicted)}
+def _point(data: SceneData, entry: few.Entry, predicted: np.ndarray) -> dict[str, Any]:
+    board, draw = entry.fold.name.rsplit("-draw", 1)
+    point = {"method": entry.method, "inputs": entry.inputs, "labels_n": entry.labels_n, "fold": board}
+    return point | {"seed_i": int(draw), "scores": score_test(data, entry.fold.test, predicted)}
 
 
 class UniversalSection(TrainingSettings):

@@ -1,8 +1,8 @@
-"""How well a place is told before its touch, on the folds within one skin: scores of 2 neighbours. Knows no argv.
+"""Scores of places that are estimated without the contact, on the folds within one skin, by 2 neighbours.
 
-They stand beside a network's scores on the same rows: what they reach, the network may have learnt from the scan. The
-hover control asks what was learnt on contacts for the place of a tip that does not touch: a skin that feels nothing
-answers by chance, a magnet on the tip gives its place away.
+Inputs are the no-load field alone, or the row's number in the scan: an accuracy that they reach, a network may have
+learnt from the scan rather than from contacts. The hover control predicts the place of a tip that hovers, from models
+of contacts: chance for a tip that the skin does not sense, better for a magnet on it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,24 +26,24 @@ NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
 PLACE = ("accuracy_pct", "mse_xy_mm2")
 LENGTHS = ("hover_uT", "touch_uT")  # median |dB| of rows that hover, and of contacts of about 1 N
 TOUCH_N = (0.8, 1.2)
-BY_TIME = "single_temporal"  # whose tested passes are not trained on
+BY_TIME = "single_temporal"  # whose tested passes are not in training
 
 
-def score_before_touch(
+def score_before_contact(
     data: SceneData, indentations: Path, captures: list[str], networks: Mapping[str, Sequence[Network]]
 ) -> pa.Table:
-    """Score places told by the no-load field alone, by the number in the scan alone, and of a tip that only hovers.
+    """Score places by the no-load field alone, by the number in the scan alone, and of a tip that hovers.
 
-    A row a fold and input. `networks` are those of each fold that the hover control asks too, beside 2 neighbours.
+    networks: by fold, for the hover control beside 2 neighbours. Returns a row for each fold and input.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
-    told_by = {"noload": scan.noload_uT, "scan": scan.scan_i[:, None].astype(np.float32)}
+    inputs_by_name = {"noload": scan.noload_uT, "scan": scan.scan_i[:, None].astype(np.float32)}
     lines = [
         {"question": fold.experiment, "fold": fold.name, "told_by": name, **_score(data, inputs, fold.train, fold.test)}
         for fold in data.folds
         if fold.experiment in SAME_SKIN
-        for name, inputs in told_by.items()
+        for name, inputs in inputs_by_name.items()
     ]
     hover = gather_hover(read)
     for fold in [fold for fold in data.folds if fold.experiment == BY_TIME]:
@@ -54,7 +54,7 @@ def score_before_touch(
 
 
 def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network]) -> list[dict[str, Any]]:
-    """Score rows that hover in the tested passes of a fold, by what was learnt on contacts."""
+    """Score hovering rows in the tested passes of a fold, by models of contacts."""
     rows, tested = data.rows, set(zip(data.rows.skin[fold.test], data.rows.pass_i[fold.test].tolist(), strict=True))
     own = np.array([pair in tested for pair in zip(hover.skin, hover.pass_i.tolist(), strict=True)], bool)
     if not own.any():
@@ -62,24 +62,24 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
     db_uT, place_mm = hover.db_uT[own], hover.place_mm[own]
     rng = rng_for(data.settings.seed, "before-touch", "hover")
     neighbours = fit(NEIGHBOURS, rows.db_uT[fold.train], rows.target[fold.train], rng, weight=None)
-    answers = {"hover": [neighbours.predict(db_uT)], "hover_network": [network(db_uT) for network in networks]}
+    predictions = {"hover": [neighbours.predict(db_uT)], "hover_network": [network(db_uT) for network in networks]}
     force_N = rows.target[fold.test, 2]
     touch_uT = np.linalg.norm(rows.db_uT[fold.test][(force_N > TOUCH_N[0]) & (force_N < TOUCH_N[1])], axis=1)
     lengths = {"hover_uT": float(np.median(np.linalg.norm(db_uT, axis=1))), "touch_uT": float(np.median(touch_uT))}
     true = np.column_stack([place_mm, np.full(len(place_mm), np.nan)])
     lines = []
-    for told_by, found in answers.items():
-        scores = [score(true, answer) for answer in found]
+    for name, found in predictions.items():
+        scores = [score(true, predicted) for predicted in found]
         if scores:
-            means = {name: float(np.mean([one[name] for one in scores])) for name in PLACE}
-            lines.append({"question": fold.experiment, "fold": fold.name, "told_by": told_by, **means, **lengths})
+            means = {metric: float(np.mean([one[metric] for one in scores])) for metric in PLACE}
+            lines.append({"question": fold.experiment, "fold": fold.name, "told_by": name, **means, **lengths})
     return lines
 
 
 def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
 ) -> Mapping[str, float]:
-    rng = rng_for(data.settings.seed, "before-touch")  # neighbours draw nothing
+    rng = rng_for(data.settings.seed, "before-touch")  # neighbours are not random
     fitted = fit(NEIGHBOURS, inputs[train], data.rows.target[train], rng, weight=None)
     found = score(data.rows.target[test], fitted.predict(inputs[test]))
     return {name: found[name] for name in PLACE}

@@ -1,7 +1,7 @@
-"""Experiment labels: what a few labels of a new board are worth. In: rows, folds, settings. Out: what to run.
+"""Experiment labels: methods on a new board with no, a few and more labelled indentations.
 
-Networks are trained, adapted by unlabelled pokes, and fine-tuned on labelled ones; classical methods are fitted with
-them. Refuses to know how they are run and scored.
+Networks are trained, adapted by unlabelled indentations, and fine-tuned on labelled ones; classical methods are fitted
+with them. This module lists the trainings; `pipeline.stages.universal` runs and scores them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,9 +28,9 @@ Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
 class FewLabels(Strict):
-    """Section few_labels: networks and classical methods with so many labelled pokes of the held-out board.
+    """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
 
-    `adapted` names the recipes that are also adapted by their unlabelled pokes, as `adapting` says.
+    adapted: recipes that are also adapted by unlabelled indentations, with the settings `adapting`.
     """
 
     labels_n: Labels
@@ -50,7 +50,7 @@ class FewLabels(Strict):
 
 @dataclass(frozen=True)
 class Study:
-    """Rows, the folds of the experiment, the scene's seed, and the settings."""
+    """Rows, folds of the experiment, seed and settings of a scene."""
 
     rows: Rows
     folds: Sequence[Fold]
@@ -59,8 +59,8 @@ class Study:
 
 
 @dataclass(frozen=True)
-class Tried:
-    """One entry of the table: a method on a fold with so many labels."""
+class Entry:
+    """An entry of the table: a method on a fold with a number of labels."""
 
     method: str
     inputs: str
@@ -68,11 +68,11 @@ class Tried:
     fold: Fold
 
 
-Done = tuple[Tried, TrainingJob, TrainingResult]
+Done = tuple[Entry, TrainingJob, TrainingResult]
 
 
 def read_few_labels(settings: Settings) -> FewLabels:
-    """Parse section few_labels, with the shared rows that it names."""
+    """Read section few_labels, with the rows of params.yaml that it names."""
     section, where = dict(settings["few_labels"]), f"{settings.where}: few_labels"
     base = settings.row("recipes", take(section, "recipe", where)) | {"steps_n": take(section, "steps_n", where)}
     adapting, labelling = dict(take(section, "adapting", where)), dict(take(section, "labelling", where))
@@ -85,11 +85,11 @@ def read_few_labels(settings: Settings) -> FewLabels:
     return parse(FewLabels, section | resolved, where)
 
 
-def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, TrainingJob]]:
-    """Train every recipe on every fold."""
+def network_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
+    """List the training of every recipe on every fold."""
     return [
         (
-            Tried(name, recipe.inputs, 0, fold),
+            Entry(name, recipe.inputs, 0, fold),
             TrainingJob(EXPERIMENT, name, recipe, fold.name, study.seed, 0, fold.train, fold.test),
         )
         for fold in study.folds
@@ -97,36 +97,36 @@ def networks(study: Study, done: Sequence[Done]) -> list[tuple[Tried, TrainingJo
     ]
 
 
-def adapted(study: Study, done: Sequence[Done]) -> list[tuple[Tried, TrainingJob]]:
-    """Adapt the named recipes by all pokes of the pool, unlabelled."""
+def adaptation_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
+    """List the adaptation of the named recipes by all indentations of the pool, unlabelled."""
     pairs = []
-    for tried, job, trained in done:
+    for entry, job, trained in done:
         if job.recipe_name in study.settings.adapted:
-            lines = grid_lines(study.rows, tried.fold.pool)
+            lines = grid_lines(study.rows, entry.fold.pool)
             tuning = Adaptation(_start(trained), study.settings.adapting, lines)
-            pair = Tried(f"{tried.method}, adapted", tried.inputs, 0, tried.fold)
-            pairs.append((pair, _tuned(job, tuning, "adapted")))
+            adapted = Entry(f"{entry.method}, adapted", entry.inputs, 0, entry.fold)
+            pairs.append((adapted, _tuned(job, tuning, "adapted")))
     return pairs
 
 
-def labelled(study: Study, done: Sequence[Done]) -> list[tuple[Tried, TrainingJob]]:
-    """Fine-tune every network on every number of labelled pokes."""
+def fine_tuning_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
+    """List the fine-tuning of every network on every number of labelled indentations."""
     pairs = []
-    for tried, job, trained in done:
-        for labels_n, row in _labelled_rows(study, tried.fold).items():
+    for entry, job, trained in done:
+        for labels_n, row in _labelled_rows(study, entry.fold).items():
             if labels_n:
                 tuning = FineTuning(_start(trained), study.settings.labelling, row)
-                pair = Tried(tried.method, tried.inputs, labels_n, tried.fold)
-                pairs.append((pair, _tuned(job, tuning, f"{job.what}{labels_n}labels")))
+                labelled = Entry(entry.method, entry.inputs, labels_n, entry.fold)
+                pairs.append((labelled, _tuned(job, tuning, f"{job.what}{labels_n}labels")))
     return pairs
 
 
-def classical(study: Study) -> list[tuple[Tried, ClassicalJob]]:
-    """Fit every classical method with every number of labelled pokes."""
+def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
+    """List the fit of every classical method with every number of labelled indentations."""
     most_n = study.settings.rows_max_n
     return [
         (
-            Tried(method.title, method.inputs, labels_n, fold),
+            Entry(method.title, method.inputs, labels_n, fold),
             ClassicalJob(f"{name}.{fold.name}.{labels_n}", method, fold.train, fold.test, row, most_n, study.seed),
         )
         for fold in study.folds
@@ -136,12 +136,12 @@ def classical(study: Study) -> list[tuple[Tried, ClassicalJob]]:
 
 
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
-    """Choose the labelled pokes of the pool at random, the fewer among the more; give their rows."""
+    """Draw labelled indentations of the pool, the fewer among the more; return their rows by number."""
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     indentations = np.unique(indentation)
     if max(labels_n) > len(indentations):
-        rule = f"at most the {len(indentations)} pokes of its pool"
-        remedy = "Ask for fewer, or raise split.labels_pool_n."
+        rule = f"at most the {len(indentations)} indentations of its pool"
+        remedy = "Reduce labels_n, or raise split.labels_pool_n."
         raise ParamsError(f"fold labels/{fold.name}", "few_labels.labels_n", rule, max(labels_n), remedy)
     order = rng_for(study.seed, "labelled", fold.name).permutation(indentations)
     return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}

@@ -42,17 +42,17 @@ CARD = {
     "name": "universal, simulated alone",
     "source": "simulated",
     "centre": asdict(NOMINAL),
-    "map": "pokes of simulated skins on a lattice of places and forces, and their slopes; no recorded row",
-    "network": "taught pokes of simulated skins, with errors of the law drawn anew at every step; no recorded row",
+    "map": "presses of simulated skins on a lattice of places and forces, and their slopes; no recorded row",
+    "network": "trained on presses of simulated skins, errors of the law drawn at every step; no recorded row",
     "answers": "places: the map's probabilities times the network's normal; misfit: the map's",
-    "standard_deviations": "of a power of that product. The power: sureness, by unlabelled pokes (anywhere, or evenly "
-    "over the skin) and by labels, over the median misfit of the pokes (of 12 or more) and over what labelled pokes "
-    "that are left out in their turn are off. Told on simulated skins so that 1.645 to either side hold 90 %",
+    "standard_deviations": "of a power of that product. The power: `sureness`, by number of unlabelled presses "
+    "(anywhere, or evenly over the skin) and of labels, over the median misfit of the presses (of 12 or more) and over "
+    "the variance inflation of cross-validated labels. Calibrated on simulated skins: 1.645 to either side cover 90 %",
     "made_in_s_of": "one core's processor time; other machines take others",
     "recorded_knowledge": "the form of the law and the middle of its slide, from two recorded boards",
-    "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, told 65 pokes that lie "
-    "evenly (see(pokes, even=True)) and labels; intervals of skins that were told fewer pokes are told on simulated "
-    "skins alone",
+    "tested_on": "reports/lab, leave-one-board-out: `universal, simulated alone` is this model, calibrated by 65 "
+    "presses that lie evenly (see(presses, even=True)) and by labels; intervals with fewer presses are calibrated on "
+    "simulated skins alone",
     "not_for": "boards of other chips or turns, skins of other magnets, of other thickness, two contacts, shear",
 }
 

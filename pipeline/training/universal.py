@@ -28,7 +28,7 @@ from reskin.universal.calibration import (
     lower_by_residuals,
     variance_inflations,
 )
-from reskin.universal.law import TEN, Law, Seen, Setup, fit, simulate_uT
+from reskin.universal.law import TEN, AlignedPresses, Law, Setup, fit, simulate_uT
 from reskin.universal.map import (
     FORCES_N,
     NOMINAL,
@@ -89,7 +89,7 @@ class KnownBoards:
     data: SceneData
     frame: Frame
     setup: Setup
-    presses: Mapping[str, Seen]
+    presses: Mapping[str, AlignedPresses]
 
 
 @dataclass(frozen=True)
@@ -151,15 +151,16 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
     return SkinPrior(f"without {board}", centre, RIG_SPREADS, known.setup, recorded, residual)
 
 
-def residual_of(presses: Mapping[str, Seen], laws: Mapping[str, Law], setup: Setup) -> Residual:
+def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
     """Fit the residual to the laws' errors on the boards that they were fitted to."""
     errors = []
     for board, own in presses.items():
-        simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.pokes.force_N).reshape(len(own.pokes), -1)
+        simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
+        simulated_uT = simulated_uT.reshape(len(simulated_uT), -1)
         off_uT = own.db_uT.reshape(simulated_uT.shape) - simulated_uT
         errors.append(off_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
     boards = list(presses.values())
-    return fit_residual([own.place_mm for own in boards], [own.pokes.force_N for own in boards], errors)
+    return fit_residual([own.place_mm for own in boards], [own.recorded.force_N for own in boards], errors)
 
 
 def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
@@ -240,7 +241,7 @@ class Benchmark:
 
     data: SceneData
     frame: Frame
-    presses: Mapping[str, Seen]
+    presses: Mapping[str, AlignedPresses]
     nominal: Variant
     board_powers: Mapping[str, Mapping[int, Powers]]
     nominal_powers: Mapping[int, Powers]
@@ -469,9 +470,9 @@ def _simulated_coverages(calibration: PoolCalibration, tested: LabelledPresses, 
 def _board_coverages(benchmark: Benchmark, board: str, labels_n: Sequence[int]) -> dict[int, Coverages]:
     """Return coverages of the nominal variant on a board, with a third of its presses as pool, on the others."""
     own = benchmark.presses[board]
-    order = rng_for(benchmark.data.settings.seed, "universal", board).permutation(len(own.pokes))
+    order = rng_for(benchmark.data.settings.seed, "universal", board).permutation(len(own.recorded))
     db_uT = own.db_uT.reshape(len(order), -1)
-    presses = LabelledPresses(own.place_mm[order], own.pokes.force_N[order], db_uT[order])
+    presses = LabelledPresses(own.place_mm[order], own.recorded.force_N[order], db_uT[order])
     pool_n = len(order) // 3
     calibration = calibrate(benchmark.nominal.model, own.rest_uT.ravel(), presses[:pool_n])
     powers = [Powers(power, power) for power in BOARD_POWERS]

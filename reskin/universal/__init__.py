@@ -1,4 +1,1 @@
-"""Simulated twins of recorded boards: a law of a few numbers, fitted on pokes; and a map of what a skin would read.
-
-Refuses to know scenes and files.
-"""
+"""The universal model: a physical law of skins, a map and networks made from it, and their calibration to one skin."""

@@ -1,8 +1,7 @@
-"""Physics inversion: pokes at unknown places and the field at rest -> a law; readings -> places and forces in it.
+"""Physics inversion, a reference method: fit a law to one skin alone, then search it for each reading.
 
-Least squares throughout, from nominal numbers, no reading of another board: the rival of maps and networks. What a
-search leaves over tells a skin that the law does not know. Places in the board's frame, in mm; fields in its axes, in
-uT. Refuses to know recordings, folds and scores.
+The law is fitted by least squares to the no-load field and to presses at unknown places, from nominal parameters. The
+residual of a search is large on a skin that the law does not describe. Places in the board's frame, fields in its axes.
 """
 
 from dataclasses import dataclass
@@ -11,24 +10,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from reskin.universal.law import PRIOR, STEP, Law, OFFSET_uT, Setup, at_rest_uT, inside, simulate_uT, with_numbers
+from reskin.universal.law import PRIOR, STEP, Law, OFFSET_uT, Setup, at_rest_uT, inside, simulate_uT, with_parameters
 from reskin.universal.map import FORCES_N, NOMINAL, lattice_mm
 
-# Stiffness and labels' offset stay nominal: where nothing says how hard and where a poke was, no field tells them.
-NUMBERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "away_um_mm", "give_x_um", "give_y_um")
-LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # below these a skin would lie in its chips
-PRIOR_WEIGHT = 0.5  # assumed: that of `fit` was chosen with boards in view
-ROUNDS_N = 3  # of finding places under a law, then numbers and places together
+# Stiffness and labels' offset stay nominal: fields do not tell them without known forces and places.
+PARAMETERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "away_um_mm", "give_x_um", "give_y_um")
+LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin lies above its chips
+PRIOR_WEIGHT = 0.5  # assumed: that of `law.fit` was chosen on recorded boards
+ROUNDS_N = 3  # of searching places under a law, then fitting parameters and places together
 EVALUATIONS_MAX_N = 8  # of all derivatives, in a round
 STEP_MM, STEP_LOG_N = 0.05, 0.03  # of differences by place and by log force
-REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # beyond these nobody presses
-CELL = 1.0  # a search goes so many steps of the lattice past its nearest point, no farther
+REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # bounds of places and forces
+CELL = 1.0  # most steps of the lattice from the nearest point to the result of a search
 BLOCK_N = 500  # readings at a time, to bound memory
 
 
 @dataclass(frozen=True)
 class Chart:
-    """What a law reads at a lattice of places and forces, and how that changes, per step of the lattice."""
+    """Fields of a law at a lattice of places and forces, and their slopes per step of the lattice."""
 
     place_mm: Float[np.ndarray, "h 2"]
     log_N: Float[np.ndarray, " h"]
@@ -39,7 +38,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Found:
-    """Where a search ends: places, forces, and what is left over, |dB - simulated| / |dB|."""
+    """Results of a search: places, forces, and residuals |dB - simulated| / |dB|."""
 
     place_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
@@ -47,7 +46,7 @@ class Found:
 
 
 def chart(law: Law, setup: Setup) -> Chart:
-    """Simulate a law at every place and force of the lattice: some 2,900 pokes, a second."""
+    """Simulate a law at every place and force of the lattice: some 2,900 presses, a second."""
     axis_mm, log_N = lattice_mm(), np.log(FORCES_N)
     at = np.stack(np.meshgrid(axis_mm, axis_mm, log_N, indexing="ij"), axis=-1)
     flat = at.reshape(-1, 3)
@@ -59,17 +58,17 @@ def chart(law: Law, setup: Setup) -> Chart:
 
 
 def search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
-    """Find each reading on a chart: its nearest point, then one step of Gauss and Newton from there."""
+    """Search a chart for each reading: its nearest point, then one Gauss-Newton step."""
     blocks = [_search(known, db_uT[i : i + BLOCK_N]) for i in range(0, max(len(db_uT), 1), BLOCK_N)]
     return Found(*(np.concatenate([getattr(one, name) for one in blocks]) for name in Found.__annotations__))
 
 
 def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
-    far_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T  # less |dB|^2, which all points share
+    far_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T  # less |dB|^2, equal for all points
     at = far_uT2.argmin(axis=1)
     off_uT, slope_uT = db_uT - known.field_uT[at], known.slope_uT[at]
     square = slope_uT.transpose(0, 2, 1) @ slope_uT
-    held = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # where a number moves no field
+    held = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # for coordinates without effect
     steps = np.linalg.solve(square + held, np.einsum("nci,nc->ni", slope_uT, off_uT)[..., None])[..., 0]
     steps = np.clip(steps, -CELL, CELL)
     left_uT = off_uT - np.einsum("nci,ni->nc", slope_uT, steps)
@@ -79,16 +78,16 @@ def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
 
 
 def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, " ch"], setup: Setup) -> Law:
-    """Fit a law to pokes nobody labelled and to the field at rest, from nominal numbers: some 6 s of 65 pokes."""
+    """Fit a law to unlabelled presses and the no-load field, from nominal parameters: some 6 s for 65 presses."""
     law = NOMINAL
     for _ in range(ROUNDS_N):
-        law = _Together(law, setup, db_uT, rest_uT).solve(search(chart(law, setup), db_uT))
+        law = _JointFit(law, setup, db_uT, rest_uT).solve(search(chart(law, setup), db_uT))
     return law
 
 
 @dataclass(frozen=True)
-class _Together:
-    """Least squares over a law's numbers first, then x, y and log F of each poke; weights and priors as of `fit`."""
+class _JointFit:
+    """Least squares over the law's parameters, then x, y and log F of each press; weights as in `law.fit`."""
 
     law: Law
     setup: Setup
@@ -97,40 +96,40 @@ class _Together:
 
     def solve(self, found: Found) -> Law:
         n = len(self.db_uT)
-        low = [*(LEAST.get(name, -np.inf) for name in NUMBERS), *[-REACH_MM, -REACH_MM, np.log(REACH_N[0])] * n]
-        high = [*[np.inf] * len(NUMBERS), *[REACH_MM, REACH_MM, np.log(REACH_N[1])] * n]
+        low = [*(LEAST.get(name, -np.inf) for name in PARAMETERS), *[-REACH_MM, -REACH_MM, np.log(REACH_N[0])] * n]
+        high = [*[np.inf] * len(PARAMETERS), *[REACH_MM, REACH_MM, np.log(REACH_N[1])] * n]
         at = np.column_stack([found.place_mm, np.log(found.force_N)]).ravel()
-        start = np.clip(np.concatenate([_numbers(self.law), at]), low, high)
+        start = np.clip(np.concatenate([_values(self.law), at]), low, high)
         best = least_squares(
             self.residuals, start, self.slopes, bounds=(low, high), ftol=1e-3, max_nfev=EVALUATIONS_MAX_N,
-            x_scale=np.concatenate([_numbers(STEP), np.tile([1.0, 1.0, 0.5], n)]),
+            x_scale=np.concatenate([_values(STEP), np.tile([1.0, 1.0, 0.5], n)]),
         )  # fmt: skip
-        return with_numbers(self.law, NUMBERS, best.x[: len(NUMBERS)])
+        return with_parameters(self.law, PARAMETERS, best.x[: len(PARAMETERS)])
 
     def residuals(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
-        number, at = values[: len(NUMBERS)], values[len(NUMBERS) :].reshape(-1, 3)
-        law = with_numbers(self.law, NUMBERS, number)
+        parameters, at = values[: len(PARAMETERS)], values[len(PARAMETERS) :].reshape(-1, 3)
+        law = with_parameters(self.law, PARAMETERS, parameters)
         simulated_uT = simulate_uT(law, self.setup, at[:, :2], np.exp(at[:, 2])).reshape(self.db_uT.shape)
         each = (simulated_uT - self.db_uT) / np.linalg.norm(self.db_uT, axis=1, keepdims=True)
         rest = (at_rest_uT(law, self.setup).ravel() - self.rest_uT) / OFFSET_uT
-        held = PRIOR_WEIGHT * (number - _numbers(NOMINAL)) / _numbers(PRIOR)
+        held = PRIOR_WEIGHT * (parameters - _values(NOMINAL)) / _values(PRIOR)
         return np.concatenate([each.ravel(), rest, held])
 
     def slopes(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "r p"]:
-        # What a poke is moved by touches its own rows alone: so three simulations of all pokes give all their columns.
+        # A press's coordinates change its own rows alone: three simulations of all presses give all their columns.
         n, channels_n = self.db_uT.shape
-        first, numbers_n = self.residuals(values), len(NUMBERS)
+        first, parameters_n = self.residuals(values), len(PARAMETERS)
         columns = np.zeros((len(first), len(values)))
-        for i, by in enumerate(0.1 * _numbers(STEP)):
+        for i, by in enumerate(0.1 * _values(STEP)):
             columns[:, i] = (self.residuals(values + by * (np.arange(len(values)) == i)) - first) / by
         rows = np.arange(n * channels_n).reshape(n, channels_n)
         for i, by in enumerate((STEP_MM, STEP_MM, STEP_LOG_N)):
-            own = numbers_n + 3 * np.arange(n) + i
+            own = parameters_n + 3 * np.arange(n) + i
             moved = values.copy()
             moved[own] += by
             columns[rows, own[:, None]] = (self.residuals(moved) - first)[rows] / by
         return columns
 
 
-def _numbers(law: Law) -> Float[np.ndarray, " p"]:
-    return np.array([getattr(law, name) for name in NUMBERS])
+def _values(law: Law) -> Float[np.ndarray, " p"]:
+    return np.array([getattr(law, name) for name in PARAMETERS])

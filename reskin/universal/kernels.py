@@ -80,16 +80,16 @@ def _chi2(row, read, chi2):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
-def _fill(of, numbers, errors, shape, noise_var, row):
-    (mean, slope), (number, root) = of, numbers
+def _fill(of, parameters, errors, error_cov, noise_var, row):
+    (mean, slope), (value, root) = of, parameters
     c, t = slope.shape[1:3]
     m, s = np.empty((c, LANES_N), np.float32), np.empty((c, t, LANES_N), np.float32)
     a, b = np.empty((c, c, LANES_N), np.float32), np.empty((c, c, LANES_N), np.float32)
     var, log_det = np.empty(LANES_N, np.float32), np.empty(LANES_N, np.float32)
     for k in range(len(mean)):
-        _expect((mean[k], slope[k]), number, errors, k * LANES_N, m, var)
+        _expect((mean[k], slope[k]), value, errors, k * LANES_N, m, var)
         _spread(slope[k], root, s)
-        _cov(s, var, shape, noise_var, a)
+        _cov(s, var, error_cov, noise_var, a)
         _root(a, log_det)
         _inverse(a, b)
         _write(b, m, log_det, row[:, k * LANES_N : (k + 1) * LANES_N])
@@ -97,19 +97,19 @@ def _fill(of, numbers, errors, shape, noise_var, row):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
-def _expect(of, number, errors, first, m, var):
-    (mean, slope), (missed, left) = of, errors
+def _expect(of, value, errors, first, m, var):
+    (mean, slope), (residual, share) = of, errors
     _clear(var)
     for i in range(len(m)):
         m[i] = mean[i]
-        for p in range(len(number)):
-            _add_times(m[i], number[p], slope[i, p])
+        for p in range(len(value)):
+            _add_times(m[i], value[p], slope[i, p])
         _add(var, m[i], m[i])
     for lane in range(LANES_N):
-        h = min(first + lane, len(left) - 1)
+        h = min(first + lane, len(share) - 1)
         for i in range(len(m)):
-            m[i, lane] += np.sqrt(var[lane]) * missed[h, i]
-        var[lane] *= left[h]
+            m[i, lane] += np.sqrt(var[lane]) * residual[h, i]
+        var[lane] *= share[h]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -124,13 +124,13 @@ def _spread(slope, root, s):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
-def _cov(s, var, shape, noise_var, a):
-    # The lower triangle of s s' + var shape + noise_var 1.
+def _cov(s, var, error_cov, noise_var, a):
+    # The lower triangle of s s' + var error_cov + noise_var 1.
     for i in range(len(a)):
         for j in range(i + 1):
             noise = noise_var if i == j else np.float32(0)
             for lane in range(LANES_N):
-                a[i, j, lane] = var[lane] * shape[i, j] + noise
+                a[i, j, lane] = var[lane] * error_cov[i, j] + noise
             for p in range(s.shape[1]):
                 _add(a[i, j], s[i, p], s[j, p])
 
@@ -138,7 +138,7 @@ def _cov(s, var, shape, noise_var, a):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _root(a, log_det):
-    # Cholesky's root L in place of the lower triangle, but for its diagonal, which is that of 1/L.
+    # Cholesky's root L in place of the lower triangle; its diagonal holds 1/L.
     _clear(log_det)
     for j in range(len(a)):
         for p in range(j):
@@ -154,7 +154,7 @@ def _root(a, log_det):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _inverse(a, b):
-    # From the root L in `a` its inverse, lower too.
+    # The inverse of the root L in `a`, also lower.
     for j in range(len(a)):
         b[j, j] = a[j, j]
         for i in range(j + 1, len(a)):
@@ -178,7 +178,7 @@ def _write(b, m, log_det, row):
     row[f] = log_det[:n]
 
 
-# Loops over lanes are written out: as expressions of arrays they are not turned into vector instructions.
+# Loops over lanes are written out, as expressions of arrays are not vectorised.
 @njit(inline="always")
 @no_type_check
 def _add(total, one, other):

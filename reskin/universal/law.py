@@ -1,4 +1,4 @@
-"""The law of a skin: ten numbers and a rotation that give the change of field at any place and force.
+"""The law of a skin: ten parameters and a rotation that give the change of field at any place and force.
 
 Also fits the law to the presses of one board. Units: uT, mm, N.
 """
@@ -17,14 +17,14 @@ from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics import magnet as dipole
 from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
-from reskin.universal.presses import Pokes, lengths_uT
+from reskin.universal.presses import RecordedPresses, lengths_uT
 
-MARGIN_MM = 0.4  # past the outermost place of the paper's grid
+MARGIN_MM = 0.4  # beyond the outermost places of the paper's grid
 HALF_MM, CORNER_MM = 8.0, 12.0  # of that grid: |x| and |y|, |x| + |y|
 
 
 def inside(place_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Tell which places lie on the octagon of the paper's grid, a margin around it."""
+    """Return which places lie on the octagon of the paper's grid, with a margin around it."""
     x_mm, y_mm = np.abs(place_mm).T
     return (np.maximum(x_mm, y_mm) <= HALF_MM + MARGIN_MM) & (x_mm + y_mm <= CORNER_MM + 1.5 * MARGIN_MM)
 
@@ -34,21 +34,21 @@ RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick: the cheapest und
 
 @dataclass(frozen=True)
 class Law:
-    """What is fitted of one skin on its board; the first seven may differ from board to board, the rest is the law."""
+    """Parameters of one skin on its board: the first seven may differ between boards, the others are of the rig."""
 
     seat_x_mm: float  # the skin's middle, seen from the board's
     seat_y_mm: float
     rotation_deg: float  # of the skin about z
-    gap_mm: float  # from the chips to the skin; trades against the amplitude, so no measured size
-    amplitude: float  # of the magnetisation, times the nominal one
-    label_x_mm: float  # from where a label says to where the tip is, along the board's axes
+    gap_mm: float  # from the chips to the skin, as fitted: it trades off against the amplitude
+    amplitude: float  # of the magnetisation, relative to nominal
+    label_x_mm: float  # from the label to the tip, along the board's axes
     label_y_mm: float
     modulus_MPa: float
     away_um_mm: float
     give_x_um: float
     give_y_um: float
-    # What no fit of ten numbers moves.
-    lets_go_N: float = 8.0  # where the slide away from the middle is gone: chosen with both boards of scene lab in view
+    # Not fitted.
+    lets_go_N: float = 8.0  # force at which the slide away from the middle ends: chosen on both boards of scene lab
     grip_N_mm: float = 8.75  # springs of 7 N/mm over a friction of 0.8 (nominal.yaml: skin.hold)
     tilt_x_deg: float = 0.0  # of the skin over the board
     tilt_y_deg: float = 0.0
@@ -57,13 +57,13 @@ class Law:
 
 @dataclass(frozen=True)
 class Setup:
-    """What all laws of a scene share: the skin as designed, the chips under it, the tip of the fitted skin."""
+    """What all laws of a scene share: the designed skin, the chips under it, and the tip."""
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
+    skin_flipped: bool  # every field has the opposite sign: a checkerboard skin turned by 90 degrees
     tip_radius_mm: float
     rule: Quadrature = RULE
 
@@ -77,7 +77,7 @@ class Setup:
 
     @cached_property
     def rest(self) -> deformation.RestingDipoles:
-        """Magnetise the skin, its middle at the origin."""
+        """Dipoles of the magnetised skin, its middle at the origin."""
         nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
@@ -96,7 +96,7 @@ class Setup:
         )
 
     def chips_under(self, law: Law) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "3 3"]]:
-        """Give the chips' places in the skin's frame, in m, and the rotation from the skin to the board."""
+        """Return the chips' places in the skin's frame, in m, and the rotation from the skin to the board."""
         angles_deg = [law.rotation_deg, law.tilt_y_deg, law.tilt_x_deg]
         turn = Rotation.from_euler("zyx", angles_deg, degrees=True).as_matrix()
         seat_mm = (law.seat_x_mm, law.seat_y_mm)
@@ -105,7 +105,7 @@ class Setup:
 
 
 def at_rest_uT(law: Law, setup: Setup, rest: deformation.RestingDipoles | None = None) -> Float[np.ndarray, "k 3"]:
-    """Give the field of the untouched skin at the chips, in the board's axes; `rest` as of `simulate_uT`."""
+    """Return the field of the untouched skin at the chips, in the board's axes; `rest` as in `simulate_uT`."""
     chips_m, turn = setup.chips_under(law)
     rest = rest or setup.rest
     field_T = dipole.field(rest.nodes_m, rest.moments_A_m2, chips_m)
@@ -119,9 +119,9 @@ def simulate_uT(
     force_N: Float[np.ndarray, " n"],
     rest: deformation.RestingDipoles | None = None,
 ) -> Float[np.ndarray, "n k 3"]:
-    """Give the change of field at the chips, in the board's axes, of pokes at labelled places of the board.
+    """Return the change of field at the chips, in the board's axes, of presses at labelled places of the board.
 
-    `rest` replaces the setup's dipoles where a skin's filler is not even; its nodes are the setup's.
+    `rest` replaces the setup's dipoles, at the same nodes, for a skin with uneven filler.
     """
     chips_m, turn = setup.chips_under(law)
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
@@ -140,7 +140,7 @@ def simulate_uT(
 def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Give the same of the skin as designed: nothing fitted, no slide, force by the elastic layer."""
+    """Return the same for the designed skin: nothing fitted, no slide, force by the elastic layer."""
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
@@ -149,7 +149,7 @@ def nominal_uT(
 
 
 def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
-    """Count the pokes whose force lies beyond the deepest that a law, or without one the nominal skin, follows."""
+    """Count presses with a force beyond the range of a law, or of the nominal skin if there is none."""
     if law is None:
         known_N, _ = _nominal_curve(setup)
         return int((force_N > known_N[-1]).sum())
@@ -164,7 +164,7 @@ def _layer(law: Law, setup: Setup) -> dict[str, float]:
 
 
 def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Give forces on the skin as designed, and the depths at which it bears them: as deep as fields are tabulated."""
+    """Return forces on the designed skin and their depths, as deep as fields are tabulated."""
     curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
     known_N = layer.force(
         curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
@@ -179,67 +179,67 @@ def _changes_T(
     slides: slide.RigidMotion,
 ) -> Float[np.ndarray, "n k 3"]:  # fmt: skip
     changes_T = np.empty((len(places_m), *chips_m.shape))
-    for poke_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
+    for press_i, (place_m, depth_m) in enumerate(zip(places_m, depths_m, strict=True)):
         moved = deformation.move_dipoles(table, rest, np.append(place_m, depth_m))
-        slide.apply_in_place(slides, poke_i, moved.after)
-        changes_T[poke_i] = change_of_field(moved.before, moved.after, chips_m)
+        slide.apply_in_place(slides, press_i, moved.after)
+        changes_T[press_i] = change_of_field(moved.before, moved.after, chips_m)
     return changes_T
 
 
-def with_numbers(law: Law, names: tuple[str, ...], values: Float[np.ndarray, " p"]) -> Law:
-    """Replace some numbers of a law."""
+def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, " p"]) -> Law:
+    """Replace some parameters of a law."""
     return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))
 
 
-# Where a fit starts, what its priors centre on; then their standard deviations and the size of a step. Assumed.
+# Start of a fit and centre of its priors; standard deviations of the priors; sizes of a step. Assumed.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
 PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
-SEVEN = (*OF_BOARD, "rotation_deg")  # what may differ between boards, the law of another one held
-PRIOR_WEIGHT = 0.25  # chosen with both boards of scene lab in view: at twice as much, one of four fits explains 0.796
-GROWTH_WEIGHT = 10.0  # of how log|dB| is off by group, less its mean: growth with force
-OFFSET_uT = 200.0  # of a chip (spreads.chip_offset_uT): how far the field at rest may be off
+SEVEN = (*OF_BOARD, "rotation_deg")  # what may differ between boards, the rest taken from another one
+PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab: with twice as much, one of four fits explains 0.796
+GROWTH_WEIGHT = 10.0  # of errors of log|dB| by group less their mean: growth with force
+OFFSET_uT = 200.0  # of a chip (spreads.chip_offset_uT): standard deviation of the no-load field
 EVALUATIONS_MAX_N = 10  # of all derivatives; the fits of scene lab take 5, and a tenth of ftol changes 0.0001 of cosine
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What is fitted: pokes, with fields and places turned into the board's axes."""
+class AlignedPresses:
+    """Presses of a board, with fields and places in the board's axes."""
 
-    pokes: Pokes
+    recorded: RecordedPresses
     place_mm: Float[np.ndarray, "n 2"]
     db_uT: Float[np.ndarray, "n k 3"]
     rest_uT: Float[np.ndarray, "k 3"]
 
 
-def fit(seen: Seen, setup: Setup, names: tuple[str, ...], start: Law = START) -> Law:
-    """Fit the named numbers; the others stay as in `start`."""
-    length_uT = lengths_uT(seen.db_uT)
-    counts = np.bincount(seen.pokes.group_i)
+def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law = START) -> Law:
+    """Fit the named parameters by least squares; the others stay as in `start`."""
+    length_uT = lengths_uT(presses.db_uT)
+    counts = np.bincount(presses.recorded.group_i)
     centre, prior, step = (np.array([getattr(law, name) for name in names]) for law in (START, PRIOR, STEP))
 
     def residuals(values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
-        law = with_numbers(start, names, values)
-        simulated_uT = simulate_uT(law, setup, seen.place_mm, seen.pokes.force_N)
-        each = (simulated_uT - seen.db_uT) / length_uT[:, None, None]
+        law = with_parameters(start, names, values)
+        simulated_uT = simulate_uT(law, setup, presses.place_mm, presses.recorded.force_N)
+        each = (simulated_uT - presses.db_uT) / length_uT[:, None, None]
         ratio = np.log(lengths_uT(simulated_uT) / length_uT)
-        by_group = np.bincount(seen.pokes.group_i, ratio) / counts
-        rest = (at_rest_uT(law, setup) - seen.rest_uT) / OFFSET_uT
+        by_group = np.bincount(presses.recorded.group_i, ratio) / counts
+        rest = (at_rest_uT(law, setup) - presses.rest_uT) / OFFSET_uT
         held = PRIOR_WEIGHT * (values - centre) / prior
         return np.concatenate([each.ravel(), rest.ravel(), held, GROWTH_WEIGHT * (by_group - by_group.mean())])
 
     first = np.array([getattr(start, name) for name in names])
-    # Fields have kinks of the size of the flow's table, so differences are not taken over less.
+    # Fields have kinks at the steps of the flow's table: smaller differences would see them.
     found = least_squares(
         residuals, first, x_scale=step, diff_step=1e-3, ftol=1e-3, max_nfev=EVALUATIONS_MAX_N, bounds=_limits(names)
     )
-    return with_numbers(start, names, found.x)
+    return with_parameters(start, names, found.x)
 
 
 def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:
-    # Below these a skin would lie in its chips, or push back.
+    # Bounds: the skin lies above its chips and is elastic.
     least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01}
     return [least.get(name, -np.inf) for name in names], [np.inf] * len(names)
 

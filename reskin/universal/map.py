@@ -13,7 +13,7 @@ from scipy.linalg import solve_triangular
 
 from reskin.errors import SchemaError
 from reskin.universal.kernels import Lattice, LinearMeans, in_blocks, means, whiten
-from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT, with_numbers
+from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT, with_parameters
 
 PITCH_MM, STEPS_N = 0.8, 22  # of the lattice of places, along x and y
 FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
@@ -89,7 +89,7 @@ def mean_law(laws: list[Law]) -> Law:
 def perturb(centre: Law, name: str, by: float) -> Law:
     """Change one parameter of a law, in its unit, or in its logarithm where its spread is of that."""
     value = asdict(centre)[name]
-    return with_numbers(centre, (name,), np.array([value * np.exp(by) if name in LOGARITHMIC else value + by]))
+    return with_parameters(centre, (name,), np.array([value * np.exp(by) if name in LOGARITHMIC else value + by]))
 
 
 Relative = Float[np.ndarray, "n ch"]  # parts of |dB|

@@ -1,4 +1,4 @@
-"""Mean changes of field, noise, growth with force and memory, from the recordings of a board."""
+"""Presses of a recorded board: mean changes of field and noise; agreement with a simulation, growth and memory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,16 +9,16 @@ from jaxtyping import Bool, Float, Int
 from reskin.errors import SchemaError
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
-DRIFT_DEGREE = 4  # of the polynomial that stands for drift; on lab 8 gives a tenth less, 12 half: it takes memory too
-SERIES_MIN_N = 20  # pokes of a capture that memory is told of
-SPREAD_MIN = 0.2  # of log F within a place: where force hardly differs, no growth can be told
+DRIFT_DEGREE = 4  # of the polynomial for drift; on lab a memory by degree 8 is a tenth less, by 12 half: it fits memory
+SERIES_MIN_N = 20  # presses of a capture, for its memory
+SPREAD_MIN = 0.2  # range of log F at a place, for its growth
 
 
 @dataclass(frozen=True)
-class Pokes:
-    """The pokes of one skin on its board, each the mean of its readings; fields in the chips' axes.
+class RecordedPresses:
+    """Presses of one skin on its board, each the mean of its readings; fields in the chips' axes.
 
-    `group_i` numbers the sets of pokes that belong together: captures, and the depths in them where these are known.
+    group_i: index of the group, a capture or a depth in it where depths are known.
     """
 
     board: str
@@ -29,15 +29,15 @@ class Pokes:
     force_N: Float[np.ndarray, " n"]
     db_uT: Float[np.ndarray, "n k 3"]
     noload_uT: Float[np.ndarray, "n k 3"]
-    noise_uT: Float[np.ndarray, "3"]  # of one reading about its poke's mean, by axis
-    left_out_n: int  # pokes whose place or force is not known, or that do not press
+    noise_uT: Float[np.ndarray, "3"]  # standard deviation of a reading about the mean of its press, by axis
+    excluded_n: int  # presses without a known place or a force above 0 N
 
     def __len__(self) -> int:
         return len(self.force_N)
 
 
-def pool(captures: Sequence[Readings]) -> Pokes:
-    """Pool the captures of one skin on one board, poke by poke, in their order."""
+def pool(captures: Sequence[Readings]) -> RecordedPresses:
+    """Pool the captures of one skin on one board, press by press, in their order."""
     parts = [_means(one) for one in captures]
     capture_i = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     groups, group_i = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
@@ -46,30 +46,30 @@ def pool(captures: Sequence[Readings]) -> Pokes:
     )
     known = np.isfinite(place_mm).all(axis=1) & (force_N > 0)
     if not known.any():
-        where, remedy = f"board {captures[0].board}", "Record both, or do not ask it."
-        raise SchemaError(where, "experiment compare", "asked of pokes with place and force", "none", remedy)
-    return Pokes(
+        where, remedy = f"board {captures[0].board}", "Record both, or do not run this experiment."
+        raise SchemaError(where, "experiment compare", "run on presses with place and force", "none", remedy)
+    return RecordedPresses(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
         capture_i=capture_i[known],
         place_mm=place_mm[known], force_N=force_N[known], db_uT=db_uT[known], noload_uT=noload_uT[known],
-        noise_uT=np.sqrt(np.nanmean(var_uT2, axis=(0, 1))), left_out_n=int((~known).sum()),
+        noise_uT=np.sqrt(np.nanmean(var_uT2, axis=(0, 1))), excluded_n=int((~known).sum()),
     )  # fmt: skip
 
 
 def _means(one: Readings) -> tuple[np.ndarray, ...]:
-    # By poke: group, place, force, change of field, no-load field, variance of a reading.
-    _, first, poke_i, counts = np.unique(one.indentation, return_index=True, return_inverse=True, return_counts=True)
+    """Return by press: group, place, force, change of field, no-load field, variance of a reading."""
+    _, first, press_i, counts = np.unique(one.indentation, return_index=True, return_inverse=True, return_counts=True)
     chips = (len(first), one.chips_n, AXES_PER_CHIP_N)
 
     def mean(values: np.ndarray) -> np.ndarray:
         total = np.zeros((len(first), *values.shape[1:]))
-        np.add.at(total, poke_i.ravel(), values)
+        np.add.at(total, press_i.ravel(), values)
         return total / counts.reshape(-1, *[1] * (values.ndim - 1))
 
     b_uT, noload_uT = one.b_uT.astype(float), one.noload_uT[first].astype(float)
     mean_uT = mean(b_uT)
     with np.errstate(divide="ignore", invalid="ignore"):  # one reading has no variance
-        var_uT2 = mean((b_uT - mean_uT[poke_i.ravel()]) ** 2) * (counts / (counts - 1))[:, None]
+        var_uT2 = mean((b_uT - mean_uT[press_i.ravel()]) ** 2) * (counts / (counts - 1))[:, None]
     depths_mm = one.depth_mm[first]
     group = [one.capture + (f" {mm:g} mm" if np.isfinite(mm) else "") for mm in depths_mm]
     place_mm = np.stack([one.x_mm[first], one.y_mm[first]], axis=1)
@@ -78,43 +78,45 @@ def _means(one: Readings) -> tuple[np.ndarray, ...]:
 
 
 def lengths_uT(db_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Give |dB| over all channels."""
+    """Return |dB| over all channels."""
     return np.linalg.norm(db_uT.reshape(len(db_uT), -1), axis=1)
 
 
 def cosines(one_uT: Float[np.ndarray, "n k 3"], other_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Give, poke by poke, the cosine between two changes of field over all channels."""
+    """Return for each press the cosine between two changes of field over all channels."""
     return (one_uT * other_uT).sum(axis=(1, 2)) / (lengths_uT(one_uT) * lengths_uT(other_uT))
 
 
 def explained(simulated_uT: Float[np.ndarray, "n k 3"], recorded_uT: Float[np.ndarray, "n k 3"]) -> np.ndarray:
-    """Give, poke by poke, the part of the recorded change that is explained: 1 - |sim - rec|^2 / |rec|^2."""
+    """Return for each press the explained part of the recorded change: 1 - |sim - rec|^2 / |rec|^2."""
     return 1 - (lengths_uT(simulated_uT - recorded_uT) / lengths_uT(recorded_uT)) ** 2
 
 
-def growth(pokes: Pokes, db_uT: Float[np.ndarray, "n k 3"]) -> float | None:
-    """Give d log|dB| / d log F within a place, the median over places; None where force does not differ."""
-    log_F, log_uT = np.log(pokes.force_N), np.log(lengths_uT(db_uT))
+def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float | None:
+    """Return d log|dB| / d log F at a place, the median over places; None if force does not vary at any."""
+    log_F, log_uT = np.log(presses.force_N), np.log(lengths_uT(db_uT))
     slopes = []
-    for place in np.unique(pokes.place_mm.round(2), axis=0):
-        here: Bool[np.ndarray, " n"] = (np.abs(pokes.place_mm - place) < 0.01).all(axis=1)
+    for place in np.unique(presses.place_mm.round(2), axis=0):
+        here: Bool[np.ndarray, " n"] = (np.abs(presses.place_mm - place) < 0.01).all(axis=1)
         x, y = log_F[here] - log_F[here].mean(), log_uT[here] - log_uT[here].mean()
         if np.ptp(x) > SPREAD_MIN:
             slopes.append(float(x @ y / (x @ x)))
     return float(np.median(slopes)) if slopes else None
 
 
-def memory(pokes: Pokes, db_uT: Float[np.ndarray, "n k 3"], noload_uT: Float[np.ndarray, "n k 3"]) -> float | None:
-    """Give the part of a poke's change that stands in the next no-load reading; None where series are too short.
+def memory(
+    presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"], noload_uT: Float[np.ndarray, "n k 3"]
+) -> float | None:
+    """Return the part of a press's change that remains in the next no-load reading; None if series are too short.
 
-    By least squares beside the change of the poke to come and a polynomial for drift; the mean over captures.
+    By least squares, beside the change of the following press and a polynomial for drift; the mean over captures.
     """
     found = []
-    for capture_i in np.unique(pokes.capture_i):
-        own = np.flatnonzero(pokes.capture_i == capture_i)
+    for capture_i in np.unique(presses.capture_i):
+        own = np.flatnonzero(presses.capture_i == capture_i)
         rest = noload_uT[own].reshape(len(own), -1)
         if len(own) < SERIES_MIN_N or (np.diff(rest, axis=0) == 0).all(axis=1).any():
-            continue  # a no-load reading that is not taken before each poke
+            continue  # no-load readings were not taken before each press
         drift = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(own) - 1), DRIFT_DEGREE)
         db = db_uT[own].reshape(len(own), -1)
         left = [part - drift @ np.linalg.lstsq(drift, part)[0] for part in (rest[1:], db[:-1], db[1:])]

@@ -89,20 +89,20 @@ def as_drawn(job: TrainingJob) -> TrainingResult:
 def networks_of(at: few.Study) -> list[few.Done]:
     """Every network of the study, each step going on from those before, as the stage does."""
     done: list[few.Done] = []
-    for step in (few.networks, few.adapted, few.labelled):
+    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
         done = [*done, *((tried, job, as_drawn(job)) for tried, job in step(at, done))]
     return done
 
 
 STUDY = study()
 NETWORKS = networks_of(STUDY)
-TASKS = few.classical(STUDY)
+TASKS = few.classical_jobs(STUDY)
 ADAPTED = [job for _, job, _ in NETWORKS if isinstance(job.tuning, Adaptation)]
 LABELLED = [(tried, job) for tried, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
 
 
-def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, TrainingJob | ClassicalJob]]:
-    return [*((tried, job) for tried, job, _ in networks), *few.classical(at)]
+def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
+    return [*((tried, job) for tried, job, _ in networks), *few.classical_jobs(at)]
 
 
 def test_every_method_is_tried_once_on_every_fold_with_every_number_of_labels():
@@ -129,7 +129,7 @@ def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
     return one.few_labels if isinstance(one, ClassicalJob) else one.tuning.row
 
 
-def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Tried, TrainingJob | ClassicalJob]]:
+def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
     return [(tried, one) for tried, one in all_tried(at, networks) if tried.labels_n]
 
 
@@ -171,7 +171,7 @@ def test_which_pokes_of_a_pool_are_labelled_is_drawn_anew_in_every_fold():
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
 def test_the_fewer_labels_are_among_the_more(seed, labels_n):
     at = study(seed, labels_n=labels_n)
-    tasks = few.classical(at)
+    tasks = few.classical_jobs(at)
     rows = {(tried.fold.name, tried.labels_n): {*task.few_labels} for tried, task in tasks if "ridge" in task.name}
     for fold in at.folds:
         for less, more in pairwise(sorted(labels_n)):
@@ -180,7 +180,7 @@ def test_the_fewer_labels_are_among_the_more(seed, labels_n):
 
 def test_labels_are_drawn_by_the_seed_and_not_by_the_order_of_numbers():
     first, again, other, turned = (
-        [sorted(task.few_labels.tolist()) for tried, task in few.classical(at) if tried.labels_n == 5]
+        [sorted(task.few_labels.tolist()) for tried, task in few.classical_jobs(at) if tried.labels_n == 5]
         for at in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
     )
     assert first == again == turned
@@ -218,11 +218,11 @@ def test_only_the_networks_named_are_adapted_by_all_pokes_of_their_pool():
     assert [(job.recipe_name, job.fold) for job in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
     for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
         assert {*job.tuning.lines.row} == {*fold.pool}  # no place of 8 pokes on a 3 x 3 grid is alone on its lines
-    assert few.adapted(study(adapted=[]), few_done(study(adapted=[]))) == []
+    assert few.adaptation_jobs(study(adapted=[]), few_done(study(adapted=[]))) == []
 
 
 def few_done(at: few.Study) -> list[few.Done]:
-    return [(tried, job, as_drawn(job)) for tried, job in few.networks(at, [])]
+    return [(tried, job, as_drawn(job)) for tried, job in few.network_jobs(at, [])]
 
 
 def test_adaptation_sees_no_label_of_the_new_board():
@@ -241,7 +241,8 @@ def test_adaptation_sees_no_label_of_the_new_board():
 def test_of_places_only_the_order_along_lines_reaches_adaptation():
     stretched = replace(ROWS, target=(ROWS.target * np.float32([3, 0.5, 0]) + np.float32([7, -2, 1])))
     done = few_done(STUDY)
-    for (_, job), (_, other) in zip(few.adapted(STUDY, done), few.adapted(study(rows=stretched), done), strict=True):
+    pairs = zip(few.adaptation_jobs(STUDY, done), few.adaptation_jobs(study(rows=stretched), done), strict=True)
+    for (_, job), (_, other) in pairs:
         for name, values in vars(job.tuning.lines).items():
             assert (values == getattr(other.tuning.lines, name)).all()
 

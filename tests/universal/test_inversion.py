@@ -1,4 +1,4 @@
-"""Inversion finds the law's own pokes and numbers again; its slopes are differences; strangers leave more over."""
+"""Inversion recovers presses and parameters of the law; its slopes are differences; foreign readings have residuals."""
 
 from dataclasses import asdict, replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from reskin.seeds import rng_for
 from reskin.universal import inversion
-from reskin.universal.inversion import LEAST, NUMBERS, STEP_MM, _Together, chart, fit_unlabelled, search
+from reskin.universal.inversion import LEAST, PARAMETERS, STEP_MM, _JointFit, chart, fit_unlabelled, search
 from reskin.universal.law import at_rest_uT, simulate_uT
 from reskin.universal.map import NOMINAL, lattice_mm
 from reskin.universal.population import COARSE
@@ -28,7 +28,7 @@ def fields_uT() -> np.ndarray:
     return simulate_uT(TRUE, CHEAP, PLACE_MM, FORCE_N).reshape(len(PLACE_MM), -1)
 
 
-def test_a_search_finds_places_and_forces_of_the_laws_own_pokes():
+def test_a_search_recovers_places_and_forces():
     found = search(chart(TRUE, CHEAP), fields_uT())
     np.testing.assert_allclose(
         found.place_mm, PLACE_MM, atol=0.2
@@ -37,7 +37,7 @@ def test_a_search_finds_places_and_forces_of_the_laws_own_pokes():
     assert found.left.max() < 0.1
 
 
-def test_points_of_the_lattice_leave_nothing_over_and_strangers_do():
+def test_points_of_the_lattice_have_no_residual_and_foreign_readings_have():
     known = chart(TRUE, CHEAP)
     found = search(known, known.field_uT)
     np.testing.assert_allclose(found.place_mm, known.place_mm, atol=1e-9)
@@ -45,26 +45,26 @@ def test_points_of_the_lattice_leave_nothing_over_and_strangers_do():
     assert np.median(search(known, -fields_uT()).left) > 0.5
 
 
-def test_slopes_are_differences_of_residuals_number_by_number():
-    two = _Together(TRUE, CHEAP, fields_uT()[:2], at_rest_uT(TRUE, CHEAP).ravel())
+def test_slopes_are_differences_of_residuals():
+    two = _JointFit(TRUE, CHEAP, fields_uT()[:2], at_rest_uT(TRUE, CHEAP).ravel())
     at = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
-    values = np.concatenate([[asdict(TRUE)[name] for name in NUMBERS], at.ravel()])
+    values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], at.ravel()])
     columns = two.slopes(values)
-    for i in (0, len(NUMBERS), len(NUMBERS) + 4):  # a number, x of the first poke, y of the second
+    for i in (0, len(PARAMETERS), len(PARAMETERS) + 4):  # a parameter, x of the first press, y of the second
         by = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
         expected = (two.residuals(values + by) - two.residuals(values)) / by.max()
         np.testing.assert_allclose(columns[:, i], expected, rtol=1e-6, atol=1e-9)
 
 
-def test_pokes_nobody_labelled_tell_the_laws_numbers_and_none_tell_those_of_the_field_at_rest(monkeypatch):
+def test_unlabelled_presses_and_the_no_load_field_determine_parameters(monkeypatch):
     monkeypatch.setattr(inversion, "ROUNDS_N", 1)
-    rest_uT, pokes_uT = at_rest_uT(TRUE, CHEAP).ravel(), fields_uT()[::2]
-    found = fit_unlabelled(pokes_uT, rest_uT, CHEAP)
-    left = [np.median(search(chart(law, CHEAP), pokes_uT).left) for law in (NOMINAL, found)]
+    rest_uT, presses_uT = at_rest_uT(TRUE, CHEAP).ravel(), fields_uT()[::2]
+    found = fit_unlabelled(presses_uT, rest_uT, CHEAP)
+    left = [np.median(search(chart(law, CHEAP), presses_uT).left) for law in (NOMINAL, found)]
     assert left[1] < 0.3 * left[0]
     for name, near in {"seat_x_mm": 0.15, "seat_y_mm": 0.15, "give_x_um": 15.0}.items():
         assert abs(asdict(found)[name] - asdict(TRUE)[name]) < near
     assert all(asdict(found)[name] > least for name, least in LEAST.items())
-    untold = fit_unlabelled(pokes_uT[:0], rest_uT, CHEAP)
-    assert untold.seat_x_mm == pytest.approx(TRUE.seat_x_mm, abs=0.15)
-    assert untold.give_x_um == NOMINAL.give_x_um
+    noload_only = fit_unlabelled(presses_uT[:0], rest_uT, CHEAP)
+    assert noload_only.seat_x_mm == pytest.approx(TRUE.seat_x_mm, abs=0.15)
+    assert noload_only.give_x_um == NOMINAL.give_x_um

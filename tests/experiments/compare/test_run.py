@@ -26,7 +26,7 @@ from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
 from reskin.universal import law
 from reskin.universal import law as fit
-from reskin.universal.presses import Pokes, cosines, explained, growth, memory, pool
+from reskin.universal.presses import RecordedPresses, cosines, explained, growth, memory, pool
 from tests.data.tables import readings
 from tests.recordings.test_recordings import LAB, ingest
 
@@ -41,27 +41,27 @@ NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 TURN = chip_rotations(SECTION)
 
 
-def made(how: law.Law = TRUE, noise_uT: float = 3.0) -> Pokes:
+def made(how: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
     """Record 25 places under two forces, with a known law and noise, as labels and chips of scene lab read them."""
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
     db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(how, SETUP, place_mm, force_N))
     rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(how, SETUP))
-    return Pokes(
+    return RecordedPresses(
         board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), capture_i=np.repeat([0, 1], 25),
         place_mm=place_mm * (1, -1) + SECTION.labels_middle_mm, force_N=force_N,
         db_uT=db_uT + noise_uT * rng.standard_normal(db_uT.shape), noload_uT=np.tile(rest_uT, (50, 1, 1)),
-        noise_uT=np.full(3, noise_uT), left_out_n=0,
+        noise_uT=np.full(3, noise_uT), excluded_n=0,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def recorded() -> Pokes:
+def recorded() -> RecordedPresses:
     return made()
 
 
-def sentence(pokes: Pokes) -> str:
+def sentence(pokes: RecordedPresses) -> str:
     return check_frames(to_board_axes(pokes, SECTION), SETUP, SECTION)["sentence"]
 
 
@@ -192,7 +192,7 @@ def test_pokes_are_means_of_their_readings_and_what_knows_no_force_is_left_out_a
     pokes = pool([one])
     assert pokes.force_N.tolist() == [2.0, 4.0]
     assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # rows 0, 1, 2 and 3, 4
-    assert pokes.left_out_n == 1
+    assert pokes.excluded_n == 1
     assert pokes.groups == ("c0 1 mm",)
     with pytest.raises(SchemaError, match="experiment compare must be asked of pokes with place and force"):
         pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
@@ -201,7 +201,7 @@ def test_pokes_are_means_of_their_readings_and_what_knows_no_force_is_left_out_a
 
 
 @pytest.fixture(scope="module")
-def real(shared_data, tmp_path_factory) -> dict[str, Pokes]:
+def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
     """The pokes of lab boards 1 and 2."""
     captures: dict[str, list] = {}
     for name in LAB:
@@ -220,7 +220,7 @@ def test_laws_fitted_to_a_third_of_the_places_of_real_boards_agree_with_all_of_t
     for board, way in itertools.product(real, cosine_min):
         words, seen = numbers["by_board"][board]["laws"][way], to_board_axes(real[board], SECTION)
         found = law.Law(**{name: words[name] for name in law.Law.__dataclass_fields__})
-        agreed = agreement(seen, law.simulate_uT(found, SETUP, seen.place_mm, seen.pokes.force_N))
+        agreed = agreement(seen, law.simulate_uT(found, SETUP, seen.place_mm, seen.recorded.force_N))
         assert agreed["cosine_mean"] > cosine_min[way]
         assert agreed["explained_median"] > 0.78
         assert agreed["growth"]["simulated"] == pytest.approx(agreed["growth"]["recorded"], abs=0.12)
@@ -232,7 +232,7 @@ def test_laws_fitted_to_a_third_of_the_places_of_real_boards_agree_with_all_of_t
     assert numbers["over_boards"]["refitted"]["cosine_mean"]["n"] == 2
 
 
-def _some(pokes: Pokes, chosen: np.ndarray) -> Pokes:
+def _some(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 

@@ -1,11 +1,11 @@
-"""Places told before their touch: all of them by a scan that repeats, none by one in a random order."""
+"""Places without the contact: a repeated scan tells all of them, one in random order none."""
 
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.settings import Settings
-from pipeline.training.before_contact import score_before_touch
+from pipeline.training.before_contact import score_before_contact
 from pipeline.training.jobs import SceneData
 from reskin import io
 from reskin.data.rows import Selection, gather, gather_hover
@@ -34,19 +34,19 @@ def scored(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
     io.write_readings(folder / "c0.parquet", [one], {})
     rows = gather([one], Selection(force_min_N=0.0))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
-    table = score_before_touch(
+    table = score_before_contact(
         SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds), folder, ["c0"], {}
     )
     return dict(zip(table["told_by"].to_pylist(), table["accuracy_pct"].to_pylist(), strict=True))
 
 
-def test_a_snake_tells_every_place_by_its_number_and_with_a_memory_by_the_no_load_reading(tmp_path):
+def test_a_snake_scan_tells_places_by_number_and_with_memory_by_the_no_load_field(tmp_path):
     found = scored(tmp_path, snake=True, memory=0.1)
     assert found["scan"] == 100.0
     assert found["noload"] > 95.0
 
 
-def test_a_snake_without_memory_is_told_by_its_number_alone(tmp_path):
+def test_a_snake_scan_without_memory_tells_places_by_number_alone(tmp_path):
     found = scored(tmp_path, snake=True, memory=0.0)
     assert found["scan"] == 100.0
     assert found["noload"] < BY_CHANCE_PCT
@@ -74,19 +74,19 @@ def hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
     rows = gather([one], Selection(force_min_N=0.1))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
     data = SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds)
-    table = score_before_touch(data, folder, ["c0"], {"s0": [lambda db_uT: np.zeros((len(db_uT), 3), np.float32)]})
+    table = score_before_contact(data, folder, ["c0"], {"s0": [lambda db_uT: np.zeros((len(db_uT), 3), np.float32)]})
     return {row["told_by"]: row for row in table.to_pylist()}
 
 
-def test_a_tip_that_hovers_is_placed_if_it_is_a_magnet_and_by_chance_if_it_is_none(tmp_path):
+def test_a_hovering_tip_is_located_only_if_it_is_a_magnet(tmp_path):
     found = hovering(tmp_path, magnetic=True)
     assert found["hover"]["accuracy_pct"] > 95
     assert found["hover"]["hover_uT"] > 0.9 * found["hover"]["touch_uT"]
-    assert found["hover_network"]["accuracy_pct"] < BY_CHANCE_PCT  # the network that always answers one corner
+    assert found["hover_network"]["accuracy_pct"] < BY_CHANCE_PCT  # a network that always predicts one corner
     found = hovering(tmp_path, magnetic=False)
     assert found["hover"]["accuracy_pct"] < BY_CHANCE_PCT
     assert found["hover"]["hover_uT"] < 0.1 * found["hover"]["touch_uT"]
 
 
-def test_a_random_order_tells_nothing_even_where_the_skin_remembers(tmp_path):
+def test_a_random_order_tells_nothing_even_with_memory(tmp_path):
     assert max(scored(tmp_path, snake=False, memory=0.1).values()) < BY_CHANCE_PCT
