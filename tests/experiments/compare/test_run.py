@@ -186,7 +186,7 @@ def test_memory_is_estimated_in_spite_of_drift():
     assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None  # one no-load reading for all
 
 
-def test_pokes_are_means_of_their_readings_and_what_knows_no_force_is_left_out_and_counted():
+def test_presses_are_means_of_their_readings_and_those_without_force_are_excluded():
     one = readings(f=6, indentation=np.array([0, 0, 0, 1, 1, 2], np.int32), x_mm=np.zeros(6, np.float32),
                    Fz_N=np.array([1, 2, 3, 4, 4, np.nan], np.float32))  # fmt: skip
     pokes = pool([one])
@@ -194,7 +194,7 @@ def test_pokes_are_means_of_their_readings_and_what_knows_no_force_is_left_out_a
     assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # rows 0, 1, 2 and 3, 4
     assert pokes.excluded_n == 1
     assert pokes.groups == ("c0 1 mm",)
-    with pytest.raises(SchemaError, match="experiment compare must be asked of pokes with place and force"):
+    with pytest.raises(SchemaError, match="experiment compare must be run on presses with place and force"):
         pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
     with pytest.raises(ParamsError, match="chips of compare.design must be 1, as recorded; got 5"):
         to_board_axes(pokes, SECTION)
