@@ -26,7 +26,7 @@ from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import PRESSES_N, Population
 from reskin.universal.training import SkinPrior
 from reskin.universal.training import train as train_universal
-from tests.models.jobs import some_job, some_rows
+from tests.models.example_jobs import some_job, some_rows
 from tests.universal.skins import SETUP
 
 STEPS_N = 30

@@ -10,7 +10,7 @@ import pytest
 from pipeline import FLOW, PLAN, SCENES
 from reskin import code
 from reskin.models.job import CODE_MODULES, JobKeys
-from tests.models.example_jobs import measured, pooled
+from tests.models.example_jobs import example_data, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
@@ -173,7 +173,7 @@ def test_comments_in_the_code_of_training_change_no_cache_key_and_code_does(tmp_
         for name, text in sources.items():
             (tmp_path / files[name]).write_text(text)
         code.digest.cache_clear()
-        return JobKeys(measured()).key(pooled())
+        return JobKeys(example_data()).key(pooled())
 
     told = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
     assert (

@@ -21,7 +21,7 @@ from pipeline.cluster import _check_workers, describe_process
 from pipeline.executors import make_executor, prepare_workers
 from reskin.errors import ParamsError
 from reskin.models.runner import run_jobs
-from tests.models.example_jobs import measured
+from tests.models.example_jobs import example_data
 from tests.models.test_runner import alike, jobs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -77,7 +77,7 @@ def test_a_sweep_on_two_workers_gives_the_bytes_of_a_local_one(address, tmp_path
         prepare_workers("reskin.models.train")
         with make_executor(imports="reskin.models.train") as executor:
             cache = tmp_path / name
-            results.append(run_jobs(some, measured(), executor=executor, cache=cache, log=lambda _: None))
+            results.append(run_jobs(some, example_data(), executor=executor, cache=cache, log=lambda _: None))
             ran = [future.result() for future in [executor.submit(where, i) for i in range(6)]]
     for a, b in zip(*results, strict=True):
         assert (a.key, a.predicted.tobytes()) == (b.key, b.predicted.tobytes())

@@ -36,7 +36,7 @@ from reskin.metrics import score_groups
 from reskin.models.adversarial import Domains
 from reskin.models.network import Predictor, draw_weights, paper_layers
 from reskin.seeds import rng_for
-from tests.models.recipes import recipe
+from tests.models.example_jobs import recipe
 
 PLACES_MM = np.array([[4.0, 4.0], [6.0, 4.0], [8.0, 6.0], [4.0, 8.0], [6.0, 8.0]])
 FORCES_N = np.array([1.0, 4.0])

@@ -1,23 +1,68 @@
-"""A scene of four skins and its jobs, small enough for tests: two skins are trained on, the last one is new."""
+"""Small recipes, training data and jobs for tests.
+
+`some_job` is a prepared network whose targets are a smooth function of its inputs. The others are jobs on a scene of
+four skins: two skins are trained on, the last one is new.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 
 from reskin.data.lines import Lines, hand_lines
+from reskin.models.batches import LabelledRows, PreparedJob, UnlabelledRows
 from reskin.models.inputs import fit_standard
 from reskin.models.job import Adaptation, FineTuning, Pretrained, TrainingData, TrainingJob
+from reskin.models.losses import triplet_points
 from reskin.models.network import draw_weights, paper_layers
-from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe
+from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe
 from reskin.seeds import rng_for
-from tests.models.recipes import recipe
 
 ROWS_N = 48  # twelve a skin
 TRAIN, TEST, POKED, OWN = np.arange(24), np.arange(42, 48), np.arange(36, 42), np.arange(36, 39)
 SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 
 
-def measured() -> TrainingData:
+def recipe(**changes: object) -> Recipe:
+    values = {
+        "architecture": "paper",
+        "inputs": "raw",
+        "scaling": "standard",
+        "triplet_weight": 0.0,
+        "steps_n": 4,
+        "batch_n": 16,
+        "rate_max": 3e-3,
+        "gradient_norm_max": 1.0,
+        "weight_decay": 0.0,
+    }
+    return Recipe.model_validate(values | changes)
+
+
+def some_weights(*names: str | int) -> dict[str, np.ndarray]:
+    return draw_weights(paper_layers(15), rng_for(0, "weights", *names))
+
+
+def some_rows(n: int, *names: str | int) -> tuple[np.ndarray, np.ndarray]:
+    inputs = rng_for(0, "inputs", *names).normal(size=(n, 15)).astype(np.float32)
+    return inputs, np.tanh(inputs[:, :3] - inputs[:, 3:6])
+
+
+def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: str | int = "draws") -> PreparedJob:
+    """A fresh job, the same for the same name; with `terms`, it holds all that a loss can stand on."""
+    inputs, targets = some_rows(n, name)
+    start, rng = some_weights(name), rng_for(0, draws, name)
+    if not terms:
+        return PreparedJob(start, rng, LabelledRows(inputs, targets, None))
+    places = rng_for(0, "places", name).integers(0, 5, (n, 2)).astype(np.float64)
+    labelled = LabelledRows(inputs, targets, triplet_points(places, np.arange(n) % 2))
+    poked, _ = some_rows(20, name, "poked")
+    row = np.concatenate([np.arange(20), np.arange(10)])  # the first ten rows lie on two lines
+    line_i = np.repeat([0, 1, 2], 10)
+    order = triplet_points(np.tile(np.arange(10) // 2, 3)[:, None].astype(np.float64), line_i)
+    own = LabelledRows(*some_rows(6, name, "own"), None)
+    return PreparedJob(start, rng, labelled, UnlabelledRows(poked, order, row), own)
+
+
+def example_data() -> TrainingData:
     rng = rng_for(0, "rows")
     db_uT = rng.normal(0, 50, (ROWS_N, 15)).astype(np.float32)
     target = np.hstack([2.0 * rng.integers(0, 5, (ROWS_N, 2)), rng.uniform(0, 3, (ROWS_N, 1))]).astype(np.float32)
@@ -46,16 +91,16 @@ def lines(row: np.ndarray = POKED) -> Lines:
 
 
 def start(key: str = "start") -> Pretrained:
-    rows = measured()
+    rows = example_data()
     weights = draw_weights(paper_layers(15), rng_for(0, "start"))
     return Pretrained(key, weights, fit_standard(rows.db_uT[TRAIN], rows.target[TRAIN]))
 
 
-def adapting(*, unlabelled_weight: float = 0.5, along: Lines | None = None) -> TrainingJob:
+def adaptation(*, unlabelled_weight: float = 0.5, along: Lines | None = None) -> TrainingJob:
     settings = AdaptationRecipe(unlabelled_weight=unlabelled_weight, **SETTINGS)
     return replace(pooled(), experiment="adapt", skin="b1_s1", tuning=Adaptation(start(), settings, along or lines()))
 
 
-def few_labels(*, own_weight: float = 0.5) -> TrainingJob:
+def fine_tuning(*, own_weight: float = 0.5) -> TrainingJob:
     tuning = FineTuning(start(), FineTuningRecipe(own_weight=own_weight, **SETTINGS), OWN)
     return replace(pooled(), experiment="labels", skin="b1_s1", tuning=tuning)

@@ -7,7 +7,7 @@ from reskin.models.adversarial import Domains, ramp, reverse_gradient, train_adv
 from reskin.models.network import Stack, paper_layers
 from reskin.models.recipe import Schedule
 from reskin.seeds import rng_for
-from tests.models.jobs import some_rows
+from tests.models.example_jobs import some_rows
 
 SCHEDULE = Schedule(steps_n=600, batch_n=32, rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0)
 KNOWN, TARGET = some_rows(200, "known")

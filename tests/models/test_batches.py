@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from reskin.models.batches import Batch, BatchSampler, PreparedJob
-from tests.models.jobs import some_job
+from tests.models.example_jobs import some_job
 
 STEPS_N, BATCH_N = 20, 16
 UNLABELLED = ("unlabelled", "unlabelled_positive", "unlabelled_negative")

@@ -35,7 +35,7 @@ def test_training_imports_no_compiler():
     """It takes a process that trains two seconds, and nothing here is compiled."""
     code = (
         "import sys\nfrom reskin.models.train import train\nfrom reskin.models.job import LossWeights\n"
-        "from tests.models.jobs import some_job\nfrom tests.models.recipes import recipe\n"
+        "from tests.models.example_jobs import some_job\nfrom tests.models.example_jobs import recipe\n"
         "train([some_job(0)], 'paper', recipe(steps_n=2), LossWeights(0.0), 'cpu')\n"
         "sys.exit('torch._dynamo' in sys.modules)"
     )

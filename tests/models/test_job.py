@@ -17,19 +17,19 @@ from tests.models.example_jobs import (
     ROWS_N,
     TEST,
     TRAIN,
-    adapting,
+    adaptation,
     changed,
-    few_labels,
+    example_data,
+    fine_tuning,
     lines,
-    measured,
     pooled,
+    recipe,
     start,
     without_triplets,
 )
-from tests.models.recipes import recipe
 
 NEW = np.arange(24, ROWS_N)  # every row of a skin that is not trained on
-KINDS = {"pooled": pooled, "adapting": adapting, "few labels": few_labels}
+KINDS = {"pooled": pooled, "adapting": adaptation, "few labels": fine_tuning}
 
 
 def trained(job: TrainingJob, rows: TrainingData) -> TrainingResult:
@@ -49,21 +49,26 @@ def alike(one: TrainingResult, other: TrainingResult) -> bool:
 @pytest.mark.parametrize("new", [np.nan, 1e3, -7.0], ids=str)
 @pytest.mark.parametrize("at", [POKED, TEST, NEW], ids=["poked", "tested", "all"])
 def test_adaptation_cannot_see_places_and_forces_of_the_new_skin(at, new):
-    once, blind = trained(adapting(), measured()), trained(adapting(), changed(measured(), "target", at, new))
+    once, blind = (
+        trained(adaptation(), example_data()),
+        trained(adaptation(), changed(example_data(), "target", at, new)),
+    )
     assert alike(once, blind)
     assert (once.predicted == blind.predicted).all()
 
 
 def test_adaptation_cannot_see_which_skin_its_pokes_are_on():
-    assert alike(trained(adapting(), measured()), trained(adapting(), changed(measured(), "skin", NEW, "b0_s0")))
+    assert alike(
+        trained(adaptation(), example_data()), trained(adaptation(), changed(example_data(), "skin", NEW, "b0_s0"))
+    )
 
 
 def test_adaptation_sees_fields_and_order_of_the_pokes_that_lines_name():
-    once, along = trained(adapting(), measured()), lines()
+    once, along = trained(adaptation(), example_data()), lines()
     backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
-    assert not alike(once, trained(adapting(along=backwards), measured()))
-    assert not alike(once, trained(adapting(), changed(measured(), "db_uT", POKED[0], 0)))
-    assert not alike(once, trained(adapting(), changed(measured(), "target", TRAIN[0], 0)))
+    assert not alike(once, trained(adaptation(along=backwards), example_data()))
+    assert not alike(once, trained(adaptation(), changed(example_data(), "db_uT", POKED[0], 0)))
+    assert not alike(once, trained(adaptation(), changed(example_data(), "target", TRAIN[0], 0)))
 
 
 def test_lines_have_no_place_and_no_force():
@@ -74,9 +79,9 @@ def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
     line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
     along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
     scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
-    prepared, used = prepare(tuned(adapting(along=along), start=replace(start(), scaler=scaler)), measured())
+    prepared, used = prepare(tuned(adaptation(along=along), start=replace(start(), scaler=scaler)), example_data())
     assert used is scaler
-    db_uT = measured().db_uT
+    db_uT = example_data().db_uT
     for point, row in enumerate(along.row):
         expected = [(db_uT[row, ch] - scaler.input_shift[ch]) / scaler.input_scale[ch] for ch in range(15)]
         assert prepared.unlabelled.inputs[prepared.unlabelled.row[point]].tolist() == expected
@@ -87,19 +92,19 @@ def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
 
 @pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
 def test_the_control_looks_at_nothing_of_the_new_skin(at):
-    control = adapting(unlabelled_weight=0.0)
-    once = trained(control, measured())
+    control = adaptation(unlabelled_weight=0.0)
+    once = trained(control, example_data())
     for part, new in (("db_uT", 1e4), ("target", np.nan)):
-        assert alike(once, trained(control, changed(measured(), part, at, new)))
-    assert not alike(once, trained(adapting(), measured()))
+        assert alike(once, trained(control, changed(example_data(), part, at, new)))
+    assert not alike(once, trained(adaptation(), example_data()))
 
 
 def test_a_few_labels_are_seen_and_no_others():
-    once = trained(few_labels(), measured())
+    once = trained(fine_tuning(), example_data())
     others = np.setdiff1d(NEW, OWN)
-    assert alike(once, trained(few_labels(), changed(measured(), "target", others, np.nan)))
-    assert not alike(once, trained(few_labels(), changed(measured(), "target", OWN, 0)))
-    assert not alike(once, trained(few_labels(own_weight=0.0), measured()))
+    assert alike(once, trained(fine_tuning(), changed(example_data(), "target", others, np.nan)))
+    assert not alike(once, trained(fine_tuning(), changed(example_data(), "target", OWN, 0)))
+    assert not alike(once, trained(fine_tuning(own_weight=0.0), example_data()))
 
 
 # What is held out
@@ -109,8 +114,8 @@ def test_a_few_labels_are_seen_and_no_others():
 @pytest.mark.parametrize("view", ["raw", "shape"])
 def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model(scaling, view):
     job = pooled(scaling=scaling, inputs=view)
-    once = trained(job, measured())
-    planted = changed(changed(measured(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
+    once = trained(job, example_data())
+    planted = changed(changed(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
     again = trained(job, planted)
     assert alike(once, again)
     assert (once.predicted != again.predicted).any()
@@ -118,13 +123,13 @@ def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model(scali
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_a_scaler_is_that_of_the_rows_trained_on(kind):
-    _, scaler = prepare(KINDS[kind](), changed(measured(), "db_uT", NEW, 1e6))
-    np.testing.assert_allclose(scaler.input_shift, measured().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
-    np.testing.assert_allclose(scaler.target_scale, measured().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
+    _, scaler = prepare(KINDS[kind](), changed(example_data(), "db_uT", NEW, 1e6))
+    np.testing.assert_allclose(scaler.input_shift, example_data().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
+    np.testing.assert_allclose(scaler.target_scale, example_data().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
 
 
 def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
-    rows = measured()
+    rows = example_data()
     prepared, _ = prepare(pooled(), rows)
     assert (prepared.labelled.points.place == rows.target[TRAIN, :2]).all()
     assert prepared.labelled.points.group.tolist() == [0] * 12 + [1] * 12
@@ -138,9 +143,9 @@ def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
 
 def test_terms_weigh_what_the_recipe_and_the_tuning_say():
     assert pooled().loss_weights == LossWeights(0.5)
-    assert adapting(unlabelled_weight=0.25).loss_weights == LossWeights(0.5, unlabelled=0.25)
-    assert few_labels(own_weight=0.75).loss_weights == LossWeights(0.5, few_labels=0.75)
-    assert adapting().schedule == adapting().tuning.settings
+    assert adaptation(unlabelled_weight=0.25).loss_weights == LossWeights(0.5, unlabelled=0.25)
+    assert fine_tuning(own_weight=0.75).loss_weights == LossWeights(0.5, few_labels=0.75)
+    assert adaptation().schedule == adaptation().tuning.settings
     assert pooled().schedule == pooled().recipe
 
 
@@ -148,7 +153,7 @@ def test_terms_weigh_what_the_recipe_and_the_tuning_say():
 
 
 def first_batches(job: TrainingJob) -> list[np.ndarray]:
-    feed = BatchSampler([prepare(job, measured())[0]], 16, "cpu")
+    feed = BatchSampler([prepare(job, example_data())[0]], 16, "cpu")
     return [step["inputs"].numpy() for _ in range(3) for step in feed.sample(5)]
 
 
@@ -162,13 +167,13 @@ def first_batches(job: TrainingJob) -> list[np.ndarray]:
     ids=["another name", "another schedule", "no triplets"],
 )
 def test_recipes_are_compared_from_equal_starts_on_equal_batches(other):
-    one, two = (prepare(job, measured())[0].initial_weights for job in (pooled(), other))
+    one, two = (prepare(job, example_data())[0].initial_weights for job in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
 def test_adaptation_is_compared_with_its_control_on_equal_batches():
-    pairs = zip(first_batches(adapting()), first_batches(adapting(unlabelled_weight=0.0)), strict=True)
+    pairs = zip(first_batches(adaptation()), first_batches(adaptation(unlabelled_weight=0.0)), strict=True)
     assert all((a == b).all() for a, b in pairs)
 
 
@@ -176,8 +181,8 @@ def test_adaptation_is_compared_with_its_control_on_equal_batches():
 def test_folds_and_seeds_start_and_draw_differently(changes):
     other = replace(pooled(), **changes)
     assert (
-        prepare(pooled(), measured())[0].initial_weights["layer1.weight"]
-        != prepare(other, measured())[0].initial_weights["layer1.weight"]
+        prepare(pooled(), example_data())[0].initial_weights["layer1.weight"]
+        != prepare(other, example_data())[0].initial_weights["layer1.weight"]
     ).any()
     assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
@@ -186,7 +191,7 @@ def test_folds_and_seeds_start_and_draw_differently(changes):
 
 
 def key(job: TrainingJob, rows: TrainingData | None = None) -> str:
-    return JobKeys(rows or measured()).key(job)
+    return JobKeys(rows or example_data()).key(job)
 
 
 def tuned(job: TrainingJob, **changes: object) -> TrainingJob:
@@ -194,7 +199,7 @@ def tuned(job: TrainingJob, **changes: object) -> TrainingJob:
 
 
 def with_row(part: str, row: int, to: object) -> Callable[[], TrainingData]:
-    return lambda: changed(measured(), part, np.array([row]), to)
+    return lambda: changed(example_data(), part, np.array([row]), to)
 
 
 DECISIVE_ROWS = {
@@ -209,7 +214,7 @@ DECISIVE_ROWS = {
 IDLE_ROWS = {
     "a tested place": ("pooled", with_row("target", TEST[3], 1.0)),
     "a field that nobody uses": ("pooled", with_row("db_uT", 30, 1.0)),
-    "the name of all skins": ("pooled", lambda: replace(measured(), skin=np.char.add("x", measured().skin))),
+    "the name of all skins": ("pooled", lambda: replace(example_data(), skin=np.char.add("x", example_data().skin))),
     "the skin of a tested row": ("pooled", with_row("skin", TEST[3], "b0_s1")),
     "a poked place": ("adapting", with_row("target", POKED[3], np.nan)),
     "a label that is not its own": ("few labels", with_row("target", POKED[5], 1.0)),
@@ -235,19 +240,20 @@ def finer(job: TrainingJob, **changes: object) -> TrainingJob:
 def test_no_two_settings_share_a_key():
     along = lines()
     jobs = [
-        pooled(), adapting(), few_labels(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
+        pooled(), adaptation(), fine_tuning(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
         *[pooled(**one) for one in (
             {"architecture": "released"}, {"inputs": "shape"}, {"scaling": "released"}, {"steps_n": 5}, {"batch_n": 8},
             {"rate_max": 1e-3}, {"weight_decay": 0.1}, {"gradient_norm_max": 0.5},
         )],
         without_triplets(),
         replace(pooled(), seed=8), replace(pooled(), seed_i=1), replace(pooled(), fold="b0"),
-        replace(adapting(), skin="b1_s0"), tuned(adapting(), start=start("another")), finer(adapting(), steps_n=5),
-        finer(adapting(), unlabelled_weight=0.25), finer(adapting(), rate_max=1e-4),
-        adapting(along=replace(along, order_i=along.order_i[::-1].copy())),
-        adapting(along=replace(along, line_i=np.array([0, 0, 0, 1, 1, 1], np.int32))),
-        adapting(along=replace(along, row=along.row[::-1].copy())),
-        tuned(few_labels(), row=OWN[:2]), finer(few_labels(), own_weight=0.25),
+        replace(adaptation(), skin="b1_s0"), tuned(adaptation(), start=start("another")),
+        finer(adaptation(), steps_n=5),
+        finer(adaptation(), unlabelled_weight=0.25), finer(adaptation(), rate_max=1e-4),
+        adaptation(along=replace(along, order_i=along.order_i[::-1].copy())),
+        adaptation(along=replace(along, line_i=np.array([0, 0, 0, 1, 1, 1], np.int32))),
+        adaptation(along=replace(along, row=along.row[::-1].copy())),
+        tuned(fine_tuning(), row=OWN[:2]), finer(fine_tuning(), own_weight=0.25),
     ]  # fmt: skip
     assert len({key(job) for job in jobs}) == len(jobs)
 
@@ -255,7 +261,7 @@ def test_no_two_settings_share_a_key():
 def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_its_own():
     again = replace(pooled(), attempt_i=1)
     assert key(again) != key(pooled())
-    (one, _), (other, _) = prepare(pooled(), measured()), prepare(again, measured())
+    (one, _), (other, _) = prepare(pooled(), example_data()), prepare(again, example_data())
     assert (one.initial_weights["layer1.weight"] != other.initial_weights["layer1.weight"]).all()
     assert one.rng.integers(1 << 60) != other.rng.integers(1 << 60)
 
@@ -263,7 +269,7 @@ def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_it
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling):
     job = replace(without_triplets(), recipe=recipe(scaling=scaling))
-    rows = changed(measured(), "target", np.arange(3), np.nan)
+    rows = changed(example_data(), "target", np.arange(3), np.nan)
     prepared, scaler = prepare(job, changed(rows, "target", (slice(None), 2), np.nan))
     predicted = scaler.decode(prepared.initial_weights["layer6.bias"][None])[0]
     np.testing.assert_allclose(predicted[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
@@ -274,6 +280,7 @@ NOT_DECIDING = {
     "code": "tells code from code",
     "config": "checks settings, whose values are part of the key",
     "errors": "stops a training, and changes none",
+    "io": "reads and writes files, whose values are part of the key",
     "numerics": "its signature of the environment is part of the key, as is the device",
     "schema": "makes rows, whose values are part of the key",
     "data.baseline": "makes rows, whose values are part of the key",
@@ -297,14 +304,14 @@ def test_experiments_and_names_do_not_enter_a_key():
 
 
 def test_rows_that_nobody_uses_may_come_and_go():
-    rows = measured()
+    rows = example_data()
     fewer = TrainingData(*(getattr(rows, field.name)[6:] for field in fields(rows)))
     moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
     assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
 
 
 def test_keys_are_the_same_from_one_book_of_keys_and_from_many():
-    book, jobs = JobKeys(measured()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adapting()]
+    book, jobs = JobKeys(example_data()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adaptation()]
     assert [book.key(job) for job in jobs] == [key(job) for job in jobs]
 
 
@@ -316,14 +323,14 @@ def test_a_key_changes_with_the_code_that_trains(monkeypatch):
 
 def test_a_name_says_what_tells_a_job_apart():
     assert pooled().name == "triplet.paper.b1.seed0"
-    assert replace(adapting(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
+    assert replace(adaptation(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
 
 
 def test_copies_of_rows_keep_their_targets_and_are_skins_of_their_own():
     words = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": words})
-    (one, _), (more, _) = (prepare(job, measured()) for job in (plain, replace(plain, recipe=recipe)))
+    (one, _), (more, _) = (prepare(job, example_data()) for job in (plain, replace(plain, recipe=recipe)))
     # Boards that do not differ: the same rows three times over, with the same targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
@@ -336,7 +343,7 @@ def test_copies_are_drawn_anew_in_every_fold_and_seed_and_enter_the_key():
     other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words | {"gain_sd": 0.2}})
     job = replace(pooled(), recipe=recipe)
     drawn = [
-        prepare(one, measured())[0].labelled.inputs
+        prepare(one, example_data())[0].labelled.inputs
         for one in (job, job, replace(job, fold="b9"), replace(job, seed_i=5))
     ]
     assert (drawn[0] == drawn[1]).all()

@@ -16,8 +16,7 @@ from reskin.models.batches import prepare
 from reskin.models.job import TrainingJob, TrainingResult
 from reskin.models.runner import STACK_N, make_stacks, run_jobs
 from reskin.models.train import CHECKED_STEPS_N, train_stack
-from tests.models.example_jobs import TRAIN, adapting, few_labels, measured, pooled, without_triplets
-from tests.models.recipes import recipe
+from tests.models.example_jobs import TRAIN, adaptation, example_data, fine_tuning, pooled, recipe, without_triplets
 
 SIZE_N = STACK_N["cpu"]
 STACKED_ATOL = 1e-3  # mm, N: a job in another stack is the same to float32 rounding of its weights (test_train.py)
@@ -56,7 +55,7 @@ def run(
     some: list[TrainingJob], cache: Path, executor: Executor | None = None, said: list[str] | None = None
 ) -> list[TrainingResult]:
     tell = (lambda line: None) if said is None else said.append
-    return run_jobs(some, measured(), executor=executor or Here(), cache=cache, log=tell)
+    return run_jobs(some, example_data(), executor=executor or Here(), cache=cache, log=tell)
 
 
 def trainings_n(some: list[TrainingJob], cache: Path) -> int:
@@ -80,16 +79,16 @@ def test_a_training_says_whether_an_earlier_run_finished_it(tmp_path):
 
 
 def test_results_come_in_the_order_of_jobs_with_a_prediction_a_test_row(tmp_path):
-    some = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adapting(), few_labels()]
+    some = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adaptation(), fine_tuning()]
     done = run(some, tmp_path)
     assert len({one.key for one in done}) == len(some)
     assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in some]
 
 
 def test_a_result_is_that_of_its_own_cell_whatever_it_was_stacked_with(tmp_path):
-    some = [*jobs(2), pooled(), adapting(), jobs(3)[2]]
+    some = [*jobs(2), pooled(), adaptation(), jobs(3)[2]]
     for job, one in zip(some, run(some, tmp_path), strict=True):
-        (alone,) = train_stack([job], measured())
+        (alone,) = train_stack([job], example_data())
         np.testing.assert_allclose(one.predicted, alone.predicted, rtol=0, atol=STACKED_ATOL)
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
@@ -209,9 +208,9 @@ def test_what_is_left_in_the_cache_opens_without_pickle(tmp_path):
     assert float(metadata["seconds"]) > 0
 
 
-@pytest.mark.parametrize("job", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
+@pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
 def test_a_result_survives_the_cache_whole(tmp_path, job):
-    (direct,), (read,) = train_stack([job], measured()), run([job], tmp_path)
+    (direct,), (read,) = train_stack([job], example_data()), run([job], tmp_path)
     assert alike(direct, read)
     assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
     assert read.stopped_step is direct.stopped_step is None
@@ -261,7 +260,7 @@ def test_a_training_too_short_to_have_left_its_start_is_not_judged(tmp_path, mon
 
 
 def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
-    rows = measured()
+    rows = example_data()
     flat, unknown = rows.target.copy(), rows.target.copy()
     flat[:, 2], unknown[:, 2] = 1.5, np.nan
     one = replace(without_triplets(), recipe=recipe(steps_n=CHECKED_STEPS_N, rate_max=1e-2), test=TRAIN)
@@ -274,7 +273,7 @@ def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
 
 def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
-    some = [adapting(), few_labels()]
+    some = [adaptation(), fine_tuning()]
     with make_executor(imports="reskin.models.train") as executor:
         apart = run(some, tmp_path / "apart", executor)
     assert all(alike(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
@@ -287,8 +286,8 @@ def keyed(some: list[TrainingJob]) -> dict[str, TrainingJob]:
 def test_recipes_of_equal_settings_are_stacked_and_others_are_not():
     twin = [replace(job, recipe_name="twin") for job in jobs(1)]
     assert [len(stack) for stack in make_stacks(keyed([*jobs(2), *twin]), 3)] == [3]
-    released = replace(adapting(), recipe=pooled(architecture="released").recipe)
-    tuned = [adapting(), released, adapting(unlabelled_weight=0.0), few_labels()]
+    released = replace(adaptation(), recipe=pooled(architecture="released").recipe)
+    tuned = [adaptation(), released, adaptation(unlabelled_weight=0.0), fine_tuning()]
     others = [jobs(1, steps_n=5)[0], without_triplets(), replace(jobs(1)[0], seed_i=1), *tuned]
     assert [len(stack) for stack in make_stacks(keyed([*jobs(1), *others]), 3)] == [1] * 8
 
@@ -307,7 +306,7 @@ def test_stacks_cover_every_cell_once_and_are_no_larger_than_asked(kinds, size_n
 
 
 def test_a_network_learns_five_targets_as_it_learns_three():
-    own = measured()
+    own = example_data()
     shear_N = own.target[:, 2:] * np.array([0.5, -0.25], np.float32)
     five = replace(own, target=np.hstack([own.target, shear_N]))
     many = replace(without_triplets(), recipe=recipe(steps_n=400))

@@ -12,9 +12,8 @@ from reskin.models.network import Stack, paper_layers
 from reskin.models.recipe import Recipe
 from reskin.models.train import BLOCK_STEPS_N, Monitor, Outcome, clip_gradients, train
 from reskin.seeds import rng_for
-from tests.models.jobs import some_job, some_weights
+from tests.models.example_jobs import recipe, some_job, some_weights
 from tests.models.plain import plain_net, plain_train
-from tests.models.recipes import recipe
 
 ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = LossWeights(0.0)

@@ -13,7 +13,7 @@ from reskin.models.network import LAYERS, draw_weights
 from reskin.models.train import train
 from reskin.models.trained import Network
 from reskin.seeds import rng_for
-from tests.models.recipes import recipe
+from tests.models.example_jobs import recipe
 
 STEPS_N = 300
 SCALING = {"paper": "standard", "released": "released"}

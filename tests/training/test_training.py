@@ -7,11 +7,11 @@ from pipeline.training.jobs import model_card
 from reskin.data.rows import Rows
 from reskin.models.job import TrainingJob, TrainingResult
 from reskin.models.train import train_stack
-from tests.models.example_jobs import OWN, POKED, ROWS_N, TEST, TRAIN, adapting, few_labels, measured, pooled
+from tests.models.example_jobs import OWN, POKED, ROWS_N, TEST, TRAIN, adaptation, example_data, fine_tuning, pooled
 
 
 def rows() -> Rows:
-    own = measured()
+    own = example_data()
     board = np.array([skin[:2] for skin in own.skin])
     indentation = np.arange(ROWS_N) // 2
     passes = np.zeros(ROWS_N, np.int32)
@@ -19,7 +19,7 @@ def rows() -> Rows:
 
 
 def card(job: TrainingJob, **changes: object) -> dict:
-    (one,) = train_stack([job], measured())
+    (one,) = train_stack([job], example_data())
     trained = TrainingResult(**{**vars(one), "key": "k", **changes})
     return model_card(job, trained, rows(), scene="lab")
 
@@ -36,7 +36,7 @@ def test_a_card_says_what_was_trained_on_what_and_tested_on_what():
 
 
 def test_a_card_says_all_that_a_user_of_the_network_needs():
-    (one,) = train_stack([pooled()], measured())
+    (one,) = train_stack([pooled()], example_data())
     words = card(pooled())
     assert words["architecture"] == {name: list(values.shape) for name, values in one.weights.items()}
     assert words["architecture"]["layer6.bias"] == [3]
@@ -46,7 +46,7 @@ def test_a_card_says_all_that_a_user_of_the_network_needs():
         assert (np.array(words["scaler"][name], np.float32) == values).all()
 
 
-@pytest.mark.parametrize("job", [pooled(), adapting(), few_labels()], ids=["pooled", "adapting", "few labels"])
+@pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
 def test_a_card_is_json_that_reads_back_as_it_was(job):
     words = card(job)
     assert json.loads(json.dumps(words, allow_nan=False)) == words
@@ -65,7 +65,7 @@ def test_an_early_stop_stands_on_the_card():
 
 @pytest.mark.parametrize(
     ("job", "kind", "used"),
-    [(adapting(), "unlabelled", POKED), (few_labels(), "labelled", OWN)],
+    [(adaptation(), "unlabelled", POKED), (fine_tuning(), "labelled", OWN)],
     ids=["unlabelled", "labelled"],
 )
 def test_a_tuned_network_says_from_what_by_what_and_on_how_many_indentations(job, kind, used):
