@@ -1,10 +1,10 @@
-"""Which settings were best on the boards of a study? In: cards of its trainings. Out: the choice, and its candidates.
+"""Choose settings on the boards of a study, from the cards of its trainings.
 
-By the mean squared error of places over the boards held out in turn; the paper's inputs only, as its method is what is
-set. How many steps there are is a scene's budget: every candidate is tried with the same budgets, and its errors are
-averaged over them, so that no setting wins by training longer. Settings with which a training collapsed are not
-chosen. Settings of adaptation are chosen together with the triplet weight of the network that they start from: alone,
-the triplet term only costs. Refuses to know who uses a choice.
+The criterion is the mean squared error of places over the boards held out in turn, of networks with the paper's inputs.
+The number of steps is a scene's budget: every candidate is tried with the same budgets, and its errors are averaged
+over them, so that no setting wins by training longer. Settings with which a training collapsed are not chosen. Settings
+of adaptation are chosen together with the triplet weight of the network that they start from: alone, the triplet term
+only costs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ VARIED = (
     "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
     "unlabelled_weight",
 )  # fmt: skip
-BUDGET = ("steps_n", "base")  # how long is a scene's budget; what a base is called is no setting
+BUDGET = ("steps_n", "base")  # a scene's budget of steps, and the name of a base, are no settings of the method
 WHERE = "choice of settings"
 
 Card = Mapping[str, Any]
@@ -29,15 +29,15 @@ Cards = Sequence[Card]
 
 
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
-    """Choose for every stage: `recipe_name`, its settings, `by` which number, `candidates` with their scores.
+    """Choose settings for every stage: `recipe_name`, `settings`, `by` (the criterion), `candidates` with scores.
 
-    An adaptation's `control` is what it must beat: fine-tuned as long from the same network, without the pokes.
+    The control of adaptation, which it has to beat, is fine-tuned as long from the same network, without the pokes.
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
-    dead = [trimmed(card["recipe"]) for card in triplet if _has_collapsed(card)]
+    collapsed = [trimmed(card["recipe"]) for card in triplet if _has_collapsed(card)]
     with_pokes = [card for card in tuned if settings_of(card)["unlabelled_weight"] > 0]
-    eligible = [card for card in with_pokes if trimmed(card["recipe"]) not in dead]
+    eligible = [card for card in with_pokes if trimmed(card["recipe"]) not in collapsed]
     _, chosen_multi, _ = _choose(multi, multi, "train_multi")
     best, chosen_adapt, errors = _choose(tuned, eligible, "adapt")
     chosen_adapt["error"] = errors[best["recipe_name"]]
@@ -56,9 +56,9 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
 def to_record(
     chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int, physics: str
 ) -> dict[str, Any]:
-    """Write down what was chosen on which boards and skins, for the audit of the scenes that use it.
+    """Record the choice with its boards and skins, for the audit of the scenes that use it.
 
-    `physics` is the fingerprint of the simulated skin that they were drawn of.
+    `physics` is the fingerprint of the simulated skin's settings.
     """
     return {
         "scene": cards[0]["scene"], "source": source, "seed": seed, "physics": physics,
@@ -69,29 +69,29 @@ def to_record(
 
 
 def settings_of(card: Card) -> dict[str, Any]:
-    """Give what a training was set to: its recipe, or how it went on from one."""
+    """Return the settings of a training: its recipe, or those of its adaptation."""
     settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
     return settings
 
 
 def trimmed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out what is no setting of the method."""
+    """Leave out the budget, which is no setting of the method."""
     return {name: value for name, value in settings.items() if name not in BUDGET}
 
 
 def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, Any], dict[str, float]]:
-    """Find a card of the eligible settings with the least error; give what is chosen by it, and errors by recipe."""
+    """Find the eligible card with the smallest error; return it, the choice, and the errors by recipe."""
     what = f"candidates of {stage}"
     if not eligible:
-        raise ParamsError(WHERE, what, "one or more", "none", "Ask lobo, triplet, adapt.")
+        raise ParamsError(WHERE, what, "one or more", "none", "Run lobo, triplet, adapt.")
     _check_budgets(cards, stage)
-    dead = [_key(card) for card in cards if _has_collapsed(card)]
-    sound = [card for card in eligible if _key(card) not in dead]
-    if not sound:
+    collapsed = [_key(card) for card in cards if _has_collapsed(card)]
+    stable = [card for card in eligible if _key(card) not in collapsed]
+    if not stable:
         raise ParamsError(WHERE, what, "one or more without a collapsed training", "none", "Try lower rates.")
     candidates = _candidates(cards)
     errors = _errors(cards, candidates)
-    best = min(sound, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
+    best = min(stable, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
     chosen = {"recipe_name": best["recipe_name"], "settings": trimmed(settings_of(best))}
     return best, chosen | {"by": "MSE_xy, mean over all budgets of steps", "candidates": candidates}, errors
 
@@ -101,7 +101,7 @@ def _has_collapsed(card: Card) -> bool:
 
 
 def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Give by recipe the error's mean over its settings' budgets: recipes that differ in nothing else share it."""
+    """Average the error over budgets, by recipe: recipes that differ in their budget only share it."""
     settings = {card["recipe_name"]: (_key(card), _budget(card)) for card in cards}
     errors = {candidate["recipe_name"]: candidate[BY]["mean"] for candidate in candidates}
 
@@ -123,7 +123,7 @@ def _check_budgets(cards: Cards, stage: str) -> None:
 
 
 def _key(card: Card) -> dict[str, Any]:
-    """Name settings without their budget; an adaptation's with those of the network that it starts from."""
+    """Return the settings without their budget; of an adaptation with those of the network that it starts from."""
     return trimmed(card["recipe"]) | (trimmed(settings_of(card)) if "tuning" in card else {})
 
 

@@ -144,7 +144,7 @@ def test_how_long_and_what_a_base_is_called_are_no_settings():
     ids=["nothing", "nothing pooled", "nothing adapted", "a control alone"],
 )
 def test_nothing_to_choose_from_is_one_sentence(cards, stage):
-    with pytest.raises(ParamsError, match=f"candidates of {stage} must be one or more; got none. Ask lobo"):
+    with pytest.raises(ParamsError, match=f"candidates of {stage} must be one or more; got none. Run lobo"):
         choose(cards)
 
 

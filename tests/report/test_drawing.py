@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.report.drawing import MOST, drawing, svg
+from pipeline.report.drawing import MARKS_MAX_N, drawing, svg
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -91,7 +91,7 @@ def test_a_line_without_marks_says_its_name_alone_and_a_nameless_one_nothing():
 
 @pytest.mark.parametrize(
     "values",
-    [np.arange(MOST + 1.0), np.array([1.0, np.nan, 3.0])],
+    [np.arange(MARKS_MAX_N + 1.0), np.array([1.0, np.nan, 3.0])],
     ids=["more than one would read", "one of them not drawn"],
 )
 def test_where_it_is_not_sure_or_too_much_marks_say_nothing(values):
