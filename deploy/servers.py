@@ -1,7 +1,6 @@
-"""Servers of a team, each until its block ends: PostgreSQL, MLflow on it, and for tests an S3-compatible store.
+"""Servers of a team as context managers: PostgreSQL, MLflow on it, and for tests an S3-compatible store.
 
-In: folders and ports. Out: addresses that answer. Programs are children of this process and end with it. Refuses to
-know what is kept there.
+The servers are children of this process and end with it.
 """
 
 import ctypes
@@ -25,7 +24,7 @@ START_MAX_s = 120.0
 STOP_MAX_s = 20.0
 LOOPBACK = "127.0.0.1"
 DATABASE, OWNER = "mlflow", "mlflow"
-DEBIAN = Path("/usr/lib/postgresql")  # Debian and Ubuntu keep programs of the server by version, and not on the PATH
+DEBIAN = Path("/usr/lib/postgresql")  # Debian and Ubuntu install the server's programs by version, outside the PATH
 PR_SET_PDEATHSIG = 1
 UNPRIVILEGED = "postgres"  # PostgreSQL refuses to run as root; its package makes this user
 
@@ -35,14 +34,14 @@ class ServerError(RuntimeError):
 
 
 def free_port() -> int:
-    """Find a TCP port of the loopback address that nobody uses."""
+    """Return a free TCP port of the loopback address."""
     with socket.create_server((LOOPBACK, 0)) as server:
         return int(server.getsockname()[1])
 
 
 @contextmanager
 def postgres(folder: Path, port: int) -> Iterator[str]:
-    """Run PostgreSQL on its files in `folder`, made at the first start, on loopback; give the URI of its database."""
+    """Run PostgreSQL on loopback, with its files in `folder`; yield the URI of its database."""
     programs = _programs()
     user = UNPRIVILEGED if os.geteuid() == 0 else None
     folder.mkdir(parents=True, exist_ok=True)
@@ -58,7 +57,7 @@ def postgres(folder: Path, port: int) -> Iterator[str]:
         _run([str(programs / words[0]), *map(str, words[1:]), "--encoding", "UTF8"], folder, user)
     words = ["-D", data, "-p", port, "-c", f"listen_addresses={LOOPBACK}", "-c", f"unix_socket_directories={folder}"]
     command = [str(programs / "postgres"), *map(str, words)]
-    # SIGINT: the clients' sessions are cut, the files are left whole.
+    # SIGINT is a fast shutdown: it disconnects clients and leaves the files consistent.
     with running("PostgreSQL", command, folder / "postgres.log", stop=signal.SIGINT, user=user) as alive:
         at = {"PGPASSWORD": password.read_text()}
         ask = [str(programs / "psql"), "-h", LOOPBACK, "-p", str(port), "-U", OWNER, "-qtA"]
@@ -75,14 +74,14 @@ def postgres(folder: Path, port: int) -> Iterator[str]:
 
 @contextmanager
 def mlflow(folder: Path, database: str, port: int, *, host: str = LOOPBACK) -> Iterator[str]:
-    """Run an MLflow server on a database, artifacts in `folder/artifacts`; give its address on this machine."""
+    """Run an MLflow server on a database, artifacts in `folder/artifacts`; yield its address on this machine."""
     folder.mkdir(parents=True, exist_ok=True)
     words = ["-m", "mlflow", "server", "--artifacts-destination", folder / "artifacts", "--host", host, "--port", port]
     names = [name for name in {host, socket.gethostname(), "localhost", LOOPBACK} if name != "0.0.0.0"]
     allowed = ",".join(part for name in sorted(names) for part in (name, f"{name}:*"))  # MLflow refuses other names
-    # By variable: a password on the command line is everybody's to read.
+    # As a variable: every user can read a password on the command line.
     variables = {"MLFLOW_BACKEND_STORE_URI": database, "MLFLOW_DISABLE_TELEMETRY": "true"}
-    variables |= {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # eight processes of 240 MB that we have no use for
+    variables |= {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # eight processes of 240 MB that nobody uses
     command = [sys.executable, *map(str, words), "--workers", "1", "--allowed-hosts", allowed]
     with running("MLflow", command, folder / "mlflow.log", variables=variables) as alive:
         address = f"http://{LOOPBACK if host == '0.0.0.0' else host}:{port}"
@@ -92,7 +91,7 @@ def mlflow(folder: Path, database: str, port: int, *, host: str = LOOPBACK) -> I
 
 @contextmanager
 def s3(folder: Path, port: int) -> Iterator[str]:
-    """Run moto's server, which speaks S3 and keeps all in memory: for tests; give its address."""
+    """Run moto's server, an S3-compatible store in memory, for tests; yield its address."""
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-c", "from moto.server import main; main()", "-H", LOOPBACK, "-p", str(port)]
     with running("moto", command, folder / "s3.log") as alive:
@@ -102,7 +101,7 @@ def s3(folder: Path, port: int) -> Iterator[str]:
 
 
 def responds(url: str) -> bool:
-    """Whether an HTTP server answers with success."""
+    """Tell whether an HTTP server answers with success."""
     try:
         with urlopen(url, timeout=2.0):
             return True
@@ -111,7 +110,7 @@ def responds(url: str) -> bool:
 
 
 def listens(address: str) -> bool:
-    """Whether anything accepts connections at an address."""
+    """Tell whether anything accepts connections at an address."""
     at = urlsplit(address)
     try:
         socket.create_connection((at.hostname or "", at.port or 0), timeout=1.0).close()
@@ -125,10 +124,10 @@ def running(
     name: str, command: list[str], log: Path, *, stop: signal.Signals = signal.SIGTERM, user: str | None = None,
     variables: Mapping[str, str] | None = None,
 ) -> Iterator[Callable[[], None]]:  # fmt: skip
-    """Run a program and its children until the block ends, however it ends; give what raises if it has died."""
-    with log.open("ab") as said:
+    """Run a program and its children until the block ends; yield a function that raises if it has died."""
+    with log.open("ab") as output:
         process = subprocess.Popen(
-            command, stdout=said, stderr=said, stdin=subprocess.DEVNULL, start_new_session=True, cwd=log.parent,
+            command, stdout=output, stderr=output, stdin=subprocess.DEVNULL, start_new_session=True, cwd=log.parent,
             env={**os.environ, **(variables or {})}, user=user, group=user, extra_groups=[] if user else None,
             preexec_fn=partial(_end_with_parent, stop),
         )  # fmt: skip
@@ -136,7 +135,7 @@ def running(
     def alive() -> None:
         if process.poll() is not None:
             last = " ".join(log.read_text(errors="replace").split())[-400:]
-            raise ServerError(f"{name}: the server must stay up; got exit status {process.returncode}. {log}: {last}")
+            raise ServerError(f"{name} has stopped (exit status {process.returncode}). {log}: {last}")
 
     try:
         yield alive
@@ -150,13 +149,13 @@ def running(
 
 
 def _end_with_parent(stop: signal.Signals) -> None:
-    """Let a server end with what started it, even if that is killed (Linux)."""
+    """Make a server end with its parent process, even if that is killed (Linux)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(stop))
 
 
 def _kill_group(process: subprocess.Popen[bytes]) -> None:
-    """End what is left of a program's children."""
+    """Kill the remaining children of a program."""
     try:
         os.killpg(process.pid, signal.SIGKILL)
     except ProcessLookupError:
@@ -169,16 +168,16 @@ def _wait(name: str, ready: Callable[[], bool], alive: Callable[[], None]) -> No
     while not ready():
         alive()
         if time.monotonic() > end_s:
-            raise ServerError(f"{name}: the server must answer within {START_MAX_s:g} s; got no answer. See its log.")
+            raise ServerError(f"{name} did not answer within {START_MAX_s:g} s. See its log.")
         time.sleep(0.1)
 
 
 def _programs() -> Path:
-    """Find where PostgreSQL's own programs lie."""
+    """Return the folder of PostgreSQL's programs."""
     versions = sorted(DEBIAN.glob("*/bin/postgres"), key=lambda file: int(file.parts[-3]))
     found = shutil.which("postgres") or (str(versions[-1]) if versions else None)
     if found is None:
-        raise ServerError("PostgreSQL: the server must be installed; got none. Try: apt-get install postgresql")
+        raise ServerError("PostgreSQL is not installed. Try: apt-get install postgresql")
     return Path(found).resolve().parent
 
 
@@ -187,4 +186,4 @@ def _run(command: list[str], folder: Path, user: str | None) -> None:
         command, cwd=folder, capture_output=True, text=True, user=user, group=user, extra_groups=[] if user else None
     )
     if done.returncode:
-        raise ServerError(f"{Path(command[0]).name}: must end well; got: {' '.join(done.stderr.split())[-400:]}")
+        raise ServerError(f"{Path(command[0]).name} failed: {' '.join(done.stderr.split())[-400:]}")

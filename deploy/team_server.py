@@ -1,7 +1,7 @@
-"""A team's MLflow server on PostgreSQL: python -m deploy.team_server FOLDER. Runs until Ctrl-C; a second start goes on.
+"""A team's MLflow server on PostgreSQL: python -m deploy.team_server FOLDER. Runs until Ctrl-C.
 
-In: a folder for the database and the artifacts. Out: the line that each person sets. PostgreSQL listens on loopback
-alone, with a password of its own; MLflow has none, so that its port belongs behind a firewall or a proxy.
+FOLDER holds the database and the artifacts, also for the next start. PostgreSQL listens on loopback only, with a
+password of its own; MLflow has no password: put its port behind a firewall or a proxy.
 """
 
 import argparse
@@ -21,13 +21,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--host", default=LOOPBACK, help="the address to listen on; 0.0.0.0: every one of this machine")
     parser.add_argument("--port", type=int, default=5000)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    folder = asked.folder.resolve()
+    folder = arguments.folder.resolve()
     try:
         with (
             postgres(folder / "postgres", free_port()) as database,
-            mlflow(folder, database, asked.port, host=asked.host) as address,
+            mlflow(folder, database, arguments.port, host=arguments.host) as address,
         ):
             print(
                 f"MLflow on PostgreSQL, files in {folder}. Each person: export MLFLOW_TRACKING_URI={address}",
@@ -35,7 +35,7 @@ def main() -> None:
             )
             while listens(address):
                 time.sleep(LOOK_EVERY_s)
-            raise ServerError(f"MLflow: the server must stay up; got no answer at {address}. See {folder}/mlflow.log.")
+            raise ServerError(f"MLflow does not answer at {address} any more. See {folder}/mlflow.log.")
     except ServerError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

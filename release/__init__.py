@@ -1,1 +1,1 @@
-"""What a release takes: versions, licences. Not part of the wheel, and imported by nothing in it."""
+"""Tools of a release: versions and licences. Not part of the wheel."""

@@ -1,8 +1,8 @@
-"""constraints.txt, made anew. In: pyproject.toml and pip's index. Out: the newest versions that fit together.
+"""Update constraints.txt to the newest versions that fit together: python -m release.constraints [FILE].
 
-python -m release.constraints [FILE]. pip resolves all extras but `fuzz`, whose package few processors have, and
-installs nothing. Run it with the oldest supported Python, so that the versions exist for it; then `make test`, and only
-then commit. Refuses to judge the versions.
+pip resolves all extras but `fuzz`, whose package few processors have, and
+installs nothing. Run it with the oldest supported Python, so that the versions exist for it; run `make test` before you
+commit the result.
 """
 
 import json
@@ -14,13 +14,13 @@ from pathlib import Path
 from reskin import io
 
 HEAD = "# Exact versions with all extras but fuzz; made with `make constraints`. torch is {torch} and nothing else.\n"
-LEFT_OUT = "fuzz"
+EXCLUDED = "fuzz"
 OF_CUDA = ("nvidia-", "cuda-", "triton")  # torch for other graphics cards brings none of them
 RESOLVE = ("-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-")
 
 
 def resolve(python: str, wanted: str) -> dict[str, str]:
-    """Let pip find versions that fit together; give them by name, without what marks a build (`+cpu`)."""
+    """Let pip resolve the versions; return them by name, without build tags (`+cpu`)."""
     report = json.loads(subprocess.check_output([python, *RESOLVE, wanted]))
     packages = (item["metadata"] for item in report["install"])
     return {package["name"]: package["version"].partition("+")[0] for package in packages}
@@ -38,13 +38,13 @@ def render(versions: dict[str, str]) -> str:
 
 
 def wanted(project: str) -> str:
-    """Name the project with its extras, as pip takes it.
+    """Return the project with its extras, as pip takes it.
 
     >>> wanted('[project.optional-dependencies]\\ndev = ["pytest"]\\ndask = ["dask"]\\nfuzz = ["atheris"]')
     '.[dask,dev]'
     """
     extras = tomllib.loads(project)["project"]["optional-dependencies"]
-    return f".[{','.join(sorted(extras.keys() - {LEFT_OUT}))}]"
+    return f".[{','.join(sorted(extras.keys() - {EXCLUDED}))}]"
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
-"""The licences of what is installed. In: metadata of installed packages. Out: by package, its licence; what may not be.
+"""Check the licences of all installed packages: python -m release.licences.
 
-python -m release.licences prints them, and fails on one that is not compatible with MIT. A package tells its licence by
-an SPDX expression, a classifier or free words; whoever tells nothing that is known here is refused. No legal advice.
+Prints them, and fails if one is not compatible with MIT. A package states its licence by an SPDX expression, a
+classifier or free text; an unknown statement is refused. No legal advice.
 """
 
 import re
@@ -15,30 +15,30 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-# Words of licences that a program under MIT may import: they ask for notices, MPL for changes of its own files.
+# Licences that a program under MIT may import: they require notices, and MPL the changes of its own files.
 COMPATIBLE = re.compile(
     r"\b(MIT|BSD|0BSD|Apache|PSF|Python Software Foundation|ISC|MPL|Mozilla Public|Zlib|CC0|BSL-1\.0|ZPL|Zope|HPND)",
     re.I,
 )
 WITHHELD = re.compile(r"\b(A?GPL|LGPL|GNU|EPL|SSPL|BUSL|Commercial|Proprietary)", re.I)
-GROUP = re.compile(r"(?:^|(?<=AND )|(?<=OR )|(?<=\())\(([^()]*)\)")  # elsewhere brackets are words: BSD (3-clause)
+GROUP = re.compile(r"(?:^|(?<=AND )|(?<=OR )|(?<=\())\(([^()]*)\)")  # other brackets belong to a name: BSD (3-clause)
 # Of extra `pipeline`, never of the core: DVC imports them, we start DVC; none of them is part of our wheel.
 TOLERATED = {
     "asyncssh": "EPL-2.0 or GPL-2.0+: remotes of DVC over SSH",
     "grandalf": "GPL-2.0 or EPL-1.0: `dvc dag` draws with it",
     "pygit2": "GPL-2.0 with an exception for what links it: DVC reads git",
 }
-SILENT = {"huey": "MIT", "skops": "MIT"}  # licence files of these say what their metadata does not
+SILENT = {"huey": "MIT", "skops": "MIT"}  # stated in licence files, not in the metadata
 
 
 def wanted(extra: str | None = None) -> list[str]:
-    """Give what pyproject.toml asks for: the core, or an extra."""
+    """Return the requirements of pyproject.toml: of the core, or of an extra."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     return project["dependencies"] if extra is None else project["optional-dependencies"][extra]
 
 
 def closure(requirements: Iterable[str]) -> dict[str, Distribution]:
-    """Follow requirements to all that they install here, by canonical name; our own extras count as what they name."""
+    """Return all packages that the requirements install here, by canonical name."""
     found: dict[str, Distribution] = {}
     todo = [(Requirement(text), "") for text in requirements]
     seen = set()
@@ -60,12 +60,12 @@ def closure(requirements: Iterable[str]) -> dict[str, Distribution]:
 
 
 def licence_of(package: Distribution) -> str:
-    """Give what a package says of its licence: the expression, else classifiers, else the first line of words."""
-    words, name = package.metadata, canonicalize_name(package.metadata["Name"])
-    kinds = [line.split(" :: ")[-1] for line in words.get_all("Classifier") or () if line.startswith("License ::")]
-    told = [kind for kind in kinds if kind not in ("OSI Approved", "DFSG approved")]
-    free = (words.get("License") or "").strip().partition("\n")[0]
-    return words.get("License-Expression") or "; ".join(told) or free or SILENT.get(name, "")
+    """Return the licence that a package states: the expression, else classifiers, else the first line of its text."""
+    metadata, name = package.metadata, canonicalize_name(package.metadata["Name"])
+    kinds = [line.split(" :: ")[-1] for line in metadata.get_all("Classifier") or () if line.startswith("License ::")]
+    stated = [kind for kind in kinds if kind not in ("OSI Approved", "DFSG approved")]
+    free = (metadata.get("License") or "").strip().partition("\n")[0]
+    return metadata.get("License-Expression") or "; ".join(stated) or free or SILENT.get(name, "")
 
 
 def is_compatible(licence: str) -> bool:
@@ -74,7 +74,7 @@ def is_compatible(licence: str) -> bool:
     >>> is_compatible("Apache-2.0 OR GPL-2.0-or-later"), is_compatible("MIT AND unheard-of"), is_compatible("")
     (True, False, False)
     """
-    while group := GROUP.search(licence):  # a group is as good as a licence, or as none
+    while group := GROUP.search(licence):  # replace a group by its verdict
         verdict = "MIT" if is_compatible(group[1]) else "Proprietary"
         licence = licence[: group.start()] + verdict + licence[group.end() :]
     alternatives = [re.split(r"\s+AND\s+|;", text, flags=re.I) for text in re.split(r"\s+OR\s+", licence)]
@@ -82,7 +82,7 @@ def is_compatible(licence: str) -> bool:
 
 
 def incompatible(packages: dict[str, Distribution]) -> dict[str, str]:
-    """Give packages whose licence is unknown or not compatible, and what it is."""
+    """Return the packages with an unknown or incompatible licence, and that licence."""
     licences = {name: licence_of(package) for name, package in packages.items()}
     return {name: licence or "nothing" for name, licence in licences.items() if not is_compatible(licence)}
 
@@ -91,13 +91,13 @@ def main() -> None:
     try:
         core, full = closure(wanted()), closure(wanted("dev"))
     except PackageNotFoundError as error:
-        sys.exit(f"licences: all packages must be installed; got none of the name {error.name}. Try: make lint")
+        sys.exit(f"licences: package {error.name} is not installed. Try: make lint")
     for name, package in sorted((core | full).items()):
         print(f"{name:28} {'core' if name in core else 'dev':5} {licence_of(package)} {TOLERATED.get(name, '')}")
     refused = {name: text for name, text in incompatible(core | full).items() if name in core or name not in TOLERATED}
     if refused:
         sys.exit(
-            f"licences: each must be compatible with MIT; got {refused}. Drop the package, or state why it may stay."
+            f"licences not compatible with MIT: {refused}. Drop the package, or state in TOLERATED why it may stay."
         )
     print(f"{len(core)} packages of the core, {len(full)} with all extras of development: compatible with MIT")
 

@@ -1,4 +1,4 @@
-"""Fixtures that every folder of tests shares; which annotations of the project they execute."""
+"""Shared fixtures and settings of the tests; array annotations are checked at run time."""
 
 import pipeline  # isort: skip  # noqa: F401  (first: it selects the arithmetic that NumPy loads with)
 
@@ -17,13 +17,13 @@ from jaxtyping import AbstractArray, jaxtyped
 
 from tests.benchmarks import FULL
 
-# How long an example takes says how busy the machine is, not whether the law holds.
+# How long an example takes depends on how busy the machine is.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=50)
 settings.register_profile("thorough", settings.get_profile("busy"), max_examples=1000)  # --hypothesis-profile=thorough
 settings.load_profile("busy")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
-LONG = (  # which run stages and commands
+LONG = (  # files that run stages and commands
     "stages/test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
 )  # fmt: skip
 CHECKED_N = 50  # calls of a function, in each test
@@ -31,9 +31,9 @@ calls_n: Counter[Any] = Counter()
 
 
 def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
-    """Check shapes and kinds of arrays in the first calls of a function of the project in each test.
+    """Check shapes and dtypes of arrays in the first calls of each function in each test.
 
-    To check all calls takes longer than what is called; other types mypy checks.
+    Checking every call would take longer than the calls; mypy checks the other types.
     """
     if of is None:
         return partial(check_arrays, typechecker=typechecker)
@@ -75,19 +75,19 @@ if not FULL:  # benchmarks at full size run the code as it is
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the longest files: what begins last ends last, and one worker would wait for it (--dist loadfile)."""
+    """Start with the longest files, so that workers end together (--dist loadfile)."""
     items.sort(key=lambda item: next((i for i, name in enumerate(LONG) if f"/{name}.py" in item.nodeid), len(LONG)))
 
 
 def pytest_collection_finish() -> None:
-    """Look no more, at each search for what nobody holds, through all that was imported: it lives to the end."""
+    """Exclude all imported objects from garbage collection: they live to the end."""
     gc.freeze()
     gc.enable()
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real recordings beside the checkout; tests that need it say so when they skip."""
+    """The folder of real recordings beside the checkout; tests that need it are skipped without it."""
     if not SHARED_DATA.is_dir():
         pytest.skip("needs the real recordings in ../shared/data, which are not part of the repository")
     return SHARED_DATA.resolve()

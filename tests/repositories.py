@@ -1,4 +1,4 @@
-"""Git repositories made here, as the homes of recordings."""
+"""Git repositories for tests, as the homes of public recordings."""
 
 import subprocess
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ def git(folder: Path, *words: str) -> str:
 
 
 def commit(folder: Path, files: Mapping[str, bytes]) -> str:
-    """Write files into a repository, which is made if there is none, commit them, and give the commit's hash."""
+    """Write and commit files in a repository, which is created if needed; return the commit's hash."""
     if not (folder / ".git").exists():
         folder.mkdir(parents=True)
         git(folder, "init", "--quiet")
@@ -26,7 +26,7 @@ def commit(folder: Path, files: Mapping[str, bytes]) -> str:
 
 
 def bare(folder: Path, mirror: Path, *, filters: bool) -> str:
-    """Clone a repository as a server holds it, which may send commits without files; give its URL."""
+    """Clone a bare repository, which may serve commits without files (`filters`); return its URL."""
     subprocess.run(["git", "clone", "--quiet", "--bare", str(folder), str(mirror)], check=True)
     git(mirror, "config", "uploadpack.allowFilter", str(filters).lower())
     return mirror.as_uri()

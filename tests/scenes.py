@@ -1,4 +1,4 @@
-"""Scenes for tests, as plain words, and the settings that a stage has of them."""
+"""Scenes for tests, as plain dictionaries, and the settings that a stage reads of them."""
 
 from pipeline.scenes import EXPERIMENTS, Scene, check_scene, stages
 from pipeline.settings import Settings
@@ -24,7 +24,7 @@ def recorded(**changes: object) -> dict[str, object]:
 
 SCHEDULE = {"batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 8, "variants": {}}
-# what scenes of tests share
+# params.yaml of tests
 SHARED: dict[str, object] = {
     "lost_fraction_max": 0.05,
     "faults": AS_USUAL.model_dump(),
@@ -35,7 +35,7 @@ SHARED: dict[str, object] = {
     "skin": {}, "rig": {}, "chip": {}, "spreads": {}, "terms": {},
 }  # fmt: skip
 
-# what a scene holds, beside the experiment, for each experiment about learning
+# the sections of a scene that an experiment needs
 SECTIONS: dict[str, dict[str, object]] = {
     "lobo": {"train_multi": TRAINING},
     "transfer": {"train_single": TRAINING},
@@ -79,8 +79,8 @@ DRAWN_WITH: dict[str, dict[str, object]] = {
 }
 
 
-def asking(*experiments: str, **changes: object) -> dict[str, object]:
-    """A recorded scene with what these experiments need, and nothing else."""
+def scene_with(*experiments: str, **changes: object) -> dict[str, object]:
+    """Return a recorded scene with exactly the settings that these experiments need."""
     scene = {name: value for name, value in recorded().items() if name != "train_multi"}
     split: dict[str, object] = {}
     for experiment in experiments:
@@ -90,7 +90,7 @@ def asking(*experiments: str, **changes: object) -> dict[str, object]:
 
 
 def settings(scene: dict[str, object], name: str = "tiny", **shared: object) -> Settings:
-    """All settings of a scene, as a stage reads them."""
+    """Return all settings of a scene, as a stage reads them."""
     experiments = scene["experiments"]
     held_out = tuple(one for one in experiments if EXPERIMENTS[one].folds is not None)
     models = tuple(stages(experiments, "models"))

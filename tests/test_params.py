@@ -6,7 +6,7 @@ import pytest
 from pipeline.scenes import Scene, parse_scene, read_plan, read_scene, read_shared, stages
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
-from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, asking, check, recorded
+from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, check, recorded, scene_with
 
 ROOT = Path(__file__).resolve().parents[1]
 ADAPTED = ("lobo", "triplet", "adapt")  # the experiments that those of adaptation need
@@ -53,7 +53,7 @@ def test_a_wrong_scene_is_refused_with_the_name_of_the_parameter(changes, senten
 
 
 def scene(*experiments: str, **changes: object) -> Scene:
-    return check(asking(*experiments, **changes))
+    return check(scene_with(*experiments, **changes))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_a_scene_of_one_experiment_has_one_stage_and_no_curve():
 @pytest.mark.parametrize("experiment", [one for one in ALL if SECTIONS[one]])
 def test_a_scene_has_a_section_if_and_only_if_it_runs_its_experiment(experiment):
     ((section, words),) = SECTIONS[experiment].items()
-    lacking = {name: value for name, value in asking(*ALL).items() if name != section}
+    lacking = {name: value for name, value in scene_with(*ALL).items() if name != section}
     with pytest.raises(ParamsError, match=f"the scene lacks {section}. Mend it there."):
         parse_scene(lacking, "scene.yaml")
     with pytest.raises(ParamsError, match=f"no experiment uses {section} of the scene[.;]"):
@@ -172,9 +172,9 @@ def test_a_scene_has_a_section_if_and_only_if_it_runs_its_experiment(experiment)
 @pytest.mark.parametrize("experiment", DRAWN_WITH)
 def test_split_has_the_keys_of_the_folds_of_its_experiments_and_no_others(experiment):
     own, others = DRAWN_WITH[experiment], ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else []))
-    asked = asking(*others, experiment)
+    asked = scene_with(*others, experiment)
     parse_scene(asked, "scene.yaml")
-    unasked = asking(*others)
+    unasked = scene_with(*others)
     for key, value in own.items():
         lacking = {name: value for name, value in asked["split"].items() if name != key}
         with pytest.raises(ParamsError, match=f"split lacks {key}"):
@@ -241,14 +241,14 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 def test_a_base_that_is_no_recipe_of_train_triplet_is_refused():
-    scene = copy.deepcopy(asking("lobo", "triplet", "adapt"))
+    scene = copy.deepcopy(scene_with("lobo", "triplet", "adapt"))
     scene["adapt"]["base"] = "nope"
     with pytest.raises(ParamsError, match=r"adapt: base of paper must be one of \['paper'\]; got 'nope'"):
         check(scene)
 
 
 def test_adaptation_without_its_training_is_refused():
-    scene = asking("lobo", "triplet", "adapt")
+    scene = scene_with("lobo", "triplet", "adapt")
     scene["experiments"] = ["lobo", "adapt"]
     with pytest.raises(ParamsError, match="experiment adapt needs triplet in the same scene"):
         parse_scene(scene, "scene.yaml")

@@ -12,7 +12,7 @@ from pipeline.stages.report import planned_scene
 from reskin.config import parse
 from reskin.errors import ParamsError
 from reskin.simulation.defaults import SHARED as SIMULATED
-from tests.scenes import SHARED, asking, recorded, settings
+from tests.scenes import SHARED, recorded, scene_with, settings
 from tests.stages.checkout import copy_checkout, run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +50,7 @@ ADAPTED = ("lobo", "triplet", "adapt")
     ],
 )
 def test_a_stage_runs_for_the_scenes_with_its_experiment_and_for_no_other(stage, experiments):
-    asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (experiments, ("lobo",)))
+    asked, plain = (parse_scene(scene_with(*own), "scene.yaml") for own in (experiments, ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
     made = make_plan({"one": plain, "two": asked}, captures)
     parse(Plan, made, "plan")
@@ -60,7 +60,7 @@ def test_a_stage_runs_for_the_scenes_with_its_experiment_and_for_no_other(stage,
 
 
 def test_an_experiment_of_a_recorded_scene_reads_its_captures():
-    asked, plain = (parse_scene(asking(*own), "scene.yaml") for own in (("lobo", "drift"), ("lobo",)))
+    asked, plain = (parse_scene(scene_with(*own), "scene.yaml") for own in (("lobo", "drift"), ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
     made = make_plan({"one": plain, "two": asked}, captures)
     parse(Plan, made, "plan")
@@ -70,7 +70,7 @@ def test_an_experiment_of_a_recorded_scene_reads_its_captures():
 
 
 def test_a_choice_of_settings_needs_no_stage_of_its_own():
-    chosen, plain = (parse_scene(asking(*own), "scene.yaml") for own in ((*ADAPTED, "choice"), ADAPTED))
+    chosen, plain = (parse_scene(scene_with(*own), "scene.yaml") for own in ((*ADAPTED, "choice"), ADAPTED))
     captures = Registry(captures={"lab": {"c0": ENTRY}})
     with_choice, without = (make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
     assert with_choice == without
@@ -80,7 +80,7 @@ def test_the_report_refuses_a_plan_that_lacks_an_experiment_of_the_scene(tmp_pat
     monkeypatch.chdir(tmp_path)
     Path("pipeline").mkdir()
     Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
-    own = settings(asking("lobo", "baselines"))
+    own = settings(scene_with("lobo", "baselines"))
     assert planned_scene(own).experiments == ("lobo", "baselines")
     Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
     with pytest.raises(ParamsError, match="baselines only in one. Try: reskin scenes use tiny"):

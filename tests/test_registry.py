@@ -19,7 +19,7 @@ def added(registry: Registry, one: Header, fingerprint: str, *, allow_copy: bool
 ONE = added(EMPTY, header(), "aa")
 
 
-def test_several_captures_of_one_board_and_skin_stand_beside_each_other():
+def test_a_board_and_skin_may_have_several_captures():
     assert sorted(added(ONE, header("c1"), "bb").captures["lab"]) == ["c0", "c1"]
 
 
@@ -28,7 +28,7 @@ def test_the_same_recording_twice_is_refused():
         added(ONE, header("c1"), "aa", allow_copy=True)
 
 
-def test_a_relabelled_copy_would_leak_and_needs_a_word():
+def test_a_relabelled_copy_is_refused_unless_allowed():
     copy = header("c1", board="b1", skin="s1")
     with pytest.raises(CaptureError, match="--allow-copy"):
         added(ONE, copy, "aa")
@@ -48,11 +48,11 @@ def test_a_capture_that_contradicts_the_others_is_refused(second, sentence):
         added(ONE, second, "bb")
 
 
-def test_taking_out_what_was_added_leaves_what_was_there():
+def test_removing_an_added_capture_restores_the_registry():
     assert without_capture(added(ONE, header("c1"), "bb"), "lab", "c1") == ONE
     assert without_capture(ONE, "lab", "c0") == EMPTY
 
 
-def test_an_unknown_capture_cannot_be_taken_out():
+def test_an_unknown_capture_cannot_be_removed():
     with pytest.raises(CaptureError, match=r"one of its own \(c0\); got c7"):
         without_capture(ONE, "lab", "c7")

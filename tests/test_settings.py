@@ -1,4 +1,4 @@
-"""Settings and DVC: a stage's parameters cover what its code reads; an override runs the stages again that read it."""
+"""The params of a stage cover the settings that its code reads; an override runs the stages again that read it."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC'
 
 
 class Noting(Mapping[str, Any]):
-    """A mapping that notes which keys are read."""
+    """A mapping that records which keys are read."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.values_by_key, self.read = values, set[str]()
@@ -67,7 +67,7 @@ def readers() -> list[str]:
 
 
 @pytest.mark.parametrize("stage", readers())
-def test_the_parameters_of_a_stage_cover_what_its_reader_reads(stage):
+def test_the_params_of_a_stage_cover_the_settings_that_it_reads(stage):
     scene = next(one for one in ("ci", "lab", "eflash7", "decide", "universal") if stage_of(one, stage))
     given = read_settings(scene, ROOT)
     asked = Settings(scene, given.where, Noting(given.of_scene), Noting(given.shared), given.captures)
@@ -187,7 +187,7 @@ def test_no_file_that_dvc_reads_holds_an_anchor_an_alias_or_a_merge_key(file):
     assert not re.search(r"^\s*<<\s*:|[{,]\s*<<\s*:", file.read_text(), re.MULTILINE)
 
 
-def test_a_mistake_elsewhere_in_a_scene_does_not_stop_a_stage_but_its_own_does(root):
+def test_a_stage_fails_on_mistakes_in_its_own_sections_only(root):
     with overridden(root, (SCENE, "shear.repeats_n=0")):
         read_settings("ci", root).training("train_multi")
         with pytest.raises(ParamsError, match="shear: repeats_n must be greater than or equal to 1; got 0"):

@@ -8,7 +8,7 @@ from ruamel.yaml import YAML
 
 from pipeline import SCENES, plan
 from pipeline.manage import tidy
-from tests.scenes import asking
+from tests.scenes import scene_with
 from tests.test_plan import checkout
 
 WRITTEN = {
@@ -66,7 +66,7 @@ def test_scenes_with_a_common_prefix_are_told_apart(root):
 
 def test_an_experiment_that_runs_has_no_stale_outputs(root):
     with (root / SCENES / "one.yaml").open("w") as stream:
-        YAML().dump(asking("lobo", "drift"), stream)
+        YAML().dump(scene_with("lobo", "drift"), stream)
     plan.use(root, ["one"])
     assert set(tidy.stale_outputs(root, plan.check(root))) == {"simulate@one-gone"}
 
