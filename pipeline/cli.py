@@ -30,7 +30,7 @@ Marks = Annotated[list[str] | None, Option(help="capture, serial-*: STREAM_S,PRO
 
 
 def checked_plan() -> "Plan":
-    """Read the plan; raise if it is not what the scenes ask for."""
+    """Read the plan; raise if it is out of date."""
     from pipeline import plan
 
     return plan.check(ROOT)
@@ -210,5 +210,5 @@ def tidy() -> None:
 
 @scenes.command()
 def check() -> None:
-    """Check scenes, params.yaml, and that the plan is what the scenes ask for."""
+    """Check scenes, params.yaml, and that the plan is up to date."""
     checked_plan()
