@@ -73,8 +73,8 @@ def test_a_killed_run_draws_no_part_again(monkeypatch):
 
     monkeypatch.setattr(DesignedSkins, "draw", draw)
     monkeypatch.setattr(population, "PART_N", 3)
-    monkeypatch.setattr(population.io, "load", lambda _, name: shelf.get(name))
-    monkeypatch.setattr(population.io, "save", lambda _, name, part: shelf.update({name: part}))
+    monkeypatch.setattr(population.io, "load_cached_array", lambda _, name: shelf.get(name))
+    monkeypatch.setattr(population.io, "save_cached_array", lambda _, name, part: shelf.update({name: part}))
     designed = designed_skins(DESIGN, KIND, (0.2, 1.2), seed=0)
     population.draw(designed, 6, lambda line: None)
     drawn.clear()
