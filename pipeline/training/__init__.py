@@ -1,4 +1,1 @@
-"""Trainings of one scene: its rows and folds -> jobs -> models on disk, and these at work again.
-
-Refuses to know how a network learns (`learning`) and what is shown.
-"""
+"""Trainings of one scene: jobs from its rows and folds, models with cards, and studies that use these models."""
