@@ -41,10 +41,10 @@ def test_the_digests_of_a_stage_hold_the_modules_that_decide_its_results():
 
 
 def test_a_caption_runs_only_the_report_again(monkeypatch):
-    monkeypatch.setattr(code, "meaning", lambda file, content: b"other" if file == "manual.yaml" else b"same")
+    monkeypatch.setattr(code, "normalised", lambda file, content: b"other" if file == "manual.yaml" else b"same")
     code.digest.cache_clear()
     other = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
-    monkeypatch.setattr(code, "meaning", lambda file, content: b"same")
+    monkeypatch.setattr(code, "normalised", lambda file, content: b"same")
     code.digest.cache_clear()
     same = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
     code.digest.cache_clear()
