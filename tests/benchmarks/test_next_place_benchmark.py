@@ -19,7 +19,7 @@ from reskin.universal.law import CHIPS_MM, Setup, to_board
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, expected_gain
 from reskin.universal.model import SKIN_MM, Universal, load_universal
 from reskin.universal.population import PLACES_N, draw_population
-from reskin.universal.training import ERROR_NOMINAL_SPREADS, NOISE_uT, add_error
+from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
 from tests.benchmarks import size
 
 SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0
@@ -31,7 +31,7 @@ def test_errors_after_labels_at_fixed_random_and_chosen_places():
     design = parse(SkinDesign, nominal("skin"), "params.yaml: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
     skins = draw_population(NOMINAL, NOMINAL_SPREADS, setup, SKINS_N, rng)
-    db_uT = add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), ERROR_NOMINAL_SPREADS, rng)
+    db_uT = add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), ERROR_OF_NOMINAL, rng)
     db_uT = db_uT + np.tile(NOISE_uT, 5) * rng.standard_normal(db_uT.shape)
     to_chips = np.linalg.inv(to_board(np.eye(db_uT.shape[2])))
     for rest_uT, own_uT, place_mm, force_N in zip(
