@@ -82,6 +82,7 @@ class Settings:
 
     @property
     def seed(self) -> int:
+        """Seed of the scene, from which every random generator is derived by name (`reskin.seeds`)."""
         return parse(Seeded, {"seed": self["seed"]}, self.where).seed
 
     def training(self, section: str) -> Training:

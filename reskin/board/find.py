@@ -136,7 +136,11 @@ def find_replugged_port(
     pause: Callable[[float], None] = time.sleep,
     hunting_s: float = HUNTING_S,
 ) -> str:
-    """Find a board's port: the one that goes when it is unplugged, and comes when it is plugged in again."""
+    """Ask the user to unplug and to replug a board, and return the name of the port that disappears and comes back.
+
+    Waits `hunting_s` seconds for each of the two. The name may differ after replugging; the port is not read, so that
+    any serial device passes. Of several ports, the first by name is returned.
+    """
     say("Unplug the board.")
     before = set(names())
     gone = _wait(lambda: before - set(names()), pause, hunting_s, "a port that goes")

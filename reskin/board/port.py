@@ -85,7 +85,11 @@ def record(
 
 
 def open_port(port: str, baud: int) -> Device:
-    """Open a serial port for this process alone, or connect to a socket."""
+    """Open a serial port, exclusively for this process, or connect to `socket://host:port`.
+
+    Boards and force gauges are opened here. Bytes that waited in the port are discarded. A socket becomes
+    non-blocking: read from either with `read_waiting`.
+    """
     try:
         if "://" in port and not port.startswith(SOCKET):  # pyserial has more schemes, some of which load code
             raise ValueError(f"of these, only {SOCKET}host:port is known")

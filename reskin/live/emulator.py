@@ -241,7 +241,7 @@ class EmulatedPort:
         raise NotImplementedError
 
     def unplug(self) -> None:
-        """Remove the port."""
+        """Remove the port: as a pulled cable does, and to clean up at the end."""
         raise NotImplementedError
 
     def send(self, data: bytes, stop: threading.Event) -> int:

@@ -25,7 +25,7 @@ POLL_S = 0.1
 # Over which frames of several boards are gathered: estimating them together costs less, and no page draws faster.
 GATHER_S = 0.02
 
-WINDOW_S, BIN_S = 10.0, 0.02
+WINDOW_S, BIN_S = 10.0, 0.02  # as in page/trace.js
 BINS_N = round(WINDOW_S / BIN_S)
 LATENCIES_N = 4000  # the last frames: ten seconds at 400 Hz
 UNCONFIRMED_MAX_N = 64  # messages that may be on their way to a screen

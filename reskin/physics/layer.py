@@ -152,7 +152,9 @@ def force(
     modulus_Pa: float,
     base: Base,
 ) -> Float[np.ndarray, " n"]:
-    """Return the normal force on the tip in N; 0 without contact (depth of 0 or less).
+    """Return the normal force of a linear elastic layer on the tip in N; 0 without contact (depth of 0 or less).
+
+    The simulated skin presses back with `slide.force_at`, which multiplies this force by the stiffening of the layer.
 
     Raises
     ------

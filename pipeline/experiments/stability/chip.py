@@ -129,6 +129,7 @@ def _axes(chip_i: int) -> slice:
 
 
 def _still_board(chip: ChipDesign, chips_n: int, seed: int) -> Float32[np.ndarray, "f ch"]:
+    """Simulate readings of sound chips in constant fields, which only noise moves: faults are put into them."""
     rng = rng_for(seed, "stability", "board")
     rest_T = rng.uniform(-2, 2, (chips_n, 3)) * milli
     return np.concatenate([read_bare(np.tile(chip_T, (FRAMES_N, 1)), chip, rng)[0] for chip_T in rest_T], axis=1)

@@ -1,6 +1,7 @@
 // Ten seconds of values as lines. What was drawn is moved, and only what is new is drawn: a chip more costs little.
 // After another scale or size the picture is stretched at once, and drawn anew from the newest on, as far as a frame's time goes.
 "use strict";
+// WINDOW_S and BIN_S as in session.py.
 const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, TRACE_PX = 170, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
 const NARROW_PX = 400; // of a trace: fewer times are written below it
 const ANEW_MS = 3, LINE_PX = 1.5;
