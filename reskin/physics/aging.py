@@ -26,7 +26,7 @@ class Prony:
             raise ParamsError("prony", "share", "0 or more, 1 in sum", f"{self.share}", "Lower the shares.")
 
 
-SKIN_RELAXATION = Prony(  # assumed (PHYSICS 5)
+SKIN_RELAXATION = Prony(  # assumed
     tau_s=np.array([1e-3, 1e-1, 1e1, 1e3, 1e4]), share=np.array([0.05, 0.05, 0.05, 0.03, 0.02])
 )
 
@@ -122,7 +122,7 @@ def _mean_decay(x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
 
 
 ROOM_DEGC = 25.0
-REMANENCE_PER_K = -0.12e-2  # NdFeB powder: Br falls by 0.12 % for each kelvin (PHYSICS 5)
+REMANENCE_PER_K = -0.12e-2  # NdFeB powder: Br falls by 0.12 % for each kelvin
 
 
 class Temperature(Strict):

@@ -66,7 +66,7 @@ class BoardDesign(Strict):
 
 
 class Spreads(Strict):
-    """Standard deviations between boards and between skins: all of them assumptions (PHYSICS 6 and 7).
+    """Standard deviations between boards and between skins: all of them assumptions.
 
     Factors are drawn as exp(sd * normal), so that they stay positive; everything else is normal around the design.
     """

@@ -2,7 +2,7 @@
 
 The layer is bonded to a rigid base or slips on it. Fields are Hankel integrals over waves J0(kr) of the pressure; kh
 and kz are the wave number times the thickness and the height, primes are derivatives by kz. For a bonded base
-W = a (sinh z' - z' cosh z') + b z' sinh z' and U = -W'/k, z' = kz (PHYSICS 4).
+W = a (sinh z' - z' cosh z') + b z' sinh z' and U = -W'/k, z' = kz.
 """
 
 from dataclasses import dataclass

@@ -154,7 +154,7 @@ def moved_dipoles(
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
     """Return the rigid motion of the skin under presses (x, y, true depth), as far as the tip's friction allows.
 
-    The displacement away from the centre depends on the depth, whatever the modulus; the bound of friction on the force
+    The displacement towards the centre depends on the depth, whatever the modulus; the bound of friction on the force
     in N.
     """
     places_m = true_m[:, :2] - skin.seat_m

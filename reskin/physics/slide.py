@@ -34,7 +34,7 @@ class HoldDesign(Strict):
     """Section `skin.hold`: how the base holds a skin that slides on it, and how a press displaces it."""
 
     give_um: tuple[float, float]  # compliance of the rig: displacement of arm and skin under a press, x and y
-    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement away from the skin's centre, per distance from it
+    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement towards the skin's centre, per distance from it
     lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force over Young's modulus at which that displacement is gone
     springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base: screws, clips, friction
     friction: Annotated[float, Field(gt=0, le=10)]  # coefficient of the tip on the skin
@@ -83,8 +83,9 @@ def press_displacement_m(
 ) -> Float[np.ndarray, "n 2"]:
     """Return the displacement of the material under a tip that grips it: give - away (1 - load) p.
 
-    p is the place from the skin's centre, `load` the force over the force at which the displacement away from the
-    centre is gone. A light press reaches only a share of it, see `limit_by_friction`.
+    p is the place from the skin's centre: the second term points towards the centre, so the skin evades the tip towards
+    the opposite side. `load` is the force over the force at which that term vanishes. A light press reaches only a
+    share of the displacement, see `limit_by_friction`.
     """
     return np.array(give_m) - away * (1 - load)[:, None] * places_m
 

@@ -48,7 +48,7 @@ class Law:
     give_x_um: float
     give_y_um: float
     # Not fitted.
-    lets_go_N: float = 8.0  # force at which the slide away from the middle ends: chosen on both boards of scene lab
+    lets_go_N: float = 8.0  # force at which the slide towards the middle ends: chosen on both boards of scene lab
     grip_N_mm: float = 8.75  # springs of 7 N/mm over a friction of 0.8 (nominal.yaml: skin.hold)
     tilt_x_deg: float = 0.0  # of the skin over the board
     tilt_y_deg: float = 0.0
