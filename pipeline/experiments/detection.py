@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 NEIGHBOURS_N = 5  # assumed
-NOISE_uT = 15.0  # of all channels of a reading together (a channel's is 3 to 5 uT, FACTS 3)
+NOISE_uT = 15.0  # of all channels of a reading together (a channel's is 3 to 5 uT on recorded boards)
 
 Scores = Mapping[str, Float[np.ndarray, "_"]]  # by detector: the larger, the less like known readings
 

@@ -30,7 +30,7 @@ from reskin.simulation.contact import Response, Terms, drag_tip, simulate_respon
 from reskin.simulation.protocols import Plan
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-# Sizes of effects that a scene may neglect: the design values of PHYSICS 5 (assumed there).
+# Sizes of effects that a scene may neglect: design values, assumed.
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
 RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
 MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
@@ -38,7 +38,7 @@ WARMER_K = 1.0
 EARTH_T = np.array([20e-6, 0.0, -45e-6])  # at a middle latitude
 PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # indentations for effects inside the skin: flank and edge
 BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # of the powder's own field
-FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed (PHYSICS 4)
+FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed
 FEW = 5
 COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # where every node is followed by itself
 
@@ -70,7 +70,7 @@ class Subject:
 
 
 def measure(of: SimulationSettings, *, seed: int) -> list[Effect]:
-    """Measure every effect of PHYSICS 8 on a scene."""
+    """Measure every neglected effect on a scene."""
     subject = _make_subject(of, seed)
     without = _simulate(subject, Terms(), seed)
     of_protocols = *_over_time(subject, without, seed), _temperature(subject, without), _friction(subject)

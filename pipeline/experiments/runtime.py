@@ -70,7 +70,7 @@ class Indentations(Strict):
 
 REFERENCE = "reference"  # the method of a row with the largest error of the reference itself
 CANDIDATES = "Gauss in z"  # the rules of `magnet.place_nodes`
-ERROR_MAX = 0.02  # largest acceptable error of dB (DESIGN 6)
+ERROR_MAX = 0.02  # largest acceptable error of dB
 Key = tuple[str, str, str]  # study, method, setting
 
 
@@ -256,7 +256,7 @@ SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # of scipy.integrate
 IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that take the Jacobian, which is constant
 ATOL = 1e-3  # of the relative tolerance: states are shares, a few percent, of a force of 1
 DIVERGED = 1.0  # an error as large as the force itself
-PERIOD_S = 1.5  # twenty pokes take the 30 s of PHYSICS 5
+PERIOD_S = 1.5  # twenty indentations take 30 s
 DOWN_S, HELD_S = 0.3, 0.7
 
 Forces = Float[np.ndarray, " u"]  # relaxed, relative to the peak elastic force; at the end of linear pieces

@@ -1,6 +1,6 @@
-"""What a skin's recordings look like: fields, noise, steps, forces. In: `Readings`. Out: numbers by name, units in it.
+"""Summarise the readings of a skin: fields, noise, resolution and forces, as numbers with units in their names.
 
-The same numbers for simulated and recorded skins, so that they can stand side by side. Refuses to know who they are.
+Simulated and recorded skins are summarised alike, so that they can be compared.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,4 @@
-"""The paper's own numbers (Bhirangi et al., CoRL 2021), each with its place. No result of ours stands here.
-
-Refuses to know where they are shown.
-"""
+"""The numbers that the paper reports (Bhirangi et al., CoRL 2021), each with its section or table."""
 
 from collections.abc import Mapping
 

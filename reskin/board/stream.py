@@ -1,7 +1,7 @@
-"""From a stream to frames, without I/O. In: bytes in any portions. Out: whole frames, and a count of every lost byte.
+"""Split a byte stream into frames, without I/O; every byte belongs to a frame or is counted as lost.
 
-No format marks a frame's start, and CR LF may stand inside a float (34.513275 degC has it), so where frames lie is
-decided from the bytes alone, never from how they were portioned. Refuses to know ports, files and clocks.
+No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). Frames are
+therefore located from the bytes alone; how the stream was divided into reads does not matter.
 """
 
 import re

@@ -1,7 +1,7 @@
-"""The bytes of a frame: binary bursts and lines of text. In: frames. Out: bytes; and back, for frames that are whole.
+"""Encode and decode whole frames: binary bursts and lines of text.
 
-The layouts are those that the ReSkin and AnySkin firmwares send: no header, no checksum, no counter.
-Refuses to know where in a stream a frame begins (`stream`), and whether its values make sense (`faults`).
+These are the formats of the ReSkin and AnySkin firmwares, without header, checksum or counter. `stream` finds frames
+in a byte stream; `faults` judges their values.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,1 +1,1 @@
-"""From rows to models: the network, the one training loop, the grid of recipes. Knows no path and no page."""
+"""Networks and classical methods that estimate place and force from one reading: recipes, losses, training."""

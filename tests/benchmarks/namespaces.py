@@ -1,6 +1,6 @@
-"""Machines of a small network on this one: network namespaces, each with an address of its own, on one bridge.
+"""A small network on one machine: network namespaces, each with its own address, on one bridge.
 
-In: names. Out: addresses, and programs that run there. Needs root and `ip`; all goes with the block.
+Programs run in them by name. It needs root and `ip`; the context manager removes everything at its end.
 """
 
 import os

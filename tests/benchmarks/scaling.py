@@ -1,8 +1,8 @@
-"""Workers 1 to 256, simulated from measured times and sizes: where more of them stop helping, and why.
+"""Simulate 1 to 256 workers from measured times and sizes: where more workers stop helping, and why.
 
-In: what cluster.py measured, and what each stage's trainings took (reports/<scene>/provenance.json). Out: a table and a
-figure. The engine is simulated event by event: one client hands tasks out one after another, one network carries them,
-each worker reads the rows once, tasks take what stages took, spread as measured.
+Reads the measurements of cluster.py and the times of each stage's trainings (reports/<scene>/provenance.json); writes a
+table and a figure. The simulation is event by event: one client sends tasks one after another over one network, each
+worker reads the rows once, and tasks take as long as those of the stages, with the measured spread.
 """
 
 import heapq

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from reskin import seeds
 from reskin.board.wire import Frames
 
-# Readings whose float32 holds CR LF in its middle, at gain 6 of the chip (FACTS: fixtures of the wire format).
+# Readings whose float32 holds CR LF in its middle, at gain 6 of the chip.
 CRLF_TEMPERATURE_degC = 34.513275
 CRLF_B_uT = (2208.8477, -2208.8477, 8835.308)
 WIRES = ("binary", "binary-clock", "text-xyzt", "text-txyz")

@@ -9,7 +9,7 @@ from reskin import seeds
 from reskin.board import faults
 from tests.board.signals import frames_of
 
-NOISE_uT = 5.0  # FACTS: 3.0 to 5.0 uT on real boards
+NOISE_uT = 5.0  # 3.0 to 5.0 uT on real boards
 GRIDS_uT = {"ini": (0.15, 0.242), "lab": (0.2, 0.3227), "eflesh": (2.4, 3.872), "eflesh shear": (0.6, 0.968)}
 
 

@@ -63,7 +63,7 @@ def test_errors_of_the_force_without_ageing_and_relaxation(rows):
     left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
     assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
     assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / relaxed_share(RELAXATION) - 1), rel=1e-9)
-    assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed (PHYSICS 0)
+    assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed
 
 
 def test_one_kelvin_changes_every_field_by_0_12_percent(rows):
@@ -81,7 +81,7 @@ def test_a_steady_field_is_subtracted_with_the_no_load_reading(rows):
 
 
 def test_effects_that_are_kept_matter(rows):
-    # PHYSICS 8: increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
+    # Increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
     assert rows["increments"].field_pct > 2
     assert rows["rotation of the magnetisation"].field_pct > 5
     assert rows["slipping base"].field_pct > 50

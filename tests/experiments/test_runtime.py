@@ -196,7 +196,7 @@ def test_errors_are_those_of_the_skin_that_is_worst_at_each_depth():
 
 def test_midpoint_layers_are_wrong_by_what_the_specification_says_and_gauss_layers_are_not(quadratures):
     rows, _ = quadratures
-    # PHYSICS 0.1: 9-74 % at 0.5 mm x 4 layers; about 1 % with six Gauss nodes
+    # 9-74 % at 0.5 mm x 4 layers; about 1 % with six Gauss nodes
     assert 0.09 < error_of(rows, "midpoint", 0.5, 4) < 0.74
     assert error_of(rows, "Gauss in z", 0.5, 6) < 0.02
     assert error_of(rows, "midpoint", 0.5, 8) > 2 * error_of(rows, "Gauss in z", 0.5, 4)

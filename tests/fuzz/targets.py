@@ -1,6 +1,7 @@
-"""What arrives from outside, one target a door. In: any bytes. Out: nothing; a `ReskinError` is an answer.
+"""Fuzz targets: one function for each kind of input from outside.
 
-Used by `fuzz.py`, for as long as one likes, and by `test_corpus.py` on what is committed. Refuses to know fuzzers.
+A target takes any bytes and may raise nothing but a `ReskinError`. `fuzz.py` runs them for a given time,
+`test_corpus.py` on the committed corpus.
 """
 
 import tempfile

@@ -168,7 +168,7 @@ def test_softening_is_the_sum_of_settling_and_ageing():
 
 
 def test_softening_before_thirty_contacts_costs_what_the_specification_says():
-    # PHYSICS 8 lets a scene leave it out on a cycled skin: from contact 1000 to 1030 it is far below 1 %
+    # A scene may neglect it on a cycled skin: from contact 1000 to 1030 it is far below 1 %.
     cycled = softening(np.array([1000, 1030]), **DESIGN)
     assert 0 < 1 - cycled[1] / cycled[0] < 0.01
 

@@ -55,7 +55,7 @@ def test_volume_is_kept_where_one_linear_step_loses_most_of_it():
     linear = linear_at(r_m, z_m, 1.2e-3)
     one_shot = ((1 + linear.r_r) * (1 + linear.z_z) - linear.r_z * linear.z_r) * (1 + linear.hoop)
     followed = det_f(follow(r_m, z_m))
-    assert one_shot.min() < 0.5  # PHYSICS 0: 0.42 on the axis
+    assert one_shot.min() < 0.5  # 0.42 on the axis
     assert np.mean(np.abs(followed - 1) < 0.01) > 0.97
 
 

@@ -70,7 +70,7 @@ def test_the_mirror_image_of_a_place_has_the_mirrored_field(point_m, polarity):
 
 
 def test_the_array_gives_the_strength_that_the_specification_states():
-    # PHYSICS 3: 0.38-0.65 T in the slab; the seam crossings are weaker and the faces stronger.
+    # 0.38-0.65 T in the slab; the seam crossings are weaker and the faces stronger.
     size_T = np.linalg.norm(magnet.array_field(NODES_M, THICKNESS_M, "checkerboard"), axis=1)
     assert 0.38 < np.median(size_T) < 0.65
 
@@ -99,7 +99,7 @@ def test_without_a_field_nothing_is_magnetised_and_nothing_is_nan():
 
 
 def test_the_mean_magnetisation_is_that_of_the_specification():
-    # PHYSICS 3: 22-28 mT for phi Br = 0.11 T and B_half = 0.8 T
+    # 22-28 mT for phi Br = 0.11 T and B_half = 0.8 T
     rest = place_nodes(THICKNESS_M)
     b_T = magnet.array_field(rest.nodes_m, THICKNESS_M, "checkerboard")
     j_T = np.linalg.norm(magnet.magnetise(b_T, saturation_T=0.11, half_field_T=0.8), axis=1)

@@ -244,7 +244,7 @@ def test_the_specifications_sum_of_limits_is_up_to_5_percent_too_stiff_for_stick
     ratio = [shear.tangential_stiffness_m(shear.stick_traction(a, H_M), H_M) for a in a_m] / (
         16 / 3 * a_m + np.pi * a_m**2 / H_M
     )
-    # PHYSICS 4; right at both ends. Sticking that is the same all round is at most as stiff as the true one.
+    # The formula is exact in both limits. Axisymmetric stick is at most as stiff as the true one.
     assert ratio.max() < 1
     assert ratio.min() == pytest.approx(0.955, abs=0.005)
 

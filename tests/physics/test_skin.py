@@ -101,8 +101,8 @@ def test_material_under_the_tips_flank_leans_as_the_dent_does():
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.2e-3, 1.0e-3])
 def test_cells_half_as_wide_change_a_poke_by_less_than_2_percent_and_more_layers_by_half_a_percent(depth_m, base):
-    # PHYSICS 9. Judged on dB, not on the field at rest; a pattern off its place, so that no symmetry helps. Of a
-    # shallow poke over a seam 2 % is less than any chip can see: there the bound is a tenth of its noise, 3.3 uT.
+    # Compares dB, not the field at rest; the pattern is shifted, so that no symmetry hides errors. For a shallow
+    # indentation over a seam 2 % is below the resolution of a chip: there the bound is a tenth of its noise, 3.3 uT.
     rules = (
         DEFAULT_QUADRATURE,
         Quadrature(DEFAULT_QUADRATURE.cell_m / 2, DEFAULT_QUADRATURE.layers_n),
@@ -114,7 +114,7 @@ def test_cells_half_as_wide_change_a_poke_by_less_than_2_percent_and_more_layers
 
 
 def test_without_the_rotation_of_the_moments_the_change_would_be_wrong_by_more_than_itself():
-    # PHYSICS 0.2: 156-242 %, over pokes of the grid; R.M, never M alone
+    # 156-242 % over indentations of the grid: moments are rotated, R.M, not only moved
     one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
         moved = moved_by(one, (*place, DEPTH_M))
@@ -266,7 +266,7 @@ def test_filler_and_amplitude_scale_the_moments_by_their_spreads():
 
 
 def test_the_field_at_rest_lies_in_the_plane_and_is_as_strong_as_a_recorded_one():
-    # PHYSICS 3: recorded B0 in-plane up to 3.6 mT; a factor of two, since the amplitude is one number for all skins.
+    # Recorded B0 in-plane up to 3.6 mT; a factor of two, since the amplitude is one number for all skins.
     rest_T, _ = changes_of_field(BOARD, skin(rule=DEFAULT_QUADRATURE), np.zeros((0, 3)))
     assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
@@ -274,13 +274,13 @@ def test_the_field_at_rest_lies_in_the_plane_and_is_as_strong_as_a_recorded_one(
 
 def test_a_skin_that_slides_is_softer_and_is_felt_where_a_bonded_one_is_not():
     bonded, slipping = skin(), skin(base="slipping")
-    assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))  # PHYSICS 4: 1.8 times at 1.2 mm
+    assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))  # 1.8 times at 1.2 mm
     far = [np.linalg.norm(change((-8e-3, 0.0, 1e-3), one)[3]) for one in (bonded, slipping)]  # chip 3, 15 mm away
     assert far[1] > 10 * far[0]
 
 
 def test_the_force_at_the_deepest_poke_is_that_of_the_specification():
-    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)  # PHYSICS 4, two digits
+    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)  # known to two digits
 
 
 @pytest.mark.parametrize("place_m", [(10.1e-3, 0.0), (0.0, -12e-3), (np.nan, 0.0)])

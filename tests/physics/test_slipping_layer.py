@@ -64,7 +64,7 @@ def test_on_a_thick_layer_the_base_does_not_matter():
 def test_on_the_skin_a_sliding_base_takes_1_8_off_the_force():
     at = {**SKIN, "modulus_Pa": 190e3}
     held, sliding = (layer.force(np.array([1.2e-3]), **at, base=base) for base in ("bonded", "slipping"))
-    assert held / sliding == pytest.approx(1.8, abs=0.05)  # PHYSICS 4, two digits
+    assert held / sliding == pytest.approx(1.8, abs=0.05)  # a factor of 1.8, known to two digits
 
 
 @given(st.floats(0.05, 0.55))

@@ -12,9 +12,9 @@ from reskin.recordings.readers import eflesh
 from tests.recordings.test_recordings import SPATIAL, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
-# FACTS 3: another network, trained on pass 1 and tested on passes 2 to 5, accuracies in %.
+# Accuracies in % of another network, trained on pass 1 and tested on passes 2 to 5.
 FRESH_PCT, INITIAL_PCT = (89, 88, 86, 84), (55, 19, 13, 10)
-# Network and length of training differ: the same tale, each pass within so many points.
+# Network and number of training steps differ: equal within so many percentage points on each pass.
 TOLERANCE_PCT = 15
 
 

@@ -12,7 +12,7 @@ from reskin.errors import ReskinError
 
 @dataclass(frozen=True)
 class Case:
-    """A case of PHYSICS 10: expected and actual behaviour, and the error where there is one."""
+    """A case: expected and actual behaviour, and the error where there is one."""
 
     area: str
     case: str

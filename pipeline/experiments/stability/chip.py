@@ -1,4 +1,4 @@
-"""Fields beyond a chip's range, and broken chips (PHYSICS 10); the faults are those of real recordings."""
+"""Fields beyond a chip's range, and broken chips; the faults are those of real recordings."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""Extreme cases of learning (PHYSICS 10), on small trainings with random data in uT, mm and N."""
+"""Extreme cases of learning, on small trainings with random data in uT, mm and N."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,7 +19,7 @@ from reskin.seeds import rng_for
 AREA = "learning"
 ROWS_N, TRAIN_N, CHANNELS_N = 240, 160, 15
 SIGNAL_uT = 50.0
-MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])  # mm, mm, N: 0.6 to 9.4 N, as recorded (FACTS 3)
+MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])  # mm, mm, N: 0.6 to 9.4 N, as recorded
 STEPS_N = BLOCK_STEPS_N  # the loop looks at its loss once
 CONSTANT_uT = 12.3
 BOTTLENECK = "layer3.weight"

@@ -1,4 +1,4 @@
-"""Extreme skins, indentations, drags and times (PHYSICS 10)."""
+"""Extreme skins, indentations, drags and times."""
 
 from dataclasses import asdict, replace
 from functools import partial
@@ -26,7 +26,7 @@ AREA = "physics"
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7]]) * milli
 DEPTH = 0.3  # of the thickness
-FLAGGED_DEPTH = 0.6  # of the thickness (PHYSICS 10)
+FLAGGED_DEPTH = 0.6  # of the thickness
 POKES_N = 2000
 BYTES_MAX_N = 1000  # a poke: 1e6 pokes in 1 GB, 120 bytes of each its result
 PATH_MM = (0.0, 0.1, 0.5, 4.0)  # of a drag

@@ -1,4 +1,4 @@
-"""Extreme cases of a skin that slides on its base (PHYSICS 10).
+"""Extreme cases of a skin that slides on its base.
 
 Drags with almost no and with very high friction, a tip that lifts while it drags, indentations at the free edge, and
 force control.

@@ -1,4 +1,4 @@
-"""Damaged streams of every wire format (PHYSICS 10), compared with the intact stream."""
+"""Damaged streams of every wire format, compared with the intact stream."""
 
 from collections import Counter
 from collections.abc import Sequence

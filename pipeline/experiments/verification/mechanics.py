@@ -31,7 +31,7 @@ from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
 HALF_SPACE_M = 100.0  # thickness of a layer whose base does not matter under a tip of millimetres
-A0 = 1.770  # integral of 1 - compliance (PHYSICS 4; Dimitriadis et al. 2002 fit 1.780)
+A0 = 1.770  # integral of 1 - compliance (Dimitriadis et al. 2002 fit 1.780)
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002, powers of chi = sqrt(R d) / h
 RINGS_N = 40
 SKIN_FORCE = "force of the skin"
@@ -226,7 +226,7 @@ def straight_drag(
                  )  # fmt: skip
 
 
-STEPS_N = 12  # of 0.1 mm at 1.2 mm (PHYSICS 0)
+STEPS_N = 12  # of 0.1 mm at 1.2 mm
 STEP_M = 1e-7  # of finite differences
 HELD = {"bonded": "stays", "slipping": "keeps its height"}
 

@@ -27,7 +27,7 @@ from reskin.physics.skin import SkinDesign
 from reskin.recordings.header import Wire
 from reskin.seeds import rng_for
 
-NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in sizes of a cell (PHYSICS 9)
+NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in sizes of a cell
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
 MU_0_DIGITS = 1e-8  # between CODATA years mu_0 differs by 1e-10 to 1e-9
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter turn about z
@@ -157,7 +157,7 @@ def field_of(of: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.nda
 
 PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # by GAIN_SEL; RES 0
 PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # GAIN_SEL 0 to 7
-RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))  # sd on x, y and on z, of three recorded data sets (PHYSICS 6)
+RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))  # sd on x, y and on z, of three recorded data sets
 STILL_FRAMES_N = 20_000
 
 
@@ -311,7 +311,7 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
     return float(np.abs(found - values).max()) if found.shape == values.shape else np.inf
 
 
-POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 pokes over 30 s (PHYSICS 5)
+POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 indentations in 30 s
 NAME = "relaxation of the force"
 STATE = np.array([0.7, -0.2, 0.4])
 RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # of the slowest relaxation to the fastest, which takes 1 ms
