@@ -93,13 +93,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene on the page of all scenes; a stale one was computed by earlier code and shows no results."""
+    """A scene on the page of all scenes."""
 
     scene: str
     about: str
     summary: Table | None
     figure: Drawing | None
-    stale: bool
 
 
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
@@ -158,12 +157,10 @@ def index(results: Sequence[Mapping[str, Any]], drawn: Mapping[str, str]) -> str
 
 def _entry(numbers: Mapping[str, Any], drawn: Mapping[str, str]) -> Entry:
     scene = str(numbers["provenance"]["scene"])
-    if "trainings" not in numbers:
-        return Entry(scene, "", None, None, stale=True)
     summary = summary_table(numbers)
     table = None if summary is None else lay_out(f"summary-{scene}", SUMMARY, summary)
     figure = measure(f"{scene}/figures/{HEADLINE}", drawn[scene]) if scene in drawn else None
-    return Entry(scene, counts_of(numbers), table, figure, stale=False)
+    return Entry(scene, counts_of(numbers), table, figure)
 
 
 def template(name: str) -> Template:

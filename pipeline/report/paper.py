@@ -80,7 +80,6 @@ PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% ac
 LASTING_CONTACTS_N = 50_000  # section 1: "perform accurate predictions even beyond 50K interactions"
 LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"
 PLATEAU_POKES_N = 780  # section 5: no great gain beyond
-SENSITIVITY = '"less than 20 mL (< 0.2N) of water"'
 MONOTONIC = '"monotonically increasing sensor measurements"'
 DYNAMICS = '"ReSkin can stream data up to 400 Hz and we aim to leverage this capability": future work'  # section 7
 FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'

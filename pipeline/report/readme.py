@@ -92,7 +92,7 @@ def blocks_of(
         "recorded": "\n\n".join(map(_summary, labelled)) or NONE_YET,
         "results": "\n\n".join(_tables(numbers, TABLES) for numbers in results),
         "time": "Not timed yet: `make time-repro`." if times is None else _time(times),
-        "costs": to_markdown(costs_table([numbers for numbers in (*results, *recorded) if "trainings" in numbers])),
+        "costs": to_markdown(costs_table([*results, *recorded])),
         "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
         "skins": to_markdown(skins_table(skins)),
@@ -109,13 +109,6 @@ def _summary(numbers: Numbers) -> str:
 def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     """Write the named tables of a scene, below a heading with its provenance."""
     provenance = numbers["provenance"]
-    if "trainings" not in numbers:
-        scene = provenance["scene"]
-        return (
-            f"Scene `{scene}`, **{provenance['source']}**: stale. `reports/{scene}` was made by code "
-            f"{provenance['git']}, with other settings and before the check for collapsed networks; its numbers are "
-            f"not shown here. Run it again: `reskin scenes use {scene}`, `dvc repro`."
-        )
     # Results that were committed before the code of other experiments changed can still be shown.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
     heading = (

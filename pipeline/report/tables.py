@@ -549,7 +549,7 @@ def measured(numbers: Numbers) -> dict[str, str]:
         area = " x ".join(f"{side:g}" for side in sleeve["area_mm"])
         cells["Area coverage"] = f"{sleeve['chips_n']} chips under {area} mm" + ", a setting" * simulated
     if drift := numbers.get("drift"):
-        policy = next(name for name in ("each", "regular", "initial") if name in drift)
+        policy = next(name for name in ("each", "regular", "initial", "free") if name in drift)
         last = drift[policy][-1]
         cells["Durable (> 50k contacts)"] = (
             f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts, "

@@ -232,11 +232,3 @@ def test_the_readme_takes_what_a_scene_costs_from_its_provenance():
     numbers["provenance"] |= {"seconds": 5400.0, "scene": "paper"}
     row = next(line for line in blocks_of([numbers], [], {}, None)["costs"].splitlines() if "`paper`" in line)
     assert [cell.strip() for cell in row.split("|")[1:5]] == ["`paper`", "90", "0", "0"]
-
-
-def test_a_scene_of_earlier_code_is_called_stale_and_none_of_its_numbers_is_shown():
-    numbers = everything() | {"described": {"grid": {"source": "simulated", "over_skins": {}}}}
-    blocks = blocks_of([numbers], [], {}, None)
-    assert "stale" in blocks["results"]
-    assert "|" not in blocks["results"]
-    assert "`x`" not in blocks["costs"]

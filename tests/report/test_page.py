@@ -310,15 +310,6 @@ def test_each_scene_says_how_it_does_on_boards_never_seen_or_that_it_held_out_no
     assert "No board was held out" in recorded
 
 
-def test_a_scene_of_earlier_code_is_named_without_a_figure():
-    old = of_scene("old", "simulated")
-    old.pop("trainings")
-    text = index([old], {"old": HEADLINE_SVG})
-    assert "Out of date" in text
-    assert "<figure" not in text
-    assert "<table" not in text
-
-
 def test_the_page_needs_nothing_but_the_pages_beside_it():
     text = index([of_scene("here", "simulated")], {"here": HEADLINE_SVG})
     addresses = re.findall(r'(?:src|href|data)="([^"]+)"', text)
