@@ -28,7 +28,7 @@ PERCENTAGES = ("accuracy_pct", "coverage_pct")  # between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")
 DECIMALS = 12  # of a difference in %, mm2 or N2: what is below is rounding of float sums
 BOARDS_MIN = 4  # from so many on there is an interval; of fewer, each board's value is given
-YES, NO, INCONCLUSIVE = "supported", "contradicted", "undecided"
+SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
 VERDICTS = (
     "Supported: the 95 % interval lies wholly on the claim's side of 0 or of the stated threshold. Contradicted: "
@@ -395,7 +395,7 @@ def verdict(stat: Stat, *, above: float = 0.0) -> str:
     if "ci95" not in stat:
         return FEW_BOARDS
     low, high = stat["ci95"]
-    return YES if low > above else NO if high < above else INCONCLUSIVE
+    return SUPPORTED if low > above else CONTRADICTED if high < above else UNDECIDED
 
 
 def verdict_within(stat: Stat, margin: float) -> str:
@@ -404,10 +404,10 @@ def verdict_within(stat: Stat, margin: float) -> str:
         return FEW_BOARDS
     low, high = stat["ci95"]
     if -margin < low and high < margin:
-        return YES
-    return NO if low > margin or high < -margin else INCONCLUSIVE
+        return SUPPORTED
+    return CONTRADICTED if low > margin or high < -margin else UNDECIDED
 
 
 def combine_verdicts(verdicts: Sequence[str]) -> str:
     """Judge a claim of several parts: contradicted if one part is, supported if all are."""
-    return next((verdict for verdict in (NO, FEW_BOARDS, INCONCLUSIVE) if verdict in verdicts), YES)
+    return next((verdict for verdict in (CONTRADICTED, FEW_BOARDS, UNDECIDED) if verdict in verdicts), SUPPORTED)

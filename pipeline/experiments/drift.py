@@ -24,9 +24,9 @@ from pipeline.report.formatting import COLUMNS, show, tabulate
 from pipeline.report.paper import FIGURE_5
 from pipeline.settings import Settings, Training
 from pipeline.statistics import (
-    INCONCLUSIVE,
+    SUPPORTED,
+    UNDECIDED,
     VERDICTS,
-    YES,
     Stat,
     add_seed_sd,
     board_means,
@@ -591,11 +591,11 @@ def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[
     """Judge a finding by all of its comparisons, over boards and over trainings on these boards."""
     judged = combine_verdicts([verdict(part.over_boards) for part in parts])
     trainings = [part.over_trainings for part in parts]
-    of_trainings = combine_verdicts([INCONCLUSIVE if ends is None else verdict({"ci95": ends}) for ends in trainings])
+    of_trainings = combine_verdicts([UNDECIDED if ends is None else verdict({"ci95": ends}) for ends in trainings])
     return {
         "id": name,
         "finding": finding,
-        "holds": judged == YES,
+        "holds": judged == SUPPORTED,
         "verdict": judged,
         "of_trainings": of_trainings,
         "measured": "; ".join(part.text for part in parts),

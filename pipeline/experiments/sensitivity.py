@@ -15,7 +15,7 @@ from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import load_protocol
 from pipeline.stage import say
-from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE
+from pipeline.statistics import FEW_BOARDS, UNDECIDED
 from reskin.data.baseline import subtract
 from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
@@ -218,7 +218,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _rises(rise: Mapping[str, Any]) -> str:
     ranks = f"rank correlation {rise['spearman']:.4f}"
     if "step_N" not in rise:
-        return f"{INCONCLUSIVE}: no step is above the noise; {ranks}"
+        return f"{UNDECIDED}: no step is above the noise; {ranks}"
     here = "rises" if rise["holds"] else "does not rise"
     rises_n = rise["pairs_n"] - rise["falls_n"]
     return (

@@ -16,7 +16,7 @@ from pipeline import statistics
 from pipeline.report import paper
 from pipeline.report.experiments import add_rows
 from pipeline.report.formatting import FEW_POINTS, Stat, gain, is_pooled, show, show_difference
-from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, VERDICTS, YES
+from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED, VERDICTS
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
 
@@ -203,8 +203,8 @@ def p_of(row: Row, printed: Any, ours: Any) -> float | None:
 def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
     """Make a claim of the family undecided unless it is significant among all of them."""
     verdict = judgement.verdict
-    if verdict in (YES, NO) and p_adjusted > SIGNIFICANT:
-        verdict = INCONCLUSIVE
+    if verdict in (SUPPORTED, CONTRADICTED) and p_adjusted > SIGNIFICANT:
+        verdict = UNDECIDED
     return replace(judgement, verdict=verdict, p_adjusted=p_adjusted)
 
 
@@ -226,7 +226,7 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -
     if row.rule == "view":
         return Judgement()
     if row.rule == "finding":
-        of_trainings = {YES: "yes", NO: "no"}.get(ours["of_trainings"], ours["of_trainings"])
+        of_trainings = {SUPPORTED: "yes", CONTRADICTED: "no"}.get(ours["of_trainings"], ours["of_trainings"])
         return Judgement(ours["verdict"], "holds for these trainings", of_trainings)
     if row.rule == "each":
         return _judge_each(ours)

@@ -26,7 +26,7 @@ from pipeline.report.checklist import (
     resolve,
 )
 from pipeline.scenes import ANALYSES
-from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
+from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED
 from reskin.errors import SchemaError
 from tests.report.synthetic import all_experiments, over_boards, stat
 
@@ -116,7 +116,7 @@ def test_limits_are_met_by_the_mean(rule, ours, paper, criterion, met):
 
 
 def test_a_finding_has_the_verdict_of_its_experiment():
-    found = judged({"verdict": "undecided", "of_trainings": YES}, rule="finding")
+    found = judged({"verdict": "undecided", "of_trainings": SUPPORTED}, rule="finding")
     assert (found.verdict, found.met) == ("undecided", "yes")
     assert judged(False).met == "no"
 
@@ -124,10 +124,10 @@ def test_a_finding_has_the_verdict_of_its_experiment():
 @pytest.mark.parametrize(
     ("rule", "low", "high", "verdict"),
     [
-        ("gain", 0.1, 3.0, YES), ("gain", -3.0, -0.1, NO), ("gain", -0.1, 3.0, INCONCLUSIVE),
-        ("slight", -4.9, 1.0, YES), ("slight", -9.0, -5.1, NO), ("slight", -6.0, 1.0, INCONCLUSIVE),
-        ("plateau", -0.9, 0.9, YES), ("plateau", 1.1, 3.0, NO), ("plateau", -1.1, 0.9, INCONCLUSIVE),
-        ("positive", 0.1, 3.0, YES), ("positive", -3.0, -0.1, NO), ("positive", -1.0, 3.0, INCONCLUSIVE),
+        ("gain", 0.1, 3.0, SUPPORTED), ("gain", -3.0, -0.1, CONTRADICTED), ("gain", -0.1, 3.0, UNDECIDED),
+        ("slight", -4.9, 1.0, SUPPORTED), ("slight", -9.0, -5.1, CONTRADICTED), ("slight", -6.0, 1.0, UNDECIDED),
+        ("plateau", -0.9, 0.9, SUPPORTED), ("plateau", 1.1, 3.0, CONTRADICTED), ("plateau", -1.1, 0.9, UNDECIDED),
+        ("positive", 0.1, 3.0, SUPPORTED), ("positive", -3.0, -0.1, CONTRADICTED), ("positive", -1.0, 3.0, UNDECIDED),
     ],
 )  # fmt: skip
 def test_claims_are_judged_by_their_interval_over_boards(rule, low, high, verdict):
@@ -139,18 +139,23 @@ def test_claims_are_judged_by_their_interval_over_boards(rule, low, high, verdic
 def test_limits_are_judged_from_both_sides_alike(low, width, limit):
     ours = over_boards(low, low + width)
     least, most = (judged(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
-    assert (least, most) in {(YES, NO), (NO, YES), (INCONCLUSIVE, INCONCLUSIVE)}
-    assert (least == YES) == (low > limit)
+    assert (least, most) in {(SUPPORTED, CONTRADICTED), (CONTRADICTED, SUPPORTED), (UNDECIDED, UNDECIDED)}
+    assert (least == SUPPORTED) == (low > limit)
 
 
 def test_less_of_an_error_is_a_gain():
-    assert judged(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == YES
-    assert judged(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == NO
+    assert judged(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == SUPPORTED
+    assert judged(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == CONTRADICTED
 
 
 @pytest.mark.parametrize(
     ("low", "high", "verdict", "equivalent"),
-    [(3.0, 8.0, YES, False), (2.0, 8.0, INCONCLUSIVE, False), (-1.0, 2.9, NO, True), (-4.0, 2.9, NO, False)],
+    [
+        (3.0, 8.0, SUPPORTED, False),
+        (2.0, 8.0, UNDECIDED, False),
+        (-1.0, 2.9, CONTRADICTED, True),
+        (-4.0, 2.9, CONTRADICTED, False),
+    ],
 )
 def test_a_sizeable_gain_is_half_of_the_papers_and_one_below_that_may_be_equivalent_to_none(
     low, high, verdict, equivalent
@@ -169,10 +174,10 @@ def test_what_is_to_hold_at_every_number_of_skins_fails_where_one_fails():
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
     found = judged(sweep, rule="each")
-    assert (found.verdict, found.met) == (INCONCLUSIVE, "yes")
+    assert (found.verdict, found.met) == (UNDECIDED, "yes")
     assert found.notes == ("1 skins: supported, 6 skins: undecided, 15 skins: supported",)
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
-    assert judged(sweep, rule="each").verdict == NO
+    assert judged(sweep, rule="each").verdict == CONTRADICTED
 
 
 def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
@@ -187,9 +192,9 @@ def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
 def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
     table = checklist(all_experiments())
     claims = table["result"].str.startswith("claim")
-    assert set(table.loc[claims, "verdict"]) <= {YES, NO, INCONCLUSIVE, FEW_BOARDS}
+    assert set(table.loc[claims, "verdict"]) <= {SUPPORTED, CONTRADICTED, UNDECIDED, FEW_BOARDS}
     assert claims.sum() > 20
-    assert set(table["verdict"]) <= {YES, NO, INCONCLUSIVE, FEW_BOARDS, "–"}
+    assert set(table["verdict"]) <= {SUPPORTED, CONTRADICTED, UNDECIDED, FEW_BOARDS, "–"}
 
 
 def test_a_sweep_that_does_not_go_as_far_as_a_claim_is_named_so():
@@ -277,7 +282,7 @@ def test_a_family_of_claims_is_judged_by_holm_and_other_rows_are_not():
     numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
     # Of three, 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: no longer significant, though their intervals exclude 0.
-    assert table["verdict"].tolist() == [YES, INCONCLUSIVE, INCONCLUSIVE, YES]
+    assert table["verdict"].tolist() == [SUPPORTED, UNDECIDED, UNDECIDED, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
 
 

@@ -11,13 +11,13 @@ from scipy.stats import t, ttest_rel
 
 from pipeline.statistics import (
     AS_LABELLED,
+    CONTRADICTED,
     FEW_BOARDS,
-    INCONCLUSIVE,
     KEYS,
-    NO,
     REGISTERED,
+    SUPPORTED,
     UNCERTAINTY,
-    YES,
+    UNDECIDED,
     add_seed_sd,
     board_means,
     by_skin,
@@ -154,7 +154,7 @@ def test_paired_boards_are_judged_as_by_the_paired_t_test(pairs):
     low, high = test.confidence_interval(0.95)
     assert stat["ci95"] == pytest.approx([low, high], abs=DOUBLE)
     if abs(test.pvalue - 0.05) > 1e-6:
-        assert (verdict(stat) == INCONCLUSIVE) == (test.pvalue > 0.05)
+        assert (verdict(stat) == UNDECIDED) == (test.pvalue > 0.05)
 
 
 def test_differences_are_of_skins_then_boards_each_the_mean_of_its_networks():
@@ -218,7 +218,7 @@ def test_swapped_sides_turn_the_difference_and_the_verdict_round(values):
     turned = negate(ahead)
     assert back["ci95"] == pytest.approx(turned["ci95"], abs=DOUBLE)
     assert back["mean"] == pytest.approx(turned["mean"], abs=DOUBLE)
-    opposite = {YES: NO, NO: YES, INCONCLUSIVE: INCONCLUSIVE}
+    opposite = {SUPPORTED: CONTRADICTED, CONTRADICTED: SUPPORTED, UNDECIDED: UNDECIDED}
     assert verdict(turned) == opposite[verdict(ahead)]
 
 
@@ -231,7 +231,8 @@ def test_a_threshold_is_a_shift_of_all_boards(values, above):
 
 
 @pytest.mark.parametrize(
-    ("ends", "word"), [([0.1, 4.0], YES), ([-4.0, -0.1], NO), ([-0.1, 4.0], INCONCLUSIVE), ([0.0, 1.0], INCONCLUSIVE)]
+    ("ends", "word"),
+    [([0.1, 4.0], SUPPORTED), ([-4.0, -0.1], CONTRADICTED), ([-0.1, 4.0], UNDECIDED), ([0.0, 1.0], UNDECIDED)],
 )
 def test_an_interval_that_includes_0_concludes_nothing(ends, word):
     assert verdict({"mean": 1.0, "n": 6, "ci95": ends}) == word
@@ -239,7 +240,13 @@ def test_an_interval_that_includes_0_concludes_nothing(ends, word):
 
 @pytest.mark.parametrize(
     ("ends", "word"),
-    [([-4.9, 4.9], YES), ([5.1, 9.0], NO), ([-9.0, -5.1], NO), ([4.0, 6.0], INCONCLUSIVE), ([-9.0, 9.0], INCONCLUSIVE)],
+    [
+        ([-4.9, 4.9], SUPPORTED),
+        ([5.1, 9.0], CONTRADICTED),
+        ([-9.0, -5.1], CONTRADICTED),
+        ([4.0, 6.0], UNDECIDED),
+        ([-9.0, 9.0], UNDECIDED),
+    ],
 )
 def test_small_is_what_lies_wholly_between_both_limits(ends, word):
     assert verdict_within({"mean": 1.0, "n": 6, "ci95": ends}, 5.0) == word
@@ -256,10 +263,10 @@ def test_repeats_on_one_skin_are_no_boards():
 
 
 def test_a_claim_of_several_parts_holds_where_all_do_and_fails_where_one_does():
-    assert combine_verdicts([YES, YES]) == YES
-    assert combine_verdicts([YES, INCONCLUSIVE, NO]) == NO
-    assert combine_verdicts([YES, INCONCLUSIVE]) == INCONCLUSIVE
-    assert combine_verdicts([YES, FEW_BOARDS]) == FEW_BOARDS
+    assert combine_verdicts([SUPPORTED, SUPPORTED]) == SUPPORTED
+    assert combine_verdicts([SUPPORTED, UNDECIDED, CONTRADICTED]) == CONTRADICTED
+    assert combine_verdicts([SUPPORTED, UNDECIDED]) == UNDECIDED
+    assert combine_verdicts([SUPPORTED, FEW_BOARDS]) == FEW_BOARDS
 
 
 def test_sides_with_other_skins_make_no_pair():

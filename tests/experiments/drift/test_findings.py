@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.stats import ttest_rel
 
 from pipeline.experiments.drift import EACH_IS_WORSE, HIGHER_AND_FASTER, OFFSET, OVERESTIMATES, growth, judge_findings
-from pipeline.statistics import FEW_BOARDS, INCONCLUSIVE, NO, YES
+from pipeline.statistics import CONTRADICTED, FEW_BOARDS, SUPPORTED, UNDECIDED
 
 LATE = {
     "policy": "regular", "contacts_n": 45_000, "bias_N": 0.02, "bias_pct": 1.7, "bias_se_N": 7e-4, "slope": 1.01,
@@ -38,7 +38,7 @@ def verdicts(networks: dict, late: dict | None = LATE) -> dict[str, str]:
 
 
 def test_errors_as_in_the_paper_support_all_its_findings():
-    assert verdicts(PAPER) == dict.fromkeys((HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE, OVERESTIMATES), YES)
+    assert verdicts(PAPER) == dict.fromkeys((HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE, OVERESTIMATES), SUPPORTED)
     assert all(one["holds"] for one in found(PAPER).values())
 
 
@@ -54,7 +54,7 @@ def test_errors_as_in_the_paper_support_all_its_findings():
 )
 def test_a_finding_that_is_the_other_way_round_is_contradicted(finding, changed, late):
     one = found(PAPER | changed, late)[finding]
-    assert (one["holds"], one["verdict"]) == (False, NO)
+    assert (one["holds"], one["verdict"]) == (False, CONTRADICTED)
 
 
 @pytest.mark.parametrize("finding", [HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE])
@@ -64,20 +64,20 @@ def test_a_difference_that_boards_disagree_on_is_undecided(finding):
     apart = {name: of + np.array(signs)[:, None] * 0.1 * np.arange(1, 5) * of for name, of in near.items()}
     changed = {"each": apart} if finding == EACH_IS_WORSE else {"initial": apart}
     one = found(PAPER | {"regular": near} | changed)[finding]
-    assert (one["holds"], one["verdict"]) == (False, INCONCLUSIVE)
+    assert (one["holds"], one["verdict"]) == (False, UNDECIDED)
 
 
 def test_one_network_decides_nothing():
     alone = {policy: {name: of[:1] for name, of in own.items()} for policy, own in PAPER.items()}
     told = found(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
     assert {one["verdict"] for one in told.values()} == {FEW_BOARDS}
-    assert {one["of_trainings"] for one in told.values()} == {INCONCLUSIVE}
+    assert {one["of_trainings"] for one in told.values()} == {UNDECIDED}
 
 
 def test_many_trainings_on_one_board_are_judged_as_trainings_only():
     one_board = found(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
     assert {one["verdict"] for one in one_board.values()} == {FEW_BOARDS}
-    assert {one["of_trainings"] for one in one_board.values()} == {YES}
+    assert {one["of_trainings"] for one in one_board.values()} == {SUPPORTED}
 
 
 def test_more_trainings_with_equal_errors_do_not_narrow_the_interval_over_boards():
@@ -91,23 +91,23 @@ def test_more_trainings_with_equal_errors_do_not_narrow_the_interval_over_boards
 
 def test_one_contradicting_metric_contradicts_and_an_undecided_one_leaves_undecided():
     falls = PAPER["initial"] | {"mse_f_N2": 0.02 - 0.004 * np.arange(4) + np.array([[0.0], [1e-5], [2e-5], [3e-5]])}
-    assert verdicts(PAPER | {"initial": falls})[HIGHER_AND_FASTER] == NO
+    assert verdicts(PAPER | {"initial": falls})[HIGHER_AND_FASTER] == CONTRADICTED
     unclear = PAPER["initial"] | {"mse_f_N2": PAPER["regular"]["mse_f_N2"] + np.array([[-1.0], [1.0], [0.3], [0.1]])}
-    assert verdicts(PAPER | {"initial": unclear})[OFFSET] == INCONCLUSIVE
+    assert verdicts(PAPER | {"initial": unclear})[OFFSET] == UNDECIDED
 
 
 def test_more_frequent_readings_are_judged_over_all_windows_and_not_by_the_last():
     last_good = {name: of.copy() for name, of in errors(1.0, 0.5).items()}
     for of in last_good.values():
         of[:, -1] = 0
-    assert verdicts(PAPER | {"initial": last_good})[OFFSET] == YES
+    assert verdicts(PAPER | {"initial": last_good})[OFFSET] == SUPPORTED
 
 
 def test_differences_are_of_pairs_so_that_a_shared_error_cancels():
     shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # one seed is far worse under both policies
     regular = {name: of + shared for name, of in PAPER["regular"].items()}
     each = {name: of + shared for name, of in PAPER["each"].items()}
-    assert verdicts(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE] == YES
+    assert verdicts(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE] == SUPPORTED
     own, other = (of["mse_xy_mm2"].mean(axis=1) for of in (each, regular))
     low, high = ttest_rel(own, other).confidence_interval(0.95)
     difference = f"difference {(own - other).mean():+.2g} [{low:+.2g}, {high:+.2g}] mm²"
@@ -117,11 +117,11 @@ def test_differences_are_of_pairs_so_that_a_shared_error_cancels():
 @pytest.mark.parametrize(
     ("bias_N", "se_N", "networks_N", "verdict"),
     [
-        (0.02, 0.0099, [0.02, 0.02, 0.02, 0.02], YES),
-        (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], INCONCLUSIVE),  # two standard errors over indentations
-        (-0.02, 0.0101, [-0.02, -0.02, -0.02, -0.02], INCONCLUSIVE),
-        (-0.02, 0.0099, [-0.02, -0.02, -0.02, -0.02], NO),
-        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], INCONCLUSIVE),  # trainings differ more
+        (0.02, 0.0099, [0.02, 0.02, 0.02, 0.02], SUPPORTED),
+        (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),  # two standard errors over indentations
+        (-0.02, 0.0101, [-0.02, -0.02, -0.02, -0.02], UNDECIDED),
+        (-0.02, 0.0099, [-0.02, -0.02, -0.02, -0.02], CONTRADICTED),
+        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),  # trainings differ more
     ],
 )
 def test_a_bias_must_exceed_the_variation_of_indentations_and_of_trainings(bias_N, se_N, networks_N, verdict):
@@ -131,7 +131,7 @@ def test_a_bias_must_exceed_the_variation_of_indentations_and_of_trainings(bias_
 
 def test_without_forces_only_places_are_judged():
     two = {"initial": errors(1.0, 0.5, force=False), "each": errors(0.3, 0.01, force=False)}
-    assert verdicts(two, None) == {HIGHER_AND_FASTER: YES, OFFSET: YES}
+    assert verdicts(two, None) == {HIGHER_AND_FASTER: SUPPORTED, OFFSET: SUPPORTED}
     assert not any("MSE_F" in one["measured"] for one in found(two, None).values())
 
 
