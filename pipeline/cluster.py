@@ -139,9 +139,8 @@ def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> 
     from distributed import KilledWorker
 
     if submitted.cancelled():  # by Dask, when it loses the scheduler; nobody waits for calls that we cancel
-        what, got = f"the scheduler at {address}", "one that went away"
-        remedy = "Start it and its workers again, then run again: what was finished is kept."
-        future.set_exception(ParamsError("RESKIN_EXECUTOR", what, "there until the work is done", got, remedy))
+        remedy = "Finished trainings are cached: start it again, then repeat the command."
+        future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))
         return
     error = submitted.exception()
     if isinstance(error, KilledWorker):

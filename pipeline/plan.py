@@ -81,7 +81,7 @@ def _folder(scene: str, protocol: str) -> str:
 
 def scene_names(root: Path) -> list[str]:
     if not (root / SCENES).is_dir():
-        raise ParamsError(root / SCENES, "the folder", "there", "nothing", "Run this in the checkout.")
+        raise ParamsError(f"{root / SCENES}: folder not found. Run this in the checkout.")
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
 
 

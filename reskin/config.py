@@ -29,7 +29,7 @@ def read_yaml(path: Path) -> Any:
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ParamsError(path, "the file", "there", "nothing", "Check the name.") from None
+        raise ParamsError(f"{path}: file not found. Check the name.") from None
     except (YAMLError, UnicodeDecodeError) as error:
         problem = " ".join(str(error).split())
         raise ParamsError(path, "the file", "YAML", problem, "Mend the line it names.") from None

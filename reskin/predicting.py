@@ -15,6 +15,7 @@ from reskin import io
 from reskin.board.decode import read_frames
 from reskin.board.stream import decode_all
 from reskin.config import Strict, parse
+from reskin.data.rows import TARGETS
 from reskin.errors import CaptureError, ParamsError, SchemaError, require
 from reskin.live.contacts import Estimator, LogEstimates, describe, estimate, quiet_start
 from reskin.models.inputs import VIEW
@@ -26,7 +27,6 @@ from reskin.recordings.readers import sd_card
 from reskin.universal.calibration import CHANNELS_N, is_calibration
 from reskin.universal.model import Universal, load_universal
 
-TARGETS = ("x_mm", "y_mm", "Fz_N")
 PARQUET_MAGIC = b"PAR1"
 
 

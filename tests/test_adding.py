@@ -191,7 +191,7 @@ def test_a_broken_recording_leaves_nothing_behind(root, tmp_path, content):
 
 
 def test_a_recording_that_is_not_there_is_called_missing(root, tmp_path):
-    missing = "none: the file must be there; got nothing"
+    missing = "none: file not found"
     for layout in ("lab", "ini", "eflesh", "eflash7"):
         refuse(root, lambda: preparing.foreign(tmp_path / "none", layout, labels(), {}), missing)  # noqa: B023
     refuse(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)

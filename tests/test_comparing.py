@@ -108,7 +108,7 @@ def test_a_folder_or_a_file_in_it_may_stand_for_the_revision(checkout, where):
     ("words", "sentence"),
     [
         (["quick", "--against", "nowhere"], "git revision nowhere: reports/quick/numbers.json must be committed"),
-        (["quick", "--against", "reports"], None), (["lab"], "reports/lab/numbers.json: the file must be there"),
+        (["quick", "--against", "reports"], None), (["lab"], "reports/lab/numbers.json: file not found"),
         (["quick", "--against", ".git"], ".git: the folder must be one that holds quick/numbers.json"),
     ],
 )  # fmt: skip

@@ -121,7 +121,7 @@ def test_a_clone_that_is_cut_off_at_the_commit_is_a_mirror(tmp_path, home, scrat
 
 
 def test_what_is_no_repository_is_refused_with_the_reason_that_git_gives(tmp_path, scratch):
-    refuse("nowhere: the mirror or folder must be there; got nothing", str(tmp_path / "nowhere"), None, scratch)
+    refuse("nowhere: no such mirror or folder", str(tmp_path / "nowhere"), None, scratch)
     nowhere = (tmp_path / "nowhere.git").as_uri()
     refuse("nowhere.git: the repository must be there and readable; got fatal: .*--from", nowhere, None, scratch)
     (tmp_path / "file").write_bytes(b"no bundle")

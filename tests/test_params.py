@@ -236,7 +236,7 @@ def test_broken_yaml_is_refused(tmp_path, content):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ParamsError, match="none.yaml: the file must be there"):
+    with pytest.raises(ParamsError, match="none.yaml: file not found"):
         read_yaml(tmp_path / "none.yaml")
 
 

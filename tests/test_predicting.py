@@ -123,7 +123,7 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
         (log, model, model, "is the log, the model or its card"),
         (log, model, model.with_suffix(".json"), "is the log, the model or its card"),
         (log, model, tmp_path / "four" / ".." / "model.json", "is the log, the model or its card"),
-        (tmp_path / "none.csv", model, out, r"none\.csv: the file must be there; got nothing"),
+        (tmp_path / "none.csv", model, out, r"none\.csv: file not found"),
     ]
     files = (log, model, model.with_suffix(".json"))
     before = [file.read_bytes() for file in files]

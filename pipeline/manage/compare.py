@@ -184,7 +184,7 @@ def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
         folder = root / "reports" / scene
         if not (folder / "numbers.json").exists():
             remedy = f"Try: reskin scenes use {scene}, then dvc repro."
-            raise SchemaError(folder / "numbers.json", "the file", "there", "none", remedy)
+            raise SchemaError(f"{folder / 'numbers.json'}: file not found. {remedy}")
         committed = read_folder(Path(against), scene) if Path(against).exists() else read_revision(root, scene, against)
         return print_comparison(scene, committed, read_folder(folder, scene), echo)
     except ReskinError as error:

@@ -235,7 +235,7 @@ def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
     """Open a folder, or a git repository at a commit (None: its newest); `scratch` is an empty folder for git."""
     folder = Path(where)
     if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # neither a path nor URL nor host:path
-        raise CaptureError(where, "the mirror or folder", "there", "nothing", f"Check the path; {USE_FROM}")
+        raise CaptureError(f"{where}: no such mirror or folder. Check the path; {USE_FROM}")
     is_bare = (folder / "HEAD").is_file() and (folder / "objects").is_dir()
     if folder.is_dir() and not is_bare and not (folder / ".git").exists():
         paths = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*")) if path.is_file()]

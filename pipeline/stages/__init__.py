@@ -5,8 +5,9 @@ in its module of `pipeline.experiments`.
 """
 
 from importlib import import_module
-from pathlib import Path
 from types import ModuleType
+
+from pipeline.catalogue import FOLDER
 
 STAGES = {
     "simulate": ("simulate",),
@@ -18,7 +19,6 @@ STAGES = {
 }
 MODULES = {stage: f"pipeline.stages.{module}" for module, stages in STAGES.items() for stage in stages}
 EXPERIMENTS = "pipeline.experiments"
-FOLDER = Path(__file__).parents[1] / "experiments"
 
 
 def is_stage(name: str) -> bool:

@@ -285,7 +285,7 @@ def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iter
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
-        raise CaptureError(stream, "the file", "there", "nothing", "Copy the whole capture folder.")
+        raise CaptureError(f"{stream}: file not found. Copy the whole capture folder.")
     log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
     check_log(log, str(folder / PROBE_FILE))
     times_of = timer(folder, header)

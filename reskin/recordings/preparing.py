@@ -168,6 +168,6 @@ def _header(names: CaptureNames, recording: Path, *, layout: headers.Layout, chi
 def _need(path: Path, *, folder: bool = False) -> None:
     """Raise `CaptureError` if a path does not exist, or is a folder where a file is needed."""
     if not path.exists():
-        raise CaptureError(path, "the file", "there", "nothing", "Check the path.")
+        raise CaptureError(f"{path}: file not found. Check the path.")
     if path.is_dir() and not folder:
         raise CaptureError(path, "the file", "a file", "a folder", "Check the path.")

@@ -40,7 +40,7 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
         rule = f"CSV with columns {_list(types)}"
         raise CaptureError(where, "the table", rule, got, "Mend that row.") from None
     except FileNotFoundError:
-        raise CaptureError(where, "the file", "there", "nothing", "Copy the whole capture folder.") from None
+        raise CaptureError(f"{where}: file not found. Copy the whole capture folder.") from None
     _check_names(table.column_names, types, where)
     return table.select(list(types)).combine_chunks()
 

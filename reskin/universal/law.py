@@ -14,7 +14,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from reskin.physics import deformation, layer, magnet, slide
-from reskin.physics import magnet as dipole
 from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
 from reskin.universal.presses import RecordedPresses, lengths_uT
@@ -108,7 +107,7 @@ def at_rest_uT(law: Law, setup: Setup, rest: deformation.RestingDipoles | None =
     """Return the field of the untouched skin at the chips, in the board's axes; `rest` as in `simulate_uT`."""
     chips_m, turn = setup.chips_under(law)
     rest = rest or setup.rest
-    field_T = dipole.field(rest.nodes_m, rest.moments_A_m2, chips_m)
+    field_T = magnet.field(rest.nodes_m, rest.moments_A_m2, chips_m)
     return law.amplitude * field_T @ turn.T / micro
 
 

@@ -93,5 +93,5 @@ def test_a_fault_is_one_sentence_that_names_its_place(old: str, new: str, says: 
 
 
 def test_an_absent_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CaptureError, match="arrivals.csv: the file must be there"):
+    with pytest.raises(CaptureError, match="arrivals.csv: file not found"):
         clocks.parse(tmp_path / "arrivals.csv", "arrivals.csv")

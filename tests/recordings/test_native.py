@@ -255,5 +255,5 @@ def test_a_broken_capture_is_one_sentence(tmp_path: Path, files: dict[str, bytes
 @pytest.mark.parametrize("name", [STREAM_FILE, ARRIVALS_FILE, PROBE_FILE])
 def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
     (write(tmp_path, "binary") / name).unlink()
-    with pytest.raises(CaptureError, match=f"{name}: the file must be there; got nothing"):
+    with pytest.raises(CaptureError, match=f"{name}: file not found"):
         read(tmp_path, header_of("binary"))

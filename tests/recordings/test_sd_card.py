@@ -72,7 +72,7 @@ def test_a_broken_log_is_refused_in_one_sentence_that_names_the_place(log, break
 
 
 def test_a_log_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match="the file must be there; got nothing"):
+    with pytest.raises(CaptureError, match="file not found"):
         read_log(tmp_path / "log.csv")
 
 

@@ -102,7 +102,7 @@ def _chips_n(path: Path, where: str) -> int:
             file.seek(-1, 2)
             last = file.read(1)
     except FileNotFoundError:
-        raise CaptureError(where, "the file", "there", "nothing", "Check the path.") from None
+        raise CaptureError(f"{where}: file not found. Check the path.") from None
     except OSError as error:
         got = "an empty file" if path.is_file() and not path.stat().st_size else error.strerror
         raise CaptureError(where, "the log", "a readable file", got, "Check the name.") from None
