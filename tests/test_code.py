@@ -2,6 +2,8 @@
 
 import pytest
 
+from pipeline.stages import MODULES, module_name
+from pipeline.stages.code import experiment_stages
 from reskin import code
 
 SOURCE = '''"""A module."""
@@ -62,6 +64,15 @@ def test_imports_are_followed_within_the_package():
 
 def test_an_edit_of_the_library_runs_the_stages_again_that_use_it():
     assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
+
+
+DISPLAY = {"pipeline.report", *(f"pipeline.report.{name}" for name in ("drawing", "formatting", "paper"))}
+
+
+@pytest.mark.parametrize("stage", sorted({*MODULES, *experiment_stages()} - {"table2", "report", "publish"}))
+def test_a_stage_that_computes_imports_of_the_report_only_what_its_digest_may_leave_out(stage):
+    imported = {name for name in code.imported(module_name(stage)) if name.startswith("pipeline.report")}
+    assert imported <= DISPLAY
 
 
 def test_an_editors_backup_beside_a_module_changes_nothing(monkeypatch, tmp_path):

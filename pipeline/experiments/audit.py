@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from pipeline.report.choice import settings_of, trimmed
 from pipeline.settings import Settings
 from pipeline.stage import say
+from pipeline.training.choice import settings_of, trimmed
 from pipeline.training.jobs import SceneData, read_data
 from reskin import io
 from reskin.config import Strict, parse

@@ -4,9 +4,9 @@ import hashlib
 import shutil
 from pathlib import Path
 
+from pipeline.description import describe as describe_capture
+from pipeline.description import over_skins, without_rest
 from pipeline.provenance import home
-from pipeline.report.description import describe as describe_capture
-from pipeline.report.description import over_skins, without_rest
 from pipeline.settings import Settings
 from pipeline.stage import say
 from reskin import io

@@ -21,7 +21,6 @@ from pipeline.provenance import (
     total_cost_s,
     versions,
 )
-from pipeline.report.choice import choose, to_record
 from pipeline.report.costs import cost_pages
 from pipeline.report.experiments import experiment_figures
 from pipeline.report.figures import HEADLINE as HEADLINE_FIGURE
@@ -47,6 +46,7 @@ from pipeline.stage import say
 from pipeline.statistics import tidy, to_csv
 from pipeline.tracking import Curves, TrackingAway, metrics_of
 from pipeline.tracking import publish as write_runs
+from pipeline.training.choice import choose, to_record
 from reskin import io
 from reskin.config import read_yaml
 from reskin.data.rows import SCORED

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.report.choice import choose, to_record
+from pipeline.training.choice import choose, to_record
 from reskin.errors import ParamsError
 from tests.report import cards
 from tests.scenes import RECIPE

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.report.description import describe, over_skins, without_rest
+from pipeline.description import describe, over_skins, without_rest
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
