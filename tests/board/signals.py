@@ -1,4 +1,4 @@
-"""Frames for tests: readings as a board sends them, with as many bytes CR LF in them as a test wants."""
+"""Synthetic frames for tests, with a chosen share of values whose bytes contain CR LF."""
 
 import numpy as np
 from hypothesis import strategies as st
@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from reskin import seeds
 from reskin.board.wire import Frames
 
-# Readings whose float32 holds CR LF in its middle, at gain 6 of the chip.
+# Values whose float32 bytes contain CR LF, at the chip's gain of 6.
 CRLF_TEMPERATURE_degC = 34.513275
 CRLF_B_uT = (2208.8477, -2208.8477, 8835.308)
 WIRES = ("binary", "binary-clock", "text-xyzt", "text-txyz")
@@ -15,7 +15,7 @@ TEXT_WIRES = WIRES[2:]
 
 
 def make_frames(frames_n: int, chips_n: int, seed: int, *, crlf_share: float = 0.0) -> Frames:
-    """Make readings on a grid of 0.15 uT with two decimals; a share of all values holds CR LF."""
+    """Make readings on a grid of 0.15 uT with two decimals; `crlf_share` of all values contain CR LF."""
     rng = seeds.rng_for(seed, "frames")
     b_uT = rng.integers(-20000, 20000, (frames_n, 3 * chips_n)) * 0.15
     temperature_degC = rng.integers(2000, 4000, (frames_n, chips_n)) / 100

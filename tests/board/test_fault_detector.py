@@ -1,4 +1,4 @@
-"""Chips that break while a stream comes in portions are found, and sound ones pass."""
+"""Fault detection on a stream that arrives in chunks."""
 
 import dataclasses
 from itertools import pairwise
@@ -22,7 +22,7 @@ RESET_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_u
 
 
 def board(frames_n: int, *, steps_uT: tuple[float, float, float] = (0.15, 0.15, 0.242), seed: int = 0) -> Frames:
-    """Chips with 5 uT of noise about some field, on the grid of their LSB."""
+    """Chips with 5 uT of noise about a constant field, on the grid of their LSB."""
     rng = seeds.rng_for(seed, "watch")
     rest_uT = seeds.rng_for(0, "rest").uniform(-1500, 1500, 3 * CHIPS_N)
     b_uT = rest_uT + 5 * rng.standard_normal((frames_n, 3 * CHIPS_N))
@@ -30,14 +30,14 @@ def board(frames_n: int, *, steps_uT: tuple[float, float, float] = (0.15, 0.15, 
     return frames_of(np.round(b_uT / grid_uT) * grid_uT, np.full((frames_n, CHIPS_N), 25.0))
 
 
-def changed(frames: Frames, rows: slice, chip_i: int, values_uT: np.ndarray) -> Frames:
+def with_chip_values(frames: Frames, rows: slice, chip_i: int, values_uT: np.ndarray) -> Frames:
     b_uT = frames.b_uT.copy()
     b_uT[rows, 3 * chip_i : 3 * chip_i + 3] = values_uT
     return dataclasses.replace(frames, b_uT=b_uT)
 
 
 def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | None = None) -> np.ndarray:
-    """Feed frames in portions that end at `ends`, with the usual policy; return the mask of those with a stuck chip."""
+    """Feed chunks that end at `ends`, with the default policy; return the mask of frames with a stuck chip."""
     detector, log = FaultDetector(CHIPS_N, expected_lsb_uT=expected_lsb_uT), FaultLog(AS_USUAL, "stream.bin", "ms")
     masks = []
     for begin, end in pairwise([0, *sorted(ends), len(frames)]):
@@ -47,50 +47,48 @@ def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | No
     return np.concatenate(masks)
 
 
-def test_a_sound_board_is_let_pass() -> None:
+def test_sound_board_has_no_fault() -> None:
     assert not detect(board(2000)).any()
     assert not detect(board(2000), expected_lsb_uT=(0.15, 0.242)).any()
 
 
 @pytest.mark.parametrize("chips", [(1,), (0, 1, 2)])
 @pytest.mark.parametrize("expected_lsb_uT", [None, (0.15, 0.242)])
-def test_a_chip_that_loses_its_settings_on_the_way_is_named(
-    chips: tuple[int, ...], expected_lsb_uT: tuple[float, float] | None
-) -> None:
+def test_chip_reset_is_refused(chips: tuple[int, ...], expected_lsb_uT: tuple[float, float] | None) -> None:
     frames, reset = board(2000), board(2000, steps_uT=RESET_uT)
     for chip_i in chips:
         columns = slice(3 * chip_i, 3 * chip_i + 3)
-        frames = changed(frames, slice(1200, None), chip_i, reset.b_uT[1200:, columns])
+        frames = with_chip_values(frames, slice(1200, None), chip_i, reset.b_uT[1200:, columns])
     message = rf"stream.bin from sound frame 1201: the LSB of chip {', '.join(map(str, chips))} must .* got 0.98 uT"
     with pytest.raises(CaptureError, match=message):
         detect(frames, 500, 1300, expected_lsb_uT=expected_lsb_uT)
 
 
-def test_a_board_whose_chips_all_change_to_any_other_scale_is_refused() -> None:
+def test_common_change_of_lsb_is_refused() -> None:
     frames, other = board(1600), board(1600, steps_uT=(0.6, 0.6, 0.968))
     for chip_i in range(CHIPS_N):
-        frames = changed(frames, slice(800, None), chip_i, other.b_uT[800:, 3 * chip_i : 3 * chip_i + 3])
+        frames = with_chip_values(frames, slice(800, None), chip_i, other.b_uT[800:, 3 * chip_i : 3 * chip_i + 3])
     with pytest.raises(CaptureError, match="from sound frame 801: the LSB of chip 0, 1, 2 must be as before"):
         detect(frames)
 
 
-def test_a_chip_that_freezes_for_two_thirds_of_the_stream_is_stuck_there() -> None:
+def test_frozen_chip_is_stuck() -> None:
     frames = board(1500)
-    frozen = changed(frames, slice(500, None), 1, frames.b_uT[500, 3:6])
+    frozen = with_chip_values(frames, slice(500, None), 1, frames.b_uT[500, 3:6])
     stuck = detect(frozen)
-    # It is told from the 20th equal reading on.
+    # Detection needs 20 equal readings.
     assert np.flatnonzero(stuck).tolist() == list(range(500 + faults.STUCK_FRAMES_MIN_N - 1, 1500))
 
 
 @settings(max_examples=20, deadline=None)
 @given(ends=st.lists(st.integers(0, 3 * SCALE_FRAMES_N), max_size=6))
-def test_portions_do_not_matter(ends: list[int]) -> None:
+def test_chunks_do_not_matter(ends: list[int]) -> None:
     frames = board(3 * SCALE_FRAMES_N)
-    frozen = changed(frames, slice(100, 300), 1, frames.b_uT[100, 3:6])
+    frozen = with_chip_values(frames, slice(100, 300), 1, frames.b_uT[100, 3:6])
     np.testing.assert_array_equal(detect(frozen, *ends), detect(frozen))
 
 
-def test_frames_that_were_not_read_are_neither_stuck_nor_looked_at() -> None:
-    failed = changed(board(100), slice(10, 60), 0, np.array(faults.FAILED_B_uT))
+def test_failed_reads_are_not_stuck() -> None:
+    failed = with_chip_values(board(100), slice(10, 60), 0, np.array(faults.FAILED_B_uT))
     failed.temperature_degC[10:60, 0] = faults.FAILED_TEMPERATURE_degC
     assert not detect(failed).any()

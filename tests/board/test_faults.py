@@ -1,4 +1,4 @@
-"""Broken chips are told from working ones, in made and in real recordings."""
+"""Chip faults in synthetic and in real recordings."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ GRIDS_uT = {"ini": (0.15, 0.242), "lab": (0.2, 0.3227), "eflesh": (2.4, 3.872), 
 def readings_on_grid(
     lsb_uT: list[tuple[float, float]], frames_n: int, seed: int, *, noise_uT: float = 5.0
 ) -> np.ndarray:
-    """Make noisy readings of chips with the given steps along x, y and along z, rounded to two decimals as text is."""
+    """Make noisy readings of chips with the given LSB (xy, z), rounded to two decimals like text."""
     rng = seeds.rng_for(seed, "faults")
     step_uT = np.array([[xy, xy, z] for xy, z in lsb_uT]).reshape(-1)
     field_uT = rng.uniform(-3000, 3000, len(step_uT)) + NOISE_uT * rng.standard_normal((frames_n, len(step_uT)))
@@ -29,41 +29,41 @@ def load_ini(shared_data, name: str, rows: slice = slice(None)) -> tuple[np.ndar
 
 
 class TestFailedReads:
-    def test_a_failed_read_is_one_whose_four_values_are_all_those_of_a_failure(self):
+    def test_all_four_values_must_be_those_of_a_failure(self):
         b_uT = np.tile([8028.16, 5194.00, 12943.36], 3)[None]
         temperature_degC = np.array([[-880.49, -880.49, 25.0]])
         b_uT[0, 4] = 5194.2
         assert faults.failed_reads(b_uT, temperature_degC).tolist() == [[True, False, False]]
 
-    def test_without_temperatures_the_field_decides(self):
+    def test_without_temperature_the_field_decides(self):
         b_uT = np.array([[8028.16, 5194.00, 12943.36, 1.0, 2.0, 3.0]])
         assert faults.failed_reads(b_uT, np.full((1, 2), np.nan)).tolist() == [[True, False]]
 
-    def test_a_failed_read_is_known_as_the_float32_that_the_wire_carries(self):
+    def test_float32_failure_is_recognised(self):
         sent = frames_of(np.tile([8028.16, 5194.00, 12943.36], 5)[None], np.full((1, 5), -880.49))
         assert faults.failed_reads(sent.b_uT, sent.temperature_degC).all()
 
-    def test_a_real_recording_of_failed_reads_has_nothing_else(self, shared_data):
+    def test_real_failed_recording(self, shared_data):
         assert faults.failed_reads(*load_ini(shared_data, "faults/b20_artillery_AFG_flex_50.head400.txt")).all()
 
-    def test_a_real_recording_of_a_working_board_has_none(self, shared_data):
+    def test_real_working_board(self, shared_data):
         assert not faults.failed_reads(*load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")).any()
 
 
 class TestZeroReads:
-    def test_three_zeros_are_no_reading_and_two_may_be_one(self):
+    def test_only_three_zeros_are_a_zero_read(self):
         b_uT = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
         assert faults.zero_reads(b_uT).tolist() == [[True, False], [False, True]]
 
     @pytest.mark.parametrize(
         ("name", "zeros_n"), [("position_1_20251028_003401", 18), ("multi_touch_1_2_20251109_230349", 61)]
     )
-    def test_the_rows_of_zeros_of_a_real_recording_are_all_found(self, shared_data, name, zeros_n):
+    def test_zero_rows_of_real_recordings(self, shared_data, name, zeros_n):
         table = np.genfromtxt(shared_data / f"eflash7/{name}.csv", delimiter=",", skip_header=1)
         zeros = faults.zero_reads(table[:, -15:])
         assert zeros.all(axis=1).sum() == zeros.any(axis=1).sum() == zeros_n
 
-    def test_real_recordings_of_working_boards_have_none(self, shared_data):
+    def test_real_working_boards(self, shared_data):
         assert not faults.zero_reads(load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")[0]).any()
         for file in (shared_data / "lab").glob("*.csv"):
             table = np.genfromtxt(file, delimiter=",", names=True)
@@ -73,19 +73,19 @@ class TestZeroReads:
 
 class TestScale:
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 1000))
-    def test_the_step_of_a_chip_is_found(self, name, seed):
+    def test_lsb_is_found(self, name, seed):
         # Within 2 %: two decimals shift a step of 0.15 uT by as much, and the mean of many steps by less.
         lsb_uT = faults.find_lsb(readings_on_grid([GRIDS_uT[name]], 400, seed))
         np.testing.assert_allclose(lsb_uT, [GRIDS_uT[name]], rtol=0.02)
 
     @given(st.integers(0, 1000))
-    def test_values_without_a_grid_have_no_step(self, seed):
+    def test_values_without_grid_have_no_lsb(self, seed):
         field_uT = 5.0 * seeds.rng_for(seed, "smooth").standard_normal((400, 6))
         assert np.isnan(faults.find_lsb(field_uT)).all()
         assert not faults.reset_chips(field_uT, None).any()
 
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 4), st.integers(0, 1000))
-    def test_one_chip_after_a_reset_stands_out(self, name, chip_i, seed):
+    def test_reset_chip_is_found(self, name, chip_i, seed):
         grids_uT = [GRIDS_uT[name]] * 5
         grids_uT[chip_i] = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
         b_uT = readings_on_grid(grids_uT, 400, seed)
@@ -93,20 +93,20 @@ class TestScale:
         assert faults.reset_chips(b_uT, None).tolist() == expected
         assert faults.reset_chips(b_uT, GRIDS_uT[name]).tolist() == expected
 
-    def test_a_board_that_is_meant_to_have_the_grid_of_a_reset_is_sound(self):
+    def test_expected_lsb_may_equal_that_of_a_reset(self):
         grid_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
         b_uT = readings_on_grid([grid_uT] * 5, 400, 0)
         assert faults.reset_chips(b_uT, None).all()
         assert not faults.reset_chips(b_uT, grid_uT).any()
 
-    def test_real_resets_are_found(self, shared_data):
+    def test_real_resets(self, shared_data):
         one_chip, _ = load_ini(shared_data, "faults/b20_artillery_AFG_test_new_board15.head400.txt")
         all_chips, _ = load_ini(shared_data, "faults/b20_artillery_piezo.head400.txt")
         assert faults.reset_chips(one_chip, None).tolist() == [False, False, False, True, False]
         assert faults.reset_chips(one_chip, GRIDS_uT["ini"]).tolist() == [False, False, False, True, False]
         assert faults.reset_chips(all_chips, None).all()
 
-    def test_real_working_boards_keep_their_grid(self, shared_data):
+    def test_real_working_boards(self, shared_data):
         b_uT, _ = load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt", slice(0, 8000))
         for first in range(0, len(b_uT), 400):
             assert not faults.reset_chips(b_uT[first : first + 400], None).any()
@@ -117,8 +117,8 @@ class TestScale:
 
 
 class TestStuck:
-    def naive(self, b_uT: np.ndarray) -> np.ndarray:
-        """For every chip and frame, walk back over its run of equal readings, and count others' moves on the way."""
+    def stuck_naively(self, b_uT: np.ndarray) -> np.ndarray:
+        """Reference: walk back over each run of equal readings and count the frames in which other chips moved."""
         frames_n, chips_n = len(b_uT), b_uT.shape[1] // 3
         rows = b_uT.reshape(frames_n, chips_n, 3)
         stuck = np.zeros((frames_n, chips_n), bool)
@@ -135,31 +135,31 @@ class TestStuck:
         return stuck
 
     @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 45)), max_size=6), st.integers(1, 2))
-    def test_stuck_chips_are_those_that_a_walk_finds(self, stretches, chips_n):
-        """Stretches of frames: bit 0 moves chip 0, bit 1 the last chip; chips that do not move stay as they are."""
+    def test_stuck_chips_equal_naive_loop(self, stretches, chips_n):
+        """Bit 0 of a stretch moves chip 0, bit 1 moves the last chip; the other chips stay still."""
         moves = np.array([[which & 1, which >> 1] for which, frames_n in stretches for _ in range(frames_n)])
         places = moves.reshape(-1, 2)[:, :chips_n].cumsum(axis=0)
         b_uT = np.repeat(places, 3, axis=1).astype(np.float32)
-        np.testing.assert_array_equal(faults.stuck_chips(b_uT), self.naive(b_uT))
+        np.testing.assert_array_equal(faults.stuck_chips(b_uT), self.stuck_naively(b_uT))
 
     @given(st.lists(st.integers(0, 200), max_size=4))
-    def test_portions_do_not_matter(self, ends):
+    def test_chunks_do_not_matter(self, ends):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 2, 200, 0)
         b_uT[60:150, 3:6] = b_uT[60, 3:6]
-        watch = faults.StuckChips(2)
-        parts = [watch.feed(part) for part in np.split(b_uT, sorted(ends))]
+        detector = faults.StuckChips(2)
+        parts = [detector.feed(part) for part in np.split(b_uT, sorted(ends))]
         np.testing.assert_array_equal(np.concatenate(parts), faults.stuck_chips(b_uT))
 
-    def test_a_chip_that_stops_while_others_move_is_stuck_from_its_20th_equal_reading_on(self):
+    def test_stuck_from_20th_equal_reading(self):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 3, 200, 0)
         b_uT[120:, 3:6] = b_uT[120, 3:6]
         expected = np.zeros((200, 3), bool)
         expected[120 + faults.STUCK_FRAMES_MIN_N - 1 :, 1] = True
         np.testing.assert_array_equal(faults.stuck_chips(b_uT), expected)
 
-    def test_a_board_that_stands_still_as_a_whole_is_not_a_stuck_chip(self):
+    def test_still_board_is_not_stuck(self):
         assert not faults.stuck_chips(np.ones((100, 15))).any()
 
-    def test_no_chip_of_a_real_working_board_is_stuck(self, shared_data):
+    def test_real_working_board(self, shared_data):
         b_uT, _ = load_ini(shared_data, "b20_artillery_AFG_board2_50_screw.txt")
         assert not faults.stuck_chips(b_uT).any()

@@ -1,4 +1,4 @@
-"""A port is recorded whole, over a pseudo-terminal, however the recording ends."""
+"""Recording from a serial port, over a pseudo-terminal."""
 
 import math
 import os
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = make_frames(100, 5, 0)
-LONG_s = 120.0  # for what must not happen in a test that passes
+LONG_s = 120.0  # timeout that a passing test never reaches
 SETTINGS = PortSettings(
     baud=115200, wire="binary", chips_n=5, duration_s=LONG_s, bytes_max_n=None, silence_s=LONG_s, no_frame_s=LONG_s
 )
@@ -38,14 +38,14 @@ SETTINGS = PortSettings(
 
 @dataclass
 class Board:
-    """The far end of a pseudo-terminal: what it sends arrives at `name`."""
+    """The board's end of a pseudo-terminal: what it sends can be read at `name`."""
 
     far: int
     near: int
     name: str
 
     def send(self, *chunks: bytes) -> None:
-        with suppress(OSError):  # nobody listens any more
+        with suppress(OSError):  # nobody reads any more
             for chunk in chunks:
                 os.write(self.far, chunk)
 
@@ -66,21 +66,21 @@ def board() -> Iterator[Board]:
 
 
 @dataclass
-class StandingClock:
-    """The recorder's clock, which a test moves: however late the machine is, to the recorder no time passes."""
+class ManualClock:
+    """The recorder's clock, advanced only by the test, so that a busy machine changes nothing."""
 
     s: float = 0.0
 
 
 @pytest.fixture
-def clock(monkeypatch) -> StandingClock:
-    standing = StandingClock()
-    monkeypatch.setattr(port, "time", SimpleNamespace(monotonic=lambda: standing.s, time=time.time))
-    return standing
+def clock(monkeypatch) -> ManualClock:
+    manual = ManualClock()
+    monkeypatch.setattr(port, "time", SimpleNamespace(monotonic=lambda: manual.s, time=time.time))
+    return manual
 
 
 def record(board: Board, folder: Path, act: Callable[[threading.Event], None], **changed: object) -> Recording:
-    """Record from a board that begins to `act` once the port is open: what came before is thrown away."""
+    """Record from a board that starts to `act` once the port is open (earlier bytes are discarded)."""
 
     def begin() -> None:
         wait_until((folder / STREAM_FILE).exists)
@@ -115,7 +115,7 @@ def check_files(folder: Path, recording: Recording, sent: bytes) -> None:
     assert recording.account["frames_n"] == len(stream.decode_all(data, SETTINGS.wire, 5, "stream.bin")[0])
 
 
-def test_what_was_sent_is_what_is_written_and_stops_after_the_duration(board, clock, tmp_path):
+def test_recording_ends_after_duration(board, clock, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(_: threading.Event) -> None:
@@ -130,7 +130,7 @@ def test_what_was_sent_is_what_is_written_and_stops_after_the_duration(board, cl
     check_files(tmp_path, recording, data)
 
 
-def test_a_report_counts_the_frames_while_they_come(board, tmp_path):
+def test_report_counts_frames(board, tmp_path):
     seen: list[int] = []
     data = encode(FRAMES, "binary")
     settings = replace(SETTINGS, bytes_max_n=len(data))
@@ -146,7 +146,7 @@ def test_a_report_counts_the_frames_while_they_come(board, tmp_path):
     assert seen[-1] >= 1
 
 
-def test_arrivals_tell_when_bytes_came(board, clock, tmp_path):
+def test_arrival_times(board, clock, tmp_path):
     data, pause_s = encode(FRAMES, "binary"), 0.4
 
     def act(_: threading.Event) -> None:
@@ -157,11 +157,11 @@ def test_arrivals_tell_when_bytes_came(board, clock, tmp_path):
 
     record(board, tmp_path, act, bytes_max_n=len(data))
     rows = clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv")
-    came_s = clocks.times_of(np.array([4100, 8200]), rows)
-    assert came_s[1] - came_s[0] == pytest.approx(pause_s, abs=1e-5)
+    arrived_s = clocks.times_of(np.array([4100, 8200]), rows)
+    assert arrived_s[1] - arrived_s[0] == pytest.approx(pause_s, abs=1e-5)
 
 
-def test_a_byte_limit_is_kept_to_the_byte(board, tmp_path):
+def test_byte_limit_is_exact(board, tmp_path):
     data = encode(FRAMES, "binary")
     recording = record(board, tmp_path, lambda _: board.send(data), bytes_max_n=1000)
     assert recording.ended == "bytes"
@@ -169,7 +169,7 @@ def test_a_byte_limit_is_kept_to_the_byte(board, tmp_path):
     assert recording.account["skipped_truncated_bytes_n"] == 1000 % 82
 
 
-def test_unplugging_keeps_what_came(board, tmp_path):
+def test_unplugging_keeps_received_bytes(board, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(_: threading.Event) -> None:
@@ -183,7 +183,7 @@ def test_unplugging_keeps_what_came(board, tmp_path):
     check_files(tmp_path, recording, data[:-7])
 
 
-def test_a_stop_from_outside_keeps_what_came(board, tmp_path):
+def test_stop_event_keeps_received_bytes(board, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(stop: threading.Event) -> None:
@@ -196,7 +196,7 @@ def test_a_stop_from_outside_keeps_what_came(board, tmp_path):
     check_files(tmp_path, recording, data)
 
 
-def test_a_port_that_falls_silent_after_its_frames_keeps_them(board, clock, tmp_path):
+def test_silence_ends_recording(board, clock, tmp_path):
     data = encode(FRAMES, "binary")
 
     def act(_: threading.Event) -> None:
@@ -209,7 +209,7 @@ def test_a_port_that_falls_silent_after_its_frames_keeps_them(board, clock, tmp_
     check_files(tmp_path, recording, data)
 
 
-LISTEN = """
+RECORD = """
 import sys, threading
 from pathlib import Path
 from reskin.board import port
@@ -219,9 +219,9 @@ print(port.record(sys.argv[1], Path(sys.argv[2]), settings=settings, stop=thread
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_and_termination_keep_what_came(board, tmp_path, number):
+def test_signal_keeps_received_bytes(board, tmp_path, number):
     data = encode(FRAMES, "binary")
-    command = [sys.executable, "-c", LISTEN, board.name, str(tmp_path)]
+    command = [sys.executable, "-c", RECORD, board.name, str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         written = tmp_path / STREAM_FILE
         wait_until(written.exists)
@@ -234,9 +234,9 @@ def test_ctrl_c_and_termination_keep_what_came(board, tmp_path, number):
     assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == len(data)
 
 
-def test_a_kill_loses_nothing_that_was_read(board, tmp_path):
+def test_kill_loses_nothing_that_was_read(board, tmp_path):
     data = encode(FRAMES, "binary")
-    with subprocess.Popen([sys.executable, "-c", LISTEN, board.name, str(tmp_path)], cwd=ROOT) as process:
+    with subprocess.Popen([sys.executable, "-c", RECORD, board.name, str(tmp_path)], cwd=ROOT) as process:
         written = tmp_path / STREAM_FILE
         wait_until(written.exists)
         board.send(data)
@@ -245,14 +245,14 @@ def test_a_kill_loses_nothing_that_was_read(board, tmp_path):
     assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] <= len(data)
 
 
-def test_waiting_for_bytes_costs_no_processor_time(board, tmp_path):
+def test_waiting_uses_no_processor_time(board, tmp_path):
     before_s = time.process_time()
     with pytest.raises(CaptureError):
         record(board, tmp_path, lambda _: None, silence_s=1.0)
-    assert time.process_time() - before_s < 0.3  # a busy wait takes all of the second
+    assert time.process_time() - before_s < 0.3  # a busy wait would take the whole second
 
 
-def test_the_partial_line_at_the_start_of_text_is_counted_and_not_written(board, clock, tmp_path):
+def test_partial_first_line_is_dropped(board, clock, tmp_path):
     data = encode(FRAMES, "text-xyzt")
     first_n = data.index(b"\n") + 1
 
@@ -266,13 +266,13 @@ def test_the_partial_line_at_the_start_of_text_is_counted_and_not_written(board,
     assert (tmp_path / STREAM_FILE).read_bytes() == data[first_n:2000]
 
 
-def test_a_socket_is_recorded_as_a_port_is(tmp_path):
+def test_socket_is_recorded_like_a_port(tmp_path):
     data = encode(FRAMES, "binary")
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def send() -> None:
             with server.accept()[0] as end:
-                wait_until((tmp_path / STREAM_FILE).exists)  # what came before is thrown away when a port is opened
+                wait_until((tmp_path / STREAM_FILE).exists)  # opening a port discards earlier bytes
                 end.sendall(data)
 
         sender = threading.Thread(target=send)
@@ -284,17 +284,24 @@ def test_a_socket_is_recorded_as_a_port_is(tmp_path):
     check_files(tmp_path, recording, data)
 
 
-FULL = """
+FULL_DISK = """
 import resource
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # as a disk that is full
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # like a full disk
 """
 
 
-def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(board, tmp_path):
-    command = [sys.executable, "-B", "-c", FULL + LISTEN, board.name, str(tmp_path)]  # -B: nor is compiled code cut
+def test_full_disk_keeps_a_readable_recording(board, tmp_path):
+    command = [
+        sys.executable,
+        "-B",
+        "-c",
+        FULL_DISK + RECORD,
+        board.name,
+        str(tmp_path),
+    ]  # -B: no cut .pyc
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         wait_until((tmp_path / STREAM_FILE).exists)
-        os.set_blocking(board.far, False)  # a recorder that ends reads no more
+        os.set_blocking(board.far, False)  # the recorder stops reading when it ends
 
         def ended() -> bool:
             board.send(encode(FRAMES, "binary")[:820])
@@ -309,32 +316,32 @@ def test_a_full_disk_ends_a_recording_that_can_be_read_up_to_there(board, tmp_pa
 
 
 class TestErrors:
-    def test_an_absent_port_is_named(self, tmp_path):
+    def test_absent_port(self, tmp_path):
         with pytest.raises(CaptureError, match="/dev/tty-none: the port must be one that opens; .*orts?.*found"):
             port.record("/dev/tty-none", tmp_path, settings=SETTINGS, stop=threading.Event())
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_file_is_no_port(self, tmp_path):
+    def test_file_is_no_port(self, tmp_path):
         file = tmp_path / "no_port"
         file.touch()
         with pytest.raises(CaptureError, match="no_port: the port must be one that opens"):
             port.record(str(file), tmp_path, settings=SETTINGS, stop=threading.Event())
 
-    def test_a_silent_port_is_named(self, board, clock, tmp_path):
+    def test_silent_port(self, board, clock, tmp_path):
         with pytest.raises(CaptureError, match=f"{board.name}: bytes must be coming in; got none in 0.7 s. Is the"):
             record(board, tmp_path, lambda _: setattr(clock, "s", 0.7), silence_s=0.6)
 
-    def test_a_port_unplugged_before_its_first_byte_is_named(self, board, tmp_path):
+    def test_port_unplugged_before_first_byte(self, board, tmp_path):
         with pytest.raises(CaptureError, match="bytes must be coming in"):
             record(board, tmp_path, lambda _: board.unplug())
 
-    def test_bytes_without_a_frame_mean_a_wrong_baud_rate(self, board, tmp_path):
-        rubbish = bytes(range(128)) * 4
-        os.set_blocking(board.far, False)  # nobody listens while the error is made
+    def test_no_frame_suggests_wrong_baud_rate(self, board, tmp_path):
+        noise = bytes(range(128)) * 4
+        os.set_blocking(board.far, False)  # nobody reads while the error is built
 
         def act(stop: threading.Event) -> None:
             while not stop.wait(0.05) and board.far >= 0:
-                board.send(rubbish)
+                board.send(noise)
 
         stop = threading.Event()
         actor = threading.Thread(target=act, args=[stop])
@@ -346,7 +353,7 @@ class TestErrors:
             stop.set()
             actor.join()
 
-    def test_the_error_says_that_the_board_has_fewer_chips(self, board, clock, tmp_path):
+    def test_error_suggests_fewer_chips(self, board, clock, tmp_path):
         data = encode(make_frames(30, 4, 0), "binary")
 
         def act(_: threading.Event) -> None:
@@ -357,7 +364,7 @@ class TestErrors:
         with pytest.raises(CaptureError, match="It fits binary with 4 chips"):
             record(board, tmp_path, act, no_frame_s=0.5)
 
-    def test_a_folder_that_holds_a_stream_is_not_written_to(self, board, tmp_path):
+    def test_existing_stream_is_not_overwritten(self, board, tmp_path):
         (tmp_path / STREAM_FILE).write_bytes(b"old")
         with pytest.raises(FileExistsError):
             port.record(board.name, tmp_path, settings=replace(SETTINGS, duration_s=math.inf), stop=threading.Event())

@@ -1,4 +1,4 @@
-"""A stream gives the same frames however its bytes are portioned, and accounts for each byte."""
+"""Decoding does not depend on how a stream is split into chunks, and every byte is accounted for."""
 
 import struct
 from itertools import pairwise
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from pipeline.experiments.stability.wire import Damage, decode_damaged, deliver, joined, records
 from reskin.board import stream
+from reskin.board.decode import decode_dump
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import Frames, encode, line_bytes_max_n, record_type
 from reskin.errors import CaptureError
@@ -29,36 +30,36 @@ def check_account(account: dict[str, int], data: bytes) -> None:
     assert account["frame_bytes_n"] + skipped_n == account["bytes_n"] == len(data)
 
 
-def check_cost(frames, wire, portions, *, lost_n, false_n):
-    damage = Damage("", "", portions, lost_n=lost_n, false_n=false_n, not_finite_n=None)
+def check_damage(frames, wire, chunks, *, lost_n, false_n):
+    damage = Damage("", "", chunks, lost_n=lost_n, false_n=false_n, not_finite_n=None)
     assert not broken([decode_damaged(damage, frames, wire)])
 
 
-def check_same(frames: Frames, others: Frames) -> None:
+def check_equal(frames: Frames, others: Frames) -> None:
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(frames, name), getattr(others, name))
 
 
-def cut_up(data: bytes, sizes: list[int]) -> list[bytes]:
+def split_bytes(data: bytes, sizes: list[int]) -> list[bytes]:
     return [data[first:last] for first, last in pairwise([0, *np.cumsum(sizes).tolist(), None])]
 
 
-# What was sent comes back -------------------------------------------------------------------------------------------
+# Round trips ----------------------------------------------------------------------------------------------------
 
 
 @given(frames_strategy(), EVERY_WIRE, st.lists(st.integers(0, 200), max_size=8))
-def test_frames_come_back_under_any_portions(frames, wire, sizes):
+def test_frames_round_trip_in_any_chunks(frames, wire, sizes):
     data = encode(frames, wire)
-    again, account = deliver(cut_up(data, sizes), wire, chips_of(frames))
+    decoded, account = deliver(split_bytes(data, sizes), wire, chips_of(frames))
     decimals = 2 if wire in TEXT_WIRES else 10
-    np.testing.assert_array_equal(again.b_uT, frames.b_uT.astype(float).round(decimals).astype(np.float32))
+    np.testing.assert_array_equal(decoded.b_uT, frames.b_uT.astype(float).round(decimals).astype(np.float32))
     assert account["frames_n"] == len(frames)
     assert account["frame_bytes_n"] == len(data)
     check_account(account, data)
 
 
 @given(st.integers(1, 5), st.binary(max_size=400))
-def test_any_finite_floats_come_back(chips_n, payload):
+def test_any_finite_floats_round_trip(chips_n, payload):
     values = np.frombuffer(payload[: len(payload) // (16 * chips_n) * 16 * chips_n], "<f4").reshape(-1, 4 * chips_n)
     values = np.where(np.isfinite(values), values, np.float32(0))
     data = b"".join(struct.pack(f"<{4 * chips_n}f", *row) + b"\r\n" for row in values)
@@ -67,18 +68,18 @@ def test_any_finite_floats_come_back(chips_n, payload):
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_byte_by_byte_is_as_good_as_whole(wire):
+def test_byte_by_byte_equals_whole(wire):
     data = b"\x07rubbish" + encode(make_frames(6, 5, 1, crlf_share=0.3), wire)[5:-3]
     data = data[:200] + data[205:]
     whole, account = deliver([data], wire, 5)
     single, single_account = deliver([data[i : i + 1] for i in range(len(data))], wire, 5)
     assert len(whole) >= 3
-    check_same(whole, single)
+    check_equal(whole, single)
     assert account == single_account
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_a_frame_is_there_with_its_last_byte_and_not_one_frame_later(wire):
+def test_frame_is_emitted_with_its_last_byte(wire):
     frames = make_frames(4, 5, 2)
     frame_stream, data = FrameStream(wire, 5), encode(frames, wire)
     arrivals = [i + 1 for i in range(len(data)) for _ in range(len(frame_stream.feed(data[i : i + 1])))]
@@ -87,28 +88,28 @@ def test_a_frame_is_there_with_its_last_byte_and_not_one_frame_later(wire):
 
 
 @given(st.binary(max_size=600), EVERY_WIRE, st.integers(1, 3), st.lists(st.integers(0, 50), max_size=8))
-def test_rubbish_is_the_same_rubbish_under_any_portions(data, wire, chips_n, sizes):
+def test_random_bytes_decode_alike_in_any_chunks(data, wire, chips_n, sizes):
     whole, account = deliver([data], wire, chips_n)
-    portions, portions_account = deliver(cut_up(data, sizes), wire, chips_n)
-    check_same(whole, portions)
-    assert account == portions_account
+    chunks, chunks_account = deliver(split_bytes(data, sizes), wire, chips_n)
+    check_equal(whole, chunks)
+    assert account == chunks_account
     check_account(account, data)
 
 
-SCRAPS = (b"\r\n", b"\r", b"\n", b"\r\n" * 9, b"\0" * 16, b"\0" * 7, b"B", b"\xff\x7f")
+FRAGMENTS = (b"\r\n", b"\r", b"\n", b"\r\n" * 9, b"\0" * 16, b"\0" * 7, b"B", b"\xff\x7f")
 
 
 @settings(max_examples=150)
-@given(st.lists(st.sampled_from(SCRAPS)).map(b"".join), st.integers(1, 2), st.lists(st.integers(1, 30), max_size=8))
-def test_bytes_full_of_terminators_are_cut_into_the_same_frames_under_any_portions(data, chips_n, sizes):
+@given(st.lists(st.sampled_from(FRAGMENTS)).map(b"".join), st.integers(1, 2), st.lists(st.integers(1, 30), max_size=8))
+def test_terminators_decode_alike_in_any_chunks(data, chips_n, sizes):
     whole, account = deliver([data], "binary", chips_n)
-    portions, portions_account = deliver(cut_up(data, sizes), "binary", chips_n)
-    check_same(whole, portions)
-    assert account == portions_account
+    chunks, chunks_account = deliver(split_bytes(data, sizes), "binary", chips_n)
+    check_equal(whole, chunks)
+    assert account == chunks_account
     check_account(account, data)
 
 
-# Damage costs little: `decode_damaged` counts lost frames, false frames and every byte ----------------------------
+# Damage: `decode_damaged` counts lost frames, false frames and every byte ----------------------------------------
 
 
 @settings(max_examples=150)
@@ -117,52 +118,52 @@ def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, how_many):
     data = encode(frames, wire)
     missing_n = 1 + int(how_many * (record_type(wire, chips_of(frames)).itemsize - 2))
     first = int(where * (len(data) - missing_n))
-    # What is left of two frames passes for one only where a CR LF in a payload stands a frame after an end.
+    # The remains of two frames can pass for one frame only if a payload contains CR LF at one frame's distance.
     false_n = int(data.count(b"\r\n") > len(frames))
-    check_cost(frames, wire, [data[:first], data[first + missing_n :]], lost_n=2, false_n=false_n)
+    check_damage(frames, wire, [data[:first], data[first + missing_n :]], lost_n=2, false_n=false_n)
 
 
 @settings(max_examples=150)
 @given(frames_strategy(min_frames_n=6), st.sampled_from(BINARY_WIRES), st.floats(0, 1), st.binary(max_size=300))
-def test_inserted_bytes_cost_at_most_two_frames(frames, wire, where, rubbish):
+def test_inserted_bytes_cost_at_most_two_frames(frames, wire, where, noise):
     data = encode(frames, wire)
     first = int(where * len(data))
-    check_cost(frames, wire, [data[:first], rubbish, data[first:]], lost_n=2, false_n=len(rubbish))
+    check_damage(frames, wire, [data[:first], noise, data[first:]], lost_n=2, false_n=len(noise))
 
 
 @given(frames_strategy(min_frames_n=4), st.sampled_from(TEXT_WIRES), st.floats(0, 1), st.integers(1, 40))
-def test_missing_bytes_of_text_cost_at_most_the_lines_they_touch(frames, wire, where, missing_n):
+def test_missing_text_bytes_cost_only_touched_lines(frames, wire, where, missing_n):
     data = encode(frames, wire)
     first = int(where * max(len(data) - missing_n, 0))
     damaged = data[:first] + data[first + missing_n :]
     touched_n = data[: first + missing_n].count(b"\n") - data[:first].count(b"\n") + 1
-    check_cost(frames, wire, [damaged], lost_n=touched_n, false_n=len(frames))
+    check_damage(frames, wire, [damaged], lost_n=touched_n, false_n=len(frames))
 
 
 @given(frames_strategy(min_frames_n=4), st.sampled_from(BINARY_WIRES), st.floats(0, 1))
-def test_a_stream_joined_in_the_middle_of_a_frame_loses_that_frame_alone(frames, wire, where):
+def test_joining_mid_frame_loses_one_frame(frames, wire, where):
     length_n = record_type(wire, chips_of(frames)).itemsize
-    joined_n = 1 + int(where * (length_n - 3))  # not between CR and LF: that takes the next frame's mark too
+    joined_n = 1 + int(where * (length_n - 3))  # not between CR and LF: that costs the next frame too
     assert decode_damaged(joined(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
 
 
-def test_a_steady_temperature_that_holds_the_terminator_misleads_nobody():
+def test_terminator_in_steady_temperature():
     frames = make_frames(50, 5, 3)
     frames.temperature_degC[:] = CRLF_TEMPERATURE_degC
     assert not broken([decode_damaged(joined(frames, "binary", n / 82), frames, "binary") for n in range(1, 81)])
 
 
-def test_the_rest_of_two_frames_behind_a_terminator_in_a_payload_is_no_frame():
+def test_remains_of_two_frames_are_no_frame():
     frames = make_frames(6, 1, 3)
     frames.temperature_degC[2], frames.b_uT[2, 0] = CRLF_TEMPERATURE_degC, 100.0
     data = encode(frames, "binary")
-    # 8 bytes of frame 2 and 13 of frame 3 are left: from behind the CR LF in the temperature, as many as a frame has.
+    # 8 bytes of frame 2 and 13 of frame 3 remain: after the CR LF in the temperature, exactly one frame's length.
     kept, _ = deliver([data[: 2 * 18 + 8] + data[3 * 18 + 5 :]], "binary", 1)
     assert records(kept) == [record for i, record in enumerate(records(frames)) if i not in (2, 3)]
 
 
 @pytest.mark.parametrize("wire", BINARY_WIRES)
-def test_chips_that_answer_nonsense_still_send_frames(wire):
+def test_failed_reads_are_still_frames(wire):
     frames = make_frames(20, 5, 4)
     frames.b_uT[:], frames.temperature_degC[:] = np.tile([8028.16, 5194.00, 12943.36], 5), -880.49
     kept, account = deliver([encode(frames, wire)[30:]], wire, 5)
@@ -170,7 +171,7 @@ def test_chips_that_answer_nonsense_still_send_frames(wire):
     assert account["frames_n"] == 19
 
 
-def test_every_lost_byte_has_a_reason():
+def test_lost_bytes_are_counted_by_reason():
     frames = make_frames(10, 5, 5)
     frames.b_uT[3, 2], frames.temperature_degC[6, 0] = np.nan, np.inf
     data = b"junk\r\n" + encode(frames, "binary")[:-20]
@@ -182,7 +183,7 @@ def test_every_lost_byte_has_a_reason():
     }  # fmt: skip
 
 
-def test_a_frame_without_a_time_is_not_finite():
+def test_infinite_clock_is_not_finite():
     frames = make_frames(3, 2, 6)
     frames.device_s[1] = np.inf
     assert deliver([encode(frames, "binary-clock")], "binary-clock", 2)[1]["not_finite_frames_n"] == 1
@@ -190,7 +191,7 @@ def test_a_frame_without_a_time_is_not_finite():
 
 @pytest.mark.parametrize("word", ["nan", "inf", "-inf", "ovf"])
 @pytest.mark.parametrize("wire", TEXT_WIRES)
-def test_a_line_with_a_word_for_a_number_is_a_frame_that_is_not_finite(wire, word):
+def test_text_nan_and_inf_are_not_finite(wire, word):
     line = encode(make_frames(1, 2, 7), wire)
     broken = word.encode() + line[line.index(b"\t") :]
     _, account = deliver([line + broken + line], wire, 2)
@@ -199,29 +200,29 @@ def test_a_line_with_a_word_for_a_number_is_a_frame_that_is_not_finite(wire, wor
     assert account["skipped_not_finite_bytes_n"] == len(broken)
 
 
-@pytest.mark.parametrize("portion_n", [1, 7, 10**6])
-def test_a_line_without_end_is_not_kept_waiting(portion_n):
+@pytest.mark.parametrize("chunk_n", [1, 7, 10**6])
+def test_endless_line_is_skipped(chunk_n):
     line = encode(make_frames(1, 1, 8), "text-xyzt")
     data = line + b"9" * 3 * line_bytes_max_n(1) + line + line
-    kept, account = deliver([data[i : i + portion_n] for i in range(0, len(data), portion_n)], "text-xyzt", 1)
+    kept, account = deliver([data[i : i + chunk_n] for i in range(0, len(data), chunk_n)], "text-xyzt", 1)
     assert len(kept) == 2
     check_account(account, data)
 
 
-def test_what_is_left_of_a_line_without_end_is_no_frame():
+def test_rest_of_endless_line_is_no_frame():
     line = encode(make_frames(1, 1, 8), "text-xyzt")
     kept, account = deliver([line + b"9" * 2 * line_bytes_max_n(1), line, line], "text-xyzt", 1)
     assert kept.end_byte.tolist() == [len(line), account["bytes_n"]]
 
 
-def test_many_lines_are_read_in_pieces_and_each_ends_where_it_ends(monkeypatch):
+def test_text_end_bytes_over_several_blocks(monkeypatch):
     data = encode(make_frames(10, 2, 8), "text-xyzt")
     monkeypatch.setattr(stream, "BLOCK_LINES_N", 3)
     kept, _ = deliver([data[:20], data[20:]], "text-xyzt", 2)
     assert kept.end_byte.tolist() == np.cumsum([len(line) for line in data.splitlines(keepends=True)]).tolist()
 
 
-def test_a_long_stream_with_many_breaks_is_read_in_pieces():
+def test_long_stream_with_many_breaks():
     frames = make_frames(3 * stream.BLOCK_FRAMES_N, 5, 9, crlf_share=0.01)
     data = encode(frames, "binary")
     data = b"".join(data[i + 7 : i + 82 * 100] for i in range(0, len(data), 82 * 100))
@@ -230,12 +231,12 @@ def test_a_long_stream_with_many_breaks_is_read_in_pieces():
     assert account["frames_n"] == len(kept)
 
 
-# What is no stream is said to be none -------------------------------------------------------------------------------
+# Errors ---------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=25, deadline=None)  # each error tries what would fit instead
 @given(st.binary(max_size=2000), EVERY_WIRE, st.integers(1, 6))
-def test_random_bytes_give_frames_or_the_one_error(data, wire, chips_n):
+def test_random_bytes_decode_or_raise_capture_error(data, wire, chips_n):
     try:
         frames, _ = decode_all(data, wire, chips_n, "random")
         assert len(frames)
@@ -244,17 +245,32 @@ def test_random_bytes_give_frames_or_the_one_error(data, wire, chips_n):
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_no_bytes_are_no_stream(wire):
+def test_empty_stream_is_refused(wire):
     with pytest.raises(CaptureError, match="empty.bin: the stream must be .* no frame found in 0 bytes"):
         decode_all(b"", wire, 5, "empty.bin")
 
 
-def test_the_error_says_what_fits_instead():
+def test_error_suggests_matching_wire():
     data = encode(make_frames(20, 4, 10), "binary")
     with pytest.raises(CaptureError, match="Wrong baud rate, chip count or wire format\\? It fits binary with 4 chips"):
         decode_all(data, "binary", 5, "a.bin")
 
 
-def test_where_nothing_fits_the_error_guesses_nothing():
+def test_error_without_suggestion():
     with pytest.raises(CaptureError, match="in 1 bytes. Wrong baud rate, chip count or wire format\\?$"):
         decode_all(b"\0", "binary", 5, "a.bin")
+
+
+def test_dump_becomes_a_table_with_units():
+    frames = make_frames(4, 2, seed=0)
+    table, account = decode_dump(encode(frames, "binary"), "binary", 2, "dump.bin")
+    assert account["frames_n"] == len(table) == 4
+    np.testing.assert_array_equal(table["by1_uT"].to_numpy(), frames.b_uT[:, 4])
+    np.testing.assert_array_equal(table["temperature1_degC"].to_numpy(), frames.temperature_degC[:, 1])
+    assert table.schema.field("bz0_uT").metadata[b"unit"] == b"uT"
+    assert table["end_byte"].to_pylist() == [34, 68, 102, 136]
+
+
+def test_dump_without_frames_is_refused():
+    with pytest.raises(CaptureError, match="no frame found in 3 bytes"):
+        decode_dump(b"abc", "binary", 2, "dump.bin")
