@@ -16,12 +16,11 @@ from pipeline.settings import Settings, take
 from reskin.config import Strict, parse
 from reskin.data.lines import grid_lines
 from reskin.data.rows import Rows
-from reskin.data.splits import Fold
+from reskin.data.splits import Fold, labelling_order
 from reskin.errors import ParamsError
 from reskin.models.classical import Classical, ClassicalJob
 from reskin.models.job import Adaptation, FineTuning, Pretrained, TrainingJob, TrainingResult
 from reskin.models.recipe import AdaptationRecipe, AugmentedRecipe, FineTuningRecipe, Name, Recipe
-from reskin.seeds import rng_for
 
 EXPERIMENT = "labels"
 Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
@@ -105,7 +104,7 @@ def adaptation_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, Tra
             lines = grid_lines(study.rows, entry.fold.pool)
             tuning = Adaptation(_start(trained), study.settings.adapting, lines)
             adapted = Entry(f"{entry.method}, adapted", entry.inputs, 0, entry.fold)
-            pairs.append((adapted, _tuned(job, tuning, "adapted")))
+            pairs.append((adapted, replace(job, tuning=tuning, skin=entry.fold.board, what="adapted")))
     return pairs
 
 
@@ -117,7 +116,8 @@ def fine_tuning_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, Tr
             if labels_n:
                 tuning = FineTuning(_start(trained), study.settings.labelling, row)
                 labelled = Entry(entry.method, entry.inputs, labels_n, entry.fold)
-                pairs.append((labelled, _tuned(job, tuning, f"{job.what}{labels_n}labels")))
+                what = f"{job.what}{labels_n}labels"
+                pairs.append((labelled, replace(job, tuning=tuning, skin=entry.fold.board, what=what)))
     return pairs
 
 
@@ -138,18 +138,13 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
     """Draw labelled indentations of the pool, the fewer among the more; return their rows by number."""
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
-    indentations = np.unique(indentation)
-    if max(labels_n) > len(indentations):
-        rule = f"at most the {len(indentations)} indentations of its pool"
+    order = labelling_order(study.rows, fold, study.seed)
+    if max(labels_n) > len(order):
+        rule = f"at most the {len(order)} indentations of its pool"
         remedy = "Reduce labels_n, or raise split.labels_pool_n."
         raise ParamsError(f"fold labels/{fold.name}", "few_labels.labels_n", rule, max(labels_n), remedy)
-    order = rng_for(study.seed, "labelled", fold.name).permutation(indentations)
     return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}
 
 
 def _start(trained: TrainingResult) -> Pretrained:
     return Pretrained(trained.key, trained.weights, trained.scaler)
-
-
-def _tuned(job: TrainingJob, tuning: Adaptation | FineTuning, what: str) -> TrainingJob:
-    return replace(job, tuning=tuning, skin=job.fold.rsplit("-draw", 1)[0], what=what)

@@ -24,6 +24,7 @@ SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that test on the sk
 ONE_SKIN = {"transfer", *SAME_SKIN}  # experiments whose networks are trained on one skin
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
+DRAW = "-draw"  # in a fold's name, before the number of the draw
 STATES_N = 2**32  # scikit-learn's seeds are below it
 
 Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and test
@@ -62,6 +63,16 @@ class Fold:
     train: Int64[np.ndarray, " a"]
     test: Int64[np.ndarray, " b"]
     pool: Int64[np.ndarray, " c"]
+
+    @property
+    def board(self) -> str:
+        """The board that a fold of experiment labels holds out."""
+        return self.name.rpartition(DRAW)[0]
+
+    @property
+    def draw_i(self) -> int:
+        """The draw of the pool of a fold of experiment labels."""
+        return int(self.name.rpartition(DRAW)[2])
 
 
 NO_POOL = np.zeros(0, np.int64)
@@ -131,7 +142,7 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
         for skins_n in split.sensors_skins_n:
             for draw_i, order in enumerate(orders if skins_n < len(skins) else orders[:1]):
                 train = np.flatnonzero(np.isin(rows.skin, order[:skins_n]))
-                name = f"{board}-{skins_n:02d}skins-draw{draw_i}" if skins_n < len(skins) else str(board)
+                name = f"{board}-{skins_n:02d}skins{DRAW}{draw_i}" if skins_n < len(skins) else str(board)
                 folds.append(hold_out_skins(rows, "sensors", name, (train, held), split))
     return folds
 
@@ -158,8 +169,13 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
                 what, rule = "split.labels_pool_n", "less than its indentations"
                 remedy = "Ask for fewer, or record more."
                 raise ParamsError(f"fold labels/{whole.name}", what, rule, split.labels_pool_n, remedy)
-            folds.append(Fold("labels", f"{whole.name}-draw{draw_i}", whole.train, test, pool))
+            folds.append(Fold("labels", f"{whole.name}{DRAW}{draw_i}", whole.train, test, pool))
     return folds
+
+
+def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
+    """Draw the order in which the indentations of a fold's pool are labelled: n labels are those of the first n."""
+    return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
