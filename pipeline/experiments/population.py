@@ -28,7 +28,8 @@ from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import summarise
 from pipeline.training.jobs import SceneData, read_data
-from pipeline.training.universal import BOARD_POWERS, Frame, coverage
+from pipeline.training.universal import BOARD_POWERS, coverage
+from pipeline.training.universal_variants import Frame
 from reskin import io
 from reskin.code import digest, imported
 from reskin.config import Strict

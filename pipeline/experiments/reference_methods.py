@@ -18,30 +18,27 @@ import pandas as pd
 from jaxtyping import Float, Int64
 from pydantic import Field
 
-from pipeline.experiments.compare import Compare, chip_rotations, make_setup, pool_skins, to_board_axes
 from pipeline.experiments.detection import roc_area
-from pipeline.experiments.results import read_captures, write_results
+from pipeline.experiments.known_boards import read_known_boards
+from pipeline.experiments.results import write_results
 from pipeline.provenance import SECONDS
 from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
 from pipeline.settings import Settings, take
 from pipeline.stage import say
 from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy
-from pipeline.training.jobs import SceneData, read_data, score_test
+from pipeline.training.jobs import SceneData, score_test
 from pipeline.training.universal import (
     ASSUMED_POWER,
     EXPERIMENT,
     METHODS,
     WAYS,
-    Benchmark,
-    Frame,
-    KnownBoards,
     Powers,
-    Variant,
     calibrate,
     estimate,
     pool_of,
-    read_variants,
+    pool_rows,
 )
+from pipeline.training.universal_variants import KnownBoards, Variant, Variants, read_variants
 from reskin import io
 from reskin.config import Strict, parse
 from reskin.data.rows import Rows
@@ -56,11 +53,10 @@ from reskin.models.job import COLLAPSED, Weights
 from reskin.models.network import Predictor
 from reskin.models.recipe import Name, Recipe
 from reskin.models.runner import MAX_ATTEMPTS_N
-from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.universal.calibration import LabelledPresses
 from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
-from reskin.universal.law import AlignedPresses, Setup
+from reskin.universal.law import Setup
 from reskin.universal.model import PriorModel
 
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method receives
@@ -90,14 +86,8 @@ def read(settings: Settings) -> ReferenceMethods:
 
 def reference_methods(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path) -> None:
     """Score reference methods on every held-out board, on the rows that experiment labels tests."""
-    data, compare = read_data(settings, indentations, folds), settings.section(Compare, "compare")
-    skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
-    if len(skins) < 2:
-        raise ParamsError(f"scene {settings.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
-    setup = make_setup(compare, settings.shared_section(SkinDesign, "skin"))
-    frame = Frame(chip_rotations(compare), compare.labels_middle_mm, compare.labels_mirrored)
-    seen = {board: to_board_axes(pokes, compare) for board, pokes in skins.items()}
-    section, of_labels = read(settings), data.folds_of(EXPERIMENT)
+    known, section = read_known_boards(settings, indentations, folds), read(settings)
+    data, of_labels = known.data, known.data.folds_of(EXPERIMENT)
 
     points: list[Point] = []
     trainings: list[dict[str, Any]] = []
@@ -107,23 +97,22 @@ def reference_methods(settings: Settings, indentations: Path, folds: Path, model
             points += score_regressor(data, fold, method, section.labels_n)
         adversarial_points, records = score_adversarial(data, fold, section.recipe, section.adversarial_weight)
         points, trainings = points + adversarial_points, trainings + records
-        paired_uT = pairs_uT(data.rows, fold.train, pokes_of(data, fold)[: max(section.labels_n)])
+        paired_uT = pairs_uT(data.rows, fold.train, pool_rows(data, fold)[: max(section.labels_n)])
         unpaired_n += int(np.isnan(paired_uT).any(axis=1).sum())
         say(f"{data.scene} reference_methods: methods with aligned inputs on {fold.name} done")
 
-    nominal, rig = read_variants(KnownBoards(data, frame, setup, seen), models)
-    bench = Benchmark(data, frame, seen, nominal, {}, {})
+    variants = read_variants(known, models)
     seconds: list[Seconds] = []
     for fold in of_labels:
-        unlabelled_points, took = score_unlabelled(bench, setup, of_labels, fold, rig)
+        unlabelled_points, took = score_unlabelled(known, of_labels, fold, variants)
         points, seconds = points + unlabelled_points, seconds + took
         say(f"{settings.scene} reference_methods: methods with unlabelled pokes on {fold.name} done")
 
-    alarm, flagged = evaluate_alarm(data, frame, setup, seen, of_labels, section.false_alarm_fraction)
+    alarm, flagged = evaluate_alarm(known, of_labels, section.false_alarm_fraction)
     numbers: dict[str, Any] = {
         "methods": summarise(points, alignment_controls(section.methods, section.labels_n) | unlabelled_controls()),
         "unpaired_n": unpaired_n,
-        "flagged": [*flag_by_universal(bench, of_labels, section.false_alarm_fraction), flagged],
+        "flagged": [*flag_by_universal(known, variants.nominal, of_labels, section.false_alarm_fraction), flagged],
         "alarm": alarm,
     }
     write_results(results, numbers, {}, trainings=tally(trainings))
@@ -133,28 +122,16 @@ def reference_methods(settings: Settings, indentations: Path, folds: Path, model
 # --- Folds, pokes, points ---
 
 
-def board_of(fold: Fold) -> str:
-    """Name the board that a fold of experiment labels holds out."""
-    return fold.name.rsplit("-draw", 1)[0]
-
-
 def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
     """Give the fold of the board after this one, of the same draw: its pool is another skin's pokes."""
-    same = [one for one in folds if one.name.rsplit("-draw", 1)[1] == fold.name.rsplit("-draw", 1)[1]]
+    same = [one for one in folds if one.draw_i == fold.draw_i]
     names = [one.name for one in same]
     return same[(names.index(fold.name) + 1) % len(same)]
 
 
 def first_folds(folds: Sequence[Fold]) -> dict[str, Fold]:
     """Give the first fold of each board."""
-    return dict(sorted({board_of(fold): fold for fold in reversed(folds)}.items()))
-
-
-def pokes_of(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
-    """Give the rows of each poke of the pool, in the order in which experiment labels labels them."""
-    indentation = data.rows.indentation[fold.pool]
-    order = rng_for(data.settings.seed, "labelled", fold.name).permutation(np.unique(indentation))
-    return [fold.pool[indentation == one] for one in order]
+    return dict(sorted({fold.board: fold for fold in reversed(folds)}.items()))
 
 
 def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float[np.ndarray, "m ch"]:
@@ -166,8 +143,7 @@ def point(
     data: SceneData, fold: Fold, predicted: Float[np.ndarray, "b 3"], *, method: str, pokes: str, labels_n: int = 0
 ) -> Point:
     """Score predictions (x and y as labelled, F) for the tested rows of a fold."""
-    board, draw = fold.name.rsplit("-draw", 1)
-    keys = {"method": method, "name": pokes, "labels_n": labels_n, "fold": board, "seed_i": int(draw)}
+    keys = {"method": method, "name": pokes, "labels_n": labels_n, "fold": fold.board, "seed_i": fold.draw_i}
     return keys | {"scores": score_test(data, fold.test, predicted.astype(np.float32))}
 
 
@@ -198,7 +174,7 @@ ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long 
 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
     """Score a regressor of known boards as it is, with every alignment, and with labels as rows."""
-    rows, view, pokes = data.rows, VIEW[method.inputs], pokes_of(data, fold)
+    rows, view, pokes = data.rows, VIEW[method.inputs], pool_rows(data, fold)
     known, new, test = (view(rows.db_uT[at]) for at in (fold.train, fold.pool, fold.test))
     target, name = rows.target[fold.train], f"{method.title} ({method.inputs})"
     draws = partial(rng_for, data.settings.seed, RNG, name, fold.name)
@@ -338,22 +314,22 @@ Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Second
 
 
 def score_unlabelled(
-    bench: Benchmark, setup: Setup, folds: Sequence[Fold], fold: Fold, rig: Mapping[str, Variant]
+    known: KnownBoards, folds: Sequence[Fold], fold: Fold, variants: Variants
 ) -> tuple[list[Point], list[Seconds]]:
     """Score the universal models and the inversion with a skin's own pokes, with none and with another skin's."""
     points, took = [], []
-    frame, db_uT = bench.frame, bench.data.rows.db_uT
-    test_uT, rest_uT = frame.field(db_uT[fold.test]), bench.presses[board_of(fold)].rest_uT.ravel()
-    own = pool_of(bench, fold)
-    pools = {OWN: own, NONE: own[:0], FOREIGN: pool_of(bench, next_board(fold, folds))}
+    test_uT = known.frame.field(known.data.rows.db_uT[fold.test])
+    rest_uT = known.presses[fold.board].rest_uT.ravel()
+    own = pool_of(known, fold)
+    pools = {OWN: own, NONE: own[:0], FOREIGN: pool_of(known, next_board(fold, folds))}
     for given, pool in pools.items():
         for method, place_mm, force_N, seconds in [
-            *estimate_universal(bench.nominal.model, rest_uT, pool, test_uT, WAYS["nominal"]),
-            *estimate_universal(rig[board_of(fold)].model, rest_uT, pool, test_uT, WAYS["rig"]),
-            *estimate_inversion(setup, rest_uT, pool, test_uT),
+            *estimate_universal(variants.nominal.model, rest_uT, pool, test_uT, WAYS["nominal"]),
+            *estimate_universal(variants.rig[fold.board].model, rest_uT, pool, test_uT, WAYS["rig"]),
+            *estimate_inversion(known.setup, rest_uT, pool, test_uT),
         ]:
-            predicted = np.column_stack([frame.label(place_mm), force_N])
-            points.append(point(bench.data, fold, predicted, method=method, pokes=given))
+            predicted = np.column_stack([known.frame.label(place_mm), force_N])
+            points.append(point(known.data, fold, predicted, method=method, pokes=given))
             took += [replace(seconds, name=f"{method}.{fold.name}")] if given == OWN else []
     return points, took
 
@@ -429,34 +405,28 @@ class Board:
         return Board(*(change(part.reshape(len(part), -1, 3)).reshape(part.shape) for part in parts))
 
 
-def evaluate_alarm(
-    data: SceneData,
-    frame: Frame,
-    setup: Setup,
-    seen: Mapping[str, AlignedPresses],
-    folds: Sequence[Fold],
-    fraction: float,
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -> tuple[dict[str, Any], dict[str, Any]]:
     """Evaluate the residual of inversion as an alarm for foreign boards, and as a flag of wrong estimates.
 
     A physical model is fitted to each board's unlabelled pokes of its first fold, and inverted for tested readings of
     the board itself and of foreign boards.
     """
+    data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)
     boards = {}
     for board, fold in first.items():
-        rest_uT = seen[board].recorded.noload_uT.mean(axis=0).reshape(1, -1)
+        rest_uT = known.presses[board].recorded.noload_uT.mean(axis=0).reshape(1, -1)
         tested_uT = data.rows.db_uT[fold.test[::TESTED_EVERY_N]].astype(float)
-        boards[board] = Board(rest_uT, means_uT(data, pokes_of(data, fold)), tested_uT)
+        boards[board] = Board(rest_uT, means_uT(data, pool_rows(data, fold)), tested_uT)
 
     def fit_board(board: Board) -> Chart:
         return chart(fit_unlabelled(frame.field(board.pool_uT), frame.field(board.rest_uT)[0], setup), setup)
 
-    def residual(known: Chart, board: Board) -> Float[np.ndarray, " b"]:
-        return search(known, frame.field(board.tested_uT)).left
+    def residual(fitted: Chart, board: Board) -> Float[np.ndarray, " b"]:
+        return search(fitted, frame.field(board.tested_uT)).left
 
-    known = {board: fit_board(own) for board, own in boards.items()}
-    found = {board: search(known[board], frame.field(own.tested_uT)) for board, own in boards.items()}
+    charts = {board: fit_board(own) for board, own in boards.items()}
+    found = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}
     left = {board: own.left for board, own in found.items()}
     true_mm = {board: data.rows.target[first[board].test[::TESTED_EVERY_N], :2].astype(float) for board in boards}
     off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in found.items()}
@@ -465,10 +435,10 @@ def evaluate_alarm(
     names = list(boards)
     for i, (board, own) in enumerate(boards.items()):
         other = boards[names[(i + 1) % len(names)]]
-        strangers.setdefault((ANOTHER, OF_RIGHT), {})[board] = residual(known[board], other)
+        strangers.setdefault((ANOTHER, OF_RIGHT), {})[board] = residual(charts[board], other)
         for name, change in STRANGERS.items():
             stranger = own.alter(change)
-            strangers.setdefault((name, OF_RIGHT), {})[board] = residual(known[board], stranger)
+            strangers.setdefault((name, OF_RIGHT), {})[board] = residual(charts[board], stranger)
             strangers.setdefault((name, OF_STRANGER), {})[board] = residual(fit_board(stranger), stranger)
     alarm = {
         "asked_pct": 100 * fraction,
@@ -513,14 +483,16 @@ def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]]
     return {name: statistic(values, boards=True) for name, values in found.items()}
 
 
-def flag_by_universal(bench: Benchmark, folds: Sequence[Fold], fraction: float) -> list[dict[str, Any]]:
+def flag_by_universal(
+    known: KnownBoards, nominal: Variant, folds: Sequence[Fold], fraction: float
+) -> list[dict[str, Any]]:
     """Flag readings of the universal model by the standard deviation of the place, and by the misfit of the map."""
     sd_mm, misfit, off_mm = {}, {}, {}
     for board, fold in first_folds(folds).items():
-        rows, test = bench.data.rows, fold.test[::TESTED_EVERY_N]
-        calibration = calibrate(bench.nominal.model, bench.presses[board].rest_uT.ravel(), pool_of(bench, fold))
-        ((_, both),) = estimate(calibration.with_labels(0), bench.frame.field(rows.db_uT[test]), ASSUMED)
-        off_mm[board] = both.place_mm - bench.frame.place(rows.target[test, :2].astype(float))
+        rows, test = known.data.rows, fold.test[::TESTED_EVERY_N]
+        calibration = calibrate(nominal.model, known.presses[board].rest_uT.ravel(), pool_of(known, fold))
+        ((_, both),) = estimate(calibration.with_labels(0), known.frame.field(rows.db_uT[test]), ASSUMED)
+        off_mm[board] = both.place_mm - known.frame.place(rows.target[test, :2].astype(float))
         sd_mm[board], misfit[board] = both.sd_mm.max(axis=1), both.misfit
     method = METHODS[1] + WAYS["nominal"]
     by = {"standard deviation of the place": sd_mm, "misfit of the map": misfit}

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.executors import make_executor
-from pipeline.experiments.compare import Compare, chip_rotations, make_setup, pool_skins, to_board_axes
-from pipeline.experiments.results import read_captures
+from pipeline.experiments.known_boards import read_known_boards
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.training import few_labels as few
@@ -18,18 +17,13 @@ from pipeline.training.jobs import SceneData, collapse_record, read_data, score_
 from pipeline.training.universal import (
     EXPERIMENT,
     Benchmark,
-    Frame,
-    KnownBoards,
     calibrate_on_boards,
     calibrate_on_simulated,
-    make_variants,
     score_fold,
-    write_networks,
 )
+from pipeline.training.universal_variants import make_variants, write_networks
 from reskin import io
-from reskin.errors import ParamsError
 from reskin.models.classical import run_classical_jobs
-from reskin.physics.skin import SkinDesign
 from reskin.universal.training import TrainingSettings
 
 
@@ -61,9 +55,8 @@ def few_labels(settings: Settings, indentations: Path, folds: Path, scores: Path
 
 
 def _point(data: SceneData, entry: few.Entry, predicted: np.ndarray) -> dict[str, Any]:
-    board, draw = entry.fold.name.rsplit("-draw", 1)
-    point = {"method": entry.method, "inputs": entry.inputs, "labels_n": entry.labels_n, "fold": board}
-    return point | {"seed_i": int(draw), "scores": score_test(data, entry.fold.test, predicted)}
+    point = {"method": entry.method, "inputs": entry.inputs, "labels_n": entry.labels_n, "fold": entry.fold.board}
+    return point | {"seed_i": entry.fold.draw_i, "scores": score_test(data, entry.fold.test, predicted)}
 
 
 class UniversalSection(TrainingSettings):
@@ -82,20 +75,13 @@ def universal(settings: Settings, indentations: Path, folds: Path, models: Path,
 
     The map alone, and with networks; knowing the other boards of the rig, and simulated skins alone.
     """
-    data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
-    skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
-    if len(skins) < 2:
-        raise ParamsError(f"scene {data.scene}", "boards with known forces", "two or more", len(skins), "Add one.")
-    setup = make_setup(section, settings.shared_section(SkinDesign, "skin"))
-    frame = Frame(chip_rotations(section), section.labels_middle_mm, section.labels_mirrored)
-    presses = {board: to_board_axes(pokes, section) for board, pokes in skins.items()}
-    training = read_universal(settings)
-    variants = make_variants(KnownBoards(data, frame, setup, presses), training)
+    known, training = read_known_boards(settings, indentations, folds), read_universal(settings)
+    variants = make_variants(known, training)
     write_networks(models, variants, training, settings.seed)
     nominal_powers = calibrate_on_simulated(variants.nominal, training.labels_n, settings.seed)
-    benchmark, points = Benchmark(data, frame, presses, variants.nominal, {}, nominal_powers), []
+    benchmark, points = Benchmark(known, variants.nominal, {}, nominal_powers), []
     benchmark = replace(benchmark, board_powers=calibrate_on_boards(benchmark, training.labels_n))
-    for fold in data.folds_of(EXPERIMENT):
+    for fold in known.data.folds_of(EXPERIMENT):
         points += score_fold(benchmark, fold, variants.rig, training.labels_n)
-        say(f"{data.scene} universal: {fold.name} done")
+        say(f"{settings.scene} universal: {fold.name} done")
     io.write_json(scores, points)

@@ -17,7 +17,6 @@ from pipeline.training.universal import (
     REACH,
     LawError,
     Powers,
-    Variant,
     calibrate_on_simulated,
     calibrate_to_simulated,
     coverage,
@@ -25,6 +24,7 @@ from pipeline.training.universal import (
     estimate,
     lower_by_labels,
 )
+from pipeline.training.universal_variants import Variant
 from reskin.universal import training
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map, tabulate
 from reskin.universal.model import PriorModel

@@ -23,7 +23,8 @@ from pipeline.experiments.population import (
     score_skin,
     simulated_skins,
 )
-from pipeline.training.universal import BOARD_POWERS, Frame
+from pipeline.training.universal import BOARD_POWERS
+from pipeline.training.universal_variants import Frame
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import SchemaError

@@ -20,7 +20,6 @@ from pipeline.experiments.reference_methods import (
     limits_of,
     next_board,
     pairs_uT,
-    pokes_of,
     score_flagged,
     standardised_uT,
     summarise,
@@ -29,6 +28,7 @@ from pipeline.experiments.reference_methods import (
 )
 from pipeline.settings import Settings
 from pipeline.training.jobs import SceneData
+from pipeline.training.universal import pool_rows
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
@@ -83,11 +83,11 @@ def test_pairs_are_fields_of_known_boards_at_the_same_place_and_force():
 
 
 def test_enough_pairs_map_a_new_boards_fields_to_the_known_ones():
-    back_uT = standardised_uT(DATA, FOLD, pokes_of(DATA, FOLD))
+    back_uT = standardised_uT(DATA, FOLD, pool_rows(DATA, FOLD))
     np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # the least ridge is not 0
     nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
     with pytest.raises(ParamsError, match="labelled pokes must be within"):
-        standardised_uT(DATA, nowhere, pokes_of(DATA, nowhere))
+        standardised_uT(DATA, nowhere, pool_rows(DATA, nowhere))
 
 
 def test_a_collapsed_network_is_trained_again_with_other_draws(monkeypatch):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.training.universal import (
+from pipeline.training.universal_variants import (
     READINGS_N,
     Frame,
     Variant,

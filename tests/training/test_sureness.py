@@ -11,7 +11,6 @@ from pipeline.training.universal import (
     NOMINAL_POWERS,
     PoolCalibration,
     Powers,
-    Variant,
     best_powers,
     calibrate_on_simulated,
     calibrate_to_simulated,
@@ -19,6 +18,7 @@ from pipeline.training.universal import (
     estimate,
     lower_by_labels,
 )
+from pipeline.training.universal_variants import Variant
 from reskin.seeds import rng_for
 from reskin.universal.calibration import LabelledPresses, variance_inflation
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map

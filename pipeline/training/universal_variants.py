@@ -1,0 +1,181 @@
+"""The universal model before calibration to a held-out board: train it on other boards and simulated skins, or read it.
+
+Two variants: `rig` knows the recorded boards that are not held out, `nominal` simulated skins alone.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.executors import make_executor
+from pipeline.training.jobs import SceneData
+from reskin import io
+from reskin.data.rows import Rows
+from reskin.universal.law import TEN, AlignedPresses, Law, Setup, fit, simulate_uT
+from reskin.universal.map import (
+    NOMINAL,
+    NOMINAL_SPREADS,
+    RIG_SPREADS,
+    Residual,
+    fit_residual,
+    mean_law,
+    new_map,
+    tabulate,
+)
+from reskin.universal.model import PriorModel
+from reskin.universal.network import Weights, from_tensors, to_tensors
+from reskin.universal.training import NOMINAL_NAME, RecordedBoard, SkinPrior, TrainingSettings, train_networks
+
+READINGS_N = 100  # of each press of a recorded board, for training
+FORMAT = "reskin-universal-1"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How boards lie under their labels: chips' axes, and labels' middle and direction of y."""
+
+    turn: Float[np.ndarray, "k 3 3"]
+    middle_mm: tuple[float, float]
+    mirrored: bool
+
+    def field(self, b_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n ch"]:
+        """Turn readings from the chips' axes to the board's."""
+        of_chips = b_uT.astype(float).reshape(len(b_uT), -1, 3)
+        return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(len(b_uT), -1)
+
+    def place(self, label_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Turn labels to places in the board's frame."""
+        return (label_mm - self.middle_mm) * (1, -1 if self.mirrored else 1)
+
+    def label(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Turn places in the board's frame to labels."""
+        return place_mm * (1, -1 if self.mirrored else 1) + self.middle_mm
+
+
+@dataclass(frozen=True)
+class KnownBoards:
+    """The scene's recorded boards, before one is held out: `presses` by board, in the board's frame."""
+
+    data: SceneData
+    frame: Frame
+    setup: Setup
+    presses: Mapping[str, AlignedPresses]
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The model before calibration to a board, and the skins that it was made from."""
+
+    prior: SkinPrior
+    model: PriorModel
+
+
+class Variants(NamedTuple):
+    """The variant that knows no board, and by held-out board the variant that knows the others."""
+
+    nominal: Variant
+    rig: Mapping[str, Variant]
+
+
+def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
+    """Fit laws to the known boards, tabulate maps and train networks."""
+    with make_executor(imports="reskin.universal.training") as executor:
+        priors = _priors(known, executor)
+        tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
+        networks = [executor.submit(train_networks, prior, settings, known.data.settings.seed) for prior in priors]
+        variants = [
+            Variant(prior, PriorModel(new_map(of_map.result(), prior.residual), of_networks.result()))
+            for prior, of_map, of_networks in zip(priors, tables, networks, strict=True)
+        ]
+    return Variants(variants[0], dict(zip(known.presses, variants[1:], strict=True)))
+
+
+def read_variants(known: KnownBoards, models: Path) -> Variants:
+    """Read the networks that `write_networks` wrote; fit laws and tabulate maps anew."""
+    with make_executor(imports="reskin.universal.map") as executor:
+        priors = _priors(known, executor)
+        tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
+        variants = [
+            Variant(prior, PriorModel(new_map(of_map.result(), prior.residual), read_networks(models, prior.name)))
+            for prior, of_map in zip(priors, tables, strict=True)
+        ]
+    return Variants(variants[0], dict(zip(known.presses, variants[1:], strict=True)))
+
+
+def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
+    """Return the nominal prior, and for each board the prior when it is held out."""
+    boards, setup = known.presses, known.setup
+    laws = dict(
+        zip(boards, executor.map(fit, boards.values(), [setup] * len(boards), [TEN] * len(boards)), strict=True)
+    )
+    nominal = SkinPrior(NOMINAL_NAME, NOMINAL, NOMINAL_SPREADS, setup)
+    return [nominal, *(prior_without(known, laws, board) for board in boards)]
+
+
+def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
+    """Return the prior that knows all boards but one: their laws, the laws' errors, and their readings."""
+    others = {other: own for other, own in known.presses.items() if other != board}
+    rows, frame = known.data.rows, known.frame
+    recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
+    centre, residual = mean_law([laws[other] for other in others]), residual_of(others, laws, known.setup)
+    return SkinPrior(f"without {board}", centre, RIG_SPREADS, known.setup, recorded, residual)
+
+
+def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
+    """Fit the residual to the laws' errors on the boards that they were fitted to."""
+    errors = []
+    for board, own in presses.items():
+        simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
+        simulated_uT = simulated_uT.reshape(len(simulated_uT), -1)
+        off_uT = own.db_uT.reshape(simulated_uT.shape) - simulated_uT
+        errors.append(off_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
+    boards = list(presses.values())
+    return fit_residual([own.place_mm for own in boards], [own.recorded.force_N for own in boards], errors)
+
+
+def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
+    """Select a board's readings for training: equally many of each press with a force."""
+    own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
+    _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
+    each = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]  # the readings of a press are adjacent
+    db_uT = frame.field(rows.db_uT[each.ravel()]).reshape(*each.shape, -1)
+    place_mm = frame.place(rows.target[each[:, 0], :2].astype(float))
+    parts = db_uT, rest_uT, place_mm, rows.target[each, 2]
+    return RecordedBoard(*(part.astype(np.float32) for part in parts))
+
+
+def write_networks(models: Path, variants: Variants, settings: TrainingSettings, seed: int) -> None:
+    """Write the networks of each variant, with a card."""
+    with io.replacing(models) as folder:
+        folder.mkdir()
+        for variant in (variants.nominal, *variants.rig.values()):
+            name = _file_name(variant.prior.name)
+            io.write_tensors(folder / f"{name}.safetensors", to_tensors(variant.model.networks), {"format": FORMAT})
+            io.write_json(folder / f"{name}.json", card_of(variant, settings, seed))
+
+
+def read_networks(models: Path, name: str) -> list[Weights]:
+    """Read the networks of a prior, by its name."""
+    return from_tensors(io.read_tensors(models / f"{_file_name(name)}.safetensors")[0])
+
+
+def _file_name(name: str) -> str:
+    return name.replace(" ", "-")
+
+
+def card_of(variant: Variant, settings: TrainingSettings, seed: int) -> dict[str, object]:
+    """Describe networks: the skins they were trained on, and what they are not for."""
+    prior = variant.prior
+    return {
+        "format": FORMAT, "method": f"universal, {prior.name}", "seed": seed,
+        "skins_n": settings.skins_n, "steps_n": settings.steps_n, "networks_n": len(variant.model.networks),
+        "centre": asdict(prior.centre), "spreads": dict(prior.spreads), "recorded_boards_n": len(prior.recorded),
+        "inputs": "change of field (uT, board's axes), field at rest, any number of unlabelled pokes",
+        "outputs": "x, y over 8 mm; log F over 3; log sd of each",
+        "not_for": "other boards' layouts, skins of another polarity, two contacts at once, shear",
+    }  # fmt: skip
