@@ -1,4 +1,4 @@
-"""Readings and rows made by hand, for tests."""
+"""Synthetic readings and rows for tests."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from reskin.seeds import rng_for
 
 
 def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 6, **changes: object) -> Readings:
-    """A capture of one chip: two passes of one place a reading, force 1 N, db = b - noload = row number."""
+    """A capture of one chip: two passes, one place per reading, force 1 N, db = b - noload = row number."""
     ones = np.ones(f, np.float32)
     values = {
         "capture": capture, "board": board, "skin": skin, "source": "recorded",

@@ -9,29 +9,29 @@ from reskin.seeds import rng_for
 B_uT, NOLOAD_uT = (rng_for(0, name).normal(0, 500, (5, 15)).astype(np.float32) for name in ("b", "noload"))
 
 
-def test_the_change_is_what_two_loops_find():
+def test_change_equals_two_loops():
     expected = [[float(B_uT[f, ch] - NOLOAD_uT[f, ch]) for ch in range(15)] for f in range(5)]
     assert subtract(B_uT, NOLOAD_uT).tolist() == expected
 
 
 @given(st.floats(-3000, 3000, width=32))
-def test_a_field_that_is_always_there_drops_out(ambient_uT):
-    # float32 numbers of thousands carry some 1e-4 of rounding each
+def test_constant_field_cancels(ambient_uT):
+    # float32 rounding of numbers in the thousands: about 1e-4 each
     shifted = subtract(B_uT + np.float32(ambient_uT), NOLOAD_uT + np.float32(ambient_uT))
     np.testing.assert_allclose(shifted, subtract(B_uT, NOLOAD_uT), atol=2e-3)
 
 
-runs_n = st.lists(st.integers(1, 4), min_size=1, max_size=12)  # readings of each indentation
+runs_n = st.lists(st.integers(1, 4), min_size=1, max_size=12)  # readings per indentation
 
 
 def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Indentations, numbered with gaps, and the no-load field of each: its number."""
+    """Indentation numbers, with gaps, and no-load fields that equal the number of their indentation."""
     indentation = np.repeat(7 + 3 * np.arange(len(runs_n), dtype=np.int32), runs_n)
     return np.repeat(indentation[:, None], 3, axis=1).astype(np.float32), indentation
 
 
 @given(runs_n, st.integers(1, 5))
-def test_policies_are_what_a_loop_over_readings_finds(runs_n, regular_n):
+def test_policies_equal_loop_over_readings(runs_n, regular_n):
     noload_uT, indentation = capture(runs_n)
     seen, first, last = [], None, None
     for i, own in enumerate(indentation.tolist()):
@@ -46,7 +46,7 @@ def test_policies_are_what_a_loop_over_readings_finds(runs_n, regular_n):
 
 
 @given(runs_n, st.integers(1, 5))
-def test_policies_agree_at_the_first_indentation_and_a_reading_every_time_is_each(runs_n, regular_n):
+def test_policies_agree_at_first_indentation(runs_n, regular_n):
     noload_uT, indentation = capture(runs_n)
     first = slice(0, runs_n[0])
     for policy in (initial(noload_uT, indentation), regular(noload_uT, indentation, regular_n=regular_n)):
@@ -55,13 +55,13 @@ def test_policies_agree_at_the_first_indentation_and_a_reading_every_time_is_eac
     assert (regular(noload_uT, indentation, regular_n=len(runs_n)) == initial(noload_uT, indentation)).all()
 
 
-def test_ranks_count_indentations_in_order_of_time():
+def test_ranks_follow_time():
     assert rank(np.array([5, 5, 2, 9, 9])).tolist() == [0, 0, 1, 2, 2]
     assert rank(np.zeros(0, np.int32)).tolist() == []
 
 
 def touched(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A skin whose field at rest walks, touched each time elsewhere for so many rows: b, no-load and indentation."""
+    """A skin with a random walk at rest, touched at random places for `rows_n` rows each: b, no-load, indentation."""
     rng = rng_for(0, "touched")
     rest_uT = np.cumsum(walk_uT * rng.standard_normal((touches_n, 15)), axis=0)
     touch_uT = 60 * rng.standard_normal((touches_n, 15))
@@ -71,16 +71,16 @@ def touched(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tuple[np
 
 
 @pytest.mark.parametrize("rows_n", [1, 4, 50])
-def test_readings_judged_free_of_contact_follow_a_walk_however_long_each_press_lasts(rows_n):
+def test_contact_free_policy_follows_drift(rows_n):
     b_uT, noload_uT, indentation = touched(rows_n)
     within_uT = alike_within_uT(noload_uT[: 20 * rows_n], indentation[: 20 * rows_n])
     assert within_uT == pytest.approx(2.0, rel=0.2)
     off_uT = free(b_uT, noload_uT, indentation, within_uT=within_uT) - noload_uT
-    assert np.sqrt((off_uT**2).mean()) < 0.7  # the walk of a fraction of a touch, now and then of one or two
+    assert np.sqrt((off_uT**2).mean()) < 0.7  # the drift during part of a touch, occasionally of one or two
     assert np.sqrt(((initial(noload_uT, indentation) - noload_uT) ** 2).mean()) > 5
 
 
-def test_a_finger_that_slides_on_leaves_the_old_reading_in_force_and_the_skin_is_found_again_when_it_lets_go():
+def test_long_slide_keeps_the_old_no_load_reading():
     b_uT, noload_uT, _ = touched(1, walk_uT=0.1)
     sent = [field for pair in zip(noload_uT, b_uT, strict=True) for field in pair]
     slid = [*sent[:100], *(sent[101] + 20 * i for i in range(60)), *sent[100:]]
@@ -89,7 +89,7 @@ def test_a_finger_that_slides_on_leaves_the_old_reading_in_force_and_the_skin_is
     np.testing.assert_array_equal(zeros[-1], sent[-2])
 
 
-def test_nothing_but_the_past_decides_what_is_free():
+def test_contact_free_policy_is_causal():
     b_uT, noload_uT, indentation = touched(2)
     whole, part = (free(b_uT[:n], noload_uT[:n], indentation[:n], within_uT=2.0) for n in (400, 123))
     np.testing.assert_array_equal(whole[:123], part)

@@ -1,4 +1,4 @@
-"""The protocol against the paper's counts and against the order of real recordings."""
+"""The grid protocol, compared with the paper's counts and the order of real recordings."""
 
 import csv
 
@@ -11,7 +11,7 @@ from reskin.data.grid import points_mm, protocol
 depths_mm = st.lists(st.floats(0.1, 1.2), min_size=1, max_size=6, unique=True)
 
 
-def test_there_are_65_points_on_16_mm_with_4_missing_in_each_corner():
+def test_grid_has_65_points():
     points = {tuple(point) for point in points_mm()}
     full = {(2.0 * i, 2.0 * j) for i in range(9) for j in range(9)}
     missing = {(x, y) for x in (0.0, 2.0, 14.0, 16.0) for y in (0.0, 2.0, 14.0, 16.0)}
@@ -19,28 +19,28 @@ def test_there_are_65_points_on_16_mm_with_4_missing_in_each_corner():
     assert points == full - missing
 
 
-def test_the_snake_steps_over_corners_only_and_never_jumps_two_rows():
+def test_snake_order():
     steps_mm = np.abs(np.diff(points_mm(), axis=0))
     assert (steps_mm[:, 1] <= 2).all()
     along = steps_mm[:, 1] == 0
     assert (steps_mm[along, 0] == 2).all()
-    assert (steps_mm[~along, 0] <= 4).all()  # a row that is two points longer or shorter
+    assert (steps_mm[~along, 0] <= 4).all()  # neighbouring rows differ by at most two points in length
 
 
-def test_the_points_come_in_the_order_of_the_labs_recordings(shared_data):
+def test_order_equals_lab_recordings(shared_data):
     with (shared_data / "lab" / "board1_depth1.csv").open() as file:
         rows = {int(row["indent"]): (float(row["x_mm"]), float(row["y_mm"])) for row in csv.DictReader(file)}
     np.testing.assert_array_equal(points_mm(), [rows[i] for i in sorted(rows)])
 
 
-def test_six_depths_make_390_indentations_a_pass():
+def test_six_depths_make_390_indentations():
     plan = protocol((0.2, 0.4, 0.6, 0.8, 1.0, 1.2), 26)
     assert len(plan) == 26 * 390
     assert np.bincount(plan.pass_i).tolist() == [390] * 26
 
 
 @given(depths_mm, st.integers(1, 3))
-def test_every_pass_pokes_every_point_at_every_depth_once(depths, passes_n):
+def test_every_pass_covers_every_point_and_depth(depths, passes_n):
     plan = protocol(depths, passes_n)
     pokes = set(zip(plan.pass_i, plan.x_mm, plan.y_mm, plan.depth_mm, strict=True))
     assert len(pokes) == len(plan) == passes_n * len(depths) * 65
@@ -49,7 +49,7 @@ def test_every_pass_pokes_every_point_at_every_depth_once(depths, passes_n):
 
 
 @given(depths_mm)
-def test_a_pass_more_leaves_the_passes_before_as_they_are(depths):
+def test_another_pass_keeps_earlier_passes(depths):
     short, long = protocol(depths, 1), protocol(depths, 2)
     for name in ("indentation", "pass_i", "x_mm", "y_mm", "depth_mm"):
         assert np.array_equal(getattr(short, name), getattr(long, name)[: len(short)])

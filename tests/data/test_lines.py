@@ -15,11 +15,11 @@ from reskin.simulation.protocols import SKIN_MM, Hand
 from tests.data.tables import readings
 from tests.data.tables import rows as labelled
 
-READINGS_N = 2  # of one indentation
+READINGS_N = 2  # per indentation
 
 
 def at(place_mm, skins=None, indentation=None) -> Rows:
-    """Rows at these places (x, y), each an indentation of its own unless told."""
+    """Rows at places (x, y), by default one indentation each."""
     f = len(place_mm)
     skins = ["s0"] * f if skins is None else skins
     table = labelled([f"b_{skin}" for skin in skins], skins)
@@ -47,8 +47,8 @@ def as_set(lines: Lines, names=None) -> set:
     return {frozenset(pairs) for pairs in one.values()}
 
 
-def naive_grid(table: Rows, chosen) -> set:
-    """The same by loops over rows: all of one skin with the same y (then the same x), indexed by the other."""
+def grid_lines_naively(table: Rows, chosen) -> set:
+    """Reference by loops: rows of one skin with the same y (then the same x), indexed by the other coordinate."""
     found = set()
     place = {int(i): (str(table.skin[i]), *(round(float(v) * 10) for v in table.target[i, :2])) for i in chosen}
     for i in place:
@@ -68,24 +68,24 @@ places = st.lists(
 
 
 @given(places, st.data())
-def test_lines_of_a_grid_are_those_of_nested_loops_over_chosen_rows(labels, data):
+def test_grid_lines_equal_nested_loops(labels, data):
     table = at([(1.3 * x, 0.7 * y) for _, x, y in labels], [skin for skin, _, _ in labels])
     chosen = np.array(sorted(data.draw(st.sets(st.integers(0, len(labels) - 1), min_size=1))))
-    lines, naive = grid_lines(table, chosen), naive_grid(table, chosen)
+    lines, naive = grid_lines(table, chosen), grid_lines_naively(table, chosen)
     assert as_set(lines, every(table)) == {line for _, line in naive}
     assert len(set(lines.line_i.tolist())) == len(naive)
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_the_papers_65_points_are_9_rows_and_9_columns_of_known_lengths():
+def test_65_points_are_9_rows_and_9_columns():
     lines = grid_lines(grid(depths_n=2), every(grid(depths_n=2)))
     lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
     assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # rows of the grid, then columns
     assert lines.line_i.max() == 17
-    assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)  # each on its row and column
+    assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)  # each in its row and column
 
 
-def test_readings_and_visits_of_one_place_share_line_and_index():
+def test_repeated_visits_share_line_and_index():
     table = grid(depths_n=2, passes_n=3)
     lines = grid_lines(table, every(table))
     of_row = {row: set() for row in range(len(table))}
@@ -96,11 +96,11 @@ def test_readings_and_visits_of_one_place_share_line_and_index():
         by_place.setdefault((x_mm, y_mm), set()).add(frozenset(of_row[row]))
     assert len(by_place) == 65
     assert all(len(seen) == 1 for seen in by_place.values())
-    assert len(set.union(*by_place.values())) == 65  # and no two places share both
+    assert len(set.union(*by_place.values())) == 65  # no two places share both
 
 
 @given(places, st.data())
-def test_the_order_of_rows_changes_no_line(labels, data):
+def test_row_order_does_not_matter(labels, data):
     order = data.draw(st.permutations(range(len(labels))))
     straight = at([(x, y) for _, x, y in labels], [skin for skin, _, _ in labels])
     turned = [labels[i] for i in order]
@@ -113,7 +113,7 @@ def test_the_order_of_rows_changes_no_line(labels, data):
 
 
 @given(places, st.lists(st.floats(0.3, 5), min_size=10, max_size=10), st.floats(-20, 20))
-def test_only_the_order_of_places_matters_not_spacing_nor_origin_nor_force(labels, gaps_mm, origin_mm):
+def test_only_the_order_of_places_matters(labels, gaps_mm, origin_mm):
     skins = [skin for skin, _, _ in labels]
     along_mm = origin_mm + np.cumsum(gaps_mm)
     plain = at([(x, y) for _, x, y in labels], skins)
@@ -126,35 +126,35 @@ def test_only_the_order_of_places_matters_not_spacing_nor_origin_nor_force(label
         assert (getattr(one, field.name) == getattr(other, field.name)).all()
 
 
-def test_a_place_written_a_hair_aside_is_the_same_place():
+def test_rounding_differences_are_one_place():
     lines = grid_lines(at([(0, 0), (2.00001, 0), (1.99999, 0.02), (4, 0)]), np.arange(4))
     assert as_set(lines) == {frozenset({(0, 0), (1, 1), (2, 1), (3, 2)})}
 
 
-def test_a_place_that_one_line_lacks_leaves_a_gap():
+def test_missing_place_leaves_a_gap():
     lines = grid_lines(at([(0, 0), (4, 0), (0, 2), (2, 2)]), np.arange(4))
     assert frozenset({(0, 0), (1, 2)}) in as_set(lines)
     assert frozenset({(2, 0), (3, 1)}) in as_set(lines)
 
 
-def test_a_pool_without_rows_or_of_one_place_has_no_lines():
+def test_empty_pool_and_single_place_have_no_lines():
     assert len(grid_lines(at([(1, 1)] * 3), np.arange(3))) == 0
     assert len(grid_lines(at([(1, 1)]), np.zeros(0, np.int64))) == 0
 
 
 @pytest.mark.parametrize("lines", [grid_lines(grid(), np.arange(130)), hand_lines(*np.zeros((2, 4), np.int32))])
-def test_neither_place_nor_force_nor_field_is_reachable_from_lines(lines):
+def test_lines_expose_no_place_force_or_field(lines):
     assert [field.name for field in fields(lines)] == ["row", "line_i", "order_i"]
     assert set(vars(lines)) == {"row", "line_i", "order_i"}
     for array in vars(lines).values():
         assert array.dtype.kind == "i"
-        assert array.base is None  # no view of a table
+        assert array.base is None  # not a view of a table
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), min_size=1, max_size=30))
-def test_lines_by_hand_are_those_of_nested_loops(pokes):
+def test_hand_lines_equal_nested_loops(pokes):
     pass_i, along = (np.array(column, np.int32) for column in zip(*pokes, strict=True))
-    indentation = (10 * pass_i + along).astype(np.int32)  # counts on over the passes
+    indentation = (10 * pass_i + along).astype(np.int32)  # continues across passes
     naive = set()
     for one in set(pass_i.tolist()):
         own = [i for i in range(len(pokes)) if pass_i[i] == one]
@@ -166,12 +166,12 @@ def test_lines_by_hand_are_those_of_nested_loops(pokes):
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_a_simulated_hands_pokes_are_indexed_from_0_along_each_line():
-    asked = Hand(
+def test_simulated_hand_pokes_are_indexed_from_0():
+    hand = Hand(
         boards="rigid", skins_n=1, terms=(), kind="hand", lines_n=3, pokes_per_line_n=4, depth_mm=(0.5, 1.0),
         place_sd_mm=0.3, tilt_sd_deg=5.0,
     )  # fmt: skip
-    pass_i = asked.plan(rng_for(0, "hand"), SKIN_MM).pass_i
+    pass_i = hand.plan(rng_for(0, "hand"), SKIN_MM).pass_i
     readings = np.repeat(np.arange(12, dtype=np.int32), READINGS_N)
     lines = hand_lines(pass_i[readings], readings)
     assert lines.row.tolist() == list(range(24))
@@ -180,7 +180,7 @@ def test_a_simulated_hands_pokes_are_indexed_from_0_along_each_line():
 
 
 @given(st.integers(0, 6 * 65), st.integers(0, 2**32))
-def test_every_place_is_poked_equally_often_and_with_all_its_readings(indentations_n, seed):
+def test_places_are_poked_equally_often(indentations_n, seed):
     table = grid(depths_n=3, passes_n=2)
     chosen = take_pokes(table, every(table), indentations_n, rng_for(seed, "pokes"))
     taken = set(table.indentation[chosen].tolist())
@@ -192,7 +192,7 @@ def test_every_place_is_poked_equally_often_and_with_all_its_readings(indentatio
 
 
 @given(st.integers(0, 390), st.integers(0, 390), st.integers(0, 2**32))
-def test_from_one_seed_a_smaller_choice_is_part_of_a_larger_one(one_n, other_n, seed):
+def test_smaller_choice_is_part_of_larger_one(one_n, other_n, seed):
     table = grid(depths_n=3, passes_n=2)
     few, many = (
         set(take_pokes(table, every(table), n, rng_for(seed, "pokes")).tolist()) for n in sorted((one_n, other_n))
@@ -201,7 +201,7 @@ def test_from_one_seed_a_smaller_choice_is_part_of_a_larger_one(one_n, other_n, 
 
 
 @given(st.integers(0, 2**32))
-def test_the_order_of_rows_does_not_decide_which_pokes_are_taken(seed):
+def test_row_order_does_not_decide_the_choice(seed):
     table = grid(depths_n=2)
     order = rng_for(seed, "order").permutation(len(table))
     shuffled = replace(table, target=table.target[order], indentation=table.indentation[order])
@@ -216,21 +216,21 @@ def test_only_the_pool_is_poked():
     assert set(take_pokes(table, pool, 20, rng_for(0, "pokes")).tolist()) < set(pool.tolist())
 
 
-def test_places_of_a_remainder_and_depths_of_a_visit_are_drawn_fairly():
-    # Place 0 was visited 8 times, place 1 once: the one poke falls on either alike, and on each of the 8 alike.
+def test_remainder_and_depths_are_drawn_fairly():
+    # Place 0 has 8 visits, place 1 has one: the poke falls on each place equally often, and on each of the 8 visits.
     table = at([(0, 0)] * 8 + [(2, 0)])
     taken = Counter(int(take_pokes(table, every(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
     assert abs(taken[8] - 800) < 4 * np.sqrt(1600 / 4)  # four standard deviations of a fair coin
     assert all(abs(taken[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
 
 
-def test_more_pokes_than_the_pool_holds_is_one_sentence_with_both_numbers():
+def test_too_many_pokes_are_refused():
     table = grid()
     with pytest.raises(ParamsError, match="skin s0: pokes to choose must be at most the 65 indentations.*; got 66"):
         take_pokes(table, every(table), 66, rng_for(0, "pokes"))
 
 
-def test_pokes_are_chosen_on_one_skin_at_a_time():
+def test_pokes_are_chosen_on_one_skin():
     with pytest.raises(ParamsError, match="its pool must be of one skin; got s0, s1"):
         take_pokes(at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
 
@@ -246,7 +246,7 @@ def by_hand(skin: str = "s0", **changes: object):
 
 
 @given(st.integers(2, 12), st.integers(2, 12))
-def test_rows_above_stay_as_they_were_and_indentations_are_never_shared(above_n, below_n):
+def test_rows_above_stay_and_indentations_are_distinct(above_n, below_n):
     above, below = gather([readings("c0", f=above_n)], EVERY), gather([readings("c1", skin="s1", f=below_n)], EVERY)
     both = stack(above, below)
     assert len(both) == above_n + below_n
@@ -258,7 +258,7 @@ def test_rows_above_stay_as_they_were_and_indentations_are_never_shared(above_n,
     assert len({*both.indentation[above_n:]}) == len({*below.indentation})
 
 
-def test_pokes_by_hand_have_fields_but_neither_place_nor_force_and_no_row_is_left_out():
+def test_hand_pokes_have_fields_but_no_labels():
     rows, _ = hand_rows([by_hand("s0"), by_hand("s1")])
     assert len(rows) == 12
     assert np.isnan(rows.target).all()
@@ -266,7 +266,7 @@ def test_pokes_by_hand_have_fields_but_neither_place_nor_force_and_no_row_is_lef
     assert len({*rows.indentation}) == 6
 
 
-def test_lines_of_each_skin_name_its_own_rows_in_the_order_of_the_hand():
+def test_lines_of_each_skin_name_its_own_rows():
     captures = [by_hand("s0"), by_hand("s1")]
     rows, lines = hand_rows(captures)
     for one in captures:
@@ -278,7 +278,7 @@ def test_lines_of_each_skin_name_its_own_rows_in_the_order_of_the_hand():
     assert set(stack(above, rows).skin[below.row]) == {"s1"}
 
 
-def test_boards_of_other_channels_and_a_skin_poked_twice_are_refused():
+def test_other_channels_and_repeated_skin_are_refused():
     wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], EVERY)
     with pytest.raises(ParamsError, match="channels must be the 3 of c0; got 6"):

@@ -8,26 +8,26 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 
 
-def test_the_change_of_field_is_against_the_rows_own_no_load_reading():
+def test_change_uses_the_no_load_reading_of_the_row():
     rows = gather([readings()], ALL)
     assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5]
 
 
-def test_rows_without_place_or_with_too_little_force_are_counted_and_left_out():
+def test_rows_without_place_or_force_are_counted():
     x_mm = np.array([0, np.nan, 2, 3, 4, 5], np.float32)
     Fz_N = np.array([1, 1, 0.05, np.nan, 1, 1], np.float32)
     rows = gather([readings(x_mm=x_mm, Fz_N=Fz_N)], Selection(force_min_N=0.1))
-    assert rows.target[:, 0].tolist() == [0, 3, 4, 5]  # unknown force is not too little
+    assert rows.target[:, 0].tolist() == [0, 3, 4, 5]  # unknown force is kept
     assert rows.dropped == {"no_contact_rows_n": 1, "low_force_rows_n": 1}
 
 
-def test_passes_count_on_over_the_captures_of_a_skin_but_not_over_skins():
+def test_passes_continue_across_captures_of_a_skin():
     rows = gather([readings("c1"), readings("c0"), readings("c2", skin="s1")], ALL)
     assert rows.pass_i.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 0, 0, 0, 1, 1, 1]
 
 
-def test_an_indentation_has_one_number_in_the_whole_scene_and_its_readings_share_it():
-    press = np.array([7, 7, 2, 2, 9, 9], np.int32)  # the captures number alike, and not from 0
+def test_indentation_numbers_are_unique_in_the_scene():
+    press = np.array([7, 7, 2, 2, 9, 9], np.int32)  # all captures use the same numbers, not from 0
     lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
     rows = gather([readings("c1", indentation=press, x_mm=lost), readings("c0", indentation=press)], ALL)
     naive, seen = [], []
@@ -41,7 +41,7 @@ def test_an_indentation_has_one_number_in_the_whole_scene_and_its_readings_share
     assert rows.indentation[rows.capture == "c0"].max() < rows.indentation[rows.capture == "c1"].min()
 
 
-def test_the_order_of_captures_changes_nothing():
+def test_capture_order_does_not_matter():
     one, other = readings("c0"), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, 2, np.float32))
     ahead, behind = gather([one, other], ALL), gather([other, one], ALL)
     assert (ahead.board == behind.board).all()
@@ -49,7 +49,7 @@ def test_the_order_of_captures_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    ("second", "sentence"),
+    ("second", "message"),
     [
         (readings("c1", board="b9"), "board of skin s0 must be b0"),
         (readings("c1", skin="s1", source="simulated"), "source must be recorded"),
@@ -59,24 +59,24 @@ def test_the_order_of_captures_changes_nothing():
         ),
     ],
 )
-def test_captures_that_do_not_go_together_are_refused(second, sentence):
-    with pytest.raises(ParamsError, match=sentence):
+def test_inconsistent_captures_are_refused(second, message):
+    with pytest.raises(ParamsError, match=message):
         gather([readings(), second], ALL)
 
 
-def test_a_capture_that_would_vanish_is_an_error_and_no_silent_loss():
+def test_capture_without_usable_rows_is_refused():
     with pytest.raises(
         ParamsError, match="capture c1: readings with a known place and at least 0.0 N must be one or more"
     ):
         gather([readings(), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, -3, np.float32))], ALL)
 
 
-def test_a_scene_without_captures_says_how_to_get_some():
+def test_scene_without_captures_is_refused():
     with pytest.raises(ParamsError, match="reskin add"):
         gather([], ALL)
 
 
-def test_other_columns_can_be_targets_and_places_come_first():
+def test_target_columns_are_configurable():
     rows = gather(
         [readings(Fx_N=np.full(6, 0.5, np.float32), Fy_N=np.full(6, -0.25, np.float32))], ALL, targets=SHEAR_TARGETS
     )

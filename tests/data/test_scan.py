@@ -1,4 +1,4 @@
-"""What is known before a touch: the number in the pass, rows aligned with those that a model sees."""
+"""Scan order: the number of an indentation in its pass, aligned with the selected rows."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 
 
-def test_indentations_are_numbered_from_0_in_each_pass_whatever_their_own_numbers():
+def test_indentations_count_from_0_in_each_pass():
     press = np.array([7, 7, 8, 20, 21, 21], np.int32)
     one = readings(indentation=press, pass_i=np.array([0, 0, 0, 1, 1, 1], np.int32))
     assert number_in_pass(one).tolist() == [0, 0, 1, 0, 1, 1]
 
 
-def test_a_row_that_no_model_sees_keeps_its_number_so_that_later_ones_do_not_move_up():
+def test_excluded_rows_keep_their_numbers():
     lost = np.array([0, np.nan, 2, 3, np.nan, 5], np.float32)
     one = readings(x_mm=lost, noload_uT=np.arange(18, dtype=np.float32).reshape(6, 3))
     scan = gather_scan([one], ALL)
@@ -23,7 +23,7 @@ def test_a_row_that_no_model_sees_keeps_its_number_so_that_later_ones_do_not_mov
     assert scan.noload_uT[:, 0].tolist() == [0, 6, 9, 15]
 
 
-def test_rows_stand_in_the_order_of_gather_whatever_the_order_of_captures():
+def test_rows_are_aligned_with_gather():
     def made(name: str, first: float) -> Readings:
         x_mm = first + np.arange(6, dtype=np.float32)
         return readings(name, x_mm=x_mm, noload_uT=np.tile(x_mm[:, None], 3))

@@ -1,4 +1,4 @@
-"""Splits within one skin: what must stay together does, in any order of rows, and the paper's way does not."""
+"""Splits within one skin: indentations and passes stay together, except in the paper's split."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ splits = st.builds(
 
 
 def visited(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int = 2):
-    """So many skins on one board, so many passes of so many indentations of so many readings."""
+    """`skins_n` skins on one board, each with passes of indentations of readings."""
     labels = [(skin, p) for skin in range(skins_n) for p in range(passes_n) for _ in range(pokes_n * readings_n)]
     table = rows(["b0"] * len(labels), [f"b0_s{skin}" for skin, _ in labels], [p for _, p in labels])
     return replace(table, indentation=np.arange(len(labels)) // readings_n)
@@ -28,9 +28,7 @@ def visited(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int = 2):
 
 @pytest.mark.parametrize("experiment", TOGETHER)
 @given(passes_n=st.integers(2, 7), pokes_n=st.integers(1, 6), split=splits, seed=st.integers(0, 2**40))
-def test_no_indentation_and_no_pass_is_on_both_sides_and_no_row_of_the_skin_is_lost(
-    experiment, passes_n, pokes_n, split, seed
-):
+def test_indentations_and_passes_are_not_split(experiment, passes_n, pokes_n, split, seed):
     table = visited(passes_n, pokes_n)
     group = getattr(table, TOGETHER[experiment])
     folds = draw_folds(table, [experiment], split, seed)
@@ -45,7 +43,7 @@ def test_no_indentation_and_no_pass_is_on_both_sides_and_no_row_of_the_skin_is_l
 
 @pytest.mark.parametrize("experiment", TOGETHER)
 @given(order=st.permutations(range(24)))
-def test_which_groups_are_held_out_is_the_same_for_any_order_of_rows_that_keeps_their_numbers(experiment, order):
+def test_row_order_does_not_matter(experiment, order):
     table = visited(3, 4, skins_n=1)
     order = np.array(order)
     shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
@@ -55,7 +53,7 @@ def test_which_groups_are_held_out_is_the_same_for_any_order_of_rows_that_keeps_
         assert {*getattr(table, group)[one.test]} == {*getattr(shuffled, group)[other.test]}
 
 
-def test_the_papers_way_has_readings_of_one_indentation_on_both_sides():
+def test_paper_split_separates_readings_of_one_indentation():
     table = visited(4, 10, readings_n=5)
     (fold,) = draw_folds(table, ["single_random"], Split(random_test_fraction=0.1, random_repeats_n=1), 0)
     shared = {*table.indentation[fold.train]} & {*table.indentation[fold.test]}
@@ -63,7 +61,7 @@ def test_the_papers_way_has_readings_of_one_indentation_on_both_sides():
 
 
 @given(st.integers(2, 200), st.floats(0.01, 0.9), st.integers(0, 2**32 - 1))
-def test_groups_of_one_row_are_drawn_as_scikit_learn_draws_rows(rows_n, fraction, state):
+def test_groups_of_one_row_equal_scikit_learn(rows_n, fraction, state):
     test_n = max(1, round(fraction * rows_n))
     if test_n == rows_n:
         return
@@ -74,14 +72,19 @@ def test_groups_of_one_row_are_drawn_as_scikit_learn_draws_rows(rows_n, fraction
         assert test.tolist() == sorted(test_too)
 
 
-def test_one_pass_of_four_is_tested_though_a_tenth_of_four_is_none():
+def test_at_least_one_pass_is_tested():
     table = visited(4, 5)
     folds = draw_folds(table, ["single_pass"], Split(random_test_fraction=0.1, random_repeats_n=20), 0)
     assert {len({*table.pass_i[fold.test]}) for fold in folds} == {1}
-    assert {int(table.pass_i[fold.test[0]]) for fold in folds} == {0, 1, 2, 3}  # by chance alone: 4 (3/4)^20 = 1 %
+    assert {int(table.pass_i[fold.test[0]]) for fold in folds} == {
+        0,
+        1,
+        2,
+        3,
+    }  # probability of a false failure: 4 (3/4)^20 = 1 %
 
 
-def test_a_skin_of_one_pass_cannot_be_split_by_pass_and_says_so():
+def test_skin_with_one_pass_is_refused():
     split = Split(random_test_fraction=0.1, random_repeats_n=1)
     with pytest.raises(ParamsError, match="experiment single_pass: passes of skin b0_s0 must be enough for both sides"):
         draw_folds(visited(1, 5), ["single_pass"], split, 0)

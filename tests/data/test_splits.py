@@ -27,7 +27,7 @@ def six_by_three(readings_n: int = 4):
 
 
 @given(labels.filter(lambda pairs: len({board for board, _ in pairs}) > 1))
-def test_every_row_is_held_out_once_and_never_trained_on_in_its_fold(pairs):
+def test_every_row_is_held_out_once(pairs):
     table = of_pairs(pairs)
     folds = draw_folds(table, ["lobo"], Split(), 0)
     assert sorted(np.concatenate([fold.test for fold in folds]).tolist()) == list(range(len(table)))
@@ -37,7 +37,7 @@ def test_every_row_is_held_out_once_and_never_trained_on_in_its_fold(pairs):
             assert not set(names[fold.train]) & set(names[fold.test])
 
 
-def test_six_boards_give_six_folds_of_three_skins():
+def test_six_boards_give_six_folds():
     table = six_by_three()
     folds = draw_folds(table, ["lobo"], Split(), 0)
     assert [fold.name for fold in folds] == [f"b{i}" for i in range(6)]
@@ -45,7 +45,7 @@ def test_six_boards_give_six_folds_of_three_skins():
 
 
 @given(st.permutations(range(18)))
-def test_the_order_of_rows_does_not_decide_who_is_held_out(order):
+def test_row_order_does_not_matter(order):
     pairs = [(board, skin) for board in range(6) for skin in range(3)]
     straight, shuffled = of_pairs(pairs), of_pairs([pairs[i] for i in order])
     for experiment, split in (("lobo", Split()), ("transfer", TRANSFER)):
@@ -55,7 +55,7 @@ def test_the_order_of_rows_does_not_decide_who_is_held_out(order):
             assert set(straight.skin[one.test]) == set(shuffled.skin[other.test])
 
 
-def test_transfer_is_three_single_skins_on_nine_others_as_in_the_paper():
+def test_transfer_is_three_skins_on_nine_others():
     table = six_by_three()
     folds = draw_folds(table, ["transfer"], TRANSFER, 0)
     assert [set(table.skin[fold.train]) for fold in folds] == [{"b0_s0"}, {"b1_s0"}, {"b2_s0"}]
@@ -64,7 +64,7 @@ def test_transfer_is_three_single_skins_on_nine_others_as_in_the_paper():
         assert not set(table.board[fold.train]) & set(table.board[fold.test])
 
 
-def test_random_readings_stay_within_one_skin_and_differ_between_repeats():
+def test_random_readings_stay_within_one_skin():
     table = six_by_three(50)
     folds = draw_folds(table, ["single_random"], RANDOM, 5)
     assert len(folds) == 4
@@ -78,7 +78,7 @@ def test_random_readings_stay_within_one_skin_and_differ_between_repeats():
 
 
 @given(st.integers(3, 30))
-def test_the_last_passes_are_tested_and_no_later_pass_is_trained_on(passes_n):
+def test_last_passes_are_tested(passes_n):
     table = rows(["b0"] * 2 * passes_n, ["s0"] * 2 * passes_n, [i // 2 for i in range(2 * passes_n)])
     (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
     assert table.pass_i[fold.train].max() < table.pass_i[fold.test].min()
@@ -103,7 +103,7 @@ SENSORS = Split(sensors_skins_n=(15, 1, 6), sensors_draws_n=3, pool_passes_n=2)
 
 
 @pytest.mark.parametrize(("experiment", "split"), [("lobo", Split(pool_passes_n=2)), ("sensors", SENSORS)])
-def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_later_ones(experiment, split):
+def test_pool_is_the_first_passes_of_held_out_skins(experiment, split):
     table = six_by_three_in_passes(5)
     for fold in draw_folds(table, [experiment], split, 0):
         board = {*table.board[fold.test]}
@@ -116,9 +116,9 @@ def test_the_pool_is_the_first_passes_of_each_held_out_skin_and_the_test_its_lat
 
 @pytest.mark.parametrize("experiment", ["lobo", "sensors"])
 @given(order=st.permutations(range(12)))
-def test_the_order_of_rows_decides_neither_pool_nor_training_skins(experiment, order):
+def test_row_order_decides_neither_pool_nor_skins(experiment, order):
     labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
-    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no row left
+    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no rows
     straight, shuffled = (
         rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
         for numbers in (range(12), order)
@@ -130,7 +130,7 @@ def test_the_order_of_rows_decides_neither_pool_nor_training_skins(experiment, o
             assert {*getattr(one, side).tolist()} == {order[i] for i in getattr(other, side).tolist()}
 
 
-def test_without_a_pool_all_rows_of_the_held_out_board_are_tested():
+def test_without_pool_all_held_out_rows_are_tested():
     table = six_by_three_in_passes(2)
     for experiment in ("lobo", "sensors"):
         for fold in draw_folds(table, [experiment], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
@@ -139,7 +139,7 @@ def test_without_a_pool_all_rows_of_the_held_out_board_are_tested():
 
 
 @pytest.mark.parametrize(("experiment", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
-def test_experiments_that_adapt_nothing_have_no_pool_even_where_others_have_one(experiment, split):
+def test_experiments_without_adaptation_have_no_pool(experiment, split):
     table = six_by_three_in_passes(5)
     pooled = draw_folds(table, [experiment], split.model_copy(update={"pool_passes_n": 1}), 0)
     for fold, plain in zip(pooled, draw_folds(table, [experiment], split, 0), strict=True):
@@ -148,7 +148,7 @@ def test_experiments_that_adapt_nothing_have_no_pool_even_where_others_have_one(
 
 
 @given(st.integers(0, 2**32))
-def test_fewer_sensors_are_nested_within_a_draw_and_never_of_the_board_held_out(seed):
+def test_fewer_sensors_are_nested_within_a_draw(seed):
     table = six_by_three_in_passes(3, readings_n=1)
     folds = {fold.name: fold for fold in draw_folds(table, ["sensors"], SENSORS, seed)}
     boards = [f"b{i}" for i in range(6)]
@@ -166,7 +166,7 @@ def test_fewer_sensors_are_nested_within_a_draw_and_never_of_the_board_held_out(
         assert board not in {skin[:2] for skin in all_of_them}
 
 
-def test_all_skins_but_those_of_a_board_are_its_fold_of_lobo():
+def test_all_sensors_equal_the_lobo_fold():
     table = six_by_three_in_passes(3)
     split = Split(sensors_skins_n=(15,), sensors_draws_n=2, pool_passes_n=1)
     for fold, whole in zip(
@@ -177,7 +177,7 @@ def test_all_skins_but_those_of_a_board_are_its_fold_of_lobo():
             np.testing.assert_array_equal(getattr(fold, side), getattr(whole, side))
 
 
-def test_another_draw_of_sensors_takes_other_skins_and_no_more_draws_change_it():
+def test_draws_of_sensors_are_independent():
     table = six_by_three_in_passes(1)
     few, many = (
         draw_folds(table, ["sensors"], Split(sensors_skins_n=(6,), sensors_draws_n=draws_n), 0) for draws_n in (2, 5)
@@ -187,28 +187,28 @@ def test_another_draw_of_sensors_takes_other_skins_and_no_more_draws_change_it()
     assert [fold.train.tolist() for fold in few[:2]] == [fold.train.tolist() for fold in first[:2]]
 
 
-def test_boards_draw_their_training_skins_each_by_itself():
+def test_boards_draw_their_skins_independently():
     table = six_by_three_in_passes(1)
     folds = draw_folds(table, ["sensors"], Split(sensors_skins_n=(3,), sensors_draws_n=1), 0)
     ranks = {
         tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
         for fold in folds
     }
-    assert len(ranks) > 1  # not the same three of the fifteen that each board leaves
+    assert len(ranks) > 1  # boards do not all draw the same three
 
 
-def test_a_number_of_sensors_asked_twice_is_refused_as_its_folds_would_share_a_name():
+def test_repeated_number_of_sensors_is_refused():
     with pytest.raises(ParamsError, match="names each number of skins once"):
         parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
 
 LABELS = Split(labels_pool_n=5, labels_draws_n=3)
 PLACES_N = 4
-PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])  # of ten indentations: unequal visits, as recordings have
+PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])  # places of ten indentations, unequally often as in recordings
 
 
 def poked(boards_n: int = 3, readings_n: int = 2):
-    """Two skins a board, each with ten indentations at four places, in two passes."""
+    """Two skins per board, each with ten indentations at four places in two passes."""
     labels = [
         (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
         for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)
@@ -220,13 +220,13 @@ def poked(boards_n: int = 3, readings_n: int = 2):
 
 
 @given(st.integers(0, 2**32), st.integers(1, 9), st.integers(1, 3))
-def test_a_board_is_held_out_whole_and_a_pool_drawn_from_each_of_its_skins(seed, pool_n, draws_n):
+def test_boards_are_held_out_with_a_pool_of_each_skin(seed, pool_n, draws_n):
     table = poked()
     folds = draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=draws_n), seed)
     assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
     for fold in folds:
         held = np.flatnonzero(table.board == fold.name[:2])
-        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # apart, and nothing is lost
+        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # disjoint and complete
         assert sorted([*fold.train, *held]) == list(range(len(table)))
         assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
         for skin in np.unique(table.skin[held]):
@@ -234,7 +234,7 @@ def test_a_board_is_held_out_whole_and_a_pool_drawn_from_each_of_its_skins(seed,
 
 
 @given(st.integers(0, 2**32), st.integers(1, 8))
-def test_a_pool_of_labels_takes_every_place_equally_often(seed, pool_n):
+def test_label_pool_takes_places_equally_often(seed, pool_n):
     table = poked()
     for fold in draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=2), seed):
         for skin in np.unique(table.skin[fold.pool]):
@@ -244,7 +244,7 @@ def test_a_pool_of_labels_takes_every_place_equally_often(seed, pool_n):
             assert visits.max() <= -(-pool_n // PLACES_N)
 
 
-def test_draws_of_a_pool_of_labels_differ_and_follow_from_the_seed_alone():
+def test_label_pools_follow_from_seed_and_draw():
     table = poked()
     first, again, other = (draw_folds(table, ["labels"], LABELS, seed) for seed in (1, 1, 2))
     fewer = draw_folds(table, ["labels"], Split(labels_pool_n=5, labels_draws_n=1), 1)
@@ -253,7 +253,7 @@ def test_draws_of_a_pool_of_labels_differ_and_follow_from_the_seed_alone():
     assert [fold.pool.tolist() for fold in fewer] == [fold.pool.tolist() for fold in first[::3]]
 
 
-def test_two_skins_of_a_board_are_labelled_at_pokes_of_their_own():
+def test_skins_of_a_board_have_different_label_pools():
     table = poked(boards_n=2)
     own_n = len(PLACE)
     for fold in draw_folds(table, ["labels"], LABELS, 0):
@@ -264,7 +264,7 @@ def test_two_skins_of_a_board_are_labelled_at_pokes_of_their_own():
         assert one != other
 
 
-def test_a_pool_for_adaptation_is_another_and_does_not_shrink_the_folds_of_labels():
+def test_adaptation_pool_does_not_change_label_folds():
     table = poked()
     plain, pooled = (
         draw_folds(table, ["labels"], LABELS.model_copy(update={"pool_passes_n": passes_n}), 0)
@@ -283,7 +283,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
 
 
 @pytest.mark.parametrize(
-    ("table", "experiment", "split", "sentence"),
+    ("table", "experiment", "split", "message"),
     [
         (ONE_BOARD, "lobo", Split(), "experiment lobo: boards must be two or more; got 1"),
         (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
@@ -305,14 +305,14 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "the captures of skin s0 must be one, .*; got run10, run2"),
     ],
 )  # fmt: skip
-def test_folds_that_the_data_cannot_give_are_one_sentence(table, experiment, split, sentence):
-    with pytest.raises(ParamsError, match=sentence):
+def test_impossible_folds_are_refused(table, experiment, split, message):
+    with pytest.raises(ParamsError, match=message):
         draw_folds(table, [experiment], split, 0)
 
 
 @pytest.mark.parametrize(
     ("experiment", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
 )
-def test_a_planted_leak_a_skin_on_two_boards_is_refused(experiment, split):
+def test_skin_on_two_boards_is_refused(experiment, split):
     with pytest.raises(ParamsError, match="must be on one side only; got .* on both"):
         draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [experiment], split, 0)

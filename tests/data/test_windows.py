@@ -16,7 +16,7 @@ sizes = st.tuples(st.integers(1, 60), st.integers(1, 10), st.integers(0, 10), st
 
 
 @given(sizes)
-def test_windows_are_what_a_walk_along_the_capture_finds(sizes):
+def test_windows_equal_naive_loop(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
     expected, cut_n, start = [], 0, every_n
@@ -26,18 +26,18 @@ def test_windows_are_what_a_walk_along_the_capture_finds(sizes):
         else:
             cut_n = units_n - start
         start += every_n
-    asked = {"train_n": max(1, every_n - less_n), "test_n": test_n, "every_n": every_n}
+    sizes_n = {"train_n": max(1, every_n - less_n), "test_n": test_n, "every_n": every_n}
     if not expected:
         with pytest.raises(ParamsError, match="experiment drift: the shortest capture must be at least"):
-            make_windows([units_n], **asked)
+            make_windows([units_n], **sizes_n)
         return
-    windows = make_windows([units_n], **asked)
+    windows = make_windows([units_n], **sizes_n)
     assert list(windows.tests) == expected
     assert windows.left_out_units_n == cut_n
 
 
 @given(sizes)
-def test_no_unit_is_trained_on_and_tested_or_tested_twice(sizes):
+def test_units_are_tested_once_and_never_trained_on(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
     windows = make_windows(
@@ -47,26 +47,26 @@ def test_no_unit_is_trained_on_and_tested_or_tested_twice(sizes):
     assert len(used) == len(set(used))
 
 
-def test_captures_of_several_skins_are_tested_as_far_as_all_go_and_the_rest_is_counted():
+def test_skins_share_the_shortest_range():
     windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
-    assert windows.left_out_units_n == 24 - 15  # all after the start of the first window that the shorter one lacks
+    assert windows.left_out_units_n == 24 - 15  # everything from the first window that the shorter one lacks
 
 
-def test_what_is_taken_of_a_capture_is_whole_rows():
+def test_parts_are_whole_rows():
     some = take(readings(), np.array([0, 1, 0, 0, 1, 0], bool))
     assert some.x_mm.tolist() == [1, 4] == some.indentation.tolist()
     assert some.b_uT[:, 0].tolist() == [101, 104]
     assert (some.capture, len(some)) == ("c0", 2)
 
 
-def test_two_captures_of_one_skin_are_refused_in_one_sentence():
+def test_two_captures_of_one_skin_are_refused():
     with pytest.raises(ParamsError, match="captures of skin s0 must be one, as no clock orders several; got c0, c1"):
         check_one_each([readings("c0"), readings("c1")])
     check_one_each([readings("c0"), readings("c1", skin="s1")])
 
 
-def test_the_documented_windows_are_what_is_laid():
+def test_documented_windows():
     outcome = doctest.testmod(documented)
     assert (outcome.attempted, outcome.failed) == (2, 0)
 
@@ -78,7 +78,7 @@ POLICIES = {
 
 
 def capture(skin: str, f: int = 24):
-    """A reading an indentation, whose no-load field is its number; each fifth is too weak to be selected."""
+    """One reading per indentation, with its number as no-load field; every fifth is too weak to be selected."""
     noload_uT = np.tile(np.arange(f, dtype=np.float32)[:, None], (1, 3))
     weak = np.where(np.arange(f) % 5 == 0, 0.01, 1).astype(np.float32)
     return readings(skin, skin=skin, f=f, noload_uT=noload_uT, b_uT=np.full((f, 3), 100, np.float32), Fz_N=weak)
@@ -90,7 +90,7 @@ def lay(*skins: str):
     return make_parts(captures, POLICIES, windows=windows, selection=Selection(force_min_N=0.1))
 
 
-def test_each_window_of_each_skin_stands_under_each_policy_with_that_policys_change():
+def test_every_window_has_the_change_of_each_policy():
     for part in lay("s0", "s1"):
         start, end = {TRAIN: (0, 6), 0: (8, 12), 1: (16, 20)}[part.window_i]
         strong = [i for i in range(start, end) if i % 5]
@@ -100,12 +100,12 @@ def test_each_window_of_each_skin_stands_under_each_policy_with_that_policys_cha
         np.testing.assert_allclose(part.noload_off_uT, np.sqrt(np.mean(off)))
 
 
-def test_the_first_no_load_reading_is_the_captures_even_if_its_contact_is_not_selected():
+def test_first_no_load_reading_may_be_unselected():
     first = next(part for part in lay("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
-    assert (first.rows.db_uT == 100).all()  # against reading 0, whose contact was too weak
+    assert (first.rows.db_uT == 100).all()  # relative to reading 0, whose contact is too weak
 
 
-def test_parts_know_their_rows_in_the_stack_and_fill_it():
+def test_parts_know_their_rows():
     parts = lay("s0", "s1")
     rows = stack(parts)
     assert np.concatenate([part.row_i for part in parts]).tolist() == list(range(len(rows)))
@@ -114,13 +114,13 @@ def test_parts_know_their_rows_in_the_stack_and_fill_it():
         assert (rows.skin[part.row_i] == part.readings.skin).all()
 
 
-def test_what_the_selection_left_out_is_counted_once_for_all_policies():
+def test_unselected_rows_are_counted_once():
     weak_n = sum(i % 5 == 0 for window in ((0, 6), (8, 12), (16, 20)) for i in range(*window))
     assert stack(lay("s0")).dropped == {"no_contact_rows_n": 0, "low_force_rows_n": weak_n}
 
 
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 3))
-def test_as_read_a_part_is_what_gather_makes_of_its_readings(train_n, test_n, more_n):
+def test_as_read_part_equals_gather(train_n, test_n, more_n):
     every_n = max(train_n, test_n) + more_n
     windows = make_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
     one, everything = capture("s0"), Selection(force_min_N=0.0)

@@ -1,4 +1,4 @@
-"""Headers for tests: every field of a plausible capture, any of which a test may change."""
+"""Capture headers and the default fault policy for tests."""
 
 from pathlib import Path
 from typing import Any
@@ -8,10 +8,10 @@ from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header, recorded
 
 LAB = {"board": "board1", "skin": "skin1", "layout": "lab", "chips_n": 5, "protocol": "", "note": ""}
-# What is decided for faults, as params.yaml says.
+# The fault policy of params.yaml.
 AS_USUAL = parse(FaultPolicy, read_yaml(Path(__file__).parents[2] / "params.yaml")["faults"], "params.yaml: faults")
 
 
 def make_header(**changed: Any) -> Header:
-    """Make a header of a recorded lab capture with five chips; `changed` fields are checked like the rest."""
+    """Make the header of a recorded lab capture with five chips; `changed` fields are validated like the rest."""
     return recorded("test", **({"capture": "a_capture"} | LAB | changed))

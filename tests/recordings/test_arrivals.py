@@ -23,7 +23,7 @@ def arrivals_of(steps: Steps, first: tuple[int, float]) -> Arrivals:
 
 
 def naive_time_s(end_byte: int, table: Arrivals) -> float:
-    """Walk the chunks one by one, as the words of `times_of` say it."""
+    """Walk the chunks one by one, as documented for `times_of`."""
     rows = list(zip(table.byte_end.tolist(), table.t_s.tolist(), strict=True))
     if end_byte <= rows[0][0]:
         return rows[0][1] - (rows[0][0] - end_byte) * (rows[-1][1] - rows[0][1]) / (rows[-1][0] - rows[0][0])
@@ -34,7 +34,7 @@ def naive_time_s(end_byte: int, table: Arrivals) -> float:
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e3, 1e3)))
-def test_a_frame_time_is_what_a_walk_over_the_chunks_gives(steps: Steps, first: tuple[int, float]) -> None:
+def test_frame_times_equal_naive_loop(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
     end_byte = np.linspace(1, table.byte_end[-1] + 50, 40).astype(np.int64)
     want_s = [naive_time_s(int(byte), table) for byte in end_byte]
@@ -43,7 +43,7 @@ def test_a_frame_time_is_what_a_walk_over_the_chunks_gives(steps: Steps, first: 
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e3, 1e3)))
-def test_times_never_fall_and_stay_within_their_chunk(steps: Steps, first: tuple[int, float]) -> None:
+def test_times_never_decrease(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
     end_byte = np.arange(table.byte_end[0], min(table.byte_end[-1], table.byte_end[0] + 3000), dtype=np.int64) + 1
     t_s = clocks.times_of(end_byte, table)
@@ -53,18 +53,18 @@ def test_times_never_fall_and_stay_within_their_chunk(steps: Steps, first: tuple
     assert (t_s >= table.t_s[chunk_i - 1] - 1e-9).all()
 
 
-def test_a_frame_past_the_last_chunk_has_no_time() -> None:
+def test_frame_past_last_chunk_has_no_time() -> None:
     t_s = clocks.times_of(np.array([82, 400, 401], np.int64), clocks.parse(GOOD, "arrivals.csv"))
     np.testing.assert_array_equal(t_s, [10 + 0.5 * 0.82, 11.5, np.nan])
 
 
-def test_at_a_constant_rate_frames_follow_evenly_whatever_the_dump_starts_with() -> None:
+def test_constant_rate() -> None:
     t_s = clocks.constant_rate(np.array([1.0, 2.0, 401.0]), 400.0)
     np.testing.assert_allclose(t_s, [0.0025, 0.005, 1.0025], rtol=1e-15)
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e9, 1e9)))
-def test_parse_undoes_render(steps: Steps, first: tuple[int, float]) -> None:
+def test_arrivals_round_trip(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
     again = clocks.parse(clocks.render(table), "arrivals.csv")
     np.testing.assert_array_equal(again.byte_end, table.byte_end)
@@ -72,7 +72,7 @@ def test_parse_undoes_render(steps: Steps, first: tuple[int, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "says"),
+    ("old", "new", "message"),
     [
         ("t_s", "t_ms", "row 1.*missing t_s, unknown t_ms"),
         ("300", "99", "row 4: byte_end must be more than in the row above; got 99"),
@@ -87,11 +87,11 @@ def test_parse_undoes_render(steps: Steps, first: tuple[int, float]) -> None:
         (GOOD, "byte_end,t_s\n1,2\n3,2\n", "spread in time; got 2.0 in every row"),
     ],
 )
-def test_a_fault_is_one_sentence_that_names_its_place(old: str, new: str, says: str) -> None:
-    with pytest.raises(CaptureError, match=rf"^arrivals\.csv.*{says}"):
+def test_invalid_arrivals_name_their_line(old: str, new: str, message: str) -> None:
+    with pytest.raises(CaptureError, match=rf"^arrivals\.csv.*{message}"):
         clocks.parse(GOOD.replace(old, new, 1), "arrivals.csv")
 
 
-def test_an_absent_file_is_named(tmp_path: Path) -> None:
+def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="arrivals.csv: file not found"):
         clocks.parse(tmp_path / "arrivals.csv", "arrivals.csv")

@@ -14,13 +14,13 @@ def capture(folder):
     return folder
 
 
-def test_a_capture_opens_through_the_reader_of_its_layout(tmp_path):
+def test_capture_opens_with_the_reader_of_its_layout(tmp_path):
     header, blocks, account = open_capture(capture(tmp_path / "c0"), AS_USUAL)
     assert header.layout in READERS
     assert sum(map(len, blocks)) == account["rows_n"] == 4
 
 
-def test_a_file_changed_since_it_was_added_is_refused(tmp_path):
+def test_changed_file_is_refused(tmp_path):
     folder = capture(tmp_path / "c0")
     with (folder / lab.READINGS).open("a") as stream:
         stream.write("\n")
@@ -31,13 +31,13 @@ def test_a_file_changed_since_it_was_added_is_refused(tmp_path):
         open_capture(folder, AS_USUAL)
 
 
-def test_a_folder_without_header_is_no_capture(tmp_path):
+def test_folder_without_header_is_refused(tmp_path):
     with pytest.raises(CaptureError, match="a folder with header.json"):
         read_header(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("account", "sentence"),
+    ("account", "message"),
     [
         (
             {"bytes_n": 100, "skipped_resync_bytes_n": 6},
@@ -48,12 +48,12 @@ def test_a_folder_without_header_is_no_capture(tmp_path):
         ({"logged_indentations_n": 10, "dropped_no_frame_indentations_n": 9}, "9 dropped_no_frame_indentations"),
     ],
 )
-def test_too_much_loss_is_an_error_that_counts(account, sentence):
-    with pytest.raises(CaptureError, match=sentence):
+def test_too_much_loss_is_refused(account, message):
+    with pytest.raises(CaptureError, match=message):
         check_losses(account, 0.05, "c0")
 
 
-def test_what_lies_between_dwells_and_a_little_loss_are_accepted():
+def test_small_loss_and_frames_between_dwells_are_accepted():
     check_losses(
         {"bytes_n": 100, "skipped_resync_bytes_n": 5, "frames_n": 9, "dropped_between_dwells_frames_n": 8}, 0.05, "c0"
     )

@@ -1,4 +1,4 @@
-"""Two clocks: marks give the line exactly, contacts to a fraction of a dwell, and what fits twice is refused."""
+"""Synchronisation of the stream's clock with the probe's, from marks or from contacts."""
 
 import numpy as np
 import pytest
@@ -11,8 +11,8 @@ from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.seeds import rng_for
 
 FRAME_S = 1 / 400
-NOISE_UT = 4.0  # of a real board
-DRIFT_UT_PER_S = 10 / 60  # of a board that warms up
+NOISE_UT = 4.0  # typical of real boards
+DRIFT_UT_PER_S = 10 / 60  # a board that warms up
 UNIX_S = 1.7e9
 JITTER_S = (0.2, 0.5)
 
@@ -31,7 +31,7 @@ def line(offset_s: float, rate: float = 1.0) -> ClockMap:
 
 
 def stream_of(log: ProbeLog, truth: ClockMap, margin_s: float = 1.0, faint: float = 0.0) -> Block:
-    """What a board reads: 15 channels that go from a drifting no-load to a random contact and back.
+    """Readings of 15 channels that go from a drifting no-load to a random contact and back.
 
     The skin is touched from 60 ms before a contact dwell, and until 60 ms after it; the share `faint` of the contacts
     is not felt.
@@ -60,31 +60,31 @@ def worst_s(found: ClockMap, truth: ClockMap, stream_s: np.ndarray) -> float:
     begin_s=st.sampled_from([0.0, UNIX_S]),
     marks_n=st.integers(2, 6),
 )
-def test_exact_marks_give_the_line_back(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
+def test_exact_marks_recover_the_line(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
     stream_s = begin_s + np.linspace(3, 3600, marks_n)
-    # Times since 1970 are told to 2e-7 s by a double; the line is looked at within its marks.
+    # A double holds Unix time to 2e-7 s; the line is evaluated between its marks.
     truth = line(offset_s, 1 + drift_ppm * 1e-6)
     found = from_marks(np.stack([stream_s, truth.probe_s(stream_s)], axis=1), "header.json")
     assert worst_s(found, truth, stream_s) < 3e-6
     assert found.residual_s < 3e-6
 
 
-def test_one_mark_gives_the_offset_alone() -> None:
+def test_one_mark_gives_the_offset() -> None:
     found = from_marks(np.array([[10.0, 110.5]]), "header.json")
     assert (found.offset_s, found.rate, found.residual_s) == (100.5, 1.0, 0.0)
 
 
-def test_noisy_marks_give_the_least_squares_line_and_their_misfit() -> None:
+def test_noisy_marks_give_the_least_squares_line() -> None:
     stream_s = np.linspace(0, 600, 12)
     probe_s = 5 + (1 + 50e-6) * stream_s + rng_for(0, "marks").normal(0, 2e-3, 12)
     found = from_marks(np.stack([stream_s, probe_s], axis=1), "header.json")
-    slope, offset_s = np.polyfit(stream_s, probe_s, 1)  # an independent solver, in another parametrisation
+    slope, offset_s = np.polyfit(stream_s, probe_s, 1)  # an independent solver with another parametrisation
     assert found.rate == pytest.approx(slope, abs=1e-12)
     assert found.offset_s == pytest.approx(offset_s, abs=1e-9)
     assert found.residual_s == pytest.approx(np.abs(probe_s - offset_s - slope * stream_s).max(), abs=1e-9)
 
 
-def test_marks_read_to_a_millisecond_time_ten_minutes_of_drift_to_a_frame() -> None:
+def test_millisecond_marks_resolve_ten_minutes_of_drift() -> None:
     truth = line(-37.25, 1 + 50e-6)
     stream_s = np.array([2.0, 300.0, 598.0])
     probe_s = truth.probe_s(stream_s) + np.array([1e-3, -1e-3, 1e-3])
@@ -93,7 +93,7 @@ def test_marks_read_to_a_millisecond_time_ten_minutes_of_drift_to_a_frame() -> N
 
 
 @pytest.mark.parametrize(
-    ("marks", "says"),
+    ("marks", "message"),
     [
         (np.zeros((0, 2)), "one or more pairs"),
         (np.array([[0.0, np.nan]]), "finite"),
@@ -101,38 +101,38 @@ def test_marks_read_to_a_millisecond_time_ten_minutes_of_drift_to_a_frame() -> N
         (np.array([[1.0, 2.0], [2.0, 1002.0]]), "rate is 1 within 0.1; got rate 1000"),
     ],
 )
-def test_marks_that_cannot_be_are_refused(marks: np.ndarray, says: str) -> None:
-    with pytest.raises(CaptureError, match=f"^header.json: clock.marks must be .*{says}"):
+def test_invalid_marks_are_refused(marks: np.ndarray, message: str) -> None:
+    with pytest.raises(CaptureError, match=f"^header.json: clock.marks must be .*{message}"):
         from_marks(marks, "header.json")
 
 
 @pytest.mark.parametrize("offset_s", [0.0, 12.345, -250.06, UNIX_S])
 @pytest.mark.parametrize("dwell_s", [0.1, 0.4])
-def test_contacts_give_the_offset_to_a_quarter_of_a_dwell(offset_s: float, dwell_s: float) -> None:
+def test_contacts_give_the_offset(offset_s: float, dwell_s: float) -> None:
     log, truth = log_of(100, dwell_s), line(offset_s)
     t_s, b_uT = stream_of(log, truth)
     found = from_contacts([(t_s, b_uT)], log, "c")
     assert worst_s(found, truth, t_s) < dwell_s / 4
-    assert worst_s(found, truth, t_s) < FRAME_S  # nothing biases it: pressing and lifting are alike
+    assert worst_s(found, truth, t_s) < FRAME_S  # unbiased: pressing and lifting are symmetric
     assert found.explained > 0.8
 
 
-def test_contacts_follow_clocks_that_drift_for_half_an_hour() -> None:
+def test_contacts_follow_drifting_clocks() -> None:
     log, truth = log_of(2000, 0.1), line(8.0, 1 + 200e-6)
     t_s, b_uT = stream_of(log, truth)
     blocks = [(t_s[i : i + 20_000], b_uT[i : i + 20_000]) for i in range(0, len(t_s), 20_000)]
     found = from_contacts(blocks, log, "c")
-    assert 200e-6 * np.ptp(t_s) > 0.1  # an offset alone would be wrong by a dwell in the end
+    assert 200e-6 * np.ptp(t_s) > 0.1  # an offset alone would end up wrong by a dwell
     assert worst_s(found, truth, t_s) < 0.1 / 4
 
 
-def test_contacts_pressed_twice_as_long_as_not_are_found() -> None:
+def test_contacts_longer_than_pauses() -> None:
     log, truth = log_of(60, 0.5, (0.13, 0.4)), line(3.0)
     t_s, b_uT = stream_of(log, truth)
     assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s) < 0.5 / 4
 
 
-def test_a_part_of_the_stream_is_enough_when_travel_is_irregular() -> None:
+def test_part_of_the_stream_suffices_with_irregular_travel() -> None:
     log, truth = log_of(100, 0.2), line(3.0)
     t_s, b_uT = stream_of(log, truth)
     part = slice(np.searchsorted(truth.probe_s(t_s), log.t_start_s[60]), None)
@@ -141,7 +141,7 @@ def test_a_part_of_the_stream_is_enough_when_travel_is_irregular() -> None:
 
 
 @pytest.mark.parametrize("part", [slice(None), slice(5000, 15000)], ids=["whole", "piece"])
-def test_a_periodic_protocol_fits_a_period_later_about_as_well_and_is_refused(part: slice) -> None:
+def test_ambiguous_periodic_protocol_is_refused(part: slice) -> None:
     log = log_of(40, 0.25, (0.25, 0.25))
     t_s, b_uT = stream_of(log, line(7.0), margin_s=3.0)
     with pytest.raises(CaptureError, match="better than any other; got two fits .* Add sync marks: .*--mark"):
@@ -155,7 +155,7 @@ def test_a_periodic_protocol_fits_a_period_later_about_as_well_and_is_refused(pa
     lost=st.floats(0, 0.3),
     indentations_n=st.integers(15, 60),
 )
-def test_the_offset_is_right_or_refused(
+def test_offset_is_right_or_refused(
     faint: float, travel_s: tuple[float, float], margin_s: float, lost: float, indentations_n: int
 ) -> None:
     log, truth = log_of(indentations_n, 0.25, travel_s), line(7.0)
@@ -169,7 +169,7 @@ def test_the_offset_is_right_or_refused(
     assert worst_s(found, truth, t_s) < 0.25 / 4
 
 
-def test_a_field_that_feels_nothing_is_refused() -> None:
+def test_stream_without_contact_signal_is_refused() -> None:
     log = log_of(50, 0.2)
     t_s, b_uT = stream_of(log, line(0.0))
     still_uT = rng_for(3, "still").normal(1000, NOISE_UT, b_uT.shape).astype(np.float32)
@@ -177,13 +177,13 @@ def test_a_field_that_feels_nothing_is_refused() -> None:
         from_contacts([(t_s, still_uT)], log, "c")
 
 
-def test_the_contacts_of_another_log_are_refused() -> None:
+def test_contacts_of_another_log_are_refused() -> None:
     t_s, b_uT = stream_of(log_of(50, 0.2), line(0.0))
     with pytest.raises(CaptureError, match="Add sync marks"):
         from_contacts([(t_s, b_uT)], log_of(50, 0.2, (0.1, 0.9)), "c")
 
 
-def test_a_log_without_contacts_and_a_stream_without_frames_are_refused() -> None:
+def test_empty_log_and_empty_stream_are_refused() -> None:
     log = log_of(2, 0.2)
     with pytest.raises(CaptureError, match="one with frames"):
         from_contacts([], log, "c")
@@ -192,7 +192,7 @@ def test_a_log_without_contacts_and_a_stream_without_frames_are_refused() -> Non
         from_contacts([stream_of(log, line(0.0))], lifted, "c")
 
 
-def test_frames_that_cannot_be_read_do_not_move_the_clock() -> None:
+def test_failed_reads_do_not_move_the_clock() -> None:
     log, truth = log_of(60, 0.2), line(1.5)
     t_s, b_uT = stream_of(log, truth)
     b_uT[::50] = np.nan

@@ -1,4 +1,4 @@
-"""Each fault is counted, with its span, and the policy is applied: dropped, flagged, or the recording refused."""
+"""Faults are counted with their time span, and the policy drops, flags or refuses them."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -22,7 +22,7 @@ from tests.recordings.headers import AS_USUAL
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
 FROM_S, LASTS_S = 2.0, 0.5
-# the fault that is put in, on which wire, the name it is found under, how many frames (or bytes: None)
+# injected fault, wire, name in the log, number of faulty frames (None: bytes)
 FAULTS = [
     ("failed-read", "binary", "failed_read", 200), ("zeros", "binary", "zeros", 200), ("stuck", "binary", "stuck", 181),
     ("saturated", "binary", "saturated", 200), ("too-hot", "binary", "too_hot", 200),
@@ -33,7 +33,7 @@ FAULTS = [
 
 
 def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy, wire: str = "binary"):
-    """Feed frames as ingestion does, in portions that end at `ends`; return the log and the mask of kept frames."""
+    """Feed frames in chunks that end at `ends`, as ingestion does; return the log and the mask of kept frames."""
     frame_bytes_n = None if wire.startswith("text") else record_type(wire, 5).itemsize
     detector = FaultDetector(frames.temperature_degC.shape[1], frame_bytes_n=frame_bytes_n)
     log, kept = FaultLog(policy, "stream.bin", "ms"), []
@@ -45,7 +45,7 @@ def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy
 
 
 def record_fault(name: str, wire: str, policy: FaultPolicy = AS_USUAL):
-    """Record a stream with a fault, in two portions."""
+    """Record a stream with a fault, in two chunks."""
     script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], parse_fault(f"{name}@{FROM_S}+{LASTS_S}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     sent_byte = np.cumsum([len(piece) for piece in script.pieces])
@@ -54,14 +54,14 @@ def record_fault(name: str, wire: str, policy: FaultPolicy = AS_USUAL):
 
 
 @pytest.mark.parametrize("wire", SCRIPTS)
-def test_a_sound_stream_has_no_fault_in_its_account(wire):
+def test_sound_stream_has_no_fault(wire):
     log, kept = record_fault("none", wire)
     assert log.account() == {}
     assert kept.all()
 
 
 @pytest.mark.parametrize(("name", "wire", "fault", "frames_n"), FAULTS)
-def test_each_fault_is_found_where_it_was_and_the_policy_applied(name, wire, fault, frames_n):
+def test_faults_are_found_and_the_policy_applied(name, wire, fault, frames_n):
     for action in FaultPolicy.model_fields[fault].annotation.__args__:
         policy = override(AS_USUAL, [f"{fault}={action}"], "test")
         if action == "refuse":
@@ -79,14 +79,14 @@ def test_each_fault_is_found_where_it_was_and_the_policy_applied(name, wire, fau
         assert (~kept).sum() == (found.count_n if dropped else 0)
 
 
-def test_a_board_that_is_silent_for_a_second_was_unplugged():
+def test_silent_second_is_an_unplugging():
     script = SCRIPTS["binary"]
     frames = replace(script.frames, end_byte=82 * (1 + np.arange(len(script))))
     log, _ = record(frames, script.t_s + 1.5 * (script.t_s > 1.0), [], AS_USUAL)
     assert {name: (found.count_n, round(found.first, 1)) for name, found in log.records.items()} == {"unplug": (1, 2.5)}
 
 
-def test_a_chip_reset_is_refused_or_flagged():
+def test_chip_reset_is_refused_or_flagged():
     script = inject(make_script(pokes_n=2), parse_fault("chip-reset@2+5"))
     frames, _ = decode_all(b"".join(script.pieces), "binary", 5, "reset")
     with pytest.raises(CaptureError, match="the LSB of chip 1"):
@@ -97,7 +97,7 @@ def test_a_chip_reset_is_refused_or_flagged():
     assert 1.0 <= log.records["chip_reset"].first <= 3.0
 
 
-def test_a_fault_without_time_is_counted_and_leaves_the_span_as_it_is():
+def test_fault_without_time_leaves_the_span():
     mask, unknown_s = np.ones(2, bool), np.array([3.0, np.nan])
     log = FaultLog(AS_USUAL, "x", "ms")
     for at_s in (unknown_s * np.nan, unknown_s, unknown_s * np.nan):
@@ -109,7 +109,7 @@ def test_a_fault_without_time_is_counted_and_leaves_the_span_as_it_is():
         FaultLog(override(AS_USUAL, ["stuck=refuse"], "t"), "x", "ms").record("stuck", mask, unknown_s * np.nan)
 
 
-def test_rows_of_a_table_follow_the_policy_likewise():
+def test_policy_applies_to_table_rows():
     rng = rng_for(0, "rows")
     b_uT, temperature_degC = rng.normal(300, 5, (200, 6)), np.full((200, 2), 25.0)
     temperature_degC[20:30, 1], b_uT[100] = 150.0, 0.0
@@ -125,7 +125,7 @@ def test_rows_of_a_table_follow_the_policy_likewise():
         check_rows(b_uT, temperature_degC, None, where="here", policy=override(AS_USUAL, ["zeros=refuse"], "t"))
 
 
-def test_a_wrong_override_is_refused_and_an_absent_fault_is_not_in_the_account():
+def test_invalid_overrides_are_refused():
     wrong = {"melted=drop": "NAME=drop", "torn=flag": "torn=drop|refuse", "stuck": "stuck=drop"}
     for text, rule in wrong.items():
         with pytest.raises(ParamsError, match="the action for a fault must be") as error:
@@ -142,13 +142,13 @@ CONSTANT = (
 
 
 def constant_z(b_uT: np.ndarray) -> np.ndarray:
-    """Chips 0 and 1 whose z never changes, the second one at 0."""
+    """Set z of chips 0 and 1 to a constant, of the second one to 0."""
     changed = b_uT.copy()
     changed[:, 2], changed[:, 5] = b_uT[0, 2], 0.0
     return changed
 
 
-def test_channels_that_never_change_are_refused_or_flagged_in_rows():
+def test_constant_channels_of_a_table_are_refused_or_flagged():
     rng = rng_for(0, "constant")
     b_uT, warm_degC = constant_z(rng.normal(300, 5, (200, 9))), np.full((200, 3), 25.0)
     with pytest.raises(CaptureError, match=CONSTANT):
@@ -162,7 +162,7 @@ def test_channels_that_never_change_are_refused_or_flagged_in_rows():
 
 
 @given(st.lists(st.integers(0, 400), max_size=4))
-def test_channels_that_never_change_are_found_in_a_stream_of_any_portions(ends):
+def test_constant_channels_are_found_in_any_chunks(ends):
     frames = SCRIPTS["binary"].frames
     frames = replace(frames, b_uT=constant_z(frames.b_uT), end_byte=82 * (1 + np.arange(len(frames))))
     with pytest.raises(CaptureError, match=CONSTANT):
@@ -171,7 +171,7 @@ def test_channels_that_never_change_are_found_in_a_stream_of_any_portions(ends):
     assert log.account()["fault_constant_channel_last_ms"] > 0
 
 
-def test_a_board_whose_chips_or_all_channels_stand_still_has_no_constant_channel():
+def test_still_chips_and_boards_have_no_constant_channel():
     channels = ConstantChannels(2)
     channels.feed(np.zeros((50, 6)))
     assert channels.found() == []
@@ -194,7 +194,7 @@ def noisy_fields_uT(rows_n: int) -> np.ndarray:
 
 @settings(max_examples=30, deadline=None)
 @given(failed=st.sets(st.tuples(st.integers(0, 49), st.integers(0, CHIPS_N - 1))))
-def test_a_row_is_whole_if_none_of_its_chips_failed(failed: set[tuple[int, int]]) -> None:
+def test_row_is_valid_if_no_chip_failed(failed: set[tuple[int, int]]) -> None:
     b_uT, temperature_degC = noisy_fields_uT(50), np.full((50, CHIPS_N), 25.0)
     for row_i, chip_i in failed:
         b_uT[row_i, 3 * chip_i : 3 * chip_i + 3] = faults.FAILED_B_uT
@@ -205,7 +205,7 @@ def test_a_row_is_whole_if_none_of_its_chips_failed(failed: set[tuple[int, int]]
         assert set(np.flatnonzero(~whole).tolist()) == rows
 
 
-def test_a_row_with_zeros_in_place_of_a_chips_reading_is_not_whole():
+def test_row_with_a_zero_reading_is_invalid():
     b_uT = noisy_fields_uT(50)
     b_uT[7, 3:6] = 0.0
     rows = check_rows(b_uT, np.full((50, CHIPS_N), 25.0), None, where="here", policy=AS_USUAL)
@@ -214,7 +214,7 @@ def test_a_row_with_zeros_in_place_of_a_chips_reading_is_not_whole():
 
 
 @pytest.mark.parametrize("chip_i", range(CHIPS_N))
-def test_a_chip_without_the_others_grid_is_named(chip_i: int) -> None:
+def test_chip_with_another_lsb_is_named(chip_i: int) -> None:
     b_uT = noisy_fields_uT(GRID_ROWS_N)
     spread = seeds.rng_for(2021, "spread").standard_normal((GRID_ROWS_N, 3))
     b_uT[:, 3 * chip_i : 3 * chip_i + 3] = 300 + 5 * spread
@@ -222,14 +222,14 @@ def test_a_chip_without_the_others_grid_is_named(chip_i: int) -> None:
         check_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), None, where="here", policy=AS_USUAL)
 
 
-def test_fields_that_show_no_grid_at_all_are_believed() -> None:
-    # As of a recorder that averages: there is nothing to compare.
+def test_fields_without_grid_are_accepted() -> None:
+    # For example of a recorder that averages: there is no LSB to compare.
     b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
     unknown_degC = np.full((GRID_ROWS_N, CHIPS_N), np.nan)
     assert check_rows(b_uT, unknown_degC, None, where="here", policy=AS_USUAL).keep.all()
 
 
-def test_a_row_with_a_stuck_chip_is_told_from_one_that_failed() -> None:
+def test_stuck_and_failed_rows_are_counted_apart() -> None:
     b_uT, temperature_degC = noisy_fields_uT(100), np.full((100, CHIPS_N), 25.0)
     b_uT[50:, 3:6] = b_uT[50, 3:6]
     b_uT[10, :3], temperature_degC[10, 0] = faults.FAILED_B_uT, faults.FAILED_TEMPERATURE_degC

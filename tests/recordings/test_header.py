@@ -11,14 +11,14 @@ from tests.recordings.headers import make_header
 
 
 @given(st.floats(0.1, 1e5), st.lists(st.tuples(st.floats(0, 1e9), st.floats(0, 1e9)), max_size=3))
-def test_a_header_survives_json(rate_hz, marks):
+def test_header_round_trip(rate_hz, marks):
     clock = Clock(kind="rate", rate_hz=rate_hz, marks=tuple(marks))
     header = make_header(layout="native", wire="binary", clock=clock)
     assert parse(render(header), "header.json") == header
 
 
 @pytest.mark.parametrize(
-    ("changed", "sentence"),
+    ("changed", "message"),
     [
         ({"unit_b": "mT"}, "header.json: unit_b: Input should be 'uT'; got 'mT'"),
         ({"chips_n": 0}, "chips_n: Input should be greater than or equal to 1; got 0"),
@@ -30,13 +30,13 @@ def test_a_header_survives_json(rate_hz, marks):
         ({"clock": {"kind": "rate", "rate_hz": None, "marks": []}}, "rate_hz belongs to clock kind 'rate'"),
     ],
 )
-def test_a_wrong_header_names_its_field_and_value(changed, sentence):
+def test_invalid_field_is_named(changed, message):
     fields = json.loads(render(make_header())) | changed
-    with pytest.raises(CaptureError, match=sentence):
+    with pytest.raises(CaptureError, match=message):
         parse(json.dumps(fields), "header.json")
 
 
-def test_a_field_that_is_not_written_is_an_error():
+def test_missing_field_is_an_error():
     fields = json.loads(render(make_header()))
     del fields["skin"]
     with pytest.raises(CaptureError, match="skin: Field required; got nothing"):
@@ -44,18 +44,18 @@ def test_a_field_that_is_not_written_is_an_error():
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "\x00", "null"])
-def test_what_is_no_header_is_one_sentence(text):
+def test_malformed_header_is_refused(text):
     with pytest.raises(CaptureError, match="header.json: header: ") as caught:
         parse(text, "header.json")
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_renamed_by_hand_is_noticed():
+def test_renamed_folder_is_refused():
     with pytest.raises(CaptureError, match="capture must be the folder's name 'other'; got 'a_capture'"):
         check_same_capture(make_header(), "other")
 
 
-def test_a_capture_vouches_for_its_files(tmp_path):
+def test_capture_checks_its_files(tmp_path):
     (tmp_path / "source.csv").write_bytes(b"copied")
     header = write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "source.csv"})
     assert header.files == {
@@ -65,7 +65,7 @@ def test_a_capture_vouches_for_its_files(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["c0", "source.csv"]
 
 
-def test_a_source_that_is_missing_leaves_no_folder(tmp_path):
+def test_missing_source_leaves_no_folder(tmp_path):
     with pytest.raises(FileNotFoundError):
         write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "none.csv"})
     assert list(tmp_path.iterdir()) == []

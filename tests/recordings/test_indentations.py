@@ -1,4 +1,4 @@
-"""Frames join dwells: told by a naive double loop; the same for any blocking; every frame is accounted for."""
+"""Frames are matched with dwells as by a naive double loop, in any blocks, and every frame is accounted for."""
 
 import dataclasses
 import tracemalloc
@@ -20,12 +20,12 @@ from tests.recordings.headers import make_header
 CHIPS_N = 2
 CLOCK = ClockMap(offset_s=-5.0, rate=1.25, residual_s=0.0, explained=1.0)
 HEADER = make_header(chips_n=CHIPS_N, contacts_before_n=100)
-# One indentation: its dwells as (gap before, length), whole numbers of half frames, so that edges fall on frames, too.
+# One indentation: its dwells as (gap before, length) in half frames, so that some frames fall on edges.
 DWELLS = st.lists(st.tuples(st.integers(0, 3), st.integers(1, 9)), min_size=1, max_size=3)
 
 
 def log_of(indentations: list[list[tuple[int, int]]]) -> ProbeLog:
-    """A log of these dwells, the first of each indentation lifted, the others in contact."""
+    """A log of these dwells; the first of each indentation is lifted, the others are in contact."""
     rows = [
         (number, dwell_i > 0, *dwell) for number, one in enumerate(indentations) for dwell_i, dwell in enumerate(one)
     ]
@@ -64,7 +64,7 @@ def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
 
 
 def joined(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """All readings of all blocks, column by column."""
+    """Concatenate the readings of all blocks by column."""
     account: dict[str, int] = {}
     parts = list(join(blocks, log, CLOCK, HEADER, account))
     empty = Joiner(log, CLOCK, HEADER).close()
@@ -75,7 +75,7 @@ def joined(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarr
 
 
 def naive(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
-    """Every frame against every dwell, as the words say it: the later dwell takes a frame on a common edge."""
+    """Compare every frame with every dwell; the later dwell takes a frame on a common edge."""
     noload: dict[int, list[np.ndarray]] = {}
     contact: list[tuple[int, int]] = []
     for frame_i, t_s in enumerate(timed.t_s.tolist()):
@@ -113,7 +113,7 @@ FAULTS = st.dictionaries(st.integers(0, 60), st.sampled_from(["failed", "stuck",
 
 
 @given(indentations=st.lists(DWELLS, min_size=1, max_size=6), frames_n=st.integers(0, 60), faults=FAULTS)
-def test_readings_are_those_of_a_double_loop(
+def test_readings_equal_double_loop(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str]
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
@@ -122,7 +122,7 @@ def test_readings_are_those_of_a_double_loop(
     assert len(got["indentation"]) == len(want)
     for row_i, row in enumerate(want):
         for name, value in row.items():
-            # float32 of a mean taken in float64; all else is copied
+            # the mean is taken in float64; everything else is copied
             np.testing.assert_allclose(got[name][row_i], value, rtol=1e-6 if name == "noload_uT" else 0, err_msg=name)
 
 
@@ -132,7 +132,7 @@ def test_readings_are_those_of_a_double_loop(
     faults=FAULTS,
     ends=st.lists(st.integers(0, 60), max_size=60),
 )
-def test_any_blocking_gives_the_same_readings_and_account(
+def test_blocks_do_not_matter(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str], ends: list[int]
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
@@ -149,7 +149,7 @@ def test_any_blocking_gives_the_same_readings_and_account(
     faults=FAULTS,
     untimed_n=st.integers(0, 5),
 )
-def test_every_frame_and_every_indentation_is_accounted_for(
+def test_frames_and_indentations_are_accounted_for(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str], untimed_n: int
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
@@ -164,8 +164,8 @@ def test_every_frame_and_every_indentation_is_accounted_for(
     assert min(account.values()) >= 0
 
 
-def test_each_loss_has_its_reason() -> None:
-    # Frames lie at -2, -1, 0, ... s of the probe; dwells at 0-2, 3-4 | 5-6, 7-8 | 9-9.5 s, and after the stream.
+def test_losses_are_counted_by_reason() -> None:
+    # Frames at -2, -1, 0, ... s of probe time; dwells at 0-2, 3-4 | 5-6, 7-8 | 9-9.5 s, and after the stream.
     log = log_of([[(0, 4), (2, 2)], [(2, 2), (2, 2)], [(2, 1), (1, 1)], [(60, 2), (2, 2)]])
     timed = timed_of(13, {2: "failed", 3: "field", 7: "field", 8: "failed"})
     timed.t_s[12:] = np.nan
@@ -190,7 +190,7 @@ def test_each_loss_has_its_reason() -> None:
     assert rows["reading_i"].tolist() == [0, 1]
 
 
-def test_readings_come_as_soon_as_the_next_indentation_begins_and_no_more_is_kept() -> None:
+def test_readings_are_released_when_the_next_indentation_begins() -> None:
     log = log_of([[(2, 6), (2, 6)]] * 50)
     timed = timed_of(400)
     joiner = Joiner(log, CLOCK, HEADER)
@@ -199,7 +199,7 @@ def test_readings_come_as_soon_as_the_next_indentation_begins_and_no_more_is_kep
     assert len(joiner.close()) <= 4
 
 
-def test_ten_times_the_frames_need_no_more_memory() -> None:
+def test_memory_does_not_grow_with_the_stream() -> None:
     block = timed_of(4000)
 
     def peak_bytes_n(blocks_n: int) -> int:
@@ -212,4 +212,4 @@ def test_ten_times_the_frames_need_no_more_memory() -> None:
         tracemalloc.stop()
         return peak
 
-    assert peak_bytes_n(30) < 1.1 * peak_bytes_n(3)  # a tenth for what the counters and the allocator do
+    assert peak_bytes_n(30) < 1.1 * peak_bytes_n(3)  # 10 % for counters and the allocator

@@ -1,4 +1,4 @@
-"""How the chips of real boards are turned: recorded changes of field against the scenes' skin, with nothing fitted.
+"""Orientation of real chips: recorded changes of field compared with the scenes' skin, nothing fitted.
 
 Labels run along the board's x and against its y.
 """
@@ -23,21 +23,21 @@ from tests.physics.test_board import SPREADS, as_tuples
 from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
-DEPTH_M = 0.8e-3  # the recordings do not say; at 0.6 and 1 mm the directions are the same
-TURNED = np.diag([1.0, -1.0])  # labels to the board's axes
+DEPTH_M = 0.8e-3  # not recorded; the directions at 0.6 and 1 mm are the same
+TURNED = np.diag([1.0, -1.0])  # from label axes to board axes
 MIDDLE_MM = 8.0
 
 
 @pytest.fixture(scope="module")
 def design() -> BoardDesign:
     scene = YAML(typ="safe").load((ROOT / SCENES / "quick.yaml").read_text())
-    words = scene["simulate"]["boards"]["rigid"]["design"]
-    return parse(BoardDesign, {name: as_tuples(value) for name, value in words.items()}, "test")
+    values = scene["simulate"]["boards"]["rigid"]["design"]
+    return parse(BoardDesign, {name: as_tuples(value) for name, value in values.items()}, "test")
 
 
 @pytest.fixture(scope="module")
 def recorded_uT(shared_data, tmp_path_factory) -> np.ndarray:
-    """Changes of field in the chips' axes: [files, places, chips, 3]; every file has the places of `simulated_uT`."""
+    """Changes of field in the chips' axes: [files, places, chips, 3]; all files have the places of `simulated_uT`."""
     return np.stack([_change_uT(_readings(name, shared_data, tmp_path_factory)) for name in LAB])
 
 
@@ -48,8 +48,8 @@ def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
     pokes_m = np.column_stack([labels_mm @ TURNED * milli, np.full(65, DEPTH_M)])
     still = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
-    words = nominal("skin") | {"hold": None}  # which was fitted on these boards
-    skin = draw_skin(parse(SkinDesign, words, "test"), still, seed=0, name="nominal")
+    values = nominal("skin") | {"hold": None}  # `hold` was fitted on these boards
+    skin = draw_skin(parse(SkinDesign, values, "test"), still, seed=0, name="nominal")
     _, changes_T = changes_of_field(draw_board(design, still, seed=0, name="nominal"), skin, pokes_m)
     return changes_T / micro
 
@@ -62,18 +62,18 @@ def _change_uT(readings: Readings) -> np.ndarray:
     return (readings.b_uT - readings.noload_uT).reshape(65, 100, 5, 3).mean(axis=1)
 
 
-def test_each_chip_is_turned_as_the_scenes_say(recorded_uT, simulated_uT, design):
-    # Over all files, for a turn that one file tells is up to 40 degrees off, and once mirrored.
+def test_chip_rotations_of_the_scenes(recorded_uT, simulated_uT, design):
+    # Over all files: a rotation from one file alone is up to 40 degrees off, in one case mirrored.
     for chip_i, turn_deg in enumerate(design.chips_turn_deg):
         read_uT = recorded_uT[:, :, chip_i].reshape(-1, 3)
         found, _ = orthogonal_procrustes(read_uT, np.tile(simulated_uT[:, chip_i], (len(LAB), 1)))
         turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         assert np.linalg.det(found) > 0, f"chip {chip_i} is mirrored"
-        # A quarter turn would be wrong by 1; what is left is the skins': they sit aside, and slide.
+        # A quarter turn would give 1; the rest is due to the skins, which are offset and slide.
         assert np.abs(found.T - turn).max() < 0.35, f"chip {chip_i}"
 
 
-def test_the_nominal_skin_has_the_recorded_direction(recorded_uT, simulated_uT, design):
+def test_nominal_skin_has_the_recorded_direction(recorded_uT, simulated_uT, design):
     turn = Rotation.from_euler("z", np.array(design.chips_turn_deg)[:, None], degrees=True).as_matrix()
     seen_uT = np.einsum("kij,dnkj->dnki", turn, recorded_uT)
     along = (seen_uT * simulated_uT).sum(axis=(2, 3))

@@ -1,4 +1,4 @@
-"""Real recordings from `reskin add` to a leave-one-board-out table, and one board more, and one less."""
+"""Real recordings from `reskin add` to a leave-one-board-out table; adding and removing a board."""
 
 import json
 import re
@@ -14,7 +14,7 @@ from reskin.recordings import preparing
 from reskin.recordings.preparing import CaptureNames
 from tests.stages.checkout import copy_checkout, run
 
-SAID = "said.txt"  # by DVC in the first run
+REPRO_LOG = "repro.log"  # output of DVC's first run
 pytestmark = pytest.mark.timeout(1800)
 
 
@@ -25,7 +25,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
-    settings |= {"experiments": ["lobo"], "split": {}}  # more: the story of scene ci
+    settings |= {"experiments": ["lobo"], "split": {}}  # scene ci tests the other experiments
     for section in ("few_labels", "audit", "compare", "universal", "reference_methods"):
         del settings[section]
     with scene.open("w") as stream:
@@ -35,7 +35,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
         labels = CaptureNames(f"board{board}", f"skin{board}", None)
         prepared = preparing.foreign(shared_data / f"lab/board{board}_depth2.csv", "lab", labels, {})
         add.add(root, "lab", prepared, allow_copy=False)
-    (root / SAID).write_text(run(root, "dvc", "repro").stdout)
+    (root / REPRO_LOG).write_text(run(root, "dvc", "repro").stdout)
     return root
 
 
@@ -45,7 +45,7 @@ def by_board(root: Path) -> dict:
     return numbers["lobo"]["by_board"]
 
 
-def test_two_real_boards_give_two_folds_with_all_three_numbers(lab):
+def test_two_boards_give_two_folds(lab):
     boards = by_board(lab)
     assert sorted(boards) == ["board1", "board2"]
     for parts in boards.values():
@@ -53,18 +53,18 @@ def test_two_real_boards_give_two_folds_with_all_three_numbers(lab):
         assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f"}
 
 
-def test_stages_run_in_the_order_by_which_they_are_counted(lab):
+def test_stages_run_in_the_listed_order(lab):
     order = json.loads((lab / ".reskin/order.json").read_text())["stages"]
-    assert re.findall("^Running stage '(.*)':", (lab / SAID).read_text(), re.MULTILINE) == order
+    assert re.findall("^Running stage '(.*)':", (lab / REPRO_LOG).read_text(), re.MULTILINE) == order
 
 
-def test_a_third_board_is_one_command_and_no_line_of_code(lab, shared_data):
-    file = str(shared_data / "lab/board1_depth1.csv")  # stands for a third board
+def test_adding_and_removing_a_board(lab, shared_data):
+    file = str(shared_data / "lab/board1_depth1.csv")  # serves as a third board
     run(lab, "reskin", "add", file, "--layout", "lab", "--board", "board3", "--skin", "skin3", "--scene", "lab")
-    said = run(lab, "dvc", "repro", "report@lab").stdout
+    output = run(lab, "dvc", "repro", "report@lab").stdout
     assert sorted(by_board(lab)) == ["board1", "board2", "board3"]
-    assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in said
+    assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in output
     run(lab, "reskin", "remove", "lab", "board3_skin3_board1_depth1")
-    run(lab, "dvc", "repro", "split@lab")  # the first stage that boards meet in
+    run(lab, "dvc", "repro", "split@lab")  # the first stage that combines boards
     folds = json.loads((lab / "data/models/lab/folds.json").read_text())["folds"]
     assert {board for fold in folds for board in fold["test_boards"]} == {"board1", "board2"}

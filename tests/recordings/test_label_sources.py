@@ -1,4 +1,4 @@
-"""Each source of labels writes a log that ingest takes, without a board, a robot or a person."""
+"""Each label source writes a probe log, tested without board, robot or person."""
 
 import re
 import threading
@@ -27,7 +27,7 @@ from reskin.recordings.labels import Label, ProbeLogWriter
 from reskin.seeds import rng_for
 
 DWELL_s = 0.002
-LONG_S = 120.0  # for what must not happen in a test that passes
+LONG_S = 120.0  # timeout that a passing test never reaches
 
 
 @pytest.fixture
@@ -43,13 +43,15 @@ def log_of(folder):
     return probe.parse(folder / PROBE_FILE, "log")
 
 
-def prompts(words, *, scan="random", forces=None, text="grid:3x2:4", dwell_s=DWELL_s):
-    said = []
-    asked = Prompts(parse_places(text), dwell_s, said.append, lambda: iter(words), forces, rng_for(0, "keys"), scan)
-    return asked, said
+def prompts(lines, *, scan="random", forces=None, text="grid:3x2:4", dwell_s=DWELL_s):
+    printed = []
+    prompter = Prompts(
+        parse_places(text), dwell_s, printed.append, lambda: iter(lines), forces, rng_for(0, "keys"), scan
+    )
+    return prompter, printed
 
 
-def test_a_robots_program_moves_and_says_where_it_stands(context, tmp_path):
+def test_program_yields_moves_and_labels(context, tmp_path):
     def pokes():
         for x_mm in (4.0, 12.0):
             yield Label(False)
@@ -62,13 +64,13 @@ def test_a_robots_program_moves_and_says_where_it_stands(context, tmp_path):
     assert (log.t_end_s - log.t_start_s >= DWELL_s - 1e-5).all()
 
 
-def test_a_function_is_called_each_time_until_it_gives_none(context, tmp_path):
+def test_function_is_called_until_it_returns_none(context, tmp_path):
     labels = [None, Label(True, 1.0, 1.0), Label(False)]
     from_program(labels.pop, DWELL_s).run(context)
     assert len(log_of(tmp_path)) == 2
 
 
-def test_what_is_no_label_and_a_robot_that_fails_end_the_labels_and_are_told(context):
+def test_invalid_label_and_failing_robot_end_the_labels(context):
     def pokes():
         yield Label(False)
         raise RuntimeError("the robot is in its limits")
@@ -81,50 +83,52 @@ def test_what_is_no_label_and_a_robot_that_fails_end_the_labels_and_are_told(con
         from_program(["lifted"], DWELL_s).run(LabelContext(context.writer, time.time, threading.Event(), context.mark))
 
 
-def test_a_program_that_hangs_is_not_waited_for(context):
+def test_hanging_program_is_not_waited_for(context):
     hung = threading.Event()
     label_thread = LabelThread(LabelSource("hangs", None, lambda _: str(hung.wait(30))), context)
     assert label_thread.end(0.05) == "0 touches labelled"
     hung.set()
 
 
-def test_a_person_presses_the_places_shown_in_an_order_drawn_anew_each_pass(context, tmp_path):
-    asked, said = prompts([""] * 24 + ["q"])
-    asked.run(context)
+def test_places_are_shuffled_in_each_pass(context, tmp_path):
+    prompter, printed = prompts([""] * 24 + ["q"])
+    prompter.run(context)
     log = log_of(tmp_path)
     places = [tuple(xy) for xy in np.stack([log.x_mm, log.y_mm], axis=1)[log.contact].tolist()]
     assert set(places[:6]) == set(places[6:]) == {(x, y) for x in (0.0, 4.0, 8.0) for y in (0.0, 4.0)}
     assert places[:6] != places[6:]
     assert log.pass_i[log.contact].tolist() == [0] * 6 + [1] * 6
-    shown = [line for line in said if "press place" in line]
+    shown = [line for line in printed if "press place" in line]
     assert all(f"x {x:g}, y {y:g} mm" in line for line, (x, y) in zip(shown, places, strict=True))
     assert "then place" in shown[0]
 
 
-def test_another_index_a_force_and_a_slip_of_the_finger_are_understood(context, tmp_path):
-    words = ["", "4", "", "0.8N", "", "2 1.5 n", "", "99", "what", "s", "", "q"]
-    asked, said = prompts(words, scan="snake", text="line:5:2@1,8")
-    asked.run(context)
+def test_prompts_accept_index_force_and_skip(context, tmp_path):
+    lines = ["", "4", "", "0.8N", "", "2 1.5 n", "", "99", "what", "s", "", "q"]
+    prompter, printed = prompts(lines, scan="snake", text="line:5:2@1,8")
+    prompter.run(context)
     log = log_of(tmp_path)
     assert log.x_mm[log.contact].tolist() == [9.0, 3.0, 5.0]
     assert log.Fz_N[log.contact][1:] == pytest.approx([0.8, 1.5])
     assert np.isnan(log.Fz_N[log.contact][0])
-    assert len([line for line in said if "is no place" in line]) == 2
+    assert len([line for line in printed if "is no place" in line]) == 2
 
 
 @pytest.mark.parametrize(
-    ("words", "x_mm", "force_N"),
+    ("line", "x_mm", "force_N"),
     [("12N", 0, 12), ("10N", 0, 10), ("10.5N", 0, 10.5), ("3 2.5N", 3, 2.5), ("3", 3, np.nan), ("12", 12, np.nan)],
 )
-def test_a_force_is_never_cut_into_a_place_and_a_smaller_one(context, tmp_path, words, x_mm, force_N):
-    asked, said = prompts(["", "3.5", "1 2", "12N3", "1.2.3N", "3 N N", words, "", "q"], scan="snake", text="line:13:1")
-    asked.run(context)
+def test_force_is_never_split_into_place_and_force(context, tmp_path, line, x_mm, force_N):
+    prompter, printed = prompts(
+        ["", "3.5", "1 2", "12N3", "1.2.3N", "3 N N", line, "", "q"], scan="snake", text="line:13:1"
+    )
+    prompter.run(context)
     log = log_of(tmp_path)
     np.testing.assert_equal((log.x_mm[1], log.Fz_N[1]), (x_mm, force_N))
-    assert len([line for line in said if "is no place" in line]) == 5
+    assert len([line for line in printed if "is no place" in line]) == 5
 
 
-def test_a_snake_goes_there_and_back_and_places_that_are_none_are_refused():
+def test_snake_order_and_invalid_places():
     assert parse_places("grid:3x2:4").order("snake", rng_for(0, "x")) == [0, 1, 2, 5, 4, 3]
     assert parse_places("robot.csv") is None
     for wrong in ("grid:0x2:4", "line:5:0", "grid:9999x9999:1"):
@@ -139,11 +143,11 @@ def wait_until(is_so):
         time.sleep(0.002)
 
 
-class Telling:
-    """A gauge's port that says what it is told to; then it is unplugged."""
+class FakeGauge:
+    """The serial port of a force gauge that sends the given chunks and is then unplugged."""
 
     def __init__(self, chunks):
-        self.chunks, self.told_n, self.gone = iter(chunks), 0, False
+        self.chunks, self.sent_n, self.gone = iter(chunks), 0, False
 
     def __enter__(self):
         return self
@@ -154,65 +158,65 @@ class Telling:
     def read(self, *_):
         time.sleep(0.002)
         for chunk in self.chunks:
-            self.told_n += 1
+            self.sent_n += 1
             return chunk
         self.gone = True
         raise OSError("gone")
 
 
 @pytest.fixture
-def telling(monkeypatch):
-    def tell(chunks):
-        gauge = Telling(chunks)
+def fake_gauge(monkeypatch):
+    def connect(chunks):
+        gauge = FakeGauge(chunks)
         monkeypatch.setattr("reskin.recordings.label_sources.open_port", lambda *_: gauge)
-        monkeypatch.setattr("reskin.recordings.label_sources.read_waiting", Telling.read)
+        monkeypatch.setattr("reskin.recordings.label_sources.read_waiting", FakeGauge.read)
         return gauge
 
-    return tell
+    return connect
 
 
-class Heard(LabelContext):
-    """A context where a label holds until the gauge has said something, or is gone, however late the machine is."""
+class GaugeContext(LabelContext):
+    """Hold each label until the gauge has sent data or is gone, so that a busy machine changes nothing."""
 
-    gauge: Telling
+    gauge: FakeGauge
 
     def hold(self, label, dwell_s):
-        held, before_n = super().hold(label, dwell_s), self.gauge.told_n
-        wait_until(lambda: self.gauge.gone or self.gauge.told_n > before_n + 2)
+        held, before_n = super().hold(label, dwell_s), self.gauge.sent_n
+        wait_until(lambda: self.gauge.gone or self.gauge.sent_n > before_n + 2)
         return held._replace(t_end_s=self.unix_s())
 
 
-def heard(context, gauge):
-    beside = Heard(context.writer, context.unix_s, context.stop, context.mark)
+def with_gauge(context, gauge):
+    beside = GaugeContext(context.writer, context.unix_s, context.stop, context.mark)
     beside.gauge = gauge
     return beside
 
 
-def test_a_gauge_beside_the_keys_gives_each_touch_its_mean_force(context, tmp_path, telling):
-    gauge = telling(repeat(b"0.4\n0.6\n"))
-    asked, _ = prompts(["", "", "q"], forces=ForceGauge("gauge", 9600))
-    assert asked.run(heard(context, gauge)) == ""
+def test_gauge_force_is_averaged_over_each_touch(context, tmp_path, fake_gauge):
+    gauge = fake_gauge(repeat(b"0.4\n0.6\n"))
+    prompter, _ = prompts(["", "", "q"], forces=ForceGauge("gauge", 9600))
+    assert prompter.run(with_gauge(context, gauge)) == ""
     log = log_of(tmp_path)
     assert log.Fz_N[log.contact] == pytest.approx(0.5)
 
 
-def test_touches_of_which_the_gauge_said_nothing_are_counted(context, telling):
-    telling(repeat(b""))
-    asked, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=ForceGauge("gauge", 9600))
-    assert asked.run(context) == "2 touches without a force: the gauge at gauge sent none while they lasted"
+def test_touches_without_gauge_data_are_counted(context, fake_gauge):
+    fake_gauge(repeat(b""))
+    prompter, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=ForceGauge("gauge", 9600))
+    assert prompter.run(context) == "2 touches without a force: the gauge at gauge sent none while they lasted"
 
 
-def test_a_gauge_that_is_unplugged_beside_the_keys_is_told_and_touches_go_on(context, telling):
-    gauge = telling([b"0.5\n"])
-    asked, _ = prompts(["", "", "", "0.8N", "q"], forces=ForceGauge("gauge", 9600))
-    assert "gauge: the force gauge must be plugged in" in (told := asked.run(heard(context, gauge)))
-    assert "Forces are missing from then on" in told
+def test_labels_continue_without_unplugged_gauge(context, fake_gauge):
+    gauge = fake_gauge([b"0.5\n"])
+    prompter, _ = prompts(["", "", "", "0.8N", "q"], forces=ForceGauge("gauge", 9600))
+    assert "gauge: the force gauge must be plugged in" in (message := prompter.run(with_gauge(context, gauge)))
+    assert "Forces are missing from then on" in message
     assert context.writer.touches_n == 2
 
 
-def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(context, tmp_path, telling):
-    telling([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
-    ticks = count()  # a clock of its own: where the machine stalls, a touch of 0.5 s becomes several
+def test_gauge_alone_detects_touches(context, tmp_path, fake_gauge):
+    fake_gauge([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
+    ticks = count()  # simulated clock: on a stalled machine, a touch of 0.5 s would become several
     context = replace(context, unix_s=lambda: 1e9 + 0.002 * next(ticks))
     label_thread = LabelThread(from_gauge("gauge", 9600), context)
     label_thread._thread.join()
@@ -225,31 +229,31 @@ def test_a_gauge_alone_tells_touches_by_force_and_that_it_was_unplugged(context,
     assert np.isnan(log.x_mm[1])
 
 
-class Looks(threading.Event):
-    """Counts how often somebody who follows a table has looked at it: each time it waits for this."""
+class PollCounter(threading.Event):
+    """Stop event that counts how often the follower of a table has polled (it waits on this event each time)."""
 
     def __init__(self):
         super().__init__()
-        self.looks_n = 0
+        self.polls_n = 0
 
     def wait(self, timeout=None):
-        self.looks_n += 1
+        self.polls_n += 1
         return super().wait(timeout)
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_a_table_is_followed_as_it_grows_and_its_own_clock_is_marked(context, tmp_path, there):
+def test_growing_table_is_followed(context, tmp_path, there):
     file, old = tmp_path / "robot.csv", "t_s,phase,x_mm,y_mm\n"
     rows = "".join(f"{7 + 0.1 * i:.1f},{phase},4,8\n" for i, phase in enumerate(["noload"] * 3 + ["contact"] * 3))
     if there:
         file.write_text(old + rows.replace("\n7.", "\n1."))
-    looks = Looks()
-    label_thread = LabelThread(from_table(file), replace(context, stop=looks))
-    wait_until(lambda: looks.looks_n)
+    poll_counter = PollCounter()
+    label_thread = LabelThread(from_table(file), replace(context, stop=poll_counter))
+    wait_until(lambda: poll_counter.polls_n)
     with file.open("a") as stream:
         stream.write(rows if there else old + rows)
-    before_n = looks.looks_n
-    wait_until(lambda: looks.looks_n > before_n + 1)  # the first may have been begun before
+    before_n = poll_counter.polls_n
+    wait_until(lambda: poll_counter.polls_n > before_n + 1)  # the first poll may have begun before the append
     assert label_thread.end(LONG_S) == "1 touches labelled"
     log = log_of(tmp_path)
     assert log.t_start_s.tolist() == pytest.approx([7.0, 7.3])
@@ -258,10 +262,10 @@ def test_a_table_is_followed_as_it_grows_and_its_own_clock_is_marked(context, tm
 
 
 @pytest.mark.parametrize(
-    ("how", "said"),
+    ("how", "problem"),
     [("replaced", "another file in its place"), ("cut", r"10 bytes, of which \d+ were read"), ("removed", "no file")],
 )
-def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(context, tmp_path, how, said):
+def test_interrupted_table_ends_the_labels(context, tmp_path, how, problem):
     file, header = tmp_path / "robot.csv", "t_s,phase\n"
     file.write_text(header)
     label_thread = LabelThread(from_table(file), context)
@@ -269,7 +273,7 @@ def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(context, tm
         with file.open("a") as stream:
             stream.write("".join(f"{begin_s}.{i},{'contact' if i > 4 else 'noload'}\n" for i in range(9)))
         time.sleep(0.02)
-        if context.marks:  # what was there before is passed over
+        if context.marks:  # existing rows are skipped
             break
     if how == "replaced":
         (tmp_path / "new.csv").write_text(header)
@@ -279,6 +283,6 @@ def test_a_table_that_does_not_go_on_ends_the_labels_with_a_sentence(context, tm
     else:
         file.unlink()
     label_thread._thread.join(LONG_S)
-    told = label_thread.end()
-    assert re.search(f"a table that is followed must be the same file, with rows appended; got {said}", told)
-    assert not told.startswith("0 touches")
+    message = label_thread.end()
+    assert re.search(f"a table that is followed must be the same file, with rows appended; got {problem}", message)
+    assert not message.startswith("0 touches")

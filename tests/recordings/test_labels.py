@@ -1,4 +1,4 @@
-"""Labels in any portions become the same dwells, and at any moment a log that ingestion takes."""
+"""Labels in any chunks become the same dwells and, at any moment, a valid probe log."""
 
 import math
 
@@ -26,7 +26,7 @@ DWELL = st.builds(lambda label, start_s, lasts_s: Dwell(label, start_s, start_s 
                   st.floats(0, 100), st.floats(0.001, 5))  # fmt: skip
 
 
-def test_a_touch_is_written_with_the_rest_before_it_and_not_before(tmp_path):
+def test_touch_is_written_after_its_rest(tmp_path):
     writer = ProbeLogWriter(tmp_path)
     writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # no rest before it
     writer.write(Dwell(Label(False), 1.0, 2.0))
@@ -42,10 +42,10 @@ def test_a_touch_is_written_with_the_rest_before_it_and_not_before(tmp_path):
     assert math.isnan(log.x_mm[0])
     assert (writer.touches_n, writer.without_noload_n, writer.out_of_order_n) == (1, 1, 1)
     writer.close()
-    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # of a program that was not waited for
+    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # from a program that was not waited for
 
 
-def test_a_touch_that_goes_on_elsewhere_without_a_lift_is_left_out(tmp_path):
+def test_touch_that_moves_without_lift_is_skipped(tmp_path):
     writer = ProbeLogWriter(tmp_path)
     places = [(4.0, 8.0), (4.001, 8.0), (5.0, 8.0), (4.0, 9.0), (math.nan, 8.0), (4.0, 8.0)]
     writer.write(Dwell(Label(False), 0.0, 1.0))
@@ -59,7 +59,7 @@ def test_a_touch_that_goes_on_elsewhere_without_a_lift_is_left_out(tmp_path):
 
 @settings(max_examples=60)
 @given(st.lists(DWELL, max_size=12))
-def test_any_labels_make_a_log_that_can_be_read(tmp_path_factory, dwells):
+def test_any_labels_make_a_readable_log(tmp_path_factory, dwells):
     folder = tmp_path_factory.mktemp("labels")
     writer = ProbeLogWriter(folder)
     for dwell in dwells:
@@ -75,7 +75,7 @@ def test_any_labels_make_a_log_that_can_be_read(tmp_path_factory, dwells):
     [(Label(True, math.inf), 1.0), (Label(True, 1e39), 1.0), (Label(True, pass_i=-1), 1.0), (Label(True), 0.0),
      (Label(True), math.nan), (Label(True), 1e15)],
 )  # fmt: skip
-def test_what_is_no_number_or_no_time_is_refused(tmp_path, label, end_s):
+def test_invalid_label_is_refused(tmp_path, label, end_s):
     writer = ProbeLogWriter(tmp_path)
     with pytest.raises(CaptureError, match="a label: .* must be"):
         writer.write(Dwell(label, 0.0, end_s))
@@ -89,14 +89,14 @@ def rows(phase: str, first_s: float, n: int, x_mm: float, force_N: float = 0.0) 
     return "".join(f"{first_s + 0.1 * i:.1f},{phase},{x_mm},2,{force_N},\n" for i in range(n))
 
 
-def dwells_of(text: str, portion_n: int = 10**6) -> tuple[list[Dwell], SampleTable]:
+def dwells_of(text: str, chunk_n: int = 10**6) -> tuple[list[Dwell], SampleTable]:
     table, dwells, data = SampleTable("log"), DwellBuilder(), text.encode()
-    parts = [data[first : first + portion_n] for first in range(0, len(data), portion_n)]
+    parts = [data[first : first + chunk_n] for first in range(0, len(data), chunk_n)]
     found = [dwell for part in parts for dwell in dwells.feed(table.feed(part))]
     return [*found, *dwells.close()], table
 
 
-def test_a_robot_that_stands_still_gives_a_dwell_of_each_phase():
+def test_one_dwell_per_phase():
     text = HEAD + rows("noload", 0, 30, 1) + rows("moving", 3, 5, 2) + rows("contact", 4, 4, 3, 0.5)
     (rest, touch), _ = dwells_of(text)
     assert (rest.label.contact, rest.t_start_s, rest.t_end_s) == (False, 0.0, 2.9)
@@ -104,7 +104,7 @@ def test_a_robot_that_stands_still_gives_a_dwell_of_each_phase():
     assert touch.label.Fz_N == 0.5
 
 
-def test_a_long_touch_is_several_dwells_each_with_its_force_and_another_place_is_another_dwell():
+def test_long_touch_and_new_place_start_new_dwells():
     text = HEAD + "".join(rows("contact", i, 10, 3, 0.1 * (i + 1)) for i in range(3)) + rows("contact", 3, 3, 4)
     found, _ = dwells_of(text)
     assert all(dwell.t_end_s - dwell.t_start_s <= DWELL_MAX_s + 0.11 for dwell in found)
@@ -115,15 +115,15 @@ def test_a_long_touch_is_several_dwells_each_with_its_force_and_another_place_is
 
 @settings(max_examples=40)
 @given(st.integers(1, 60))
-def test_any_portions_make_the_same_dwells(portion_n):
-    text = HEAD + rows("noload", 0, 9, 1) + "rubbish\n\n1,2\n" + rows("contact", 4, 9, 3, 0.5)
-    whole, parts = dwells_of(text), dwells_of(text, portion_n)
-    assert repr(whole[0]) == repr(parts[0])  # NaN is no number
+def test_chunks_do_not_matter(chunk_n):
+    text = HEAD + rows("noload", 0, 9, 1) + "noise\n\n1,2\n" + rows("contact", 4, 9, 3, 0.5)
+    whole, parts = dwells_of(text), dwells_of(text, chunk_n)
+    assert repr(whole[0]) == repr(parts[0])  # repr: NaN != NaN
     assert whole[1].bad_n == parts[1].bad_n == 2
-    assert parts[1].first_bad == "rubbish"
+    assert parts[1].first_bad == "noise"
 
 
-def test_without_a_phase_the_force_tells_and_a_force_between_is_neither():
+def test_force_threshold_replaces_phase():
     forces_N = [0, 0.01] * 3 + [0.03] + [0.4] * 3
     text = "t_s,Fz_N\n" + "".join(f"{0.1 * i},{force_N}\n" for i, force_N in enumerate(forces_N))
     (rest, touch), table = dwells_of(text)
@@ -133,12 +133,12 @@ def test_without_a_phase_the_force_tells_and_a_force_between_is_neither():
 
 
 @pytest.mark.parametrize("head", ["x_mm,y_mm,Fz_N", "t_s,unix_s,Fz_N", "t_s,x_mm,y_mm", "t_s,t_s,Fz_N", ""])
-def test_columns_without_one_clock_or_a_touch_are_refused(head):
+def test_invalid_columns_are_refused(head):
     with pytest.raises(CaptureError, match="row 1, the column names, must be"):
         SampleTable("log").feed(head.encode() + b"\n")
 
 
-def test_a_gauge_sends_one_number_or_three_and_what_is_neither_is_counted():
+def test_gauge_lines_have_one_or_three_numbers():
     gauge = GaugeLines()
     found = gauge.feed(b"0.50\r\n0.1 -0.2; 0.7\n1,2\nERR\n0.", 3.0) + gauge.feed(b"9\n", 4.0)
     assert [(one.t_s, one.label.Fz_N) for one in found] == [(3.0, 0.5), (3.0, 0.7), (4.0, 0.9)]
@@ -146,14 +146,14 @@ def test_a_gauge_sends_one_number_or_three_and_what_is_neither_is_counted():
     assert (gauge.bad_n, gauge.first_bad) == (2, "1,2")
 
 
-def test_a_line_without_end_is_not_kept():
+def test_endless_line_is_not_kept():
     lines = LineBuffer()
     for _ in range(1000):
         lines.feed(b"9" * 100)
         assert len(lines._rest) <= 4200
 
 
-def test_touches_too_short_to_be_one_are_counted_and_told_but_not_the_rest_of_a_long_one():
+def test_too_short_touches_are_counted():
     table, dwells = SampleTable("robot.csv"), DwellBuilder()
     changes = "t_s,phase,x_mm,y_mm\n0,noload,4,8\n1,contact,4,8\n2,noload,4,8\n3,contact,5,8\n4,noload,5,8\n"
     list(dwells.feed(table.feed(changes.encode())))

@@ -1,4 +1,4 @@
-"""A native capture, from bytes to readings: what was pressed comes out, and every byte and frame is accounted for."""
+"""A native capture from bytes to readings: indentations are recovered, and every byte and frame is accounted for."""
 
 import dataclasses
 from pathlib import Path
@@ -28,7 +28,7 @@ CHIPS_N = 5
 
 
 def press() -> tuple[Frames, ProbeLog]:
-    """Press a skin at random: frames at `RATE_HZ`, whole hundredths of uT, and the log of where they were pressed."""
+    """Simulate random presses: frames at `RATE_HZ` in hundredths of uT, and the probe log."""
     rng = rng_for(0, "press")
     move_n = rng.integers(MOVE_N, 3 * MOVE_N, (INDENTATIONS_N, 2))
     parts, rows, begin = [], [], 10
@@ -97,7 +97,7 @@ def read(folder: Path, header: Header) -> tuple[dict[str, np.ndarray], dict[str,
 
 
 def expected() -> dict[str, np.ndarray]:
-    """What a loop over dwells finds, from the frames before they were bytes."""
+    """Expected readings, from a loop over dwells and the frames before encoding."""
     columns: dict[str, list[Any]] = {
         name: [] for name in ("indentation", "reading_i", "x_mm", "b_uT", "noload_uT", "t_s")
     }
@@ -119,19 +119,19 @@ def expected() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
 @pytest.mark.parametrize("kind", ["arrivals", "rate"])
 @pytest.mark.parametrize("marks", [MARKS, ()], ids=["marks", "contacts"])
-def test_what_was_pressed_comes_out(
+def test_indentations_are_recovered(
     tmp_path: Path, wire: Wire, kind: str, marks: tuple[tuple[float, float], ...]
 ) -> None:
     got, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
     for name, column in expected().items():
-        # All is copied but the mean (float32) and the time (text lines differ in length within a chunk: half a frame).
+        # Exact except the mean (float32) and the time (text lines differ in length within a chunk: half a frame).
         atol = {"t_s": 0.5 / RATE_HZ, "noload_uT": 1e-3}.get(name, 0)
         np.testing.assert_allclose(got[name], column, rtol=0, atol=atol, err_msg=name)
     assert account["indentations_n"] == account["logged_indentations_n"] == INDENTATIONS_N
     assert account["frames_n"] == len(FRAMES)
 
 
-def test_every_byte_and_frame_is_accounted_for_when_the_stream_is_broken(tmp_path: Path) -> None:
+def test_broken_stream_is_accounted_for(tmp_path: Path) -> None:
     b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
     b_uT[20:23, 3:6], temperature_degC[20:23, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     b_uT[40] = np.nan
@@ -156,7 +156,7 @@ def with_chip(rows: slice, values_uT: np.ndarray) -> Frames:
 
 
 @pytest.mark.parametrize("marks", [MARKS, ()], ids=["marks", "contacts"])
-def test_a_chip_that_freezes_costs_its_frames(tmp_path: Path, marks: tuple[tuple[float, float], ...]) -> None:
+def test_stuck_chip_loses_its_frames(tmp_path: Path, marks: tuple[tuple[float, float], ...]) -> None:
     begin = len(FRAMES) // 3
     frozen = with_chip(slice(begin, None), FRAMES.b_uT[begin, 3:6])
     _, account = read(write(tmp_path, "binary", frozen), header_of("binary", marks=marks))
@@ -166,7 +166,7 @@ def test_a_chip_that_freezes_costs_its_frames(tmp_path: Path, marks: tuple[tuple
     assert account["frames_n"] == used + sum(account[key] for key in dropped)
 
 
-def test_a_chip_that_loses_its_settings_is_named(tmp_path: Path) -> None:
+def test_reset_chip_is_named(tmp_path: Path) -> None:
     b_uT = FRAMES.b_uT.copy()
     steps_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N).astype(np.float32)
     b_uT = np.round(b_uT / steps_uT) * steps_uT
@@ -178,27 +178,27 @@ def test_a_chip_that_loses_its_settings_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("of_a_uT", [1e-2, 1e-3, 1e-6])
-def test_a_stream_in_another_unit_is_refused(tmp_path: Path, of_a_uT: float) -> None:
+def test_stream_in_another_unit_is_refused(tmp_path: Path, of_a_uT: float) -> None:
     other = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(of_a_uT))
     with pytest.raises(CaptureError, match="stream.bin: field must be .* G to uT"):
         read(write(tmp_path, "binary", other), header_of("binary"))
 
 
-@pytest.mark.parametrize(("sent", "said"), [("text-xyzt", "text-txyz"), ("text-txyz", "text-xyzt")])
+@pytest.mark.parametrize(("sent", "declared"), [("text-xyzt", "text-txyz"), ("text-txyz", "text-xyzt")])
 @pytest.mark.parametrize("scale", [1.0, 0.05])  # also fields as weak as temperatures
-def test_lines_of_the_other_order_are_refused(tmp_path: Path, sent: Wire, said: Wire, scale: float) -> None:
+def test_other_column_order_is_refused(tmp_path: Path, sent: Wire, declared: Wire, scale: float) -> None:
     frames = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(scale))
-    with pytest.raises(CaptureError, match=rf"stream.bin: temperatures of {said} .* Is the wire format {sent}\?"):
-        read(write(tmp_path, sent, frames), header_of(said))
+    with pytest.raises(CaptureError, match=rf"stream.bin: temperatures of {declared} .* Is the wire format {sent}\?"):
+        read(write(tmp_path, sent, frames), header_of(declared))
 
 
-def test_a_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
+def test_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
     folder = write(tmp_path, "binary", probe=probe.render(dataclasses.replace(LOG, x_mm=LOG.x_mm * 1000)).encode())
     with pytest.raises(CaptureError, match="probe.csv: places must be one, or spread over 1 to 200 mm; got 5.9e"):
         read(folder, header_of("binary"))
 
 
-def test_a_smaller_block_gives_the_same_readings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_block_size_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     header = header_of("binary")
     whole, whole_account = read(write(tmp_path, "binary"), header)
     monkeypatch.setattr(ingest, "BLOCK_BYTES_N", 1000)
@@ -208,7 +208,7 @@ def test_a_smaller_block_gives_the_same_readings(tmp_path: Path, monkeypatch: py
         np.testing.assert_array_equal(parts[name], column, err_msg=name)
 
 
-def test_a_recorder_killed_before_its_last_row_costs_the_frames_without_time(tmp_path: Path) -> None:
+def test_frames_without_arrival_time_are_dropped(tmp_path: Path) -> None:
     b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
     b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC  # a fault without time
     frames = dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC)
@@ -222,7 +222,7 @@ def test_a_recorder_killed_before_its_last_row_costs_the_frames_without_time(tmp
     assert "fault_failed_read_first_ms" not in account
 
 
-def test_readings_and_account_go_to_parquet_and_back(tmp_path: Path) -> None:
+def test_parquet_round_trip(tmp_path: Path) -> None:
     blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"), AS_USUAL)
     io.write_readings(tmp_path / "c.parquet", blocks, account)
     assert len(io.read_readings(tmp_path / "c.parquet")) == INDENTATIONS_N * CONTACT_N
@@ -245,7 +245,7 @@ def test_readings_and_account_go_to_parquet_and_back(tmp_path: Path) -> None:
         ({}, "recording", "clock.kind must be 'arrivals' or 'rate'"),
     ],
 )
-def test_a_broken_capture_is_one_sentence(tmp_path: Path, files: dict[str, bytes], kind: str, says: str) -> None:
+def test_broken_capture_is_refused(tmp_path: Path, files: dict[str, bytes], kind: str, says: str) -> None:
     write(tmp_path, "binary", **files)
     for marks in (MARKS, ()):
         with pytest.raises(CaptureError, match=says):
@@ -253,7 +253,7 @@ def test_a_broken_capture_is_one_sentence(tmp_path: Path, files: dict[str, bytes
 
 
 @pytest.mark.parametrize("name", [STREAM_FILE, ARRIVALS_FILE, PROBE_FILE])
-def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+def test_missing_file(tmp_path: Path, name: str) -> None:
     (write(tmp_path, "binary") / name).unlink()
     with pytest.raises(CaptureError, match=f"{name}: file not found"):
         read(tmp_path, header_of("binary"))

@@ -1,4 +1,4 @@
-"""Exchanged, mirrored and turned labels are found beside captures of other skins, and right ones are left alone."""
+"""Swapped, mirrored and turned labels are detected by comparison with captures of other skins."""
 
 import shutil
 
@@ -15,7 +15,7 @@ DEPARTURES = [name for name in WAYS if name != "as they are"]
 
 
 def board(name: str, presses_n: int = 60) -> Presses:
-    """Presses of a skin with gains of its own, under noise."""
+    """Presses of a skin with its own gains, with noise."""
     rng = rng_for(0, "orientation", name)
     place_mm = rng.uniform(-8, 8, (presses_n, 2))
     db_uT = fields_uT(place_mm, rng.uniform(1, 5, presses_n)) * rng.normal(1, 0.1, 15)
@@ -33,11 +33,11 @@ def undone(way: str) -> str:
 
 
 @pytest.mark.parametrize("way", DEPARTURES)
-def test_changed_labels_are_named_by_what_undoes_the_change(way):
+def test_changed_labels_are_named_with_their_inverse(way):
     assert other_orientation(relabelled(board("one"), way), board("other")) == undone(way)
 
 
-def test_right_labels_few_presses_and_other_boards_raise_no_alarm():
+def test_no_false_alarm():
     one, other = board("one"), board("other")
     assert other_orientation(one, other) is None
     assert other_orientation(relabelled(board("few", 19), "with x mirrored"), other) is None
@@ -47,8 +47,8 @@ def test_right_labels_few_presses_and_other_boards_raise_no_alarm():
     assert other_orientation(relabelled(one, "with x mirrored"), noise) is None
 
 
-def test_on_recorded_boards_every_change_is_found_from_the_other_board(shared_data, tmp_path):
-    """Of 18 pairs of files of two boards one says nothing (board 2, depth 3, beside board 1, depth 1)."""
+def test_every_change_is_found_on_recorded_boards(shared_data, tmp_path):
+    """Of 18 pairs of files of two boards, one is inconclusive (board 2, depth 3, with board 1, depth 1)."""
     boards = {}
     for number in (1, 2):
         shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)

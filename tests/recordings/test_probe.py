@@ -1,4 +1,4 @@
-"""The probe log: CSV and arrays tell the same, and every fault is one sentence that names its row."""
+"""The probe log as CSV; errors name the row."""
 
 import dataclasses
 from pathlib import Path
@@ -27,7 +27,7 @@ def assert_same(one: ProbeLog, other: ProbeLog) -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
 
 
-def test_a_log_reads_as_it_is_written() -> None:
+def test_log_round_trip() -> None:
     log = probe.parse(GOOD, "probe.csv")
     assert log.indentation.tolist() == [0, 0, 1, 1]
     assert log.contact.tolist() == [False, True, False, True]
@@ -38,12 +38,12 @@ def test_a_log_reads_as_it_is_written() -> None:
     assert log.Fz_N[3] == 2.5
 
 
-def test_columns_may_stand_in_any_order() -> None:
+def test_column_order_does_not_matter() -> None:
     swapped = "\n".join(",".join(reversed(row.split(","))) for row in GOOD.splitlines()) + "\n"
     assert_same(probe.parse(swapped, "probe.csv"), probe.parse(GOOD, "probe.csv"))
 
 
-def test_a_file_reads_like_its_text(tmp_path: Path) -> None:
+def test_file_reads_like_its_text(tmp_path: Path) -> None:
     (tmp_path / "probe.csv").write_text(GOOD, encoding="utf-8")
     assert_same(probe.parse(tmp_path / "probe.csv", "probe.csv"), probe.parse(GOOD, "probe.csv"))
 
@@ -53,7 +53,7 @@ def test_a_file_reads_like_its_text(tmp_path: Path) -> None:
     begin_s=st.floats(-1e9, 1e9),
     label=st.floats(-(2.0**100), 2.0**100, width=32) | st.just(float("nan")),
 )
-def test_parse_undoes_render_to_the_last_bit(lengths: list[float], begin_s: float, label: float) -> None:
+def test_round_trip_is_exact(lengths: list[float], begin_s: float, label: float) -> None:
     edges_s = begin_s + np.cumsum(lengths)
     labels = {name: np.array([np.nan, label], np.float32) for name in LABELS}
     number = np.zeros(2, np.int32)
@@ -62,7 +62,7 @@ def test_parse_undoes_render_to_the_last_bit(lengths: list[float], begin_s: floa
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "says"),
+    ("old", "new", "message"),
     [
         ("Fz_N\n", "Fz_lbf\n", "row 1.*missing Fz_N, unknown Fz_lbf"),
         (",Fz_N\n", "\n", "Row #2: Expected 10 columns, got 11"),
@@ -87,13 +87,13 @@ def test_parse_undoes_render_to_the_last_bit(lengths: list[float], begin_s: floa
         (GOOD, "\n\n", "CSV|row 1"),
     ],
 )
-def test_a_fault_is_one_sentence_that_names_its_place(old: str, new: str, says: str) -> None:
+def test_invalid_log_names_the_row(old: str, new: str, message: str) -> None:
     assert old in GOOD
-    with pytest.raises(CaptureError, match=rf"^probe\.csv.*({says})"):
+    with pytest.raises(CaptureError, match=rf"^probe\.csv.*({message})"):
         probe.parse(GOOD.replace(old, new, 1), "probe.csv")
 
 
-def test_random_bytes_raise_nothing_but_a_capture_error(tmp_path: Path) -> None:
+def test_random_bytes_raise_capture_error(tmp_path: Path) -> None:
     noise = rng_for(0, "noise").bytes(4096)
     (tmp_path / "probe.csv").write_bytes(noise)
     with pytest.raises(CaptureError):
@@ -111,7 +111,7 @@ UNITS_LOG = probe.parse(
 
 
 @pytest.mark.parametrize(
-    ("column", "factor", "says"),
+    ("column", "factor", "message"),
     [
         ("x_mm", 1e-3, "places must be .* Convert m or um"),
         ("x_mm", 1e3, "places must be .* Convert m or um"),
@@ -123,13 +123,13 @@ UNITS_LOG = probe.parse(
         ("Fz_N", -1.0, "the usual Fz_N in contact must be positive; got -1.875 N. Turn its sign"),
     ],
 )
-def test_a_probe_log_in_other_units_or_signs_is_refused(column: str, factor: float, says: str) -> None:
+def test_other_units_or_signs_are_refused(column: str, factor: float, message: str) -> None:
     check_log(UNITS_LOG, "probe.csv")
     other = dataclasses.replace(UNITS_LOG, **{column: getattr(UNITS_LOG, column) * np.float32(factor)})
-    with pytest.raises(CaptureError, match=rf"^probe.csv: {says}"):
+    with pytest.raises(CaptureError, match=rf"^probe.csv: {message}"):
         check_log(other, "probe.csv")
 
 
-def test_a_log_that_knows_no_label_is_let_pass() -> None:
+def test_log_without_labels_is_accepted() -> None:
     unknown = np.full(len(UNITS_LOG), np.nan, np.float32)
     check_log(dataclasses.replace(UNITS_LOG, **dict.fromkeys(probe.LABELS, unknown)), "probe.csv")

@@ -1,4 +1,4 @@
-"""Recordings of real hardware by other people: what data/README.md says a newcomer should see is what is there.
+"""Public recordings of real hardware have the contents that data/README.md describes.
 
 Copies stand in a capture folder under their names of `collect`, as `reskin add` puts them.
 """
@@ -46,9 +46,7 @@ LAB = [f"board{board}_depth{depth}" for board in (1, 2) for depth in (1, 2, 3)]
 
 
 @pytest.mark.parametrize("name", LAB)
-def test_a_lab_file_holds_65_presses_of_100_readings_on_the_16_mm_grid(
-    shared_data: Path, tmp_path: Path, name: str
-) -> None:
+def test_lab_file_has_65_presses_of_100_readings(shared_data: Path, tmp_path: Path, name: str) -> None:
     readings, account = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert account["rows_read_n"] == 65 * 110
     assert account["noload_rows_n"] == 65 * 10
@@ -61,7 +59,7 @@ def test_a_lab_file_holds_65_presses_of_100_readings_on_the_16_mm_grid(
     assert readings.Fz_N.max() < 9.6
 
 
-def test_the_lab_forces_reach_from_a_touch_to_ten_newtons(shared_data: Path, tmp_path: Path) -> None:
+def test_lab_forces_reach_ten_newtons(shared_data: Path, tmp_path: Path) -> None:
     soft, _ = ingest(lab, shared_data / "lab/board1_depth1.csv", tmp_path)
     hard, _ = ingest(lab, shared_data / "lab/board2_depth3.csv", tmp_path)
     assert 0.6 < soft.Fz_N.min() < 0.7
@@ -69,17 +67,15 @@ def test_the_lab_forces_reach_from_a_touch_to_ten_newtons(shared_data: Path, tmp
 
 
 @pytest.mark.parametrize("name", LAB)
-def test_the_lab_tip_pushes_the_skin_the_way_that_its_fields_say_it_moves(
-    shared_data: Path, tmp_path: Path, name: str
-) -> None:
+def test_lab_tip_pushes_the_skin_as_the_fields_show(shared_data: Path, tmp_path: Path, name: str) -> None:
     # Experiment compare, from fields alone: pokes of both boards carry the skin by 48 um along the labels' +x.
     readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert 0.08 < readings.Fx_N.mean() < 0.6
 
 
 @pytest.mark.parametrize("name", LAB)
-def test_the_lab_chips_are_as_noisy_as_the_data_sheet_says(shared_data: Path, name: str) -> None:
-    # Noise about the press's own mean, 65 x 9 degrees of freedom a channel: a standard deviation is known to 3 %.
+def test_lab_noise_matches_the_data_sheet(shared_data: Path, name: str) -> None:
+    # Noise about the press's own mean, 65 x 9 degrees of freedom a channel: relative error of the deviation 3 %.
     trials = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
     names, rows = trials[0], [row for row in trials[1:] if row[1] == "noload"]
     columns = [names.index(f"B{axis}{chip}") for chip in range(5) for axis in "xyz"]
@@ -90,13 +86,13 @@ def test_the_lab_chips_are_as_noisy_as_the_data_sheet_says(shared_data: Path, na
     assert ((sd_uT[:, 2] > 4.3) & (sd_uT[:, 2] < 5.3)).all()
 
 
-def test_the_lab_skins_are_magnetised_to_millitesla(shared_data: Path, tmp_path: Path) -> None:
+def test_lab_skins_are_magnetised_to_millitesla(shared_data: Path, tmp_path: Path) -> None:
     noload = [ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)[0].noload_uT for name in LAB]
     strength_uT = np.linalg.norm(np.concatenate(noload).reshape(-1, 5, 3), axis=2)
     assert 3600 < strength_uT.max() < 3800
 
 
-def test_the_ini_recording_is_fifty_passes_of_466_rows(shared_data: Path, tmp_path: Path) -> None:
+def test_ini_recording_has_fifty_passes(shared_data: Path, tmp_path: Path) -> None:
     readings, account = ingest(ini, shared_data / SCREW, tmp_path)
     assert account["rows_read_n"] == 23_300
     assert account["rows_n"] == 23_299  # the fields come one row late, which leaves one without a partner
@@ -110,15 +106,15 @@ def test_the_ini_recording_is_fifty_passes_of_466_rows(shared_data: Path, tmp_pa
     assert readings.Fz_N.max() == np.float32(4.1)
 
 
-def test_the_ini_centre_is_a_place_and_not_only_a_mark(shared_data: Path, tmp_path: Path) -> None:
+def test_ini_centre_is_a_place(shared_data: Path, tmp_path: Path) -> None:
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path)
     centre = (readings.x_mm == 10) & (readings.y_mm == 10)
     assert centre.sum() == 6 * 50
     assert (readings.Fz_N[centre] > 0).all()
 
 
-def test_the_ini_readings_come_one_row_late(shared_data: Path, tmp_path: Path) -> None:
-    # A known fault of existing recorders: a field follows the force of the row before, not that of its own row.
+def test_ini_fields_are_one_row_late(shared_data: Path, tmp_path: Path) -> None:
+    # A known fault of existing recorders: a field follows the force of the previous row.
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path, options={"rows_late": "0"})
     change_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
     same_row = np.corrcoef(readings.Fz_N[:-1], change_uT[:-1])[0, 1]
@@ -134,15 +130,13 @@ def test_the_ini_readings_come_one_row_late(shared_data: Path, tmp_path: Path) -
         ("piezo", "0.98"),
     ],
 )
-def test_a_broken_ini_recording_is_refused_by_its_fault(
-    shared_data: Path, tmp_path: Path, name: str, expected: str
-) -> None:
+def test_broken_ini_recordings_are_refused(shared_data: Path, tmp_path: Path, name: str, expected: str) -> None:
     with pytest.raises(CaptureError, match=expected) as caught:
         ingest(ini, shared_data / "ini/faults" / f"b20_artillery_{name}.head400.txt", tmp_path)
     assert "\n" not in str(caught.value)
 
 
-def test_the_eflesh_scan_is_five_passes_over_31_by_31_places(shared_data: Path, tmp_path: Path) -> None:
+def test_eflesh_scan_has_five_passes_over_31_by_31_places(shared_data: Path, tmp_path: Path) -> None:
     readings, account = ingest(eflesh, shared_data / SPATIAL, tmp_path)
     assert account["rows_n"] == 4805
     assert np.bincount(readings.pass_i).tolist() == [961] * 5
@@ -154,7 +148,7 @@ def test_the_eflesh_scan_is_five_passes_over_31_by_31_places(shared_data: Path, 
 
 
 @pytest.mark.parametrize("name", [NORMAL, "eflesh/normal_force/20250401_015037_probe"])
-def test_the_eflesh_gauge_saw_ten_strokes(shared_data: Path, tmp_path: Path, name: str) -> None:
+def test_eflesh_gauge_recorded_ten_strokes(shared_data: Path, tmp_path: Path, name: str) -> None:
     readings, account = ingest(eflesh, shared_data / name, tmp_path, options={"force_axis": "z"})
     assert account["rows_n"] == 3600
     assert account["no_new_force_rows_n"] == 1740 == np.isnan(readings.Fz_N).sum()
@@ -166,8 +160,8 @@ def test_the_eflesh_gauge_saw_ten_strokes(shared_data: Path, tmp_path: Path, nam
 
 
 @pytest.mark.parametrize("name", [NORMAL, SHEAR])
-def test_each_eflesh_pass_is_one_stroke_down_and_up(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # Passes are found by fresh baselines; the robot's own z tells the same story and is not used to find them.
+def test_each_eflesh_pass_is_one_stroke(shared_data: Path, tmp_path: Path, name: str) -> None:
+    # Passes are found by fresh baselines; the robot's z agrees and is not used to find them.
     readings, account = ingest(eflesh, shared_data / name, tmp_path, options={"force_axis": "z"})
     assert account["passes_n"] == 10
     for pass_i in range(10):
@@ -177,7 +171,7 @@ def test_each_eflesh_pass_is_one_stroke_down_and_up(shared_data: Path, tmp_path:
         assert crossings[crossings != 0].tolist() == [1, -1]
 
 
-def test_the_eflesh_shear_recording_has_ten_chips(shared_data: Path, tmp_path: Path) -> None:
+def test_eflesh_shear_recording_has_ten_chips(shared_data: Path, tmp_path: Path) -> None:
     readings, _ = ingest(eflesh, shared_data / SHEAR, tmp_path, options={"force_axis": "x"})
     assert readings.chips_n == 10
     assert len(readings) == 7200
@@ -189,7 +183,7 @@ def test_the_eflesh_shear_recording_has_ten_chips(shared_data: Path, tmp_path: P
     ("name", "places", "zero_rows_n", "presses_N"),
     [("position_1_20251028_003401", {1}, 18, 3.5), ("multi_touch_2_7_20251109_234435", {2, 7}, 41, 12.7)],
 )
-def test_eflash7_names_places_by_number_and_writes_zeros_between(
+def test_eflash7_places_are_numbered_and_zeros_dropped(
     shared_data: Path, tmp_path: Path, name: str, places: set[int], zero_rows_n: int, presses_N: float
 ) -> None:
     readings, account = ingest(eflash7, shared_data / "eflash7" / f"{name}.csv", tmp_path)
@@ -199,9 +193,7 @@ def test_eflash7_names_places_by_number_and_writes_zeros_between(
     np.testing.assert_allclose(readings.Fz_N.max(), presses_N, atol=0.1)
 
 
-def test_eflash7_begins_untouched_and_keeps_a_remainder_of_its_recorders_baseline(
-    shared_data: Path, tmp_path: Path
-) -> None:
+def test_eflash7_starts_untouched_with_a_residual_baseline(shared_data: Path, tmp_path: Path) -> None:
     files = sorted((shared_data / "eflash7").glob("*.csv"))
     assert len(files) == 19
     rest_uT, read_n = [], 0

@@ -1,4 +1,4 @@
-"""Logs that were written are read again; each way to break one is told, or counted, with its place."""
+"""SD card logs: round trip, faults and errors."""
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ def lines(file):
 
 
 @given(chips_n=st.integers(1, 8))
-def test_a_log_of_any_number_of_chips_is_read_as_it_was_written(tmp_path_factory, chips_n):
+def test_log_round_trip(tmp_path_factory, chips_n):
     t_s, b_uT, temperature_degC = made(chips_n=chips_n)
     file = tmp_path_factory.mktemp("card") / "log.csv"
     file.write_text(render(t_s, b_uT, temperature_degC))
@@ -42,13 +42,13 @@ def test_a_log_of_any_number_of_chips_is_read_as_it_was_written(tmp_path_factory
     assert account["rows_n"] == account["rows_read_n"] == 60
 
 
-def test_the_header_is_that_of_the_text_firmware(log):
+def test_header_is_that_of_the_text_firmware(log):
     assert column_names(2) == ["t_s", "T0", "Bx0", "By0", "Bz0", "T1", "Bx1", "By1", "Bz1"]
     assert lines(log)[0] == "t_s,T0,Bx0,By0,Bz0,T1,Bx1,By1,Bz1\n"
 
 
 @pytest.mark.parametrize(
-    ("breaking", "message"),
+    ("change", "message"),
     [
         (lambda all_: all_[1:], r"log\.csv: row 1, the column names, must be t_s,T0,Bx0,By0,Bz0"),
         (lambda all_: [all_[0].replace("Bx0,By0", "By0,Bx0"), *all_[1:]], "row 1, the column names"),
@@ -64,29 +64,29 @@ def test_the_header_is_that_of_the_text_firmware(log):
         (lambda _: [], "got an empty file"),
     ],
 )
-def test_a_broken_log_is_refused_in_one_sentence_that_names_the_place(log, breaking, message):
-    log.write_text("".join(breaking(lines(log))))
+def test_broken_log_is_refused(log, change, message):
+    log.write_text("".join(change(lines(log))))
     with pytest.raises(CaptureError, match=message) as refused:
         read_log(log)
     assert "\n" not in str(refused.value)
 
 
-def test_a_log_that_is_not_there_is_refused(tmp_path):
+def test_missing_log(tmp_path):
     with pytest.raises(CaptureError, match="file not found"):
         read_log(tmp_path / "log.csv")
 
 
-def test_missing_frames_are_counted_as_gaps_in_time(log):
+def test_missing_frames_are_counted(log):
     all_ = lines(log)
     log.write_text("".join([*all_[:10], *all_[13:30], *all_[31:]]))
     account = read_log(log)[3]
     assert (account["gaps_n"], account["gap_frames_n"]) == (2, 4)
 
 
-def test_failed_reads_and_stuck_chips_cost_their_frames_and_are_counted(log):
+def test_failed_reads_and_stuck_chips_are_dropped(log):
     t_s, b_uT, temperature_degC = made()
     b_uT[3, :3], temperature_degC[3, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
-    b_uT[30:, 3:] = b_uT[30, 3:]  # 30 frames of one value: the last 11 are stuck for sure
+    b_uT[30:, 3:] = b_uT[30, 3:]  # 30 equal frames: the last 11 are certainly stuck
     log.write_text(render(t_s, b_uT, temperature_degC))
     read_s, _, _, account = read_log(log)
     assert account["dropped_failed_read_rows_n"] == 1
@@ -95,7 +95,7 @@ def test_failed_reads_and_stuck_chips_cost_their_frames_and_are_counted(log):
     assert not np.isclose(read_s, t_s[3]).any()
 
 
-def test_a_chip_that_lost_its_settings_costs_the_log(log):
+def test_reset_chip_is_refused(log):
     t_s, b_uT, temperature_degC = made(frames_n=400, chips_n=3)
     b_uT[:, 3:6] = (500 + (b_uT[:, 3:6] - 500) / [0.2, 0.2, 0.32] * [0.98, 0.98, 1.58]).astype(np.float32)
     log.write_text(render(t_s, b_uT, temperature_degC))
@@ -107,7 +107,7 @@ def test_a_chip_that_lost_its_settings_costs_the_log(log):
     ("factor", "rate"),
     [(1e3, "0.25"), (1 / 100, r"2.5e\+04")],
 )
-def test_a_log_whose_time_cannot_be_seconds_is_refused_with_a_hint_at_the_unit(log, factor, rate):
+def test_time_in_another_unit_is_refused(log, factor, rate):
     header, *rows = lines(log)
     rows = [f"{factor * float(t_s):.7f},{rest}" for t_s, rest in (row.split(",", 1) for row in rows)]
     log.write_text("".join([header, *rows]))
@@ -116,7 +116,7 @@ def test_a_log_whose_time_cannot_be_seconds_is_refused_with_a_hint_at_the_unit(l
         read_log(log)
 
 
-def test_a_byte_order_mark_changes_nothing(log):
+def test_byte_order_mark_changes_nothing(log):
     plain = read_log(log)
     log.write_bytes(b"\xef\xbb\xbf" + log.read_bytes())
     marked = read_log(log)
@@ -132,7 +132,7 @@ def failing(failed_n, stuck_n, frames_n=60):
     return t_s, b_uT, temperature_degC
 
 
-def test_a_log_of_which_faults_leave_little_is_refused_and_says_why(log):
+def test_log_with_too_many_faults_is_refused(log):
     log.write_text(render(*failing(40, 0)))
     with pytest.raises(CaptureError, match="50 % of them or more; got 20 of 60: 40 had failed I2C reads, 0 stuck"):
         read_log(log)

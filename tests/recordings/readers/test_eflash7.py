@@ -1,4 +1,4 @@
-"""A recording of numbered places written here, row by row, comes back as touched and untouched rows, zeros counted."""
+"""Layout `eflash7`: numbered places, touched and untouched rows, dropped zeros."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from reskin.recordings.readers import eflash7
 from tests.recordings.headers import AS_USUAL, make_header
 
 CHIPS_N = 2
-STEP_uT = 2.4  # of the recorded chips, along x and y
+STEP_uT = 2.4  # of the recorded chips along x and y
 FIELDS = [f"mag{chip}_{axis}" for chip in range(CHIPS_N) for axis in "xyz"]
 NAMES = ["timestamp", "position", "x_pos", "y_pos", "fx", "fy", "fz", "tx", *FIELDS]
 NAMES_OF_TWO = ["timestamp", "fz", "ty", "pos1_x", "pos1_y", "pos2_x", "pos2_y", *FIELDS]
@@ -41,7 +41,7 @@ def write(folder: Path, rows: list[str] = ONE, names: list[str] = NAMES) -> Path
     return folder
 
 
-def complaint_of(folder: Path, header: Header = HEADER) -> str:
+def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
         eflash7.read(folder, header, AS_USUAL)
     message = str(caught.value)
@@ -50,29 +50,29 @@ def complaint_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
-def test_rows_from_the_first_touch_on_are_readings_and_those_before_the_no_load_reading(tmp_path: Path) -> None:
+def test_rows_from_the_first_touch_on_are_readings(tmp_path: Path) -> None:
     readings, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     assert readings.t_s.tolist() == [100.6, 100.7, 100.8, 100.9, 101.0, 101.2]
     np.testing.assert_allclose(readings.b_uT[:, 0], STEP_uT * np.array([41, 81, 42, 3, 2, 91]), rtol=1e-6)
-    np.testing.assert_allclose(readings.noload_uT[:, 0], 1.5 * STEP_uT, rtol=1e-6)  # of 0 and 1, in turn, plus 1
+    np.testing.assert_allclose(readings.noload_uT[:, 0], 1.5 * STEP_uT, rtol=1e-6)  # mean of 1 and 2
     assert account["noload_rows_n"] == 6
 
 
-def test_rows_of_zeros_are_dropped_and_counted_and_all_rows_add_up(tmp_path: Path) -> None:
+def test_zero_rows_are_dropped_and_counted(tmp_path: Path) -> None:
     _, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     dropped_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
     assert account["dropped_zero_rows_n"] == dropped_n == 1
     assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == len(LEVELS)
 
 
-def test_a_fault_is_told_by_the_row_of_the_file_though_a_row_of_zeros_came_before(tmp_path: Path) -> None:
+def test_errors_count_the_rows_of_the_file(tmp_path: Path) -> None:
     failed = ",".join([*ONE[-1].split(",")[:-3], *map(str, FAILED_B_uT)])
     _, account = eflash7.read(write(tmp_path, [*ONE[:-1], failed]), HEADER, AS_USUAL)
     assert account["fault_zeros_of_all_chips_first_row"] == len(ONE) - 1
     assert account["fault_failed_read_first_row"] == account["fault_failed_read_last_row"] == len(ONE)
 
 
-def test_zeros_of_one_chip_are_counted_apart_from_those_of_all(tmp_path: Path) -> None:
+def test_zeros_of_one_chip_are_counted_apart(tmp_path: Path) -> None:
     one_chip = ",".join([*ONE[-1].split(",")[:-3], "0.0", "0.0", "0.0"])
     _, account = eflash7.read(write(tmp_path, [*ONE[:-1], one_chip]), HEADER, AS_USUAL)
     assert (account["fault_zeros_of_all_chips_dropped_n"], account["fault_zeros_dropped_n"]) == (1, 1)
@@ -80,14 +80,14 @@ def test_zeros_of_one_chip_are_counted_apart_from_those_of_all(tmp_path: Path) -
     assert account["fault_zeros_first_row"] == account["fault_zeros_last_row"] == len(ONE)
 
 
-def test_forces_are_told_from_the_untouched_ones_and_compression_is_positive(tmp_path: Path) -> None:
+def test_forces_are_relative_and_compression_is_positive(tmp_path: Path) -> None:
     readings, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     np.testing.assert_allclose(readings.Fz_N, [1, 2, 1, 0, 0, 2.5], atol=1e-6)  # float32
     np.testing.assert_allclose(readings.Fx_N, 0, atol=1e-7)
     assert account["force_sign_unknown_rows_n"] == 6
 
 
-def test_a_touch_begins_where_the_force_rises(tmp_path: Path) -> None:
+def test_touch_begins_where_the_force_rises(tmp_path: Path) -> None:
     readings, _ = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
     assert readings.indentation.tolist() == [0, 0, 0, 0, 0, 1]
     assert readings.n_contacts.tolist() == [7, 7, 7, 7, 7, 8]
@@ -101,57 +101,57 @@ def test_places_have_numbers_and_no_millimetres(tmp_path: Path) -> None:
         assert all(account[f"place_{n}_rows_n"] == account["rows_n"] for n in places)
 
 
-def test_a_recording_of_two_touches_knows_the_normal_force_alone(tmp_path: Path) -> None:
+def test_multi_touch_has_normal_force_only(tmp_path: Path) -> None:
     readings, account = eflash7.read(write(tmp_path, TWO, NAMES_OF_TWO), HEADER, AS_USUAL)
     assert np.isnan(readings.Fx_N).all()
     assert readings.Fz_N.max() == np.float32(2.5)
     assert account["force_sign_unknown_rows_n"] == 0
 
 
-def test_a_row_that_comes_late_and_one_that_is_repeated_are_counted(tmp_path: Path) -> None:
+def test_late_and_repeated_rows_are_counted(tmp_path: Path) -> None:
     rows = [*ONE[:10], ONE[9].replace("100.9", "103.9"), *[row.replace("101.", "104.") for row in ONE[10:]]]
     _, account = eflash7.read(write(tmp_path, rows), HEADER, AS_USUAL)
     assert (account["gap_rows_n"], account["repeated_rows_n"]) == (1, 1)
 
 
-def changed(line_n: int, old: str, new: str) -> list[str]:
+def with_line_changed(line_n: int, old: str, new: str) -> list[str]:
     return [row.replace(old, new) if row_i + 2 == line_n else row for row_i, row in enumerate(ONE)]
 
 
 @pytest.mark.parametrize(
     ("rows", "expected"),
     [
-        (changed(4, "3,2", "3,1"), "places must be the same in all rows; got another in line 4"),
+        (with_line_changed(4, "3,2", "3,1"), "places must be the same in all rows; got another in line 4"),
         ([row.replace("6,3,2", "6,12.5,8") for row in ONE], "columns and rows 1 to 3 of a grid; got [12.5, 8.0]"),
-        (changed(5, "100.3", "100.1"), "timestamp must be later in each line; got an earlier one in line 5"),
-        (changed(8, "-0.9", "-356"), "in line 8. Convert grams"),
-        (changed(8, "-0.9", "nan"), "fz in line 8"),
+        (with_line_changed(5, "100.3", "100.1"), "timestamp must be later in each line; got an earlier one in line 5"),
+        (with_line_changed(8, "-0.9", "-356"), "in line 8. Convert grams"),
+        (with_line_changed(8, "-0.9", "nan"), "fz in line 8"),
         (ONE[5:], "the rows before the first touch must be 5 or more"),
         ([ONE[11].replace("101.1", f"{90 + i}") for i in range(9)] + ONE, "rows of zeros must be at most 25%"),
     ],
 )
-def test_what_cannot_be_is_named(tmp_path: Path, rows: list[str], expected: str) -> None:
-    assert expected in complaint_of(write(tmp_path, rows))
+def test_invalid_rows_are_refused(tmp_path: Path, rows: list[str], expected: str) -> None:
+    assert expected in error_of(write(tmp_path, rows))
 
 
-def test_a_gauge_that_reads_compression_as_positive_is_refused(tmp_path: Path) -> None:
+def test_positive_compression_is_refused(tmp_path: Path) -> None:
     rows = [row.replace(",-", ",") for row in ONE]
-    assert "the strongest fz must be negative" in complaint_of(write(tmp_path, rows))
+    assert "the strongest fz must be negative" in error_of(write(tmp_path, rows))
 
 
-def test_one_place_touched_twice_is_refused(tmp_path: Path) -> None:
+def test_repeated_place_is_refused(tmp_path: Path) -> None:
     rows = rows_of("3,1,3,1", "{fz},0.01 {place}")
-    assert "two places must be two; got place 3 twice" in complaint_of(write(tmp_path, rows, NAMES_OF_TWO))
+    assert "two places must be two; got place 3 twice" in error_of(write(tmp_path, rows, NAMES_OF_TWO))
 
 
-def test_fields_in_millitesla_are_refused(tmp_path: Path) -> None:
+def test_millitesla_is_refused(tmp_path: Path) -> None:
     cells = ONE[0].split(",")
     fields_mT = [[1e-3 * STEP_uT * (level + 5 * i) for i in range(len(FIELDS))] for level in range(40)]
     rows = [",".join([f"{i}", *cells[1:8], *(f"{b:.5f}" for b in row)]) for i, row in enumerate(fields_mT)]
-    assert "Convert nT, mT or G to uT" in complaint_of(write(tmp_path, rows))
+    assert "Convert nT, mT or G to uT" in error_of(write(tmp_path, rows))
 
 
-def test_the_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
+def test_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
     recording = tmp_path / "position_6.csv"
     recording.write_text(f"{','.join(NAMES)}\n{ONE[0]}\n")
     files = eflash7.collect(recording)

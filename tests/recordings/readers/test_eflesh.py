@@ -1,4 +1,4 @@
-"""An eFlesh folder written here, value by value, comes back as the presses and strokes that were written."""
+"""Layout `eflesh`: a folder of three arrays becomes presses and strokes."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ def strokes(folder: Path, strokes_n: int = 3) -> Path:
     return write(folder, places, [450.0 + i // len(stroke) for i in range(len(places))])
 
 
-def complaint_of(folder: Path, header: Header = HEADER) -> str:
+def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
         eflesh.read(folder, header, AS_USUAL)
     message = str(caught.value)
@@ -60,25 +60,25 @@ def edit(path: Path, line_n: int, column_i: int, cell: str) -> None:
     path.write_text("".join(",".join(line) + "\n" for line in lines))
 
 
-def test_places_count_from_the_corner_of_the_scan_without_float_noise(tmp_path: Path) -> None:
+def test_places_count_from_the_corner_of_the_scan(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
     assert readings.x_mm[:4].tolist() == [0, 0, 1, 1]
     assert readings.y_mm[:4].tolist() == [0, 1, 0, 1]
 
 
-def test_depth_counts_down_from_the_highest_place(tmp_path: Path) -> None:
+def test_depth_counts_from_the_highest_place(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
     assert readings.depth_mm[:4].tolist() == [0.75, 0.5, 0.25, 0]
 
 
-def test_the_noload_field_is_the_baseline_that_was_subtracted(tmp_path: Path) -> None:
+def test_noload_is_the_subtracted_baseline(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
     np.testing.assert_array_equal(readings.b_uT[5], 505 + 10 * np.arange(6))
-    # 300 + i fits float32, and so do the differences: no rounding to allow for.
+    # 300 + i and the differences are exact in float32.
     np.testing.assert_array_equal(readings.noload_uT[5], np.full(6, 305))
 
 
-def test_a_scan_has_a_pass_each_time_its_places_repeat(tmp_path: Path) -> None:
+def test_repeated_places_begin_a_pass(tmp_path: Path) -> None:
     readings, account = eflesh.read(scan(tmp_path, passes_n=3), HEADER, AS_USUAL)
     assert readings.pass_i.tolist() == [0] * 4 + [1] * 4 + [2] * 4
     assert account["passes_n"] == 3
@@ -86,14 +86,14 @@ def test_a_scan_has_a_pass_each_time_its_places_repeat(tmp_path: Path) -> None:
     assert np.isnan(readings.Fz_N).all()
 
 
-def test_a_fresh_baseline_begins_a_stroke(tmp_path: Path) -> None:
+def test_fresh_baseline_begins_a_stroke(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path), GAUGED, AS_USUAL)
     assert readings.pass_i.tolist() == [0] * 5 + [1] * 5 + [2] * 5
     assert account["passes_n"] == 3
     assert readings.n_contacts.tolist() == readings.pass_i.tolist()
 
 
-def test_grams_become_newtons_and_a_mask_becomes_nan(tmp_path: Path) -> None:
+def test_grams_become_newtons_and_masked_values_nan(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, AS_USUAL)
     expected = np.float32([np.nan, 0.980665, 9.80665, 1.4709975, np.nan])
     # float32 holds seven digits
@@ -105,21 +105,21 @@ def test_grams_become_newtons_and_a_mask_becomes_nan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_the_gauge_measures_the_axis_that_the_header_names(tmp_path: Path, axis: str) -> None:
+def test_gauge_axis_comes_from_the_header(tmp_path: Path, axis: str) -> None:
     readings, account = eflesh.read(
         strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}), AS_USUAL
     )
     felt = np.isfinite(getattr(readings, f"F{axis}_N"))
     assert account["force_sign_unknown_rows_n"] == felt.sum() > 0
     assert np.isnan(readings.Fz_N).all()
-    # A stroke along the skin is no depth.
+    # A stroke along the skin has no depth.
     assert np.isnan(readings.depth_mm).all()
 
 
 @pytest.mark.parametrize("options", [{}, {"force_axis": "up"}])
-def test_a_weight_without_an_axis_is_refused(tmp_path: Path, options: dict[str, str]) -> None:
+def test_weight_without_axis_is_refused(tmp_path: Path, options: dict[str, str]) -> None:
     header = GAUGED.model_copy(update={"options": options})
-    assert "option force_axis must be x, y or z" in complaint_of(strokes(tmp_path), header)
+    assert "option force_axis must be x, y or z" in error_of(strokes(tmp_path), header)
 
 
 @settings(max_examples=20, deadline=None)
@@ -131,14 +131,14 @@ def test_every_row_is_a_reading(tmp_path_factory: pytest.TempPathFactory, passes
     assert (np.diff(readings.t_s) > 0).all()
 
 
-def test_the_three_files_are_collected(tmp_path: Path) -> None:
+def test_three_files_are_collected(tmp_path: Path) -> None:
     files = eflesh.collect(scan(tmp_path))
     assert sorted(files) == sorted(eflesh.FILES)
     assert eflesh.count_chips(files) == CHIPS_N
 
 
 @pytest.mark.parametrize("name", eflesh.FILES)
-def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
+def test_missing_file(tmp_path: Path, name: str) -> None:
     (scan(tmp_path) / name).unlink()
     with pytest.raises(CaptureError, match=f"got no {name}"):
         eflesh.collect(tmp_path)
@@ -146,18 +146,18 @@ def test_a_missing_file_is_named(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", eflesh.FILES)
 @pytest.mark.parametrize("cell", ["nan", "-inf", "", "1,5", "x"])
-def test_one_broken_cell_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_broken_cell_is_named(tmp_path: Path, name: str, cell: str) -> None:
     edit(scan(tmp_path) / name, 3, 2, cell)
-    message = complaint_of(tmp_path)
+    message = error_of(tmp_path)
     assert name in message
     assert "line 3" in message
 
 
 @pytest.mark.parametrize("name", eflesh.FILES)
-def test_unequal_rows_are_refused_with_both_numbers(tmp_path: Path, name: str) -> None:
+def test_unequal_row_counts_are_refused(tmp_path: Path, name: str) -> None:
     path = scan(tmp_path) / name
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
-    message = complaint_of(tmp_path)
+    message = error_of(tmp_path)
     assert f"11 in {name}" in message
     assert "12 in" in message
 
@@ -169,27 +169,27 @@ def test_unequal_rows_are_refused_with_both_numbers(tmp_path: Path, name: str) -
         (eflesh.STATES, f"{START_s + 8.6}", "in line 3. Is a row missing"),
     ],
 )
-def test_clocks_that_disagree_are_refused(tmp_path: Path, name: str, cell: str, expected: str) -> None:
+def test_disagreeing_clocks_are_refused(tmp_path: Path, name: str, cell: str, expected: str) -> None:
     edit(scan(tmp_path) / name, 3, 0, cell)
-    assert expected in complaint_of(tmp_path)
+    assert expected in error_of(tmp_path)
 
 
-def test_a_clock_that_goes_back_is_refused(tmp_path: Path) -> None:
+def test_decreasing_clock_is_refused(tmp_path: Path) -> None:
     scan(tmp_path)
     for name in eflesh.FILES:
         edit(tmp_path / name, 3, 0, f"{START_s}")
-    assert "later in each line; got an earlier one in line 3" in complaint_of(tmp_path)
+    assert "later in each line; got an earlier one in line 3" in error_of(tmp_path)
 
 
-def test_another_number_of_chips_than_the_headers_is_refused(tmp_path: Path) -> None:
-    message = complaint_of(scan(tmp_path), HEADER.model_copy(update={"chips_n": 5}))
+def test_other_chip_count_is_refused(tmp_path: Path) -> None:
+    message = error_of(scan(tmp_path), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns must be 16 a line" in message
     assert "got 7" in message
 
 
-def test_a_weight_that_no_skin_bears_is_refused(tmp_path: Path) -> None:
+def test_implausible_weight_is_refused(tmp_path: Path) -> None:
     edit(strokes(tmp_path) / eflesh.STATES, 3, 4, "20000")
-    assert "in line 3" in complaint_of(tmp_path, GAUGED)
+    assert "in line 3" in error_of(tmp_path, GAUGED)
 
 
 def rescale(path: Path, columns: slice, factor: float) -> None:
@@ -203,13 +203,13 @@ def test_places_in_metres_or_micrometres_are_refused(tmp_path: Path, factor: flo
     folder = write(tmp_path, [[5.0 * i, 0.0, 142.0] for i in range(4)], [300.0] * 4)
     eflesh.read(folder, HEADER, AS_USUAL)
     rescale(folder / eflesh.STATES, slice(1, 4), factor)
-    assert "states.csv: places must be one, or spread over 1 to 200 mm" in complaint_of(folder)
+    assert "states.csv: places must be one, or spread over 1 to 200 mm" in error_of(folder)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
-def test_a_stroke_in_metres_or_micrometres_is_refused(tmp_path: Path, factor: float) -> None:
+def test_stroke_in_metres_or_micrometres_is_refused(tmp_path: Path, factor: float) -> None:
     rescale(strokes(tmp_path) / eflesh.STATES, slice(3, 4), factor)
-    assert "states.csv: depth must be 0.05 to 100 mm where it is greatest" in complaint_of(tmp_path, GAUGED)
+    assert "states.csv: depth must be 0.05 to 100 mm where it is greatest" in error_of(tmp_path, GAUGED)
 
 
 def test_weights_in_kilograms_are_refused(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_weights_in_kilograms_are_refused(tmp_path: Path) -> None:
     )
     states[:, 4] = np.where(states[:, 4] == -1, -1, states[:, 4] / 1000)
     (folder / eflesh.STATES).write_text(lines_of(states.tolist()))
-    assert "force must be 0.05 N or more somewhere in contact; got 0.00981 at most. Convert kg" in complaint_of(
+    assert "force must be 0.05 N or more somewhere in contact; got 0.00981 at most. Convert kg" in error_of(
         folder, GAUGED
     )
 
@@ -229,17 +229,17 @@ def test_fields_in_other_units_are_refused(tmp_path: Path, of_a_uT: float) -> No
     scan(tmp_path)
     for name in (eflesh.SENSOR, eflesh.CHANGES):
         rescale(tmp_path / name, slice(1, None), of_a_uT)
-    assert "G to uT" in complaint_of(tmp_path)
+    assert "G to uT" in error_of(tmp_path)
 
 
-def test_a_robot_of_constant_height_gives_places_and_no_depth(tmp_path):
+def test_constant_height_gives_no_depth(tmp_path):
     places = [[x, y, 142.0] for x, y in GRID] * 3
     readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, AS_USUAL)
     assert np.isnan(readings.depth_mm).all()
     assert account["no_depth_rows_n"] == len(readings) == len(places)
 
 
-def test_a_robot_that_holds_its_height_within_hundredths_of_a_mm_gives_no_depth(tmp_path):
+def test_nearly_constant_height_gives_no_depth(tmp_path):
     z_mm = np.linspace(143.0, 143.0177, 3 * len(GRID))
     places = [[x, y, z] for (x, y), z in zip(GRID * 3, z_mm, strict=True)]
     readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, AS_USUAL)

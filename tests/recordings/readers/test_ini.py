@@ -1,4 +1,4 @@
-"""An ini recording written here, value by value, comes back as the passes that were written."""
+"""Layout `ini`: two text files become passes over a raster."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ FAILED = "8028.16 5194.0 12943.36 -880.49"
 
 
 def chip_line(row_i: int, chip_i: int, lsb_xy_uT: float = LSB_XY_uT, lsb_z_uT: float = LSB_Z_uT) -> str:
-    """One chip's X, Y, Z, T, whose values of all rows together lie single steps of the LSB apart."""
+    """X, Y, Z, T of one chip, in single steps of the LSB over all rows."""
     steps = 1000 + row_i + 100 * chip_i
     return f"{steps * lsb_xy_uT:.2f} {(steps + 1) * lsb_xy_uT:.2f} {(steps + 2) * lsb_z_uT:.2f} {28 + chip_i}.5"
 
@@ -57,7 +57,7 @@ def edit(path: Path, line_n: int, line: str) -> None:
     path.write_text("".join(f"{each}\n" for each in lines))
 
 
-def complaint_of(folder: Path, header: Header = HEADER) -> str:
+def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
         ini.read(folder, header, AS_USUAL)
     message = str(caught.value)
@@ -74,7 +74,7 @@ def test_every_row_is_a_press_of_its_pass(tmp_path: Path) -> None:
     assert readings.temperature_degC[0].tolist() == [28.5, 29.5, 30.5]
 
 
-def test_force_and_not_the_label_tells_a_contact(tmp_path: Path) -> None:
+def test_contact_is_decided_by_force(tmp_path: Path) -> None:
     readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
     assert np.isnan(readings.x_mm).tolist() == [True, True, False, False, True, False, False, True]
     assert np.isnan(readings.y_mm).tolist() == np.isnan(readings.x_mm).tolist()
@@ -84,7 +84,7 @@ def test_force_and_not_the_label_tells_a_contact(tmp_path: Path) -> None:
     assert readings.n_contacts.tolist() == [7, 7, 7, 8, 9, 9, 10, 11]
 
 
-def test_the_noload_field_is_the_mean_of_the_rows_that_begin_the_pass(tmp_path: Path) -> None:
+def test_noload_is_the_mean_of_the_first_rows_of_a_pass(tmp_path: Path) -> None:
     readings, account = ini.read(write(tmp_path, ONE_PASS * 2), HEADER, AS_USUAL)
     for pass_i in (0, 1):
         corner_uT = (field_uT(8 * pass_i) + field_uT(8 * pass_i + 1)) / 2
@@ -98,25 +98,25 @@ def test_places_that_never_repeat_are_one_pass(tmp_path: Path) -> None:
     assert account["passes_n"] == 1
 
 
-def test_what_the_files_do_not_know_is_nan(tmp_path: Path) -> None:
+def test_unrecorded_quantities_are_nan(tmp_path: Path) -> None:
     readings, _ = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
     for name in ("depth_mm", "Fx_N", "Fy_N", "t_s"):
         assert np.isnan(getattr(readings, name)).all()
 
 
-def test_a_pass_that_begins_in_contact_has_no_noload_reading(tmp_path: Path) -> None:
-    message = complaint_of(write(tmp_path, ONE_PASS[2:6] * 3))
+def test_pass_that_begins_in_contact_has_no_noload(tmp_path: Path) -> None:
+    message = error_of(write(tmp_path, ONE_PASS[2:6] * 3))
     assert "none in the pass from line 1" in message
 
 
-def test_a_row_with_a_failed_read_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS * 2)
     edit(tmp_path / ini.READINGS, 2, f"{chip_line(1, 0)} {FAILED} {chip_line(1, 2)}")
     edit(tmp_path / ini.READINGS, 4, f"{FAILED} {FAILED} {FAILED}")
     readings, account = ini.read(tmp_path, HEADER, AS_USUAL)
     assert account["dropped_failed_read_rows_n"] == 2
     assert readings.indentation.tolist() == [0, 2, *range(4, 16)]
-    # The failed corner row takes no part in the no-load mean.
+    # The failed corner row is not part of the no-load mean.
     np.testing.assert_array_equal(readings.noload_uT[0], field_uT(0).astype(np.float32))
 
 
@@ -153,22 +153,20 @@ def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: i
 
 @settings(max_examples=10, deadline=None)
 @given(late_n=st.integers(0, 5))
-def test_the_account_says_by_how_many_rows_the_fields_come_late(
-    tmp_path_factory: pytest.TempPathFactory, late_n: int
-) -> None:
+def test_lateness_of_the_fields_is_reported(tmp_path_factory: pytest.TempPathFactory, late_n: int) -> None:
     folder = write_late(tmp_path_factory.mktemp("ini"), ONE_PASS * 5, late_n)
-    for said in ("0", str(late_n)):
-        _, account = ini.read(folder, late(said), AS_USUAL)
+    for declared in ("0", str(late_n)):
+        _, account = ini.read(folder, late(declared), AS_USUAL)
         assert account["best_rows_late_n"] == late_n
-        assert account["rows_late_n"] == int(said)
+        assert account["rows_late_n"] == int(declared)
 
 
 @pytest.mark.parametrize("late_n", [0, 1, 4])
-@pytest.mark.parametrize(("passes_n", "tells"), [(13, True), (5, False)])  # 104 and 40 rows
-def test_a_header_that_says_nothing_leaves_it_to_a_recording_that_is_long_enough(tmp_path, late_n, passes_n, tells):
+@pytest.mark.parametrize(("passes_n", "is_long"), [(13, True), (5, False)])  # 104 and 40 rows
+def test_lateness_is_estimated_if_the_recording_is_long_enough(tmp_path, late_n, passes_n, is_long):
     _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER, AS_USUAL)
     assert account["best_rows_late_n"] == late_n
-    assert account["rows_late_n"] == account["dropped_no_partner_rows_n"] == (late_n if tells else 0)
+    assert account["rows_late_n"] == account["dropped_no_partner_rows_n"] == (late_n if is_long else 0)
 
 
 @settings(max_examples=12, deadline=None)
@@ -197,17 +195,17 @@ def test_late_fields_are_paired_with_their_presses(
 
 
 @pytest.mark.parametrize("rows_late", ["6", "-1", "one", ""])
-def test_another_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
-    assert "option rows_late must be 0 to 5" in complaint_of(write(tmp_path, ONE_PASS), late(rows_late))
+def test_invalid_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
+    assert "option rows_late must be 0 to 5" in error_of(write(tmp_path, ONE_PASS), late(rows_late))
 
 
-def test_a_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
-    assert "rows must be more than the 5 of option rows_late; got 4" in complaint_of(
+def test_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
+    assert "rows must be more than the 5 of option rows_late; got 4" in error_of(
         write(tmp_path, ONE_PASS[:4]), late("5")
     )
 
 
-def test_the_public_recording_comes_one_row_late(tmp_path: Path, shared_data: Path) -> None:
+def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> None:
     for name, source in (
         (ini.READINGS, "b20_artillery_AFG_board2_50_screw.txt"),
         (ini.TRUTHS, "truths_artillery_AFG_board2_50_screw.txt"),
@@ -228,31 +226,31 @@ def test_the_public_recording_comes_one_row_late(tmp_path: Path, shared_data: Pa
         (slice(2, 3), 1e3, "Convert grams or mN to N"),
     ],
 )
-def test_truths_in_other_units_are_refused(tmp_path: Path, columns: slice, factor: float, expected: str) -> None:
+def test_other_units_are_refused(tmp_path: Path, columns: slice, factor: float, expected: str) -> None:
     truths = np.array(ONE_PASS)
     truths[:, columns] *= factor
     truths[:, 2] = np.where(factor == 1e-3, np.array(ONE_PASS)[:, 2], truths[:, 2])
-    message = complaint_of(write(tmp_path, [tuple(row) for row in truths.tolist()]))
+    message = error_of(write(tmp_path, [tuple(row) for row in truths.tolist()]))
     assert expected in message
     assert ini.TRUTHS in message
 
 
-def test_a_stuck_chip_costs_its_rows(tmp_path: Path) -> None:
+def test_stuck_chip_loses_its_rows(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS * 8)
     for row_i in range(20, 64):
         edit(tmp_path / ini.READINGS, row_i + 1, f"{chip_line(row_i, 0)} {chip_line(20, 1)} {chip_line(row_i, 2)}")
-    # Told from the 20th equal reading on; the last passes' corner rows are all stuck.
-    assert "none in the pass from line 41" in complaint_of(tmp_path)
+    # Detected from the 20th equal reading on; the corner rows of the last passes are all stuck.
+    assert "none in the pass from line 41" in error_of(tmp_path)
 
 
-def test_a_recording_of_failed_reads_only_is_refused(tmp_path: Path) -> None:
+def test_recording_of_failed_reads_is_refused(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS)
     (tmp_path / ini.READINGS).write_text(f"{FAILED} {FAILED} {FAILED}\n" * len(ONE_PASS))
-    assert "failed" in complaint_of(tmp_path)
+    assert "failed" in error_of(tmp_path)
 
 
 def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: int = 3) -> Path:
-    """Write passes in which the chips of `reset` lost their settings in `rows`."""
+    """Write passes in which the chips `reset` have lost their settings in `rows`."""
     write(folder, ONE_PASS * passes_n)
     lines = []
     for row_i in range(len(ONE_PASS) * passes_n):
@@ -264,32 +262,32 @@ def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: 
     return folder
 
 
-def test_a_chip_that_was_reset_is_named(tmp_path: Path) -> None:
-    message = complaint_of(recording_with_resets(tmp_path, {1}, range(24)))
+def test_reset_chip_is_named(tmp_path: Path) -> None:
+    message = error_of(recording_with_resets(tmp_path, {1}, range(24)))
     assert "chip 1 must be that of the other chips" in message
     assert "0.98 uT in x, y and 1.58 uT in z" in message
 
 
-def test_a_recording_whose_chips_were_all_reset_is_refused(tmp_path: Path) -> None:
-    message = complaint_of(recording_with_resets(tmp_path, {0, 1, 2}, range(24)))
+def test_recording_with_all_chips_reset_is_refused(tmp_path: Path) -> None:
+    message = error_of(recording_with_resets(tmp_path, {0, 1, 2}, range(24)))
     assert "chip 0, 1, 2 must" in message
     assert "0.98 uT in x, y and 1.58 uT in z" in message
 
 
-def test_a_chip_that_was_reset_on_the_way_is_named(tmp_path: Path) -> None:
-    # 2400 rows are looked at in two blocks.
-    message = complaint_of(recording_with_resets(tmp_path, {1}, range(1200, 2400), passes_n=300))
+def test_chip_reset_during_the_recording_is_named(tmp_path: Path) -> None:
+    # 2400 rows are checked in two blocks.
+    message = error_of(recording_with_resets(tmp_path, {1}, range(1200, 2400), passes_n=300))
     assert "from row 1201: the LSB of chip 1 must" in message
 
 
-def test_another_lsb_than_the_headers_is_refused(tmp_path: Path) -> None:
+def test_other_lsb_than_in_the_header_is_refused(tmp_path: Path) -> None:
     firmware = Firmware(gain_sel=6, lsb_xy_uT=0.2, lsb_z_uT=0.3227)
-    message = complaint_of(write(tmp_path, ONE_PASS * 3), HEADER.model_copy(update={"firmware": firmware}))
+    message = error_of(write(tmp_path, ONE_PASS * 3), HEADER.model_copy(update={"firmware": firmware}))
     assert "must be (0.2, 0.3227) uT; got 0.15 uT in x, y" in message
 
 
 @pytest.mark.parametrize("name", ["b20_stand.txt", "stand.txt"])
-def test_the_truths_are_found_by_name(tmp_path: Path, name: str) -> None:
+def test_truth_file_is_found_by_name(tmp_path: Path, name: str) -> None:
     recording, truths = tmp_path / name, tmp_path / "truths_stand.txt"
     recording.write_text(f"{reading_line(0)}\n")
     with pytest.raises(CaptureError, match=r"no .*truths_stand\.txt"):
@@ -304,37 +302,37 @@ def test_the_truths_are_found_by_name(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("cell", ["nan", "-inf", "1e30", "1,5", "x"])
 @pytest.mark.parametrize("name", ini.FILES)
-def test_one_broken_cell_is_named(tmp_path: Path, name: str, cell: str) -> None:
+def test_broken_cell_is_named(tmp_path: Path, name: str, cell: str) -> None:
     path = write(tmp_path, ONE_PASS) / name
     edit(path, 3, f"{cell} {path.read_text().splitlines()[2].partition(' ')[2]}")
-    message = complaint_of(tmp_path)
+    message = error_of(tmp_path)
     assert f"{name}: " in message
     assert "in line 3" in message
 
 
 @pytest.mark.parametrize("name", ini.FILES)
-def test_a_missing_or_extra_cell_is_named(tmp_path: Path, name: str) -> None:
+def test_missing_or_extra_cell_is_named(tmp_path: Path, name: str) -> None:
     path = write(tmp_path, ONE_PASS) / name
     line = path.read_text().splitlines()[2]
     for broken in (f"{line} 1", line.rpartition(" ")[0]):
         edit(path, 3, broken)
-        message = complaint_of(tmp_path)
+        message = error_of(tmp_path)
         assert name in message
         assert "in line 3" in message
 
 
-def test_unequal_rows_are_refused_with_both_numbers(tmp_path: Path) -> None:
+def test_unequal_row_counts_are_refused(tmp_path: Path) -> None:
     path = write(tmp_path, ONE_PASS) / ini.TRUTHS
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
-    assert f"8 in {ini.READINGS} and 7 in {ini.TRUTHS}" in complaint_of(tmp_path)
+    assert f"8 in {ini.READINGS} and 7 in {ini.TRUTHS}" in error_of(tmp_path)
 
 
-def test_another_number_of_chips_than_the_headers_is_refused(tmp_path: Path) -> None:
-    message = complaint_of(write(tmp_path, ONE_PASS), HEADER.model_copy(update={"chips_n": 5}))
+def test_other_chip_count_is_refused(tmp_path: Path) -> None:
+    message = error_of(write(tmp_path, ONE_PASS), HEADER.model_copy(update={"chips_n": 5}))
     assert "columns must be 20 a line" in message
     assert "got 12" in message
 
 
 def test_forces_in_grams_are_refused(tmp_path: Path) -> None:
     edit(write(tmp_path, ONE_PASS) / ini.TRUTHS, 4, "2.0 4.0 153.0")
-    assert "in line 4. Convert grams" in complaint_of(tmp_path)
+    assert "in line 4. Convert grams" in error_of(tmp_path)

@@ -1,4 +1,4 @@
-"""A lab file written here, value by value, comes back as the presses that were written."""
+"""Layout `lab`: one CSV file becomes presses."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def write(folder: Path, *rows: str, names: str = NAMES) -> Path:
     return folder
 
 
-def complaint_of(folder: Path, header: Header = HEADER) -> str:
+def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
         lab.read(folder, header, AS_USUAL)
     message = str(caught.value)
@@ -48,7 +48,7 @@ def complaint_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
-def test_contact_rows_become_readings_of_their_press(tmp_path: Path) -> None:
+def test_contact_rows_become_readings(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     assert readings.indentation.tolist() == [0, 0, 0, 1]
     assert readings.reading_i.tolist() == [0, 1, 2, 0]
@@ -60,20 +60,20 @@ def test_contact_rows_become_readings_of_their_press(tmp_path: Path) -> None:
     assert readings.n_contacts.tolist() == [7, 7, 7, 8]
 
 
-def test_the_noload_field_is_the_mean_over_the_same_press(tmp_path: Path) -> None:
+def test_noload_is_the_mean_of_the_same_press(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     assert readings.noload_uT[:, 0].tolist() == [102, 102, 102, 90]
     assert readings.noload_uT[0].tolist() == [102, 112, 122, 132, 142, 152]
 
 
-def test_all_three_forces_are_turned_from_the_gauge_to_the_skin(tmp_path: Path) -> None:
+def test_forces_are_turned_from_gauge_to_skin_axes(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     np.testing.assert_array_equal(readings.Fz_N, np.float32([3.5, 3.5, 3.5, 0.5]))
     np.testing.assert_array_equal(readings.Fx_N[:3], np.float32([-0.1] * 3))
     np.testing.assert_array_equal(readings.Fy_N[:3], np.float32([0.2] * 3))
 
 
-def test_what_the_file_does_not_know_is_nan(tmp_path: Path) -> None:
+def test_missing_quantities_are_nan(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
     assert np.isnan(readings.depth_mm).all()
     assert np.isnan(readings.t_s).all()
@@ -81,7 +81,7 @@ def test_what_the_file_does_not_know_is_nan(tmp_path: Path) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(counts=st.lists(st.tuples(st.integers(1, 4), st.integers(1, 5)), min_size=1, max_size=6))
-def test_every_row_is_a_reading_or_a_noload_row(
+def test_every_row_is_a_reading_or_noload(
     tmp_path_factory: pytest.TempPathFactory, counts: list[tuple[int, int]]
 ) -> None:
     rows = []
@@ -93,7 +93,7 @@ def test_every_row_is_a_reading_or_a_noload_row(
     assert account["noload_rows_n"] == sum(noload_n for noload_n, _ in counts)
 
 
-def test_a_row_with_a_failed_read_is_dropped_and_counted(tmp_path: Path) -> None:
+def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
     rows = list(PRESSES)
     for row_i in (1, 3):
         rows[row_i] = (
@@ -104,11 +104,11 @@ def test_a_row_with_a_failed_read_is_dropped_and_counted(tmp_path: Path) -> None
     assert account["dropped_failed_read_rows_n"] == 2
     assert (account["rows_n"], account["noload_rows_n"], account["rows_read_n"]) == (3, 2, 7)
     assert readings.b_uT[:, 0].tolist() == [160, 162, 50]
-    # The failed no-load row takes no part in the mean.
+    # The failed no-load row is not part of the mean.
     assert readings.noload_uT[:, 0].tolist() == [100, 100, 90]
 
 
-def test_order_of_columns_does_not_matter(tmp_path: Path) -> None:
+def test_column_order_does_not_matter(tmp_path: Path) -> None:
     names = NAMES.split(",")
     order = np.roll(np.arange(len(names)), 4)
     turned = [",".join(np.array(line.split(","))[order]) for line in PRESSES]
@@ -118,12 +118,12 @@ def test_order_of_columns_does_not_matter(tmp_path: Path) -> None:
     np.testing.assert_array_equal(lab.read(folder, HEADER, AS_USUAL)[0].b_uT, straight.b_uT)
 
 
-def test_a_column_nobody_knows_is_counted(tmp_path: Path) -> None:
+def test_unknown_column_is_counted(tmp_path: Path) -> None:
     _, account = lab.read(write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Mz"), HEADER, AS_USUAL)
     assert account["ignored_columns_n"] == 1
 
 
-def test_the_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
+def test_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
     recording = tmp_path / "board1_depth1.csv"
     recording.write_text(f"{NAMES}\n{PRESSES[0]}\n")
     files = lab.collect(recording)
@@ -151,28 +151,28 @@ def test_the_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
         (8, row(0, "noload", 90.0), "0 once more in line 8"),
     ],
 )
-def test_one_broken_row_is_named(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:
+def test_broken_row_is_named(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:
     rows = list(PRESSES)
     rows[line_n - 2] = broken
-    assert expected in complaint_of(write(tmp_path, *rows))
+    assert expected in error_of(write(tmp_path, *rows))
 
 
 @pytest.mark.parametrize("missing", ["indent", "phase", "x_mm", "T0", "By1", "Fz"])
-def test_a_missing_column_is_named(tmp_path: Path, missing: str) -> None:
+def test_missing_column_is_named(tmp_path: Path, missing: str) -> None:
     column = NAMES.split(",").index(missing)
     lines = [",".join(cell for i, cell in enumerate(line.split(",")) if i != column) for line in [NAMES, *PRESSES]]
-    assert f"none named {missing}" in complaint_of(write(tmp_path, *lines[1:], names=lines[0]))
+    assert f"none named {missing}" in error_of(write(tmp_path, *lines[1:], names=lines[0]))
 
 
-def test_a_column_given_twice_is_refused(tmp_path: Path) -> None:
+def test_duplicate_column_is_refused(tmp_path: Path) -> None:
     folder = write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Fz")
-    assert "Fz twice" in complaint_of(folder)
+    assert "Fz twice" in error_of(folder)
 
 
-def test_fields_in_millitesla_are_suspected(tmp_path: Path) -> None:
+def test_millitesla_is_refused(tmp_path: Path) -> None:
     rows = [row(0, "noload", -20.0), row(0, "contact", -21.0)]
     tiny = [",".join(str(float(c) / 1e3) if "." in c and "0000" in c else c for c in r.split(",")) for r in rows]
-    assert "Convert mT or G to uT" in complaint_of(write(tmp_path, *tiny))
+    assert "Convert mT or G to uT" in error_of(write(tmp_path, *tiny))
 
 
 def scaled(column: str, factor: float) -> list[str]:
@@ -200,10 +200,10 @@ def scaled(column: str, factor: float) -> list[str]:
     ],
 )
 def test_other_units_and_signs_are_refused(tmp_path: Path, column: str, factor: float, expected: str) -> None:
-    assert expected in complaint_of(write(tmp_path, *scaled(column, factor)))
+    assert expected in error_of(write(tmp_path, *scaled(column, factor)))
 
 
-def test_a_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> None:
+def test_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> None:
     lines = (shared_data / "lab" / "board1_depth1.csv").read_text().splitlines()[:1101]
     names = lines[0].split(",")
     rows = [
@@ -212,15 +212,15 @@ def test_a_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> N
         )
         for row in (line.split(",") for line in lines[1:])
     ]
-    message = complaint_of(write(tmp_path, *rows, names=lines[0]), make_header(layout="lab", chips_n=5))
+    message = error_of(write(tmp_path, *rows, names=lines[0]), make_header(layout="lab", chips_n=5))
     assert "G to uT" in message
 
 
-def test_another_number_of_chips_than_the_headers_is_refused(tmp_path: Path) -> None:
-    message = complaint_of(write(tmp_path, *PRESSES), HEADER.model_copy(update={"chips_n": 5}))
+def test_other_chip_count_is_refused(tmp_path: Path) -> None:
+    message = error_of(write(tmp_path, *PRESSES), HEADER.model_copy(update={"chips_n": 5}))
     assert "chips must be 5" in message
     assert "got 2" in message
 
 
-def test_a_recording_without_any_contact_is_refused(tmp_path: Path) -> None:
-    assert "rows of phase contact" in complaint_of(write(tmp_path, PRESSES[0]))
+def test_recording_without_contact_is_refused(tmp_path: Path) -> None:
+    assert "rows of phase contact" in error_of(write(tmp_path, PRESSES[0]))

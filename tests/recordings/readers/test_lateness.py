@@ -1,4 +1,4 @@
-"""A row that one of two joined files lost is found, and a recording without such a loss is left alone."""
+"""A row missing from one of two joined files is detected; sound recordings raise no alarm."""
 
 import re
 from pathlib import Path
@@ -15,21 +15,21 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import AS_USUAL, make_header
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")
-AT_END_ROWS_N = 100  # a row that is lost nearer to the beginning or the end may stay unseen
-ROW_OFF_MAX = 15  # how far the row that is named may lie from the lost one; over 60 public cases it is 5 at most
+AT_END_ROWS_N = 100  # a row lost nearer to either end may go undetected
+ROW_OFF_MAX = 15  # tolerance of the reported row; at most 5 in 60 public cases
 LATE_N = 1
 
 
-def made_up(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, np.ndarray]:
+def synthetic_recording(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, np.ndarray]:
     """Fields and labels like those of a printer and a gauge: |dB| 70 uT, noise 25 uT, drift, one row late."""
     rng = rng_for(seed, "lateness")
     places_mm = np.stack(np.meshgrid(np.arange(2, 19, 4.0), np.arange(2, 19, 4.0)), axis=-1).reshape(-1, 2)
-    presses_n = rng.integers(3, 8, len(places_mm))  # at each place, one deeper than the other, then one off the skin
+    presses_n = rng.integers(3, 8, len(places_mm))  # at each place: deeper and deeper, then one off the skin
     of_place = np.repeat(np.arange(len(places_mm)), presses_n)
     step = np.concatenate([np.arange(n) for n in presses_n])
     force_N = np.where(step == 0, 0.0, 0.4 * step)
     label = np.column_stack([places_mm[of_place], force_N])
-    label[force_N == 0, :2] = 10  # as the recorder labels rows without contact
+    label[force_N == 0, :2] = 10  # the recorder's label of rows without contact
     one_pass_uT = rng.normal(0, 18, (len(places_mm), 15))[of_place] * np.sqrt(force_N)[:, None]
     label, b_uT = (np.tile(one, (passes_n, 1))[: 100 * passes_n] for one in (label, one_pass_uT))
     drift_uT = np.linspace(0, 60, len(label))[:, None]
@@ -38,7 +38,7 @@ def made_up(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, np.ndarray]:
 
 
 def without_row(values: np.ndarray, row: int) -> np.ndarray:
-    """Lose a row, and repeat the last one, so that the length stays."""
+    """Delete a row and repeat the last one, so that the length stays."""
     return np.concatenate([np.delete(values, row, axis=0), values[-1:]])
 
 
@@ -48,8 +48,8 @@ def change_of(b_uT: np.ndarray, label: np.ndarray):
 
 @settings(max_examples=25)
 @given(st.integers(AT_END_ROWS_N, 1200 - AT_END_ROWS_N), st.booleans(), st.integers(0, 5))
-def test_a_lost_row_is_found_in_either_file(row, of_fields, seed):
-    b_uT, label = made_up(seed)
+def test_lost_row_is_found_in_either_file(row, of_fields, seed):
+    b_uT, label = synthetic_recording(seed)
     assert len(label) == 1200
     change = change_of(without_row(b_uT, row), label) if of_fields else change_of(b_uT, without_row(label, row))
     assert change is not None
@@ -59,13 +59,13 @@ def test_a_lost_row_is_found_in_either_file(row, of_fields, seed):
 
 @settings(max_examples=25)
 @given(st.integers(0, 100), st.integers(1, 12), st.integers(0, 3))
-def test_a_recording_without_a_loss_raises_no_alarm(seed, passes_n, further_late_n):
-    b_uT, label = made_up(seed, passes_n)
+def test_complete_recording_raises_no_alarm(seed, passes_n, further_late_n):
+    b_uT, label = synthetic_recording(seed, passes_n)
     assert change_of(np.roll(b_uT, further_late_n, axis=0), label) is None
 
 
-def test_fields_that_say_nothing_raise_no_alarm():
-    b_uT, label = made_up()
+def test_uninformative_fields_raise_no_alarm():
+    b_uT, label = synthetic_recording()
     assert change_of(np.zeros_like(b_uT), label) is None
     assert change_of(rng_for(0, "noise").normal(0, 5, b_uT.shape), label) is None
     no_contact = label * [1, 1, 0]
@@ -74,10 +74,10 @@ def test_fields_that_say_nothing_raise_no_alarm():
     assert change_of(b_uT, same_force) is None
 
 
-def test_an_ini_recording_that_lost_a_row_is_refused_with_the_row(tmp_path):
-    b_uT, label = made_up()
+def test_ini_recording_with_lost_row_is_refused(tmp_path):
+    b_uT, label = synthetic_recording()
     chips = np.concatenate([without_row(b_uT, 700).reshape(-1, 5, 3), np.full((1200, 5, 1), 25.0)], axis=2)
-    # Values on the grid of a chip, as else no chip can be believed.
+    # Values on the LSB grid of a chip, which the reader checks.
     chips[..., :3] = np.round(chips[..., :3] / [0.15, 0.15, 0.242]) * [0.15, 0.15, 0.242] + [600, -900, 1452]
     np.savetxt(tmp_path / ini.READINGS, chips.reshape(1200, -1), fmt="%.3f")
     np.savetxt(tmp_path / ini.TRUTHS, label, fmt="%.3f")
@@ -90,7 +90,7 @@ def test_an_ini_recording_that_lost_a_row_is_refused_with_the_row(tmp_path):
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_public_recordings_are_found_sound_until_a_row_is_lost(shared_data: Path, name):
+def test_public_recordings_are_sound(shared_data: Path, name):
     folder = shared_data / "ini"
     label = np.loadtxt(folder / f"truths_{name}.txt")
     values = np.loadtxt(folder / f"b20_{name}.txt").reshape(len(label), -1, 4)

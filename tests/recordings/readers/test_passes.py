@@ -1,4 +1,4 @@
-"""Passes are found as a person would: the protocol is written down, repeated, and must be found again."""
+"""Passes are found where a synthetic protocol repeats."""
 
 import time
 from itertools import pairwise
@@ -22,7 +22,7 @@ grids = st.tuples(st.integers(2, 5), st.integers(2, 5), st.integers(1, 6))
 
 @settings(deadline=None)
 @given(grid=grids, passes_n=st.integers(2, 5))
-def test_a_repeated_raster_is_cut_where_it_repeats(grid: tuple[int, int, int], passes_n: int) -> None:
+def test_raster_is_split_where_it_repeats(grid: tuple[int, int, int], passes_n: int) -> None:
     once = raster(*grid)
     place_mm = np.tile(once, (passes_n, 1))
     expected = np.repeat(np.arange(passes_n), len(once))
@@ -31,7 +31,7 @@ def test_a_repeated_raster_is_cut_where_it_repeats(grid: tuple[int, int, int], p
 
 @settings(deadline=None)
 @given(seed=st.integers(0, 1000), passes_n=st.integers(4, 8))
-def test_rows_without_contact_may_carry_any_place(seed: int, passes_n: int) -> None:
+def test_places_without_contact_do_not_matter(seed: int, passes_n: int) -> None:
     once = raster(4, 4, 3)
     place_mm = np.tile(once, (passes_n, 1))
     contact = seeds.rng_for(seed, "contact").random(len(place_mm)) > 0.1
@@ -42,19 +42,19 @@ def test_rows_without_contact_may_carry_any_place(seed: int, passes_n: int) -> N
 
 @settings(deadline=None)
 @given(grid=grids, passes_n=st.integers(2, 4), shift_mm=st.floats(-50, 50))
-def test_moving_the_whole_grid_changes_nothing(grid: tuple[int, int, int], passes_n: int, shift_mm: float) -> None:
+def test_shift_of_the_grid_does_not_matter(grid: tuple[int, int, int], passes_n: int, shift_mm: float) -> None:
     place_mm = np.tile(raster(*grid), (passes_n, 1))
     contact = np.ones(len(place_mm), bool)
     np.testing.assert_array_equal(find_passes(place_mm + shift_mm, contact), find_passes(place_mm, contact))
 
 
-def test_the_last_pass_may_be_cut() -> None:
+def test_last_pass_may_be_incomplete() -> None:
     once = raster(3, 3, 2)
     place_mm = np.tile(once, (3, 1))[:-5]
     assert np.bincount(find_passes(place_mm, np.ones(len(place_mm), bool))).tolist() == [18, 18, 13]
 
 
-def test_one_mislabelled_row_does_not_hide_the_passes() -> None:
+def test_one_mislabelled_row_does_not_matter() -> None:
     place_mm = np.tile(raster(9, 9, 6), (5, 1))
     place_mm[700] = (-1.0, -1.0)
     assert find_passes(place_mm, np.ones(len(place_mm), bool)).max() == 4
@@ -65,12 +65,12 @@ def test_places_that_never_repeat_are_one_pass() -> None:
         assert not find_passes(place_mm, np.ones(len(place_mm), bool)).any()
 
 
-def test_a_recording_without_contact_is_one_pass() -> None:
+def test_recording_without_contact_is_one_pass() -> None:
     assert not find_passes(raster(3, 3, 2), np.zeros(18, bool)).any()
 
 
-def walk(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
-    """Try every shift, as the rule is written."""
+def passes_naively(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
+    """Reference: try every shift."""
     rows_n = len(place_mm)
     touched = np.flatnonzero(contact).tolist()
     pairs = pairwise(touched)
@@ -88,18 +88,18 @@ def walk(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
 
 @settings(deadline=None, max_examples=60)
 @given(seed=st.integers(0, 10000), once_n=st.integers(2, 30), touch=st.floats(0.3, 1.0), kinds_n=st.integers(1, 4))
-def test_passes_are_those_that_trying_every_shift_finds(seed: int, once_n: int, touch: float, kinds_n: int) -> None:
+def test_passes_equal_exhaustive_search(seed: int, once_n: int, touch: float, kinds_n: int) -> None:
     rng = seeds.rng_for(seed, "passes")
     place_mm = np.tile(rng.integers(0, kinds_n, (once_n, 2)).astype(float), (3, 1))[: rng.integers(2, 3 * once_n + 1)]
     contact = rng.random(len(place_mm)) < touch
     wrong = rng.random(len(place_mm)) < 0.02
     place_mm[wrong] = -1
-    np.testing.assert_array_equal(find_passes(place_mm, contact), walk(place_mm, contact))
+    np.testing.assert_array_equal(find_passes(place_mm, contact), passes_naively(place_mm, contact))
 
 
-def test_a_long_recording_that_never_repeats_is_looked_through_in_a_moment() -> None:
+def test_long_recording_without_repeats_is_fast() -> None:
     place_mm = seeds.rng_for(0, "never").random((20000, 2))
     begin_s = time.process_time()
     assert not find_passes(place_mm, np.ones(len(place_mm), bool)).any()
-    # Trying every shift took 17 s; now it is 0.1 to 0.3 s.
+    # Exhaustive search takes 17 s, this 0.1 to 0.3 s.
     assert time.process_time() - begin_s < 5

@@ -1,4 +1,4 @@
-"""Layout `table`: what a file says is what is read, what it leaves out is unknown, every mistake has its place."""
+"""Layout `table`: CSV and Parquet tables, unknown columns, and errors with their place."""
 
 import re
 from pathlib import Path
@@ -35,12 +35,12 @@ def table(presses_n: int = 6, noload_n: int = 3, contact_n: int = 4, seed: int =
 
 
 def write(folder: Path) -> Path:
-    """A capture folder with a whole table."""
+    """Write a capture folder with a complete table."""
     table().to_csv(folder / plain.CSV, index=False)
     return folder
 
 
-def complaint_of(folder: Path) -> str:
+def error_of(folder: Path) -> str:
     with pytest.raises(CaptureError) as caught:
         plain.read(folder, make_header(layout="table", chips_n=CHIPS_N), AS_USUAL)
     assert "\n" not in str(caught.value)
@@ -59,7 +59,7 @@ def read(folder: Path, rows: pd.DataFrame, name: str = "mine.csv"):
     return plain.read(capture, make_header(layout="table", chips_n=plain.count_chips(files)), AS_USUAL)
 
 
-def test_a_spreadsheets_mark_of_byte_order_changes_nothing(tmp_path):
+def test_byte_order_mark_changes_nothing(tmp_path):
     plainly, _ = read(tmp_path / "a", table())
     table().to_csv(tmp_path / "mine.csv", index=False, encoding="utf-8-sig")
     (tmp_path / "b").mkdir()
@@ -69,7 +69,7 @@ def test_a_spreadsheets_mark_of_byte_order_changes_nothing(tmp_path):
     np.testing.assert_array_equal(marked.b_uT, plainly.b_uT)
 
 
-def test_rows_of_contact_become_readings_with_the_mean_no_load_field_before_them(tmp_path):
+def test_contact_rows_become_readings_with_noload_mean(tmp_path):
     rows = table()
     readings, account = read(tmp_path, rows)
     contact, fields = rows[rows.phase == "contact"], plain.columns_of(CHIPS_N)[3:9]
@@ -86,7 +86,7 @@ def test_rows_of_contact_become_readings_with_the_mean_no_load_field_before_them
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(2, 8), st.integers(1, 4), st.integers(1, 4))
-def test_presses_are_the_same_with_numbers_and_without(tmp_path_factory, presses_n, noload_n, contact_n):
+def test_indent_numbers_are_optional(tmp_path_factory, presses_n, noload_n, contact_n):
     rows = table(presses_n, noload_n, contact_n)
     numbered = rows.assign(indentation=np.repeat(np.arange(presses_n), noload_n + contact_n) + 7)
     without, with_numbers = (read(tmp_path_factory.mktemp("t"), part)[0] for part in (rows, numbered))
@@ -94,7 +94,7 @@ def test_presses_are_the_same_with_numbers_and_without(tmp_path_factory, presses
     assert without.reading_i.tolist() == list(range(contact_n)) * presses_n
 
 
-def test_columns_of_a_template_that_stay_empty_are_unknown(tmp_path):
+def test_empty_template_columns_are_unknown(tmp_path):
     rows = table().reindex(columns=plain.columns_of(CHIPS_N))
     readings, account = read(tmp_path, rows)
     assert np.isnan(readings.depth_mm).all()
@@ -102,19 +102,19 @@ def test_columns_of_a_template_that_stay_empty_are_unknown(tmp_path):
     assert account["ignored_columns_n"] == 0
 
 
-def test_blocks_without_contact_may_have_numbers_of_their_own(tmp_path):
+def test_noload_blocks_may_have_numbers(tmp_path):
     rows = table().assign(indentation=np.repeat(np.arange(12), [3, 4] * 6))
     readings, _ = read(tmp_path, rows)
     assert readings.indentation.tolist() == np.repeat(np.arange(6), 4).tolist()
 
 
-def test_parquet_reads_as_csv_does(tmp_path):
+def test_parquet_reads_like_csv(tmp_path):
     one, other = read(tmp_path / "a", table())[0], read(tmp_path / "b", table(), "mine.parquet")[0]
     np.testing.assert_array_equal(one.b_uT, other.b_uT)
     np.testing.assert_array_equal(one.noload_uT, other.noload_uT)
 
 
-def test_places_without_contact_may_be_empty_and_other_columns_are_counted(tmp_path):
+def test_noload_places_may_be_empty(tmp_path):
     rows = table().assign(operator="me", note="")
     rows.loc[rows.phase == "noload", ["x_mm", "y_mm", "Fz_N"]] = np.nan
     readings, account = read(tmp_path, rows)
@@ -122,7 +122,7 @@ def test_places_without_contact_may_be_empty_and_other_columns_are_counted(tmp_p
     assert np.isfinite(readings.x_mm).all()
 
 
-def test_a_depth_of_0_everywhere_is_none(tmp_path):
+def test_constant_zero_depth_is_no_depth(tmp_path):
     still, account = read(tmp_path / "still", table().assign(depth_mm=0.0))
     assert np.isnan(still.depth_mm).all()
     assert account["no_depth_rows_n"] == len(still)
@@ -133,16 +133,16 @@ def test_a_depth_of_0_everywhere_is_none(tmp_path):
     assert account["no_depth_rows_n"] == 0
 
 
-def wrong(rows: pd.DataFrame, row_i: int, column: str, value: object) -> pd.DataFrame:
+def with_cell(rows: pd.DataFrame, row_i: int, column: str, value: object) -> pd.DataFrame:
     rows = rows.astype({column: object})
     rows.loc[row_i, column] = value
     return rows
 
 
 MISTAKES = {
-    "a word for a number": (lambda t: wrong(t, 9, "Bx1", "high"), "Bx1 in line 11"),
-    "an empty field": (lambda t: wrong(t, 4, "By0", ""), "By0 in line 6"),
-    "an unknown phase": (lambda t: wrong(t, 2, "phase", "touch"), "phase in line 4"),
+    "a word for a number": (lambda t: with_cell(t, 9, "Bx1", "high"), "Bx1 in line 11"),
+    "an empty field": (lambda t: with_cell(t, 4, "By0", ""), "By0 in line 6"),
+    "an unknown phase": (lambda t: with_cell(t, 2, "phase", "touch"), "phase in line 4"),
     "no place": (lambda t: t.drop(columns="x_mm"), "x_mm"),
     "a chip without z": (lambda t: t.drop(columns="Bz1"), "Bz1"),
     "no row before the first touch": (lambda t: t[3:], "none before line 2"),
@@ -150,19 +150,19 @@ MISTAKES = {
     "millitesla": (lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}), "Convert mT or G"),
     "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Turn its sign"),
     "nearly a name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
-    "a force left out here": (lambda t: wrong(t, 10, "Fz_N", ""), "Fz_N in line 12"),
+    "a force left out here": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
     "a press twice": (lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)), "0 once more in line 19"),
 }
 
 
 @pytest.mark.parametrize("what", MISTAKES)
-def test_a_mistake_is_named_with_its_place(tmp_path, what):
-    change, said = MISTAKES[what]
-    with pytest.raises(CaptureError, match=re.escape(said)):
+def test_error_names_the_place(tmp_path, what):
+    change, message = MISTAKES[what]
+    with pytest.raises(CaptureError, match=re.escape(message)):
         read(tmp_path, change(table()))
 
 
-def test_the_script_of_the_docs_turns_three_files_into_this_format(tmp_path, shared_data, monkeypatch):
+def test_conversion_script_of_the_docs(tmp_path, shared_data, monkeypatch):
     recording = shared_data / "eflesh/normal_force/20250401_014340_probe"
     script = re.search(r"```python\n(import pandas as pd.*?)```", (ROOT / "data/README.md").read_text(), re.DOTALL)
     for file in recording.glob("*.csv"):
@@ -178,7 +178,7 @@ def test_the_script_of_the_docs_turns_three_files_into_this_format(tmp_path, sha
     np.testing.assert_allclose(ours.x_mm, theirs.x_mm, atol=1e-3)
 
 
-def test_a_template_is_the_first_line_of_such_a_file(tmp_path):
+def test_template_is_the_header_line(tmp_path):
     out = tmp_path / "mine.csv"
     done = CliRunner().invoke(app, ["template", str(out), "--chips", "3"])
     assert done.exit_code == 0, done.output
@@ -190,39 +190,39 @@ def test_a_template_is_the_first_line_of_such_a_file(tmp_path):
         plain.read(capture, make_header(layout="table", chips_n=3), AS_USUAL)
 
 
-def test_passes_are_found_where_places_and_depths_repeat_in_order_and_a_column_has_the_last_word(tmp_path):
+def test_passes_from_repeats_or_column(tmp_path):
     one = table(presses_n=9)
     three = pd.concat([one] * 3, ignore_index=True)
     found, account = read(tmp_path / "found", three)
     np.testing.assert_array_equal(found.pass_i, np.repeat([0, 1, 2], len(found) // 3))
     assert account["passes_n"] == 3
-    told, _ = read(tmp_path / "told", three.assign(**{"pass": 7}))
-    assert set(told.pass_i) == {7}
+    given, _ = read(tmp_path / "given", three.assign(**{"pass": 7}))
+    assert set(given.pass_i) == {7}
     deeper = pd.concat([one.assign(depth_mm=depth) for depth in (0.2, 0.4, 0.6)], ignore_index=True)
     other, account = read(tmp_path / "deeper", deeper)
     assert set(other.pass_i) == {0}
     assert account["passes_n"] == 1
 
 
-def test_channels_that_are_constant_throughout_are_named(tmp_path):
+def test_constant_channels_are_named(tmp_path):
     rows = table()
     rows["Bz0"], rows["Bz1"] = 12.5, 0.0
     rows.to_csv(tmp_path / plain.CSV, index=False)
-    assert "one value throughout for Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT)" in complaint_of(tmp_path)
+    assert "one value throughout for Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT)" in error_of(tmp_path)
 
 
-def test_fields_with_a_baseline_subtracted_are_called_that_and_not_another_unit(tmp_path):
+def test_subtracted_baseline_is_named(tmp_path):
     rows, columns = table(presses_n=2), plain.columns_of(CHIPS_N)[3:9]
     fields_uT = rows[columns].to_numpy()
     rest = (rows["phase"] == "noload").to_numpy()
     rows[columns] = (fields_uT - fields_uT[rest].mean(axis=0)) / 5
     rows.to_csv(tmp_path / plain.CSV, index=False)
-    assert "A baseline seems to be subtracted already" in complaint_of(tmp_path)
+    assert "A baseline seems to be subtracted already" in error_of(tmp_path)
     rows[columns] = fields_uT / 1000
     rows.to_csv(tmp_path / plain.CSV, index=False)
-    assert "Convert mT or G to uT" in complaint_of(tmp_path)
+    assert "Convert mT or G to uT" in error_of(tmp_path)
 
 
-def test_semicolons_with_decimal_commas_are_named(tmp_path):
+def test_decimal_commas_are_named(tmp_path):
     table().to_csv(tmp_path / plain.CSV, index=False, sep=";", decimal=",")
-    assert "must be separated by commas; got semicolons in line 1" in complaint_of(tmp_path)
+    assert "must be separated by commas; got semicolons in line 1" in error_of(tmp_path)

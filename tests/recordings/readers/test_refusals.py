@@ -1,4 +1,4 @@
-"""What every layout refuses in one sentence: files of rubbish, without rows, or cut."""
+"""Invalid files of every layout: random bytes, no rows, cut lines."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -25,12 +25,12 @@ ROWLESS = [b"", b"x", b"1", b"\n", b"\x00\xff\xfe\n", test_lab.NAMES.encode(), f
 def refuse(folder: Path, layout: str, name: str, change: Callable[[bytes], bytes]) -> str:
     file = WHOLE[layout](folder) / name
     file.write_bytes(change(file.read_bytes()))
-    return TESTS[layout].complaint_of(folder)
+    return TESTS[layout].error_of(folder)
 
 
 @pytest.mark.parametrize(("layout", "name"), FILES)
 @pytest.mark.parametrize("content", ROWLESS, ids=repr)
-def test_a_file_without_rows(tmp_path: Path, layout: str, name: str, content: bytes) -> None:
+def test_file_without_rows(tmp_path: Path, layout: str, name: str, content: bytes) -> None:
     assert name in refuse(tmp_path, layout, name, lambda _: content)
 
 
@@ -42,7 +42,7 @@ def test_random_bytes(tmp_path_factory: pytest.TempPathFactory, content: bytes, 
 
 @settings(max_examples=120, deadline=None)
 @given(data=st.data(), file=st.sampled_from(FILES))
-def test_a_file_cut_in_a_line(
+def test_file_cut_within_a_line(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, file: tuple[str, str]
 ) -> None:
     def cut(whole: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Units that cannot be right are told; those that can are let pass."""
+"""Checks of units: implausible values are refused."""
 
 from typing import get_args
 
@@ -17,7 +17,7 @@ from reskin.schema import to_table
 from tests.recordings.headers import make_header
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
-# Step and usual field of real boards: ReSkin with its own skins, eFlesh, and eFlesh at another gain.
+# LSB and usual field of real boards: ReSkin with its own skins, eFlesh, and eFlesh at another gain.
 BOARDS_uT = {"ini": (0.15, 400.0), "lab": (0.2, 1500.0), "eflesh": (2.4, 9000.0), "eflesh shear": (0.6, 6000.0)}
 
 
@@ -30,7 +30,7 @@ def fields_uT(step_uT: float, usual_uT: float, seed: int = 0) -> np.ndarray:
     return np.round(b_uT / step_uT) * step_uT
 
 
-def test_a_skins_field_passes_in_microtesla_only() -> None:
+def test_skin_field_passes_in_microtesla_only() -> None:
     check_fields(SKIN_uT, "here", first_line_n=1)
     with pytest.raises(CaptureError, match="Convert mT or G"):
         check_fields(SKIN_uT / 1e3, "here", first_line_n=1)
@@ -40,7 +40,7 @@ def test_a_skins_field_passes_in_microtesla_only() -> None:
 
 @settings(deadline=None, max_examples=20)
 @given(name=st.sampled_from(sorted(BOARDS_uT)), seed=st.integers(0, 1000))
-def test_a_board_passes_in_microtesla_only(name: str, seed: int) -> None:
+def test_board_passes_in_microtesla_only(name: str, seed: int) -> None:
     b_uT = fields_uT(*BOARDS_uT[name], seed)
     check_fields(b_uT, "here", first_line_n=1)
     for of_a_uT in (1e-2, 1e-3, 1e-6, 1e3):
@@ -48,13 +48,13 @@ def test_a_board_passes_in_microtesla_only(name: str, seed: int) -> None:
             check_fields(of_a_uT * b_uT, "here", first_line_n=1)
 
 
-def test_gauss_is_known_by_its_steps_where_the_field_is_strong() -> None:
+def test_gauss_is_recognised_by_its_lsb_in_strong_fields() -> None:
     with pytest.raises(CaptureError, match="0.15 to 9.68 uT; got steps of 0.024. Convert G to uT"):
         check_fields(1e-2 * fields_uT(*BOARDS_uT["eflesh"]), "here", first_line_n=1)
 
 
 @pytest.mark.parametrize("usual_uT", [30.0, 65.0, 3000.0])
-def test_fields_without_noise_or_grid_pass_from_the_earths_on(usual_uT: float) -> None:
+def test_fields_without_noise_or_grid_pass_from_earth_field_on(usual_uT: float) -> None:
     still = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
     check_fields(still, "here", first_line_n=1)
     smooth = usual_uT + seeds.rng_for(0, "smooth").standard_normal((400, 15))
@@ -62,7 +62,7 @@ def test_fields_without_noise_or_grid_pass_from_the_earths_on(usual_uT: float) -
     check_fields(smooth.round(2), "here", first_line_n=1)
 
 
-def test_the_fields_of_real_boards_pass_and_not_in_gauss(shared_data) -> None:
+def test_real_boards_pass_in_microtesla_only(shared_data) -> None:
     files = sorted((shared_data / "lab").glob("*.csv"))
     boards = [np.loadtxt(file, delimiter=",", skiprows=1, usecols=[5, 6, 7, 9, 10, 11]) for file in files]
     boards += [np.loadtxt(file, delimiter=",")[:, 1:] for file in sorted((shared_data / "eflesh").rglob("sensor.csv"))]
@@ -73,14 +73,14 @@ def test_the_fields_of_real_boards_pass_and_not_in_gauss(shared_data) -> None:
             check_fields(b_uT / 100, "here", first_line_n=1)
 
 
-def test_a_press_passes_in_newtons_only() -> None:
+def test_press_passes_in_newtons_only() -> None:
     press_N = np.array([np.nan, 0.0, -9.5, 3.4])
     check_forces(press_N, "here", first_line_n=1)
     with pytest.raises(CaptureError, match="in line 12"):
         check_forces(press_N * 101.97, "here", first_line_n=10)
 
 
-def test_forces_that_no_gauge_can_tell_are_refused() -> None:
+def test_implausible_forces_are_refused() -> None:
     for fine_N in (np.array([0.0, 0.05, np.nan]), np.zeros(3), np.full(3, np.nan), np.array([[0.1, -1.0, 0.0]])):
         check_touch(fine_N, "here")
     with pytest.raises(CaptureError, match="^here: force must be .* got 0.0416 at most. Convert kg"):
@@ -98,7 +98,7 @@ def test_places_pass_in_millimetres_only(extent_mm: float, start_mm: float) -> N
                 check_places(factor * place_mm, "here")
 
 
-def test_one_place_passes_with_the_robots_rounding() -> None:
+def test_one_place_passes_with_rounding() -> None:
     check_places(np.array([[315.0, -100.0], [315.00003, -99.99999]]), "here")
     check_places(np.full((3, 2), np.nan), "here")
 
@@ -119,7 +119,7 @@ def test_each_layout_has_a_reader() -> None:
     assert set(READERS) == set(get_args(ReaderLayout))
 
 
-def test_what_a_reader_does_not_give_is_unknown_on_every_chip() -> None:
+def test_missing_quantities_are_nan() -> None:
     readings = make_readings(
         make_header(chips_n=2), np.array([True, False]), indentation=np.zeros(2), pass_i=np.zeros(2),
         b_uT=np.ones((2, 6)), noload_uT=np.ones((2, 6)), n_contacts=np.zeros(2),
