@@ -220,7 +220,7 @@ def decode(
 ) -> None:
     """Decode a dump of a port to a table of frames, and count lost bytes."""
     from reskin import io
-    from reskin.board.decode import decode_dump
+    from reskin.recordings.decode import decode_dump
 
     table, account = decode_dump(io.read_bytes(stream), wire, chips_n, str(stream))
     io.write_table(out, table)

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,17 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
         temporary.mkdir()
         for name, text in texts.items():
             write_text(temporary / name, text)
+
+
+def append(file: FileIO, data: bytes) -> None:
+    """Append all bytes to an unbuffered file, or none if the disk is full."""
+    start = file.tell()
+    try:
+        while data:
+            data = data[file.write(data) :]
+    except OSError:
+        file.truncate(start)
+        raise
 
 
 def write_json(path: Path, value: Any) -> None:

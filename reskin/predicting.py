@@ -12,7 +12,6 @@ import pyarrow as pa
 from pydantic import Field
 
 from reskin import io
-from reskin.board.decode import read_frames
 from reskin.board.stream import decode_all
 from reskin.config import Strict, parse
 from reskin.data.rows import TARGETS
@@ -21,6 +20,7 @@ from reskin.live.contacts import Estimator, LogEstimates, describe, estimate, qu
 from reskin.models.inputs import VIEW
 from reskin.models.trained import FORMAT, Network
 from reskin.recordings import tables
+from reskin.recordings.decode import read_frames
 from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card

@@ -7,13 +7,13 @@ import pyarrow as pa
 import pytest
 
 from reskin import io, load_model
-from reskin.board.decode import decode_dump
 from reskin.board.wire import Frames, encode, record_type
 from reskin.errors import CaptureError, ReskinError
 from reskin.models.network import draw_weights, paper_layers
 from reskin.predicting import predict
 from reskin.recordings import clocks
 from reskin.recordings.clocks import Arrivals
+from reskin.recordings.decode import decode_dump
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import render
 from reskin.seeds import rng_for

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from reskin.board.port import PortSettings
 from reskin.board.wire import encode
 from reskin.errors import CaptureError
 from reskin.recordings.header import HEADER_FILE, parse
@@ -26,6 +25,7 @@ from reskin.recordings.recorder import (
     print_progress,
     record_capture,
 )
+from reskin.recordings.stream_recorder import PortSettings
 from tests.board.signals import make_frames
 from tests.stages.checkout import ROOT
 

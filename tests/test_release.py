@@ -19,7 +19,7 @@ from reskin.errors import ParamsError, explaining, require
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 CORE = (  # what runs outside a checkout
-    "reskin.cli", "reskin", "reskin.api", "reskin.recordings.recorder", "reskin.board.decode", "reskin.board.find",
+    "reskin.cli", "reskin", "reskin.api", "reskin.recordings.recorder", "reskin.recordings.decode", "reskin.board.find",
     "reskin.predicting", "reskin.live.emulator", "reskin.live.server",
 )  # fmt: skip
 AWAY = ("dvc", "grimp", "jinja2", "magpylib", "matplotlib", "mlflow", "mpmath", "onnx", "pandas", "sklearn", "torch")

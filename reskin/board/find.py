@@ -11,10 +11,9 @@ from jaxtyping import Float64
 from reskin.board import faults
 from reskin.board.port import open_port, port_names, read_waiting
 from reskin.board.stream import decode_all, fitting
-from reskin.board.wire import Frames
+from reskin.board.wire import Frames, Wire
 from reskin.errors import CaptureError, ParamsError
 from reskin.physics.chip import GAINS, steps_uT
-from reskin.recordings.header import Wire
 
 BAUD = 115200  # USB ports ignore it
 LISTENING_S = 1.5  # some 200 frames of the slowest board, in which the step of its chips shows

@@ -3,14 +3,23 @@
 import threading
 import time
 from collections import deque
+from typing import Protocol
 
 from reskin.board.find import BAUD, Chunk
-from reskin.board.port import CaptureWriter, Device, open_port, read_waiting
+from reskin.board.port import Device, open_port, read_waiting
 from reskin.errors import CaptureError
 
 QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz; then the oldest chunks are dropped
 RETRY_S = 0.5
 PLUGGED_IN = b""  # a chunk that marks the begin of a new stream
+
+
+class ChunkWriter(Protocol):
+    """A recording that chunks are written to, such as a `CaptureWriter`."""
+
+    def write(self, chunk: bytes, unix_s: float) -> object: ...
+
+    def close(self) -> None: ...
 
 
 class Reader:
@@ -21,7 +30,7 @@ class Reader:
         self.plugged_in, self.was_plugged_in, self.problem = False, False, ""
         self.missed_bytes_n = self.waiting_bytes_n = 0
         self.taken_s = 0.0  # when `take` was last called, in unix seconds
-        self.writer: CaptureWriter | None = None
+        self.writer: ChunkWriter | None = None
         self.writer_problem = ""
         self._clock_s = time.time() - time.monotonic()  # the system's clock may be set while we read
         self._chunks: deque[Chunk] = deque()
@@ -52,7 +61,7 @@ class Reader:
             self.taken_s = self.unix_s()
         return taken
 
-    def write_to(self, writer: CaptureWriter | None) -> None:
+    def write_to(self, writer: ChunkWriter | None) -> None:
         """Write what comes from now on to another recording, or none; the one before is closed."""
         with self._came:
             before, self.writer, self.writer_problem = self.writer, writer, ""

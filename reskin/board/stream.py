@@ -13,9 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from reskin.board import wire as wires
-from reskin.board.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run
+from reskin.board.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run, Wire
 from reskin.errors import CaptureError
-from reskin.recordings.header import Wire
 
 BLOCK_LINES_N = 8192
 CHIPS_MAX_N = 64  # as in the header

@@ -6,13 +6,13 @@ in a byte stream; `faults` judges their values.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from reskin.recordings.header import Wire
-
 CR, LF, TAB, MINUS, DOT, ZERO = b"\r\n\t-.0"
+Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 TEXT_WIRES = ("text-xyzt", "text-txyz")
 NUMBERS_PER_CHIP_N = 4  # a temperature and a field
 INTEGER_DIGITS_MAX_N = 10  # Arduino's print() writes "ovf" above 4294967040

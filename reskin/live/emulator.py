@@ -20,10 +20,10 @@ from jaxtyping import Float64
 from reskin import io
 from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_XY_uT, RESET_LSB_Z_uT
 from reskin.board.stream import decode_all
-from reskin.board.wire import TEXT_WIRES, Frames, encode, record_type
+from reskin.board.wire import TEXT_WIRES, Frames, Wire, encode, record_type
 from reskin.config import read_yaml
 from reskin.errors import CaptureError, ParamsError
-from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE, Wire
+from reskin.recordings.header import HEADER_FILE, LOG_FILE, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reskin.board.find import BAUD, DetectedBoard
-from reskin.board.port import PortSettings
 from reskin.errors import ParamsError
 from reskin.live.health import Health
 from reskin.recordings.label_sources import (
@@ -22,6 +21,7 @@ from reskin.recordings.label_sources import (
     parse_places,
 )
 from reskin.recordings.recorder import NO_INFO, new_folder, print_progress, record_capture
+from reskin.recordings.stream_recorder import PortSettings
 from reskin.seeds import rng_for
 
 GAUGE_BAUD = 9600

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from reskin.board.port import CaptureWriter
 from reskin.data.grid import CENTRE_MM
 from reskin.errors import ReskinError
 from reskin.live.health import LIVE_POLICY
@@ -19,6 +18,7 @@ from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, Un
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header
 from reskin.recordings.recorder import NO_INFO, begin_capture, end_capture, new_folder
+from reskin.recordings.stream_recorder import CaptureWriter
 from reskin.seeds import rng_for
 
 POLL_S = 0.1

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from reskin import io
+from reskin.board.wire import Wire
 from reskin.errors import CaptureError
 from reskin.recordings import ReaderLayout
 
@@ -27,7 +28,6 @@ NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 
 Name = Annotated[str, Field(pattern=NAME)]
 Layout = Literal["native", ReaderLayout, "sd-card"]
-Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 
 
 class _Frozen(BaseModel):

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from reskin import io
 from reskin.board.faults import FaultDetector, find_reading_faults
 from reskin.board.stream import FrameStream, TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC, no_frame
-from reskin.board.wire import TEXT_WIRES, Frames, record_type
+from reskin.board.wire import TEXT_WIRES, Frames, Wire, record_type
 from reskin.errors import CaptureError
 from reskin.recordings import clocks, probe
 from reskin.recordings.clocks import Arrivals, ClockMap, from_contacts, from_marks
@@ -26,7 +26,6 @@ from reskin.recordings.header import (
     PROBE_FILE,
     STREAM_FILE,
     Header,
-    Wire,
     check_same_capture,
     parse,
 )

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reskin.board.port import append
+from reskin import io
 from reskin.errors import CaptureError
 from reskin.recordings.header import PROBE_FILE
 from reskin.recordings.probe import CONTACT, LABELS, NOLOAD, TYPES
@@ -70,7 +70,7 @@ class ProbeLogWriter:
         self._touch: Label | None = None  # the first of the touch that may go on
         self._lock = threading.Lock()
         self._file = (folder / PROBE_FILE).open("xb", buffering=0)
-        append(self._file, (",".join(TYPES) + "\n").encode())
+        io.append(self._file, (",".join(TYPES) + "\n").encode())
 
     def close(self) -> None:
         """Take no more labels."""
@@ -111,7 +111,7 @@ class ProbeLogWriter:
         indentation = self._indentation + opens
         pass_i = touch.label.pass_i
         rows = [_row(dwell, indentation, pass_i) for dwell in (self._noload, touch) if dwell is not None]
-        append(self._file, "".join(rows).encode())
+        io.append(self._file, "".join(rows).encode())
         self._indentation, self._end_s, self._noload = indentation, touch.t_end_s, None
         self.touches_n += opens
 

@@ -13,7 +13,7 @@ from typing import Any, get_args
 
 from reskin import io
 from reskin.board import stream
-from reskin.board.wire import TEXT_WIRES
+from reskin.board.wire import TEXT_WIRES, Wire
 from reskin.errors import CaptureError, ReskinError
 from reskin.recordings import ReaderLayout
 from reskin.recordings import header as headers
@@ -42,7 +42,7 @@ class CaptureNames:
 class Dump:
     """What a bare serial dump lacks: wire format, chips, rate, the rig's probe log, and marks between the clocks."""
 
-    wire: headers.Wire
+    wire: Wire
     chips_n: int
     rate_hz: float
     probe: Path | None

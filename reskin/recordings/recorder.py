@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reskin import io
-from reskin.board.port import PortSettings, Recording, Report, Watch, record
+from reskin.board.wire import Wire
 from reskin.errors import CaptureError
-from reskin.recordings.header import HEADER_FILE, Clock, Header, Wire, recorded, render, seal
+from reskin.recordings.header import HEADER_FILE, Clock, Header, recorded, render, seal
 from reskin.recordings.label_sources import LabelContext, LabelSource, LabelThread
 from reskin.recordings.labels import ProbeLogWriter
 from reskin.recordings.preparing import UNNAMED
+from reskin.recordings.stream_recorder import PortSettings, Recording, Report, Watch, record
 
 PROGRESS_s = 1.0
 CAPTURES = Path("captures")

@@ -10,13 +10,13 @@ from jaxtyping import Float32, Float64, Int64
 from scipy.constants import milli
 
 from reskin.board import wire
-from reskin.board.wire import Frames
+from reskin.board.wire import Frames, Wire
 from reskin.physics.board import draw_board
 from reskin.physics.chip import steps_uT
 from reskin.physics.skin import Skin, draw_skin
 from reskin.recordings import clocks, probe
 from reskin.recordings.clocks import Arrivals
-from reskin.recordings.header import ARRIVALS_FILE, LOG_FILE, PROBE_FILE, STREAM_FILE, Clock, Firmware, Header, Wire
+from reskin.recordings.header import ARRIVALS_FILE, LOG_FILE, PROBE_FILE, STREAM_FILE, Clock, Firmware, Header
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from pipeline.experiments.stability.wire import Damage, decode_damaged, deliver, joined, records
 from reskin.board import stream
-from reskin.board.decode import decode_dump
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import Frames, encode, line_bytes_max_n, record_type
 from reskin.errors import CaptureError
+from reskin.recordings.decode import decode_dump
 from tests.board.signals import BINARY_WIRES, TEXT_WIRES, WIRES, CRLF_TEMPERATURE_degC, frames_strategy, make_frames
 from tests.laws import broken
 

@@ -17,12 +17,13 @@ from aiohttp.test_utils import make_mocked_request
 
 from reskin.board import find
 from reskin.board.stream import FrameStream
+from reskin.board.wire import Wire
 from reskin.errors import ReskinError
 from reskin.live.server import Server, receive
 from reskin.live.session import Session
 from reskin.predicting import read_network
 from reskin.recordings import clocks, header, probe
-from reskin.recordings.header import PROBE_FILE, Wire
+from reskin.recordings.header import PROBE_FILE
 from reskin.recordings.label_sources import Prompts, parse_places
 from reskin.recordings.labels import Dwell, DwellBuilder, GaugeLines, ProbeLogWriter, SampleTable
 from reskin.recordings.readers import READERS, sd_card

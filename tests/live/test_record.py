@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from itertools import cycle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -133,7 +134,7 @@ def test_a_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 
-    monkeypatch.setattr(labels, "append", append)
+    monkeypatch.setattr(labels, "io", SimpleNamespace(append=append))  # of labels, not of the stream
     with plugged_in(make_script(pokes_n=1), loop=True) as port, pytest.raises(OSError, match="No space left"):
         reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.2)
     assert not (tmp_path / "run1").exists()

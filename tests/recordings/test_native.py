@@ -9,11 +9,11 @@ import pytest
 
 from reskin import io
 from reskin.board.faults import STUCK_FRAMES_MIN_N, FAILED_B_uT, FAILED_TEMPERATURE_degC
-from reskin.board.wire import Frames, encode
+from reskin.board.wire import Frames, Wire, encode
 from reskin.errors import CaptureError
 from reskin.recordings import clocks, ingest, probe
 from reskin.recordings.clocks import Arrivals
-from reskin.recordings.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Header, Wire
+from reskin.recordings.header import ARRIVALS_FILE, PROBE_FILE, STREAM_FILE, Clock, Header
 from reskin.recordings.ingest import read_native
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.schema import Readings

@@ -11,8 +11,7 @@ import numpy as np
 from pipeline.experiments.stability.cases import Case, measured, peak_bytes, refused
 from pipeline.experiments.verification.signals import CRLF_degC, make_frames
 from reskin.board.stream import FrameStream, decode_all
-from reskin.board.wire import BLOCK_FRAMES_N, TEXT_WIRES, Frames, concatenate, encode
-from reskin.recordings.header import Wire
+from reskin.board.wire import BLOCK_FRAMES_N, TEXT_WIRES, Frames, Wire, concatenate, encode
 from reskin.seeds import rng_for
 
 AREA = "wire"

@@ -17,14 +17,13 @@ from scipy.constants import micro, milli, mu_0
 from pipeline.experiments.verification.checks import Check, max_error, relative_error, scaled_error
 from reskin.board import wire
 from reskin.board.stream import decode_all
-from reskin.board.wire import Frames
+from reskin.board.wire import Frames, Wire
 from reskin.physics import magnet
 from reskin.physics.aging import SKIN_RELAXATION, Prony, advance, relax
 from reskin.physics.board import Board
 from reskin.physics.chip import ChipDesign, Overruns, read_field, read_temperature, steps_uT
 from reskin.physics.magnet import Dipoles, Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
-from reskin.recordings.header import Wire
 from reskin.seeds import rng_for
 
 NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in sizes of a cell

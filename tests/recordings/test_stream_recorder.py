@@ -18,12 +18,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from reskin.board import port, stream
-from reskin.board.port import PortSettings, Recording
+from reskin.board import stream
 from reskin.board.wire import encode
 from reskin.errors import CaptureError
-from reskin.recordings import clocks
+from reskin.recordings import clocks, stream_recorder
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
+from reskin.recordings.stream_recorder import PortSettings, Recording
 from tests.board.signals import make_frames
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
@@ -75,21 +75,23 @@ class ManualClock:
 @pytest.fixture
 def clock(monkeypatch) -> ManualClock:
     manual = ManualClock()
-    monkeypatch.setattr(port, "time", SimpleNamespace(monotonic=lambda: manual.s, time=time.time))
+    monkeypatch.setattr(stream_recorder, "time", SimpleNamespace(monotonic=lambda: manual.s, time=time.time))
     return manual
 
 
 def record(board: Board, folder: Path, act: Callable[[threading.Event], None], **changed: object) -> Recording:
-    """Record from a board that starts to `act` once the port is open (earlier bytes are discarded)."""
+    """Record from a board that starts to `act` once the recorder listens (earlier bytes are discarded)."""
 
     def begin() -> None:
-        wait_until((folder / STREAM_FILE).exists)
+        assert listening.wait(LONG_s)
         act(stop)
 
-    stop, actor = threading.Event(), threading.Thread(target=begin)
+    stop, listening, actor = threading.Event(), threading.Event(), threading.Thread(target=begin)
     actor.start()
     try:
-        return port.record(board.name, folder, settings=replace(SETTINGS, **changed), stop=stop)
+        return stream_recorder.record(
+            board.name, folder, settings=replace(SETTINGS, **changed), stop=stop, report=lambda _: listening.set()
+        )
     finally:
         actor.join()
 
@@ -140,7 +142,7 @@ def test_report_counts_frames(board, tmp_path):
             board.send(data)
         seen.append(account["frames_n"])
 
-    port.record(board.name, tmp_path, settings=settings, stop=threading.Event(), report=report)
+    stream_recorder.record(board.name, tmp_path, settings=settings, stop=threading.Event(), report=report)
     assert seen[0] == 0
     assert seen == sorted(seen)
     assert seen[-1] >= 1
@@ -212,9 +214,9 @@ def test_silence_ends_recording(board, clock, tmp_path):
 RECORD = """
 import sys, threading
 from pathlib import Path
-from reskin.board import port
-settings = port.PortSettings(115200, "binary", 5, float("inf"), None, 120.0, 120.0)
-print(port.record(sys.argv[1], Path(sys.argv[2]), settings=settings, stop=threading.Event()).ended)
+from reskin.recordings import stream_recorder
+settings = stream_recorder.PortSettings(115200, "binary", 5, float("inf"), None, 120.0, 120.0)
+print(stream_recorder.record(sys.argv[1], Path(sys.argv[2]), settings=settings, stop=threading.Event()).ended)
 """
 
 
@@ -278,7 +280,7 @@ def test_socket_is_recorded_like_a_port(tmp_path):
         sender = threading.Thread(target=send)
         sender.start()
         name = f"socket://127.0.0.1:{server.getsockname()[1]}"
-        recording = port.record(name, tmp_path, settings=SETTINGS, stop=threading.Event())
+        recording = stream_recorder.record(name, tmp_path, settings=SETTINGS, stop=threading.Event())
         sender.join()
     assert recording.ended == "unplugged"
     check_files(tmp_path, recording, data)
@@ -318,14 +320,14 @@ def test_full_disk_keeps_a_readable_recording(board, tmp_path):
 class TestErrors:
     def test_absent_port(self, tmp_path):
         with pytest.raises(CaptureError, match="/dev/tty-none: the port must be one that opens; .*orts?.*found"):
-            port.record("/dev/tty-none", tmp_path, settings=SETTINGS, stop=threading.Event())
+            stream_recorder.record("/dev/tty-none", tmp_path, settings=SETTINGS, stop=threading.Event())
         assert list(tmp_path.iterdir()) == []
 
     def test_file_is_no_port(self, tmp_path):
         file = tmp_path / "no_port"
         file.touch()
         with pytest.raises(CaptureError, match="no_port: the port must be one that opens"):
-            port.record(str(file), tmp_path, settings=SETTINGS, stop=threading.Event())
+            stream_recorder.record(str(file), tmp_path, settings=SETTINGS, stop=threading.Event())
 
     def test_silent_port(self, board, clock, tmp_path):
         with pytest.raises(CaptureError, match=f"{board.name}: bytes must be coming in; got none in 0.7 s. Is the"):
@@ -348,7 +350,9 @@ class TestErrors:
         actor.start()
         try:
             with pytest.raises(CaptureError, match="no frame found in .* Wrong baud rate"):
-                port.record(board.name, tmp_path, settings=replace(SETTINGS, no_frame_s=0.7), stop=threading.Event())
+                stream_recorder.record(
+                    board.name, tmp_path, settings=replace(SETTINGS, no_frame_s=0.7), stop=threading.Event()
+                )
         finally:
             stop.set()
             actor.join()
@@ -367,5 +371,7 @@ class TestErrors:
     def test_existing_stream_is_not_overwritten(self, board, tmp_path):
         (tmp_path / STREAM_FILE).write_bytes(b"old")
         with pytest.raises(FileExistsError):
-            port.record(board.name, tmp_path, settings=replace(SETTINGS, duration_s=math.inf), stop=threading.Event())
+            stream_recorder.record(
+                board.name, tmp_path, settings=replace(SETTINGS, duration_s=math.inf), stop=threading.Event()
+            )
         assert (tmp_path / STREAM_FILE).read_bytes() == b"old"

@@ -5,10 +5,9 @@ import pyarrow as pa
 from jaxtyping import Float32, Float64
 
 from reskin.board.stream import decode_all
-from reskin.board.wire import record_type
+from reskin.board.wire import Wire, record_type
 from reskin.errors import CaptureError
 from reskin.recordings import clocks
-from reskin.recordings.header import Wire
 
 
 def decode_dump(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[pa.Table, dict[str, int]]:

@@ -1,0 +1,196 @@
+"""Record what a board's port sends: the files `stream.bin` and `arrivals.csv` of a capture."""
+
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Literal
+
+from reskin import io
+from reskin.board.port import Device, found_ports, open_port, read_waiting
+from reskin.board.stream import FrameStream, no_frame
+from reskin.board.wire import TEXT_WIRES, Frames, Wire
+from reskin.errors import CaptureError
+from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
+
+HEAD_BYTES_N = 16384  # the first bytes are kept to say what fits, should no frame come
+
+Report = Callable[[Mapping[str, int]], None]  # called with the account many times a second
+Watch = Callable[[Frames], object]  # called with frames as they come
+Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame", "not written"]
+
+
+@dataclass(frozen=True)
+class PortSettings:
+    """How to read a port, and for how long; `math.inf` seconds and no `bytes_max_n` go on until stopped."""
+
+    baud: int
+    wire: Wire
+    chips_n: int
+    duration_s: float
+    bytes_max_n: int | None
+    silence_s: float  # a port that sends nothing for so long has ended
+    no_frame_s: float  # a port that sends has so long to send its first frame
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What was recorded and how it ended; `account` counts the frames and losses that a `FrameStream` saw."""
+
+    ended: Ended
+    duration_s: float
+    partial_line_bytes_n: int  # bytes before the first whole line, not written
+    account: dict[str, int]
+
+
+def record(
+    port: str,
+    folder: Path,
+    *,
+    settings: PortSettings,
+    stop: threading.Event,
+    report: Report = lambda account: None,
+    watch: Watch = lambda frames: None,
+) -> Recording:
+    """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or the settings say so.
+
+    Raises `CaptureError` if the port does not open or not one frame comes. A port that falls silent after its first
+    frame ends the recording: what came is kept.
+    """
+    with (
+        open_port(port, settings.baud) as device,
+        _stopping_on_signals(stop),
+        CaptureWriter(folder, settings.wire) as writer,
+    ):
+        recorder = _Recorder(port, settings, writer, watch)
+        ended = recorder.listen(device, stop, report)
+    return recorder.finish(ended)
+
+
+class CaptureWriter:
+    """Write the two files of a recording as it comes: first each chunk of bytes, then its time of arrival.
+
+    So no arrival is of bytes that are not there. A chunk that a full disk does not take whole is taken back.
+    """
+
+    def __init__(self, folder: Path, wire: Wire) -> None:
+        self.bytes_n = self.partial_line_bytes_n = 0
+        self._in_partial_line = wire in TEXT_WIRES
+        # Unbuffered: what a killed process has written is kept, and closing cannot fail.
+        self._stream = (folder / STREAM_FILE).open("xb", buffering=0)
+        self._arrivals = (folder / ARRIVALS_FILE).open("xb", buffering=0)
+        self._arrivals.write(b"byte_end,t_s\n")
+        self._note_arrival(time.time())
+
+    def __enter__(self) -> "CaptureWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._stream.close()
+        self._arrivals.close()
+
+    def write(self, chunk: bytes, unix_s: float) -> bytes:
+        """Write a chunk; return what was written of it: the first line of text may be cut inside a number."""
+        if self._in_partial_line:
+            partial, newline, rest = chunk.partition(b"\n")
+            self.partial_line_bytes_n += len(partial + newline)
+            self._in_partial_line, chunk = not newline, rest
+        if chunk:
+            io.append(self._stream, chunk)
+            self.bytes_n += len(chunk)
+            self._note_arrival(unix_s)
+        return chunk
+
+    def _note_arrival(self, unix_s: float) -> None:
+        io.append(self._arrivals, f"{self.bytes_n},{unix_s:.6f}\n".encode())
+
+
+class _Recorder:
+    """A recording since its port was opened."""
+
+    def __init__(self, port: str, settings: PortSettings, writer: CaptureWriter, watch: Watch) -> None:
+        self._port, self._settings, self._writer, self._watch = port, settings, writer, watch
+        self._frames = FrameStream(settings.wire, settings.chips_n)
+        self._head = b""
+        self._start_s = self._last_byte_s = time.monotonic()
+        self._first_byte_s = math.inf
+        # The system's clock may be set while we record, and arrival times must not fall.
+        self._unix_s = time.time() - self._start_s
+
+    def listen(self, device: Device, stop: threading.Event, report: Report) -> Ended:
+        """Read until there is a reason to end; return it."""
+        while not (ended := self._reason_to_end(stop)):
+            report(self._frames.account())
+            try:
+                chunk = read_waiting(device, self._room_n())
+            except OSError:  # pyserial's errors are OSErrors too
+                return "unplugged"
+            try:
+                self._keep(chunk)
+            except OSError:
+                return "not written"
+        return ended
+
+    def finish(self, ended: Ended) -> Recording:
+        """Return the finished recording; raise `CaptureError` if there is no frame in it."""
+        self._frames.close()
+        account = self._frames.account()
+        duration_s = time.monotonic() - self._start_s
+        if not self._head:
+            got, remedy = f"none in {duration_s:.1f} s", f"Is the board running, and this its port? {found_ports()}"
+            raise CaptureError(self._port, "bytes", "coming in", got, remedy)
+        if not account["frames_n"]:
+            raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)
+        return Recording(ended, duration_s, self._writer.partial_line_bytes_n, account)
+
+    def _reason_to_end(self, stop: threading.Event) -> Ended | None:
+        settings, now_s = self._settings, time.monotonic()
+        frames_n = self._frames.account()["frames_n"]
+        reasons: dict[Ended, bool] = {
+            "stopped": stop.is_set(),
+            "duration": now_s - self._start_s >= settings.duration_s,
+            "bytes": not self._room_n(),
+            "silent": now_s - self._last_byte_s > settings.silence_s,
+            "no frame": not frames_n and now_s - self._first_byte_s > settings.no_frame_s,
+        }
+        return next((ended for ended, is_so in reasons.items() if is_so), None)
+
+    def _room_n(self) -> int:
+        bytes_max_n = self._settings.bytes_max_n
+        return sys.maxsize if bytes_max_n is None else bytes_max_n - self._writer.bytes_n
+
+    def _keep(self, chunk: bytes) -> None:
+        if not chunk:
+            return
+        self._last_byte_s = time.monotonic()
+        self._first_byte_s = min(self._first_byte_s, self._last_byte_s)
+        self._head = (self._head + chunk)[:HEAD_BYTES_N]
+        if written := self._writer.write(chunk, self._unix_s + self._last_byte_s):
+            self._watch(self._frames.feed(written))
+
+
+@contextmanager
+def _stopping_on_signals(stop: threading.Event) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM set `stop`, in the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ask(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
