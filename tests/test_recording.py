@@ -142,4 +142,4 @@ def test_a_folder_that_is_there_is_not_written_over(tmp_path):
     recorder = start("/dev/null", tmp_path / "run1")
     _, complained = recorder.communicate(timeout=LONG_S)
     assert recorder.returncode == 2
-    assert "the capture's folder must be new" in complained
+    assert "the folder exists already" in complained

@@ -92,12 +92,13 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
 
 def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
     """Make the error for a stream without a frame, from its bytes or the first of them; say what fits them instead."""
-    rule, got = f"frames of {chips_n} chips in wire format {wire}", f"no frame found in {len(data)} bytes"
     hint = " or ".join(f"{fit} with {k} chips" for fit, k in fitting(data))
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
         remedy = "Is the board running and sending?"
-    return CaptureError(where, "the stream", rule, got, remedy)
+    return CaptureError(
+        f"{where}: no frame found in {len(data)} bytes, read as {chips_n} chips in wire format {wire}. {remedy}"
+    )
 
 
 def fitting(data: bytes) -> list[tuple[Wire, int]]:

@@ -31,19 +31,20 @@ def parse(source: str | Path, where: str) -> Arrivals:
     """Read arrivals from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
     table = tables.parse_csv(source, TYPES, where)
     if len(table) < 2:
-        raise CaptureError(where, "arrivals", "two rows or more", len(table), "Give a rate in the header.")
+        raise CaptureError(
+            f"{where}: {len(table)} rows of arrivals; two or more are needed. Give a rate in the header instead."
+        )
     byte_end, t_s = (table.column(name).to_numpy() for name in TYPES)
     for bad, name, rule in (
         (~np.isfinite(byte_end), "byte_end", "known"),  # Arrow gives NaN for an empty field
         (~np.isfinite(t_s), "t_s", "a finite time"),
         (byte_end < 0, "byte_end", "0 or more"),
         (np.diff(byte_end, prepend=-1) <= 0, "byte_end", "more than in the row above"),
-        (np.diff(t_s, prepend=t_s[0]) < 0, "t_s", "not before the row above"),
+        (np.diff(t_s, prepend=t_s[0]) < 0, "t_s", "no earlier than in the row above"),
     ):
         tables.refuse_row(bad, where, name, rule, {"byte_end": byte_end, "t_s": t_s}[name], "Record the capture again.")
     if t_s[-1] == t_s[0]:
-        got = f"{t_s[0]} in every row"
-        raise CaptureError(where, "arrivals", "spread in time", got, "Mend the recorder's clock.")
+        raise CaptureError(f"{where}: t_s is {t_s[0]} in every row. Check the recorder's clock.")
     return Arrivals(byte_end, t_s)
 
 
@@ -114,9 +115,9 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
     """Draw the line through sync marks (stream time, probe time): one gives the offset, more also the rate."""
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
-        raise CaptureError(where, "clock.marks", "one or more pairs of finite times", given, "Mend them.")
+        raise CaptureError(where, "clock.marks", "one or more pairs of finite times", given, "Correct them.")
     if len(np.unique(marks[:, 0])) < len(marks):
-        raise CaptureError(where, "clock.marks", "of different stream times", given, "Keep one of them.")
+        raise CaptureError(f"{where}: clock.marks has two marks at one stream time: {given}. Keep one of them.")
     return _line(marks[:, 0], marks[:, 1] - marks[:, 0], 1.0, where)
 
 
@@ -126,7 +127,7 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
     The stream begins with the robot lifted. Memory: 1 byte a sixteenth of a dwell.
     """
     if not log.contact.any():
-        raise CaptureError(where, "the probe log", "one with contacts", "none", "Record the capture again.")
+        raise CaptureError(f"{where}: the probe log has no contacts. Record the capture again.")
     step_s = float(np.median((log.t_end_s - log.t_start_s)[log.contact])) / STEPS_PER_DWELL_N
     pattern = _Pattern(log)
     start_s, signal = _contact_signal(blocks, pattern, step_s, where)
@@ -142,8 +143,10 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
             offsets_s.append(offset_s)
         window_s += len(window) * step_s
     if matched <= EXPLAINED_MIN * dwelt:
-        raise CaptureError(where, "dwells that the field agrees with", f"over {EXPLAINED_MIN:.0%}",
-                                    f"{matched / max(dwelt, 1e-9):.0%}", _REMEDY)  # fmt: skip
+        agreed = matched / max(dwelt, 1e-9)
+        raise CaptureError(
+            f"{where}: the field agrees with {agreed:.0%} of the dwells, not over {EXPLAINED_MIN:.0%}. {_REMEDY}"
+        )
     return _line(np.array(mid_s), np.array(offsets_s), matched / dwelt, where)
 
 
@@ -191,8 +194,10 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     margin = score[top_i] - score[away].max(initial=0.0)
     unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # matched less than seen; a dwell amiss counts twice
     if margin < MARGIN_MIN + unexplained / 2:
-        got = f"two fits {margin:.2g} indentations apart, of {dwelt.sum():.0f}"
-        raise CaptureError(where, "the fit of field and dwells", "better than any other", got, _REMEDY)
+        raise CaptureError(
+            f"{where}: the field fits the dwells at two times almost equally well, {margin:.2g} of {dwelt.sum():.0f} "
+            f"indentations apart. {_REMEDY}"
+        )
     return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
 
 
@@ -246,7 +251,7 @@ def _contact_signal(
         first_i, here_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
         parts.append((first_i, np.sign(np.bincount(here_i, np.where(contact, 1, -1))).astype(np.int8)))
     if start_s is None:
-        raise CaptureError(where, "the stream", "one with frames", "none", "Record the capture again.")
+        raise CaptureError(f"{where}: the stream has no frames. Record the capture again.")
     signal = np.zeros(parts[-1][0] + len(parts[-1][1]), np.int8)
     for first_i, part in parts:
         signal[first_i : first_i + len(part)] = part
@@ -293,6 +298,8 @@ def _line(
     slope = float(((at_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(at_s) > 1 else 0.0
     residual_s = float(np.abs(offset_s - mean_s - slope * (at_s - mid_s)).max())
     if abs(slope) > RATE_LIMIT:
-        rule = f"in seconds of one event each, so that their rate is 1 within {RATE_LIMIT}"
-        raise CaptureError(where, "clock.marks", rule, f"rate {1 + slope:.6g}", "Check the marks.")
+        raise CaptureError(
+            f"{where}: clock.marks give the clock a rate of {1 + slope:.6g}, not 1 within {RATE_LIMIT}. Check that "
+            "each mark is one event, in seconds."
+        )
     return ClockMap(float(mean_s - slope * mid_s), 1 + slope, residual_s, explained)

@@ -143,9 +143,10 @@ class FaultLog:
             count_n = int(mask.sum()) if count_n is None else count_n
             if action == "refuse":
                 place = f"{self._unit} {first * self._per_unit:.0f}" if len(known) else "an unknown time"
-                remedy = f"Mend the board and record again, or set faults: {fault} in params.yaml."
-                got = f"{count_n}, the first at {place}"
-                raise CaptureError(self._where, fault.replace("_", " "), "absent", got, remedy)
+                raise CaptureError(
+                    f"{self._where}: found fault {fault.replace('_', ' ')} {count_n} x, the first at {place}. Repair "
+                    f"the board and record again, or set faults: {fault} in params.yaml."
+                )
             found = self.records.setdefault(fault, FaultRecord(0, first, last, action))
             found.count_n += count_n
             found.first, found.last = float(np.fmin(found.first, first)), float(np.fmax(found.last, last))
@@ -214,12 +215,10 @@ class FaultLog:
     ) -> None:
         """Record channels that never changed in a whole recording, or refuse it; `at` None: the span of the stream."""
         if channels and self._policy.constant_channel == "refuse":
-            remedy = (
-                "Check the wiring, the chip and the columns, and record again; or accept it by faults: "
-                "constant_channel: flag in params.yaml."
+            raise CaptureError(
+                f"{self._where}: no change in the whole recording of {', '.join(channels)}. Check the wiring, the chip "
+                "and the columns, and record again; or accept it by faults: constant_channel: flag in params.yaml."
             )
-            got = f"one value throughout for {', '.join(channels)}"
-            raise CaptureError(self._where, "each channel", "one that changes", got, remedy)
         if channels:
             at = np.array(self._span) if at is None else at
             self.record("constant_channel", np.ones(len(at), bool), at)
@@ -264,8 +263,7 @@ def check_rows(
     failed, out_of_range = log.record_readings(readings, row)
     read = ~readings.failed_rows
     if not read.any():
-        remedy = "Mend the wiring, and record again."
-        raise CaptureError(where, "rows", "read from every chip", "failed I2C reads in all of them", remedy)
+        raise CaptureError(f"{where}: every row has failed I2C reads. Check the wiring, and record again.")
     rows = np.flatnonzero(read)
     for block in np.array_split(rows, max(1, len(rows) // GRID_ROWS_N)):
         lsb_uT = find_lsb(b_uT[block])

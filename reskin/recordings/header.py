@@ -103,7 +103,7 @@ def parse(text: str, where: str) -> Header:
         field = ".".join(map(str, first["loc"])) or "header"
         got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = first["msg"].removeprefix("Value error, ")
-        raise CaptureError(f"{where}: {field}: {rule}; got {got}. Mend the header or record again.") from None
+        raise CaptureError(f"{where}: {field}: {rule}; got {got}. Correct the header or record again.") from None
 
 
 def recorded(where: str, **fields: Any) -> Header:

@@ -245,10 +245,12 @@ def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():
         if not (folder / name).is_file():
-            raise CaptureError(folder / name, "the file", "there, as the header says", "nothing", "Add it again.")
+            raise CaptureError(f"{folder / name}: file not found, but the header lists it. Add the capture again.")
         if io.sha256(folder / name) != digest:
-            rule, remedy = "unchanged since it was added", "Remove it and add it again."
-            raise CaptureError(folder / name, "the file", rule, "another hash", remedy)
+            raise CaptureError(
+                f"{folder / name}: the file has changed since it was added (another hash). Remove the capture and add "
+                "it again."
+            )
     if header.layout == "native":
         return Opened(header, *read_native(folder, header, policy))
     if header.layout not in READERS:
@@ -261,7 +263,7 @@ def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
 def read_header(folder: Path) -> Header:
     file = folder / HEADER_FILE
     if not file.is_file():
-        raise CaptureError(file, "a capture", f"a folder with {HEADER_FILE}", "none", "Is it another --layout?")
+        raise CaptureError(f"{file}: file not found, so this is no capture folder. Is it another --layout?")
     return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
 
 
@@ -272,9 +274,8 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
         lost_n = sum(account[key] for key in lost)
         if lost_n > limit * account.get(whole, 0):
             reasons = ", ".join(f"{account[key]} {key.removesuffix('_n')}" for key in lost if account[key])
-            rule = f"at most {limit:.0%} of {account[whole]}"
-            remedy = "Mend the recording, or raise lost_fraction_max in params.yaml."
-            raise CaptureError(where, f"lost {whole.removesuffix('_n')}", rule, reasons, remedy)
+            what = f"more than {limit:.0%} of {account[whole]} {whole.removesuffix('_n')} are lost: {reasons}"
+            raise CaptureError(f"{where}: {what}. Record again, or raise lost_fraction_max in params.yaml.")
 
 
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
@@ -367,7 +368,7 @@ def timer(folder: Path, header: Header) -> Timer:
         return lambda frames, _: clocks.times_of(frames.end_byte, table)
     if rate_hz is None:
         got = repr(header.clock.kind)
-        raise CaptureError(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Mend it.")
+        raise CaptureError(folder, "clock.kind", "'arrivals' or 'rate' for a port's stream", got, "Correct the header.")
     if header.wire in TEXT_WIRES:
         return lambda frames, before_n: clocks.constant_rate(before_n + 1.0 + np.arange(len(frames)), rate_hz)
     frame_bytes_n = record_type(_wire(header), header.chips_n).itemsize
@@ -379,8 +380,10 @@ def _arrivals(folder: Path) -> Arrivals:
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:
-        rule = f"the {arrived_n} bytes long that {ARRIVALS_FILE} says"
-        raise CaptureError(folder / STREAM_FILE, "the stream", rule, bytes_n, "Copy the capture again.")
+        raise CaptureError(
+            f"{folder / STREAM_FILE}: the file has {bytes_n} bytes, but {ARRIVALS_FILE} lists {arrived_n}. Copy the "
+            "capture again."
+        )
     return table
 
 

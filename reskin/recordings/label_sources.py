@@ -65,7 +65,7 @@ def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: 
             if not isinstance(label, Label):
                 remedy = "Yield reskin.lifted() or reskin.touch(x_mm, y_mm)."
                 raise ParamsError(
-                    "labels", "a label of the program", "reskin.lifted() or reskin.touch(...)", repr(label)[:60], remedy
+                    "labels", "each label", "reskin.lifted() or reskin.touch(...)", repr(label)[:60], remedy
                 )
             context.writer.write(context.hold(label, dwell_s))
             if context.stop.is_set():
@@ -192,16 +192,17 @@ def _grown(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
 
 def _check_grows(file: Path, stream: BinaryIO) -> None:
     """Raise `CaptureError` if the file was replaced or shortened."""
-    rule, remedy = "the same file, with rows appended", "Open it once, or append: do not write it anew."
+    remedy = "Append rows to it; do not write it anew."
     try:
         there = file.stat()
     except FileNotFoundError:
-        raise CaptureError(file, "a table that is followed", rule, "no file", remedy) from None
+        raise CaptureError(f"{file}: the file was removed while it was read. {remedy}") from None
     if not os.path.samestat(there, os.fstat(stream.fileno())):
-        raise CaptureError(file, "a table that is followed", rule, "another file in its place", remedy)
+        raise CaptureError(f"{file}: the file was replaced while it was read. {remedy}")
     if there.st_size < stream.tell():
-        got = f"{there.st_size} bytes, of which {stream.tell()} were read"
-        raise CaptureError(file, "a table that is followed", rule, got, remedy)
+        raise CaptureError(
+            f"{file}: the file was shortened to {there.st_size} bytes, but {stream.tell()} were read. {remedy}"
+        )
 
 
 KEPT_N = 10_000  # samples, of which a touch is a few hundred
@@ -252,8 +253,9 @@ class ForceGauge:
             try:
                 chunk = read_waiting(device)
             except OSError as error:
-                rule, remedy = "plugged in until the recording ends", "What came is kept; plug it in, record again."
-                raise CaptureError(self.port, "the force gauge", rule, error, remedy) from None
+                raise CaptureError(
+                    f"{self.port}: lost the force gauge: {error}. What it sent is kept; plug it in and record again."
+                ) from None
             if chunk:
                 use(self._gauge.feed(chunk, context.unix_s()))
 

@@ -141,8 +141,9 @@ def _check(dwell: Dwell) -> None:
     if not 0 <= label.pass_i < 2**31:
         raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Count rounds from 0.")
     if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # of NaN, nothing is so
-        got = f"{dwell.t_start_s} to {dwell.t_end_s} s"
-        raise CaptureError("a label", "its time", "a span of the clock", got, "Is the clock in seconds?")
+        raise CaptureError(
+            f"a label: {dwell.t_start_s} to {dwell.t_end_s} s is not a span of time. Is the clock in seconds?"
+        )
 
 
 class Sample(NamedTuple):
@@ -191,10 +192,11 @@ class SampleTable:
         clocks = [name for name in CLOCKS if name in names]
         shows_touch = "phase" in names or "Fz_N" in names
         if len(clocks) != 1 or not shows_touch or len(set(names)) < len(names):
-            rule = (
-                f"one of {' and '.join(CLOCKS)}, phase or Fz_N, and of the rest of {', '.join(COLUMNS)} what is known"
+            needed = f"one of {' and '.join(CLOCKS)}, phase or Fz_N, and no column twice"
+            raise CaptureError(
+                f"{self._where}: row 1 must name {needed}; found {ascii(names)[:120]}. Known columns: "
+                f"{', '.join(COLUMNS)}."
             )
-            raise CaptureError(self._where, "row 1, the column names,", rule, ascii(names)[:120], "Write them there.")
         self.clock, self._names = clocks[0], names
 
     def _sample(self, cells: list[str]) -> Sample:

@@ -32,14 +32,18 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
     try:
         with zipfile.ZipFile(BytesIO(archive)) as file:
             if (bytes_n := sum(member.file_size for member in file.infolist())) > BYTES_MAX_N:
-                raise CaptureError(where, "the archive", f"{BYTES_MAX_N} bytes or less, unpacked", bytes_n, REMEDY)
+                raise CaptureError(
+                    f"{where}: the archive unpacks to {bytes_n} bytes, more than {BYTES_MAX_N}. {REMEDY}"
+                )
             samples = {phase: decode_array(file.read(f"{name}.npy"), where) for phase, name in PHASES.items()}
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
     except CaptureError:
         raise
     except Exception as error:  # an archive may hold anything; it is refused, with the reason
-        rule = f"a .npz with samples under {' and '.join(PHASES.values())}"
-        raise CaptureError(where, "the archive", rule, _describe(error), REMEDY) from None
+        samples_of = " and ".join(PHASES.values())
+        raise CaptureError(
+            f"{where}: not a .npz with samples under {samples_of}: {_describe(error)}. {REMEDY}"
+        ) from None
     rows.sort(key=lambda row: row[0])  # stable: no-load rows stay before contact rows
     return "".join(f"{line}\r\n" for line in [HEAD, *(f"{i},{phase},{cells}" for i, phase, cells in rows)]).encode()
 
@@ -59,7 +63,7 @@ def decode_array(npy: bytes, where: str) -> Any:
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = read_header(stream)
     if not dtype.hasobject:
-        raise CaptureError(where, "an array", "one of objects", dtype, REMEDY)
+        raise CaptureError(f"{where}: the array holds {dtype}, not objects. {REMEDY}")
     return decode(stream.read(), where)
 
 
@@ -72,14 +76,16 @@ def decode(pickled: bytes, where: str) -> Any:
     try:
         for opcode, arg, at in pickletools.genops(pickled):
             if opcode.name not in STEPS:
-                rule = "made of plain values and NumPy numbers"
-                raise CaptureError(f"{where} @{at}", "a pickle", rule, f"opcode {opcode.name}", REMEDY)
+                raise CaptureError(
+                    f"{where} @{at}: the pickle has opcode {opcode.name}, beyond plain values and NumPy numbers. "
+                    f"{REMEDY}"
+                )
             STEPS[opcode.name](stack, arg)
         return plain(stack.values.pop())
     except CaptureError:
         raise
     except Exception as error:  # bytes that are no pickle fail anywhere: in pickletools, on an empty stack, in NumPy
-        raise CaptureError(where, "a pickle", "whole", _describe(error), REMEDY) from None
+        raise CaptureError(f"{where}: the pickle cannot be read: {_describe(error)}. {REMEDY}") from None
 
 
 @dataclass

@@ -111,8 +111,9 @@ def foreign(recording: Path, layout: ReaderLayout, names: CaptureNames, options:
 def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
     """Prepare a bare dump of a port with its probe log; frames get their time from a constant rate."""
     if what.probe is None:
-        remedy = "Add --probe PROBE.csv (columns in data/README.md)."
-        raise CaptureError(recording, "a serial dump", "accompanied by its probe log", "none", remedy)
+        raise CaptureError(
+            f"{recording}: a serial dump needs its probe log. Add --probe PROBE.csv (columns in data/README.md)."
+        )
     _need(recording)
     _need(what.probe)
     if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
@@ -129,7 +130,9 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
     found = read_header(recording)
     for option, given, in_header in (("--board", names.board, found.board), ("--skin", names.skin, found.skin)):
         if in_header not in (given, UNNAMED):
-            raise CaptureError(recording, option, f"{in_header!r}, as its header says", repr(given), "Which is right?")
+            raise CaptureError(
+                f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct one of them."
+            )
     # A recorder that was killed has not hashed its files into the header.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
     marks_before = found.clock.marks
@@ -138,11 +141,11 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
         marks_before = () if headers.PROBE_FILE in files else marks_before  # those of the recorded log
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
-        raise CaptureError(recording, "a capture", "labelled by a probe log", "none", "Add --probe PROBE.csv.")
+        raise CaptureError(f"{recording}: the capture has no probe log. Add --probe PROBE.csv.")
     for name, file in files.items():
         _need(file)
         if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
-            raise CaptureError(file, "the file", "unchanged since it was recorded", "another hash", "Record it again.")
+            raise CaptureError(f"{file}: the file has changed since it was recorded (another hash). Record it again.")
     _check_names(names)
     clock = found.clock.model_copy(update={"marks": (*marks_before, *marks)})
     named = {"capture": names.name or found.capture, "board": names.board, "skin": names.skin}
@@ -170,4 +173,4 @@ def _need(path: Path, *, folder: bool = False) -> None:
     if not path.exists():
         raise CaptureError(f"{path}: file not found. Check the path.")
     if path.is_dir() and not folder:
-        raise CaptureError(path, "the file", "a file", "a folder", "Check the path.")
+        raise CaptureError(f"{path}: this is a folder, not a file. Check the path.")

@@ -55,7 +55,7 @@ def parse(source: str | Path, where: str) -> ProbeLog:
     """Read a probe log from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
     table = tables.parse_csv(source, TYPES, where)
     if not len(table):
-        raise CaptureError(where, "the log", "one row a dwell", "no rows", "Record the capture again.")
+        raise CaptureError(f"{where}: the probe log has no rows. Record the capture again.")
     for name in ("indentation", "pass_i", "phase", "t_start_s", "t_end_s"):
         unknown = np.asarray(table.column(name).is_null())
         refuse_row(unknown, where, name, "known", "an empty field", "Only labels may be left empty.")
@@ -92,9 +92,11 @@ def _check_numbers(log: ProbeLog, where: str) -> None:
 
 def _check_order(log: ProbeLog, where: str) -> None:
     start_s, end_s, number = log.t_start_s, log.t_end_s, log.indentation
-    refuse_row(end_s <= start_s, where, "t_end_s", "later than t_start_s of its row", end_s, "Mend the times.")
+    refuse_row(end_s <= start_s, where, "t_end_s", "later than t_start_s of its row", end_s, "Correct the times.")
     overlaps = np.append(False, start_s[1:] < end_s[:-1])
-    refuse_row(overlaps, where, "t_start_s", "not before the dwell above has ended", start_s, "Sort dwells by time.")
+    refuse_row(
+        overlaps, where, "t_start_s", "no earlier than the end of the dwell above", start_s, "Sort dwells by time."
+    )
     falls = np.diff(number, prepend=number[0]) < 0
     refuse_row(falls, where, "indentation", "rising with time", number, "Number indentations on over the passes.")
     opens = np.diff(number, prepend=-1) != 0

@@ -100,7 +100,7 @@ def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, 
     part = _part_of(folder)
     for path in (folder, part):
         if path.exists():
-            raise CaptureError(path, "the capture's folder", "new", "one that is there", "Choose another --out.")
+            raise CaptureError(f"{path}: the folder exists already. Choose another --out.")
     options = {"scan": info.scan} | ({"labels": info.labels.name} if info.labels is not None else {})
     header = recorded(
         f"--out {folder.name}", capture=folder.name, board=info.board, skin=info.skin, layout="native",

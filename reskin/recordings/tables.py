@@ -37,8 +37,7 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
         )
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         got = ascii(" ".join(str(error).split()))[1:-1][:200]  # a row of rubbish is no message
-        rule = f"CSV with columns {_list(types)}"
-        raise CaptureError(where, "the table", rule, got, "Mend that row.") from None
+        raise CaptureError(f"{where}: not a CSV with columns {_list(types)}: {got}. Correct that row.") from None
     except FileNotFoundError:
         raise CaptureError(f"{where}: file not found. Copy the whole capture folder.") from None
     _check_names(table.column_names, types, where)
@@ -80,13 +79,14 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
     """Split a text file into cells, one list a line and all of one length; `None` splits at any white space."""
     text = _read_text(path, where)
     if separator == "," and ";" in text.partition("\n")[0]:
-        remedy = "Export it with commas between columns and points in numbers."
-        raise CaptureError(where, "columns", "separated by commas", "semicolons in line 1", remedy)
+        raise CaptureError(
+            f"{where}: semicolons in line 1. Export it with commas between columns and points in numbers."
+        )
     cells = [line.split(separator) for line in text.removesuffix("\n").split("\n")]
     for line_i, row in enumerate(cells):
         if len(row) != len(cells[0]):
-            got = f"{len(row)} in line {line_i + 1}"
-            raise CaptureError(where, "columns", f"{len(cells[0])}, as in line 1", got, "Was the file cut or edited?")
+            found = f"{len(row)} columns in line {line_i + 1}, but {len(cells[0])} in line 1"
+            raise CaptureError(f"{where}: {found}. Was the file cut or edited?")
     return cells
 
 
@@ -95,10 +95,10 @@ def to_numbers(
 ) -> Float64[np.ndarray, "f c"]:
     """Turn cells into finite numbers; `names` are the columns', `first_line_n` the file's line of `cells[0]`."""
     if cells and len(cells[0]) != len(names):
-        rule = f"{len(names)} a line ({names[0]} ... {names[-1]})"
-        raise CaptureError(where, "columns", rule, len(cells[0]), "Is the layout right, and the number of chips?")
+        found = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
+        raise CaptureError(f"{where}: {found}. Is the layout right, and the number of chips?")
     if not cells:
-        raise CaptureError(where, "the file", "at least one row of numbers", "none", "Copy the recording again.")
+        raise CaptureError(f"{where}: the file has no row of numbers. Copy the recording again.")
     try:
         numbers = np.array(cells, dtype=np.float64)
     except ValueError:
@@ -139,14 +139,13 @@ def _read_text(path: Path, where: str) -> str:
     try:
         text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin a file with a mark of byte order
     except UnicodeDecodeError as error:
-        got = f"byte {error.object[error.start]:#04x} at {error.start}"
-        raise CaptureError(where, "the file", "text", got, "Is it another file under this name?") from None
+        byte = f"{error.object[error.start]:#04x} at {error.start}"
+        raise CaptureError(f"{where}: the file is not text: byte {byte}. Is it another file under this name?") from None
     except OSError as error:
-        raise CaptureError(where, "the file", "readable", error.strerror, "Copy the recording again.") from None
+        raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
     if not text.endswith("\n"):
-        got = "no bytes" if not text else f"{text[-12:]!r}"
-        remedy = "Copy the recording again; if it is whole, end it with an empty line."
-        raise CaptureError(where, "the last line", "complete and end in a line feed", got, remedy)
+        found = f"the last line ends in {text[-12:]!r}, not in a line feed" if text else "the file is empty"
+        raise CaptureError(f"{where}: {found}. Copy the recording again; if it is whole, end it with an empty line.")
     return text
 
 
@@ -156,7 +155,9 @@ def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first
             if not _is_number(cell):
                 place = f"{name} in line {first_line_n + row_i}"
                 rule = f"a finite number below {MAGNITUDE_MAX:g}"
-                return CaptureError(where, place, rule, repr(cell[:20]), "Mend or remove this row, then add it again.")
+                return CaptureError(
+                    where, place, rule, repr(cell[:20]), "Correct or remove this row, then add it again."
+                )
     raise AssertionError("numbers refused, though every cell is one")
 
 
@@ -180,13 +181,13 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
     """Raise for a column that is not there, and for one that is there twice."""
     missing = [name for name in wanted if name not in names]
     if missing:
-        got = f"none named {', '.join(missing)}"
         raise CaptureError(
-            where, "columns", "those of data/README.md", got, f"Is this layout {layout}, line 1 its names?"
+            f"{where}: no column {', '.join(missing)}. See data/README.md: is this layout {layout}, and line 1 its "
+            "column names?"
         )
     twice = [name for name, times_n in Counter(names).items() if times_n > 1]
     if twice:
-        raise CaptureError(where, "names of columns", "unique", f"{twice[0]} twice", "Remove one of the two.")
+        raise CaptureError(f"{where}: two columns are named {twice[0]}. Remove one of them.")
 
 
 def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:
@@ -194,9 +195,9 @@ def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.nd
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {first_line_n + row_i}"
-            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Mend the word.")
+            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Correct the word.")
     if "contact" not in phases:
-        raise CaptureError(where, "the file", "rows of phase contact", "none", "Was the recording cut?")
+        raise CaptureError(f"{where}: no rows of phase contact. Was the recording cut?")
     return np.array([phase == "contact" for phase in phases])
 
 

@@ -246,7 +246,7 @@ def test_random_bytes_decode_or_raise_capture_error(data, wire, chips_n):
 
 @pytest.mark.parametrize("wire", WIRES)
 def test_empty_stream_is_refused(wire):
-    with pytest.raises(CaptureError, match="empty.bin: the stream must be .* no frame found in 0 bytes"):
+    with pytest.raises(CaptureError, match="empty.bin: no frame found in 0 bytes"):
         decode_all(b"", wire, 5, "empty.bin")
 
 
@@ -257,7 +257,7 @@ def test_error_suggests_matching_wire():
 
 
 def test_error_without_suggestion():
-    with pytest.raises(CaptureError, match="in 1 bytes. Wrong baud rate, chip count or wire format\\?$"):
+    with pytest.raises(CaptureError, match="in 1 bytes, .* Wrong baud rate, chip count or wire format\\?$"):
         decode_all(b"\0", "binary", 5, "a.bin")
 
 

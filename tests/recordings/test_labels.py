@@ -77,7 +77,7 @@ def test_any_labels_make_a_readable_log(tmp_path_factory, dwells):
 )  # fmt: skip
 def test_invalid_label_is_refused(tmp_path, label, end_s):
     writer = ProbeLogWriter(tmp_path)
-    with pytest.raises(CaptureError, match="a label: .* must be"):
+    with pytest.raises(CaptureError, match="a label: .* (must be|is not a span of time)"):
         writer.write(Dwell(label, 0.0, end_s))
     writer.close()
 
@@ -134,7 +134,7 @@ def test_force_threshold_replaces_phase():
 
 @pytest.mark.parametrize("head", ["x_mm,y_mm,Fz_N", "t_s,unix_s,Fz_N", "t_s,x_mm,y_mm", "t_s,t_s,Fz_N", ""])
 def test_invalid_columns_are_refused(head):
-    with pytest.raises(CaptureError, match="row 1, the column names, must be"):
+    with pytest.raises(CaptureError, match="row 1 must name one of unix_s and t_s"):
         SampleTable("log").feed(head.encode() + b"\n")
 
 

@@ -76,12 +76,12 @@ def test_round_trip_is_exact(lengths: list[float], begin_s: float, label: float)
         ("2,2.5,", ",2.5,", "row 4: t_start_s must be known"),
         ("2,2.5,", "nan,2.5,", "row 4: t_start_s must be a finite time; got nan"),
         ("1.0,1.5", "1.0,0.9", "row 3: t_end_s must be later than t_start_s of its row; got 0.9"),
-        ("2,2.5,", "1.4,2.5,", "row 4: t_start_s must be not before the dwell above has ended; got 1.4"),
+        ("2,2.5,", "1.4,2.5,", "row 4: t_start_s must be no earlier than the end of the dwell above; got 1.4"),
         ("2.5\n", "inf\n", "row 5: Fz_N must be finite, or empty if unknown; got inf"),
         ("0,0,noload,0.0,0.5,,,,,,\n", "", "row 2: an indentation's first dwell must be noload; got contact"),
         ("1,0,contact", "1,0,noload", "row 5: an indentation's later dwells must be contact; got noload"),
         ("1,0,contact", "0,0,contact", "row 5: indentation must be rising with time; got 0"),
-        (GOOD.removeprefix(HEAD), "", "the log must be one row a dwell; got no rows"),
+        (GOOD.removeprefix(HEAD), "", "the probe log has no rows"),
         (GOOD, "", "CSV"),
         (GOOD, "\x00\x01\x02", "Empty CSV"),
         (GOOD, "\n\n", "CSV|row 1"),
@@ -98,7 +98,7 @@ def test_random_bytes_raise_capture_error(tmp_path: Path) -> None:
     (tmp_path / "probe.csv").write_bytes(noise)
     with pytest.raises(CaptureError):
         probe.parse(tmp_path / "probe.csv", "probe.csv")
-    with pytest.raises(CaptureError, match="there"):
+    with pytest.raises(CaptureError, match="file not found"):
         probe.parse(tmp_path / "absent.csv", "absent.csv")
 
 

@@ -52,16 +52,16 @@ def test_header_is_that_of_the_text_firmware(log):
     [
         (lambda all_: all_[1:], r"log\.csv: row 1, the column names, must be t_s,T0,Bx0,By0,Bz0"),
         (lambda all_: [all_[0].replace("Bx0,By0", "By0,Bx0"), *all_[1:]], "row 1, the column names"),
-        (lambda all_: [*all_[:-1], all_[-1].rstrip()], "the last line must be complete"),
-        (lambda all_: [*all_[:-1], all_[-1][:20] + "\n"], "the table must be CSV with columns"),
+        (lambda all_: [*all_[:-1], all_[-1].rstrip()], "the last line is cut"),
+        (lambda all_: [*all_[:-1], all_[-1][:20] + "\n"], "not a CSV with columns"),
         (lambda all_: [*all_[:9], all_[9].replace("0.0360", "0.0300"), *all_[10:]], "row 10: t_s must be later"),
         (lambda all_: [*all_[:9], all_[8], *all_[9:]], "row 10: t_s must be later"),
         (lambda all_: [*all_[:5], all_[5][: all_[5].rindex(",")] + ",nan\n", *all_[6:]], "row 6: Bz1 must be a finite"),
         (lambda all_: [*all_[:5], all_[5][: all_[5].rindex(",")] + ",\n", *all_[6:]], "row 6: Bz1 must be a finite"),
-        (lambda all_: [*all_[:5], all_[5].replace(".", "x"), *all_[6:]], "the table must be CSV"),
-        (lambda all_: all_[:1], "the log must be one line a frame; got no lines"),
-        (lambda all_: all_[:2], "the log must be two lines or more"),
-        (lambda _: [], "got an empty file"),
+        (lambda all_: [*all_[:5], all_[5].replace(".", "x"), *all_[6:]], "not a CSV"),
+        (lambda all_: all_[:1], "the log has no lines"),
+        (lambda all_: all_[:2], "fewer than two lines"),
+        (lambda _: [], "the file is empty"),
     ],
 )
 def test_broken_log_is_refused(log, change, message):
@@ -99,7 +99,7 @@ def test_reset_chip_is_refused(log):
     t_s, b_uT, temperature_degC = made(frames_n=400, chips_n=3)
     b_uT[:, 3:6] = (500 + (b_uT[:, 3:6] - 500) / [0.2, 0.2, 0.32] * [0.98, 0.98, 1.58]).astype(np.float32)
     log.write_text(render(t_s, b_uT, temperature_degC))
-    with pytest.raises(CaptureError, match=r"the step of chip 1 from row 2 on must be that of the other chips"):
+    with pytest.raises(CaptureError, match="from row 2 on, the step of chip 1 differs from that of the other chips"):
         read_log(log)
 
 
@@ -134,10 +134,14 @@ def failing(failed_n, stuck_n, frames_n=60):
 
 def test_log_with_too_many_faults_is_refused(log):
     log.write_text(render(*failing(40, 0)))
-    with pytest.raises(CaptureError, match="50 % of them or more; got 20 of 60: 40 had failed I2C reads, 0 stuck"):
+    with pytest.raises(
+        CaptureError, match="only 20 of 60 lines are whole: 40 had failed I2C reads, 0 stuck chips. At least 50 % must"
+    ):
         read_log(log)
     log.write_text(render(*failing(5, 50)))
-    with pytest.raises(CaptureError, match=r"got \d+ of 60: 5 had failed I2C reads, \d+ stuck chips. Mend the wiring"):
+    with pytest.raises(
+        CaptureError, match=r"\d+ of 60 lines are whole: 5 had failed I2C reads, \d+ stuck chips. .*heck the wiring"
+    ):
         read_log(log)
     log.write_text(render(*failing(30, 0)))
     assert read_log(log)[3]["rows_n"] == 30

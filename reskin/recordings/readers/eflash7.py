@@ -54,7 +54,9 @@ class _Table:
 def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording: the CSV file itself."""
     if not recording.is_file():
-        raise CaptureError(recording, "an eflash7 recording", "one CSV file", "none", "Add each file by itself.")
+        raise CaptureError(
+            f"{recording}: not a file. A recording of layout eflash7 is one CSV file: add each file by itself."
+        )
     return {READINGS: recording}
 
 
@@ -71,8 +73,10 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.b_uT.shape[1] != 3 * header.chips_n:
-        got = table.b_uT.shape[1] // 3
-        raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
+        chips_n = table.b_uT.shape[1] // 3
+        raise CaptureError(
+            f"{where}: the file has {chips_n} chips, but the header {header.chips_n}. Correct one of them."
+        )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
     written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` tells those of some
@@ -135,8 +139,9 @@ def _read_table(path: Path, where: str) -> _Table:
     time_s, place, force_N, b_uT = np.split(numbers, np.cumsum([1, len(places), len(forces)]), axis=1)
     back = np.flatnonzero(np.diff(time_s[:, 0]) <= 0)
     if len(back):
-        got = f"an earlier one in line {FIRST_LINE_N + back[0] + 1}"
-        raise CaptureError(where, "timestamp", "later in each line", got, "Were two recordings joined?")
+        raise CaptureError(
+            f"{where}: timestamp does not increase in line {FIRST_LINE_N + back[0] + 1}. Were two recordings joined?"
+        )
     check_changes(b_uT, where, first_line_n=FIRST_LINE_N)
     known_N = np.full((len(numbers), 3), np.nan)
     known_N[:, -len(forces) :] = force_N
@@ -147,15 +152,14 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
     """Number the touched places, column 1 to 3 and row 1 to 3 of each; a recording has one place, or one pair."""
     moved = np.flatnonzero((place != place[0]).any(axis=1))
     if len(moved):
-        got = f"another in line {FIRST_LINE_N + moved[0]}"
-        raise CaptureError(where, "places", "the same in all rows", got, "Add each place by itself.")
+        raise CaptureError(f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Add each place by itself.")
     pairs = place[0].reshape(-1, 2)
     if not np.isin(pairs, np.arange(1, SIDE_N + 1)).all():
         rule = f"columns and rows 1 to {SIDE_N} of a grid"
         raise CaptureError(where, "places", rule, place[0].tolist(), "Places in mm belong to layout table.")
     numbers = sorted(int(column + SIDE_N * (row - 1)) for column, row in pairs)
     if len(set(numbers)) < len(numbers):
-        raise CaptureError(where, "two places", "two", f"place {numbers[0]} twice", "Mend the columns of places.")
+        raise CaptureError(f"{where}: both places are place {numbers[0]}. Correct the columns of places.")
     return numbers
 
 
@@ -163,8 +167,8 @@ def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray
     """Mark the rows in which the recorder wrote zeros for all chips; a change of 0 everywhere looks the same."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
-        rule, got = f"at most {ZERO_FRACTION_MAX:.0%} of the rows", f"{int(zero.sum())} of {len(zero)}"
-        raise CaptureError(where, "rows of zeros", rule, got, "Was the sensor unplugged? Record again.")
+        found = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
+        raise CaptureError(f"{where}: {found}. Was the sensor unplugged? Record again.")
     return zero
 
 
@@ -174,9 +178,11 @@ def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"],
     moved = whole & (np.abs(b_uT - first_uT) > STILL_uT).any(axis=1)
     untouched = whole & ~np.logical_or.accumulate(moved)
     if untouched.sum() < STILL_ROWS_MIN_N:
-        rule = f"{STILL_ROWS_MIN_N} or more, without contact"
-        got = f"fields that move by more than {STILL_uT:g} uT in line {FIRST_LINE_N + int(moved.argmax())}"
-        raise CaptureError(where, "the rows before the first touch", rule, got, "Record its beginning too.")
+        line_n = FIRST_LINE_N + int(moved.argmax())
+        raise CaptureError(
+            f"{where}: fewer than {STILL_ROWS_MIN_N} rows before the first touch: fields move by more than "
+            f"{STILL_uT:g} uT in line {line_n}. Begin to record before it."
+        )
     return untouched
 
 

@@ -51,8 +51,10 @@ def collect(recording: Path) -> dict[str, Path]:
     """Find the three files in the folder of one recording."""
     missing = [name for name in FILES if not (recording / name).is_file()]
     if missing:
-        rule = f"a folder with {', '.join(FILES)}"
-        raise CaptureError(recording, "an eflesh recording", rule, f"no {', '.join(missing)}", "Fetch it whole.")
+        raise CaptureError(
+            f"{recording}: no {', '.join(missing)} in it. A recording of layout eflesh is a folder with "
+            f"{', '.join(FILES)}: fetch it whole."
+        )
     return {name: recording / name for name in FILES}
 
 
@@ -61,7 +63,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[SENSOR])
     columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
-        raise CaptureError(where, "columns", "a time and 3 a chip", columns_n, "Is this layout eflesh?")
+        raise CaptureError(f"{where}: {columns_n} columns are not a time and 3 for each chip. Is this layout eflesh?")
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
@@ -115,9 +117,8 @@ def _read_fields(
     _check_rows_n({SENSOR: len(sensor), CHANGES: len(changes)}, header)
     differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
     if len(differ):
-        got = f"another in line {differ[0] + 1}"
-        where = f"{header.capture}/{CHANGES}"
-        raise CaptureError(where, "time", f"that of {SENSOR}", got, "Take both files of one recording.")
+        where = f"{header.capture}/{CHANGES} line {differ[0] + 1}"
+        raise CaptureError(f"{where}: time differs from that of {SENSOR}. Take both files of one recording.")
     check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
     return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
 
@@ -137,20 +138,23 @@ def _read_states(folder: Path, header: Header) -> Float64[np.ndarray, "f c"]:
 def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
     if len(set(rows_n.values())) != 1:
         got = " and ".join(f"{count} in {name}" for name, count in rows_n.items())
-        raise CaptureError(header.capture, "rows", "equal in number", got, "Was one of the files cut?")
+        raise CaptureError(f"{header.capture}: unequal numbers of rows, {got}. Was one of the files cut?")
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
     """Rows pair in order, so the clocks must agree row by row, and go on."""
     apart = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
     if len(apart):
-        where, rule = f"{header.capture}/{STATES}", f"within {CLOCKS_APART_MAX_s} s of {SENSOR}"
-        got = f"{states_s[apart[0]] - sensor_s[apart[0]]:.3f} s in line {apart[0] + 1}"
-        raise CaptureError(where, "time", rule, got, "Is a row missing in one of the files?")
+        where = f"{header.capture}/{STATES} line {apart[0] + 1}"
+        apart_s = states_s[apart[0]] - sensor_s[apart[0]]
+        raise CaptureError(
+            f"{where}: time is {apart_s:.3f} s from that of {SENSOR}, not within {CLOCKS_APART_MAX_s} s. Is a row "
+            "missing in one of the files?"
+        )
     back = np.flatnonzero(np.diff(sensor_s) <= 0)
     if len(back):
-        where, got = f"{header.capture}/{SENSOR}", f"an earlier one in line {back[0] + 2}"
-        raise CaptureError(where, "time", "later in each line", got, "Were two recordings joined?")
+        where = f"{header.capture}/{SENSOR}"
+        raise CaptureError(f"{where}: time does not increase in line {back[0] + 2}. Were two recordings joined?")
 
 
 def _number_passes(

@@ -37,13 +37,11 @@ Account = dict[str, int]
 def collect(recording: Path) -> dict[str, Path]:
     """Find the readings file and its truths beside it: `b20_NAME.txt` goes with `truths_NAME.txt`."""
     if not recording.is_file() or recording.name.startswith("truths_"):
-        rule = "the text file of readings"
-        raise CaptureError(recording, "an ini recording", rule, recording.name, "Name the file, not truths_*.")
+        raise CaptureError(f"{recording}: not the text file of readings. Give b20_NAME.txt, not truths_NAME.txt.")
     names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
     found = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
     if not found:
-        got = f"no {' or '.join(names)}"
-        raise CaptureError(recording, "the truths", "in the same folder", got, "Fetch or rename the truths file.")
+        raise CaptureError(f"{recording}: no {' or '.join(names)} beside it. Fetch or rename the truths file.")
     return {READINGS: recording, TRUTHS: found[0]}
 
 
@@ -52,7 +50,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[READINGS])
     columns_n = len(read_cells(files[READINGS], where, separator=None)[0])
     if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
-        raise CaptureError(where, "columns", "X, Y, Z, T a chip", columns_n, "Is this layout ini?")
+        raise CaptureError(f"{where}: {columns_n} columns are not X, Y, Z, T for each chip. Is this layout ini?")
     return columns_n // VALUES_PER_CHIP_N
 
 
@@ -124,11 +122,15 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
 
 def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
     if readings_n <= rows_late_n:
-        rule = f"more than the {rows_late_n} of option rows_late"
-        raise CaptureError(header.capture, "rows", rule, readings_n, "Was the recording cut?")
+        raise CaptureError(
+            f"{header.capture}: {readings_n} rows are not more than the {rows_late_n} of option rows_late. Was the "
+            "recording cut?"
+        )
     if readings_n != truths_n:
         got = f"{readings_n} in {READINGS} and {truths_n} in {TRUTHS}"
-        raise CaptureError(header.capture, "rows", "equal in number", got, "Is this the truths file of this one?")
+        raise CaptureError(
+            f"{header.capture}: unequal numbers of rows, {got}. Is this the truths file of this recording?"
+        )
 
 
 def _rows_late(header: Header) -> int | None:
@@ -170,13 +172,12 @@ def _check_lateness(
         return
     rows_n = abs(change.after - change.before)
     lost = f"{rows_n} row{'s' if rows_n > 1 else ''} of {'readings' if change.after < change.before else 'truths'}"
-    got = f"{change.before} before about row {change.row + 1}, {change.after} from there on"
+    found = f"{change.before} rows before about row {change.row + 1}, by {change.after} from there on"
     remedy = (
         f"{lost} seem to be missing there. Cut both files before that row, or put back what is missing, and add the "
         "recording again."
     )
-    rule = "as many rows behind their truths throughout"
-    raise CaptureError(f"{header.capture}/{READINGS}", "fields", rule, got, remedy)
+    raise CaptureError(f"{header.capture}/{READINGS}: the fields are behind their truths by {found}. {remedy}")
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
@@ -194,7 +195,9 @@ def _noload_field(
     noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):
-        got = f"none in the pass from line {int(np.argmax(pass_i == without[0])) + 1}"
-        where, rule = f"{header.capture}/{TRUTHS}", f"begun by a whole row without contact (F < {CONTACT_MIN_N} N)"
-        raise CaptureError(where, "each pass", rule, got, "Start each pass off the skin, or cut this pass out.")
+        where = f"{header.capture}/{TRUTHS} line {int(np.argmax(pass_i == without[0])) + 1}"
+        raise CaptureError(
+            f"{where}: this pass begins without a whole row without contact (F < {CONTACT_MIN_N} N). Start each pass "
+            "off the skin, or cut this pass out."
+        )
     return noload_uT[pass_i]

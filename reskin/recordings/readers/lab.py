@@ -54,7 +54,9 @@ class _Table:
 def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording: the CSV file itself, one depth of one skin."""
     if not recording.is_file():
-        raise CaptureError(recording, "a lab recording", "one CSV file", "none", "Add each depth's file by itself.")
+        raise CaptureError(
+            f"{recording}: not a file. A recording of layout lab is one CSV file: add each depth's file by itself."
+        )
     return {READINGS: recording}
 
 
@@ -68,16 +70,19 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.temperature_degC.shape[1] != header.chips_n:
-        got = table.temperature_degC.shape[1]
-        raise CaptureError(where, "chips", f"{header.chips_n}, as in the header", got, "Mend header or file.")
+        chips_n = table.temperature_degC.shape[1]
+        raise CaptureError(
+            f"{where}: the file has {chips_n} chips, but the header {header.chips_n}. Correct one of them."
+        )
     rows = check_rows(table.b_uT, table.temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
     keep, noload = table.contact & rows.keep, ~table.contact & rows.keep
     noload_uT = mean_by_group(table.b_uT[noload], table.press[noload], int(table.press[-1]) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):
-        got = f"none in the block from line {FIRST_LINE_N + int(np.argmax(table.press == without[0]))}"
-        remedy = "Remove the block, or record it again."
-        raise CaptureError(where, "each indent", "given noload rows that were read", got, remedy)
+        line_n = FIRST_LINE_N + int(np.argmax(table.press == without[0]))
+        raise CaptureError(
+            f"{where}: the indent from line {line_n} on has no whole noload row. Remove it, or record it again."
+        )
     reading_i = np.zeros(len(keep), int)
     reading_i[keep] = count_within(table.press[keep])
     readings = make_readings(
@@ -128,8 +133,8 @@ def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.nda
     seen: set[float] = set()
     for row_i in begins:
         if indent[row_i] in seen:
-            got = f"{indent[row_i]:g} once more in line {FIRST_LINE_N + row_i}"
-            raise CaptureError(where, "indent", "one block of rows a number", got, "Was the file joined twice?")
+            found = f"indent {indent[row_i]:g} begins once more in line {FIRST_LINE_N + row_i}"
+            raise CaptureError(f"{where}: {found}; its rows must be one block. Was the file joined twice?")
         seen.add(indent[row_i])
     return np.repeat(np.arange(len(begins)), np.diff(begins, append=len(indent)))
 
@@ -148,5 +153,5 @@ def _check_table(table: _Table, where: str) -> None:
     begins = np.flatnonzero(np.diff(table.press, prepend=-1))
     moved = np.flatnonzero((table.place_mm != table.place_mm[begins][table.press]).any(axis=1))
     if len(moved):
-        got = f"another in line {FIRST_LINE_N + moved[0]}"
-        raise CaptureError(where, "an indent's place", "one x_mm, y_mm", got, "Give each press its own indent.")
+        found = f"the place changes within an indent, in line {FIRST_LINE_N + moved[0]}"
+        raise CaptureError(f"{where}: {found}. Give each press its own indent.")

@@ -54,7 +54,7 @@ def read_log(path: Path) -> Log:
     chips_n = _chips_n(path, where)
     table = tables.parse_csv(path, dict.fromkeys(column_names(chips_n), pa.float64()), where)
     if not len(table):
-        raise CaptureError(where, "the log", "one line a frame", "no lines", "Copy the log again.")
+        raise CaptureError(f"{where}: the log has no lines below the column names. Copy the log again.")
     numbers = np.column_stack([_finite(table, name, where) for name in table.column_names])
     chips = numbers[:, 1:].reshape(len(numbers), chips_n, 4)
     b_uT = chips[:, :, 1:].reshape(len(chips), -1).astype(np.float32)
@@ -89,9 +89,10 @@ def _check_kept(account: dict[str, int], where: str) -> None:
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
-        got = f"{kept_n} of {read_n}: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
-        rule = f"read from every chip in {100 * KEPT_SHARE_MIN:g} % of them or more"
-        raise CaptureError(where, "lines", rule, got, "Mend the wiring, and log again.")
+        found = f"only {kept_n} of {read_n} lines are whole: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
+        raise CaptureError(
+            f"{where}: {found}. At least {100 * KEPT_SHARE_MIN:g} % must be: check the wiring, and log again."
+        )
 
 
 def _chips_n(path: Path, where: str) -> int:
@@ -104,8 +105,8 @@ def _chips_n(path: Path, where: str) -> int:
     except FileNotFoundError:
         raise CaptureError(f"{where}: file not found. Check the path.") from None
     except OSError as error:
-        got = "an empty file" if path.is_file() and not path.stat().st_size else error.strerror
-        raise CaptureError(where, "the log", "a readable file", got, "Check the name.") from None
+        reason = "the file is empty" if path.is_file() and not path.stat().st_size else error.strerror
+        raise CaptureError(f"{where}: cannot read the log: {reason}. Check the name.") from None
     # A text editor or a spreadsheet may have put a byte order mark first; the CSV reader skips it too.
     names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
     chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
@@ -115,8 +116,9 @@ def _chips_n(path: Path, where: str) -> int:
             where, "row 1, the column names,", rule, got, "If it is a board's log, write that line on top."
         )
     if last != b"\n":
-        rule, remedy = "complete and end in a line feed", "Remove it, if the board was switched off there."
-        raise CaptureError(where, "the last line", rule, "a line that was cut", remedy)
+        raise CaptureError(
+            f"{where}: the last line is cut: no line feed ends it. Remove it, if the board was switched off there."
+        )
     return chips_n
 
 
@@ -129,7 +131,7 @@ def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]
 
 def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> None:
     if len(t_s) < 2:
-        raise CaptureError(where, "the log", "two lines or more", len(t_s), "Copy the log again.")
+        raise CaptureError(f"{where}: the log has fewer than two lines below the column names. Copy the log again.")
     back = np.diff(t_s) <= 0
     if back.any():
         row_i = int(back.argmax()) + 1
@@ -148,15 +150,16 @@ def _faults(
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
     failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
     if failed.all():
-        remedy = "Mend the wiring, and log again."
-        raise CaptureError(where, "lines", "read from every chip", "failed I2C reads in all of them", remedy)
+        raise CaptureError(f"{where}: every line has failed I2C reads. Check the wiring, and log again.")
     read = np.flatnonzero(~failed)
     for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
         odd = np.flatnonzero(faults.reset_chips(b_uT[block], None))
         if len(odd):
-            what = f"the step of chip {', '.join(map(str, odd))} from row {block[0] + first_row} on"
-            rule, remedy = "that of the other chips", "It lost its settings: reset the board, log again."
-            raise CaptureError(where, what, rule, "another", remedy)
+            found = f"the step of chip {', '.join(map(str, odd))} differs from that of the other chips"
+            raise CaptureError(
+                f"{where}: from row {block[0] + first_row} on, {found}. A chip lost its settings: reset the board and "
+                "log again."
+            )
     return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
 
 

@@ -56,7 +56,7 @@ def columns_of(chips_n: int) -> list[str]:
 def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording."""
     if not recording.is_file():
-        raise CaptureError(recording, "a table", "one CSV or Parquet file", "none", "Add each file by itself.")
+        raise CaptureError(f"{recording}: not a file. A table is one CSV or Parquet file: add each file by itself.")
     return {PARQUET if recording.suffix == ".parquet" else CSV: recording}
 
 
@@ -71,9 +71,10 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
     names, cells = _read_cells(folder / name, where)
-    if count_chips_of(names) != header.chips_n:
-        rule = f"{header.chips_n}, as in the header"
-        raise CaptureError(where, "chips", rule, count_chips_of(names), "Mend header or file.")
+    if (chips_n := count_chips_of(names)) != header.chips_n:
+        raise CaptureError(
+            f"{where}: the file has {chips_n} chips, but the header {header.chips_n}. Correct one of them."
+        )
     columns = columns_of(header.chips_n)
     check_columns(names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
     contact = contact_rows([row[names.index("phase")].strip() for row in cells], where, FIRST_LINE_N)
@@ -92,8 +93,10 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     keep = contact & rows.keep
     without = np.flatnonzero(keep & np.isnan(noload_uT[:, 0]))
     if len(without):
-        got = f"none before line {FIRST_LINE_N + without[0]}"
-        raise CaptureError(where, "each press", "after no-load rows that were read", got, "Add rows of phase noload.")
+        line_n = FIRST_LINE_N + without[0]
+        raise CaptureError(
+            f"{where}: the press in line {line_n} has no whole no-load row before it. Add rows of phase noload."
+        )
     still = "depth_mm" in numbers and not numbers["depth_mm"][contact].any()
     pass_i = numbers["pass"] if "pass" in numbers else _find_passes(numbers, press, contact)
     reading_i = np.zeros(len(keep), int)
@@ -122,7 +125,7 @@ def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
     try:
         table = pq.read_table(path)
     except (pa.ArrowInvalid, OSError) as error:
-        raise CaptureError(where, "the file", "Parquet", str(error)[:60], "Write it again.") from None
+        raise CaptureError(f"{where}: the file is not Parquet: {str(error)[:60]}. Write it again.") from None
     columns = [["" if value is None else str(value) for value in column.to_pylist()] for column in table.columns]
     return list(table.column_names), [list(row) for row in zip(*columns, strict=True)]
 
@@ -131,8 +134,10 @@ def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str)
     """Raise for a column that would be ignored, though its name is nearly one that is known: `Fz` for `Fz_N`."""
     for name in names:
         if name not in columns and name.lower().split("_")[0] in STEMS:
-            rule = f"one of {', '.join((*NEEDED, *OPTIONAL))}, or another word"
-            raise CaptureError(where, "a column's name", rule, repr(name), "Rename the column, or remove it.")
+            known = ", ".join((*NEEDED, *OPTIONAL))
+            raise CaptureError(
+                f"{where}: column {name!r} is nearly, but not, one of {known}. Rename the column, or remove it."
+            )
 
 
 def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
@@ -187,9 +192,10 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
         return
     rest_uT, pressed_uT = (float(np.median(chips_uT[rows].max(axis=1))) for rows in (~contact, contact))
     if rest_uT < SUBTRACTED_PART * pressed_uT:
-        got = f"{rest_uT:.3g} uT at most in no-load rows beside {pressed_uT:.3g} uT in contact"
-        remedy = "A baseline seems to be subtracted already: write the raw fields of both phases."
-        raise CaptureError(where, "raw fields", "those of the skin at rest, not changes", got, remedy)
+        found = f"the fields are {rest_uT:.3g} uT at most in no-load rows, {pressed_uT:.3g} uT in contact"
+        raise CaptureError(
+            f"{where}: {found}. A baseline seems to be subtracted already: write the raw fields of both phases."
+        )
 
 
 def _number_presses(
@@ -204,8 +210,8 @@ def _number_presses(
         if (counts > 1).any():
             twice = firsts[counts > 1][0]
             line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
-            got = f"{twice:g} once more in line {line_n}"
-            raise CaptureError(where, "indentation", "one block of rows a number", got, "Was the file joined twice?")
+            found = f"indentation {twice:g} begins once more in line {line_n}"
+            raise CaptureError(f"{where}: {found}; its rows must be one block. Was the file joined twice?")
         begins_at = np.zeros(len(contact), bool)
         begins_at[rows[begins]] = True
         return np.maximum(np.cumsum(begins_at) - 1, 0)

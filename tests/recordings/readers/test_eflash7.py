@@ -121,13 +121,13 @@ def with_line_changed(line_n: int, old: str, new: str) -> list[str]:
 @pytest.mark.parametrize(
     ("rows", "expected"),
     [
-        (with_line_changed(4, "3,2", "3,1"), "places must be the same in all rows; got another in line 4"),
+        (with_line_changed(4, "3,2", "3,1"), "the place changes in line 4"),
         ([row.replace("6,3,2", "6,12.5,8") for row in ONE], "columns and rows 1 to 3 of a grid; got [12.5, 8.0]"),
-        (with_line_changed(5, "100.3", "100.1"), "timestamp must be later in each line; got an earlier one in line 5"),
+        (with_line_changed(5, "100.3", "100.1"), "timestamp does not increase in line 5"),
         (with_line_changed(8, "-0.9", "-356"), "in line 8. Convert grams"),
         (with_line_changed(8, "-0.9", "nan"), "fz in line 8"),
-        (ONE[5:], "the rows before the first touch must be 5 or more"),
-        ([ONE[11].replace("101.1", f"{90 + i}") for i in range(9)] + ONE, "rows of zeros must be at most 25%"),
+        (ONE[5:], "fewer than 5 rows before the first touch"),
+        ([ONE[11].replace("101.1", f"{90 + i}") for i in range(9)] + ONE, "10 of 22 rows are zeros, more than 25%"),
     ],
 )
 def test_invalid_rows_are_refused(tmp_path: Path, rows: list[str], expected: str) -> None:
@@ -141,7 +141,7 @@ def test_positive_compression_is_refused(tmp_path: Path) -> None:
 
 def test_repeated_place_is_refused(tmp_path: Path) -> None:
     rows = rows_of("3,1,3,1", "{fz},0.01 {place}")
-    assert "two places must be two; got place 3 twice" in error_of(write(tmp_path, rows, NAMES_OF_TWO))
+    assert "both places are place 3" in error_of(write(tmp_path, rows, NAMES_OF_TWO))
 
 
 def test_millitesla_is_refused(tmp_path: Path) -> None:

@@ -140,7 +140,7 @@ def test_three_files_are_collected(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", eflesh.FILES)
 def test_missing_file(tmp_path: Path, name: str) -> None:
     (scan(tmp_path) / name).unlink()
-    with pytest.raises(CaptureError, match=f"got no {name}"):
+    with pytest.raises(CaptureError, match=f"no {name}"):
         eflesh.collect(tmp_path)
 
 
@@ -165,8 +165,8 @@ def test_unequal_row_counts_are_refused(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "cell", "expected"),
     [
-        (eflesh.CHANGES, f"{START_s + 8.6}", "time must be that of sensor.csv; got another in line 3"),
-        (eflesh.STATES, f"{START_s + 8.6}", "in line 3. Is a row missing"),
+        (eflesh.CHANGES, f"{START_s + 8.6}", "line 3: time differs from that of sensor.csv"),
+        (eflesh.STATES, f"{START_s + 8.6}", "line 3: time is 0.100 s from that of sensor.csv"),
     ],
 )
 def test_disagreeing_clocks_are_refused(tmp_path: Path, name: str, cell: str, expected: str) -> None:
@@ -178,13 +178,13 @@ def test_decreasing_clock_is_refused(tmp_path: Path) -> None:
     scan(tmp_path)
     for name in eflesh.FILES:
         edit(tmp_path / name, 3, 0, f"{START_s}")
-    assert "later in each line; got an earlier one in line 3" in error_of(tmp_path)
+    assert "time does not increase in line 3" in error_of(tmp_path)
 
 
 def test_other_chip_count_is_refused(tmp_path: Path) -> None:
     message = error_of(scan(tmp_path), HEADER.model_copy(update={"chips_n": 5}))
-    assert "columns must be 16 a line" in message
-    assert "got 7" in message
+    assert "columns instead of 16" in message
+    assert ": 7 columns" in message
 
 
 def test_implausible_weight_is_refused(tmp_path: Path) -> None:

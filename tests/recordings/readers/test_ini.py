@@ -106,7 +106,7 @@ def test_unrecorded_quantities_are_nan(tmp_path: Path) -> None:
 
 def test_pass_that_begins_in_contact_has_no_noload(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS[2:6] * 3))
-    assert "none in the pass from line 1" in message
+    assert "truths.txt line 1: this pass begins without" in message
 
 
 def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
@@ -200,9 +200,7 @@ def test_invalid_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
 
 
 def test_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
-    assert "rows must be more than the 5 of option rows_late; got 4" in error_of(
-        write(tmp_path, ONE_PASS[:4]), late("5")
-    )
+    assert "4 rows are not more than the 5 of option rows_late" in error_of(write(tmp_path, ONE_PASS[:4]), late("5"))
 
 
 def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> None:
@@ -240,7 +238,7 @@ def test_stuck_chip_loses_its_rows(tmp_path: Path) -> None:
     for row_i in range(20, 64):
         edit(tmp_path / ini.READINGS, row_i + 1, f"{chip_line(row_i, 0)} {chip_line(20, 1)} {chip_line(row_i, 2)}")
     # Detected from the 20th equal reading on; the corner rows of the last passes are all stuck.
-    assert "none in the pass from line 41" in error_of(tmp_path)
+    assert "truths.txt line 41: this pass begins without" in error_of(tmp_path)
 
 
 def test_recording_of_failed_reads_is_refused(tmp_path: Path) -> None:
@@ -329,8 +327,8 @@ def test_unequal_row_counts_are_refused(tmp_path: Path) -> None:
 
 def test_other_chip_count_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS), HEADER.model_copy(update={"chips_n": 5}))
-    assert "columns must be 20 a line" in message
-    assert "got 12" in message
+    assert "columns instead of 20" in message
+    assert ": 12 columns" in message
 
 
 def test_forces_in_grams_are_refused(tmp_path: Path) -> None:

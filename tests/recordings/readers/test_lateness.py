@@ -84,7 +84,7 @@ def test_ini_recording_with_lost_row_is_refused(tmp_path):
     with pytest.raises(CaptureError) as caught:
         ini.read(tmp_path, make_header(layout="ini", chips_n=5), AS_USUAL)
     message = str(caught.value)
-    found = re.search(r"got 1 before about row (\d+), 0 from there on. 1 row of readings seem", message)
+    found = re.search(r"by 1 rows before about row (\d+), by 0 from there on. 1 row of readings seem", message)
     assert found is not None
     assert abs(int(found[1]) - 701) <= ROW_OFF_MAX
 

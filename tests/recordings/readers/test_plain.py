@@ -145,13 +145,16 @@ MISTAKES = {
     "an unknown phase": (lambda t: with_cell(t, 2, "phase", "touch"), "phase in line 4"),
     "no place": (lambda t: t.drop(columns="x_mm"), "x_mm"),
     "a chip without z": (lambda t: t.drop(columns="Bz1"), "Bz1"),
-    "no row before the first touch": (lambda t: t[3:], "none before line 2"),
+    "no row before the first touch": (lambda t: t[3:], "the press in line 2 has no"),
     "no contact": (lambda t: t[t.phase == "noload"], "rows of phase contact"),
     "millitesla": (lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}), "Convert mT or G"),
     "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Turn its sign"),
     "nearly a name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
     "a force left out here": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
-    "a press twice": (lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)), "0 once more in line 19"),
+    "a press twice": (
+        lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)),
+        "indentation 0 begins once more in line 19",
+    ),
 }
 
 
@@ -208,7 +211,7 @@ def test_constant_channels_are_named(tmp_path):
     rows = table()
     rows["Bz0"], rows["Bz1"] = 12.5, 0.0
     rows.to_csv(tmp_path / plain.CSV, index=False)
-    assert "one value throughout for Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT)" in error_of(tmp_path)
+    assert "no change in the whole recording of Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT)" in error_of(tmp_path)
 
 
 def test_subtracted_baseline_is_named(tmp_path):
@@ -225,4 +228,4 @@ def test_subtracted_baseline_is_named(tmp_path):
 
 def test_decimal_commas_are_named(tmp_path):
     table().to_csv(tmp_path / plain.CSV, index=False, sep=";", decimal=",")
-    assert "must be separated by commas; got semicolons in line 1" in error_of(tmp_path)
+    assert "semicolons in line 1" in error_of(tmp_path)
