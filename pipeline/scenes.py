@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from pipeline import PARAMS
 from pipeline.catalogue import LEARNING, Experiment, Kind, read_experiments
-from pipeline.settings import Seed, Settings, read_settings
+from pipeline.settings import Seed, Settings, read_settings, section_of
 from pipeline.stages import module_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
@@ -175,12 +175,11 @@ def read_scene(root: Path, name: str) -> Scene:
 
 
 def check_scene(settings: Settings) -> Scene:
-    """Check a scene, and each section by the `read` function of its stage."""
+    """Check a scene, and each section by the model that its stage takes."""
     scene = parse_scene(settings.of_scene, settings.where)
     for stage in dict.fromkeys(["split", *(one.stage for one in scene.rows if one.kind != "report")]):
-        module = module_of(stage)
-        if read := getattr(module, f"read_{stage}", getattr(module, "read", None)):
-            read(settings)
+        if model := section_of(getattr(module_of(stage), stage)):
+            settings.section(model, stage)
     if scene.simulate is not None:
         from pipeline.simulation import simulation_settings  # the physics, for a simulated scene only
 

@@ -3,10 +3,11 @@
 `dvc.yaml` lists the sections that a stage parses as its parameters (tests/test_settings.py compares the two).
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import Field
 
@@ -17,6 +18,7 @@ from reskin.models.recipe import HEADLINE, AdaptationWithBase, AugmentedRecipe, 
 from reskin.simulation.defaults import NOMINAL, SHARED
 
 Section = TypeVar("Section", bound=Strict)
+Row = dict[str, Any]
 Seed = Annotated[int, Field(ge=0)]
 Count = Annotated[int, Field(ge=1)]
 
@@ -27,23 +29,61 @@ class Seeded(Strict):
     seed: Seed
 
 
-class Training(Strict):
-    """Recipes by name, each trained on every fold with `seeds_n` seeds; `paper` is the headline."""
+class SectionWithRows(Strict):
+    """Base of sections that name rows of `params.yaml`, such as a recipe."""
+
+    @classmethod
+    def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
+        """Replace the names of rows by the rows, before the section is parsed."""
+        raise NotImplementedError
+
+
+class Training(SectionWithRows):
+    """Recipes by name, each trained on every fold with `seeds_n` seeds; `paper` is the headline.
+
+    In the file: the name of a shared `recipe`, `steps_n`, and changes of the recipe by variant.
+    """
 
     recipes: dict[Name, Recipe | AugmentedRecipe]
     seeds_n: Count
 
+    @classmethod
+    def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
+        return expand_variants(section, settings.row("recipes", take(section, "recipe", where)), where)
 
-class Adaptations(Strict):
-    """Adaptations by name, each with `pokes_n` unlabelled indentations of every held-out skin."""
+
+class SectionWithTraining(SectionWithRows):
+    """Base of sections that hold a `training` of their own."""
+
+    @classmethod
+    def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
+        training = dict(take(section, "training", where))
+        return section | {"training": Training.expand(training, settings, f"{where}.training")}
+
+
+class Adaptations(SectionWithRows):
+    """Adaptations by name, each with `pokes_n` unlabelled indentations of every held-out skin.
+
+    In the file: the name of a shared `adaptation`, its `base` (a recipe of section train_triplet), `steps_n`, variants.
+    """
 
     pokes_n: Count
     recipes: dict[Name, AdaptationWithBase]
 
+    @classmethod
+    def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
+        adaptation = settings.row("adaptations", take(section, "adaptation", where))
+        section = expand_variants(section, adaptation | {"base": take(section, "base", where)}, where)
+        known = sorted(settings.section(Training, "train_triplet").recipes)
+        for name, recipe in section["recipes"].items():
+            if recipe["base"] not in known:
+                raise ParamsError(where, f"base of {name}", f"one of {known}", repr(recipe["base"]), "Mend it there.")
+        return section
+
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a scene; a stage parses the sections that it needs into typed models.
+    """The settings of a scene; its sections are parsed into typed models when they are first read, once each.
 
     where: the scene's file, for error messages. of_scene: its content.
     shared: the content of `params.yaml` and of the library's nominal skin.
@@ -58,6 +98,7 @@ class Settings:
     captures: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
     models: tuple[str, ...] = ()
+    parsed: dict[tuple[type[Strict], str], Strict] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getitem__(self, section: str) -> Any:
         """Return a section of the scene's file as it is written; raise `ParamsError` if it is missing."""
@@ -66,12 +107,19 @@ class Settings:
         return self.of_scene[section]
 
     def section(self, model: type[Section], name: str) -> Section:
-        """Parse a section of the scene's file."""
-        return parse(model, self[name], f"{self.where}: {name}")
+        """Return a section of the scene's file, parsed, with the shared rows that it names."""
+        if (model, name) not in self.parsed:
+            content, where = self[name], f"{self.where}: {name}"
+            if issubclass(model, SectionWithRows):
+                content = model.expand(dict(content), self, where)
+            self.parsed[model, name] = parse(model, content, where)
+        return cast(Section, self.parsed[model, name])
 
     def shared_section(self, model: type[Section], name: str) -> Section:
-        """Parse a section that all scenes share, such as `skin`."""
-        return parse(model, self.shared[name], name)
+        """Return a section that all scenes share, such as `skin`, parsed."""
+        if (model, name) not in self.parsed:
+            self.parsed[model, name] = parse(model, self.shared[name], name)
+        return cast(Section, self.parsed[model, name])
 
     def row(self, section: str, name: Any) -> dict[str, Any]:
         """Return a named row of a shared section, such as a recipe; raise `ParamsError` if there is none."""
@@ -85,39 +133,18 @@ class Settings:
         """Seed of the scene, from which every random generator is derived by name (`reskin.seeds`)."""
         return parse(Seeded, {"seed": self["seed"]}, self.where).seed
 
-    def training(self, section: str) -> Training:
-        """Parse a section that trains."""
-        where = f"{self.where}: {section}"
-        return parse(Training, self.expand_training(self[section], where), where)
-
-    def with_training(self, model: type[Section], name: str) -> Section:
-        """Parse a section that holds a `training` of its own."""
-        section, where = dict(self[name]), f"{self.where}: {name}"
-        training = self.expand_training(take(section, "training", where), f"{where}.training")
-        return parse(model, section | {"training": training}, where)
-
-    def adaptations(self) -> Adaptations:
-        """Parse section `adapt`; every base is a recipe of section `train_triplet`."""
-        section, where = dict(self["adapt"]), f"{self.where}: adapt"
-        shared = self.row("adaptations", take(section, "adaptation", where)) | {"base": take(section, "base", where)}
-        found = parse(Adaptations, expand_variants(section, shared, where), where)
-        known = sorted(self.training("train_triplet").recipes)
-        for name, recipe in found.recipes.items():
-            if recipe.base not in known:
-                raise ParamsError(where, f"base of {name}", f"one of {known}", repr(recipe.base), "Mend it there.")
-        return found
-
-    def expand_training(self, section: Mapping[str, Any], where: str) -> dict[str, Any]:
-        """Replace the name of a shared recipe, and the changes of its variants, by complete recipes."""
-        section = dict(section)
-        return expand_variants(section, self.row("recipes", take(section, "recipe", where)), where)
-
     def captures_in(self, indentations: Path) -> list[str]:
         """Return the names of the captures in a folder of readings.
 
         Those of a recorded scene come from the registry, so that a file left by a removed capture is not read.
         """
         return sorted(self.captures) or sorted(file.stem for file in indentations.glob("*.parquet"))
+
+
+def section_of(stage: Callable[..., None]) -> type[Strict] | None:
+    """Return the model of the section that the function of a stage takes as `section`; None if it takes none."""
+    parameter = inspect.signature(stage).parameters.get("section")
+    return None if parameter is None else parameter.annotation
 
 
 def read_settings(scene: str, root: Path = Path()) -> Settings:

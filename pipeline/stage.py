@@ -5,23 +5,24 @@ import inspect
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pipeline.executors import end_workers
 from pipeline.progress import announce
 from pipeline.provenance import COSTS, clear_cost, record_cost
-from pipeline.settings import Settings, read_settings
+from pipeline.settings import Settings, read_settings, section_of
 from reskin.errors import ReskinError, explaining
 
 
 def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Call the function of a stage; its parameters are the command's options, its settings those of `--scene`."""
+    """Call the function of a stage; its paths are the command's options, its settings those of `--scene`."""
     stage = work.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=work.__doc__)
     parser.add_argument("--scene", required=True)
     kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
     for name, kind in kinds.items():
-        if kind is not Settings:
+        if kind is Path:
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
     options = vars(parser.parse_args(arguments))
     scene = options.pop("scene")
@@ -33,6 +34,8 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
             clear_cost(costs, unit)
             if Settings in kinds.values():
                 options["settings"] = read_settings(scene)
+            if model := section_of(work):
+                options["section"] = options["settings"].section(model, stage)
             work(**options)
             end_workers()
             record_cost(costs, unit, time.monotonic() - start_s)

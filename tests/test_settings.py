@@ -10,8 +10,9 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipeline import PARAMS, PLAN, SCENES, plan
-from pipeline.scenes import read_scene
-from pipeline.settings import Settings, read_settings
+from pipeline.experiments.shear import Shear
+from pipeline.scenes import SECTIONS, read_scene
+from pipeline.settings import Adaptations, Settings, Training, read_settings, section_of
 from pipeline.stages import module_of
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
@@ -57,22 +58,19 @@ def declared(stage: str) -> tuple[set[str], set[str]]:
     return of_scene, shared
 
 
-def readers() -> list[str]:
-    """The stages that parse settings of their own."""
-    return [
-        stage
-        for stage in FLOW
-        if stage != "code" and any(hasattr(module_of(stage), name) for name in (f"read_{stage}", "read"))
-    ]
+MODELS = {stage: section_of(getattr(module_of(stage), stage)) for stage in FLOW if stage != "code"}
 
 
-@pytest.mark.parametrize("stage", readers())
+def test_the_stages_that_take_a_section_are_those_of_which_a_scene_holds_settings():
+    assert {stage for stage, model in MODELS.items() if model} == SECTIONS | {"split"}
+
+
+@pytest.mark.parametrize("stage", [stage for stage, model in MODELS.items() if model])
 def test_the_params_of_a_stage_cover_the_settings_that_it_reads(stage):
     scene = next(one for one in ("ci", "lab", "eflash7", "decide", "universal") if stage_of(one, stage))
     given = read_settings(scene, ROOT)
     asked = Settings(scene, given.where, Noting(given.of_scene), Noting(given.shared), given.captures)
-    module = module_of(stage)
-    getattr(module, f"read_{stage}", getattr(module, "read", None))(asked)
+    asked.section(MODELS[stage], stage)
     of_scene, shared = declared(stage)
     assert asked.of_scene.read - of_scene == set() or "*" in of_scene
     assert asked.shared.read - shared == set()
@@ -173,7 +171,7 @@ def test_an_edit_of_a_protocol_simulates_that_protocol_again_and_no_other(root, 
 
 def test_the_code_reads_what_an_override_sets(root):
     with overridden(root, (SCENE, "train_multi.recipe=slow")):
-        assert read_settings("ci", root).training("train_multi").recipes["paper"].rate_max == 0.003
+        assert read_settings("ci", root).section(Training, "train_multi").recipes["paper"].rate_max == 0.003
 
 
 YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / PARAMS, NOMINAL, ROOT / PLAN, *sorted((ROOT / SCENES).glob("*.yaml"))]
@@ -189,15 +187,15 @@ def test_no_file_that_dvc_reads_holds_an_anchor_an_alias_or_a_merge_key(file):
 
 def test_a_stage_fails_on_mistakes_in_its_own_sections_only(root):
     with overridden(root, (SCENE, "shear.repeats_n=0")):
-        read_settings("ci", root).training("train_multi")
+        read_settings("ci", root).section(Training, "train_multi")
         with pytest.raises(ParamsError, match="shear: repeats_n must be greater than or equal to 1; got 0"):
-            module_of("shear").read(read_settings("ci", root))
+            read_settings("ci", root).section(Shear, "shear")
         with pytest.raises(ParamsError, match="shear: repeats_n must be"):
             plan.check(root)
 
 
 def test_the_control_of_an_adaptation_follows_it(root):
     with overridden(root, (PARAMS, "adaptations.paper.rate_max=0.5")):
-        adapt = read_settings("ci", root).adaptations()
+        adapt = read_settings("ci", root).section(Adaptations, "adapt")
     assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}
     assert adapt.recipes["control"].unlabelled_weight == 0

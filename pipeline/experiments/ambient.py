@@ -54,16 +54,11 @@ class Ambient(Strict):
     iron: Iron
 
 
-def read(settings: Settings) -> Ambient:
-    """Read section ambient."""
-    return settings.section(Ambient, "ambient")
-
-
-def ambient(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
+def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Test every held-out board in ambient fields; train networks without the common part for the last board."""
     data = read_data(settings, indentations, folds)
     synthesis, seed = simulation_settings(data.settings), data.settings.seed
-    section, training = read(data.settings), data.settings.training("train_multi")
+    training = data.settings.section(Training, "train_multi")
     held_out = data.folds_of("lobo")
     boards = [fold.name for fold in held_out]
     points: list[dict[str, Any]] = []

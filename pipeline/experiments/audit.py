@@ -49,12 +49,15 @@ class Check:
     known: bool = False
 
 
-def read(settings: Settings) -> AuditSettings:
-    """Read section audit."""
-    return settings.section(AuditSettings, "audit")
-
-
-def audit(settings: Settings, indentations: Path, folds: Path, models: Path, choice: Path, results: Path) -> None:
+def audit(
+    settings: Settings,
+    section: AuditSettings,
+    indentations: Path,
+    folds: Path,
+    models: Path,
+    choice: Path,
+    results: Path,
+) -> None:
     """Check every fold, the scaler of every network and the settings; raise `LeakError` for a leak."""
     data = read_data(settings, indentations, folds)
     labels = Labels(data.rows.board, data.rows.skin, data.rows.indentation, data.rows.capture)
@@ -67,7 +70,7 @@ def audit(settings: Settings, indentations: Path, folds: Path, models: Path, cho
         )
     ]
     checks += list(model_checks(data, {(side.experiment, side.name): side for side in sides}, models))
-    if read(data.settings).settings == "chosen":
+    if section.settings == "chosen":
         checks += settings_checks(data, choice, models)
     leak = next((check for check in checks if not (check.holds or check.known)), None)
     if leak is not None:

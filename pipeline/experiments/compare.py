@@ -60,16 +60,11 @@ class Compare(Strict):
     ]  # part of a poke's change that stays in the next no-load reading, assumed
 
 
-def read(settings: Settings) -> Compare:
-    """Read section compare."""
-    return settings.section(Compare, "compare")
-
-
-def compare(settings: Settings, indentations: Path, results: Path) -> None:
+def compare(settings: Settings, section: Compare, indentations: Path, results: Path) -> None:
     """Compare the recorded boards of a scene with simulated ones."""
     design = settings.shared_section(SkinDesign, "skin")
     boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
-    write_results(results, *compare_boards(boards, read(settings), design, settings.seed))
+    write_results(results, *compare_boards(boards, section, design, settings.seed))
 
 
 def compare_boards(

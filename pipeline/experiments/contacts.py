@@ -65,15 +65,11 @@ class Contacts(Strict):
     false_alarm_fraction: Annotated[float, Field(gt=0, lt=1)]
 
 
-def read(settings: Settings) -> Contacts:
-    """Read section contacts."""
-    return settings.section(Contacts, "contacts")
-
-
-def contacts(settings: Settings, folds: Path, indentations: Path, models: Path, results: Path) -> None:
+def contacts(
+    settings: Settings, section: Contacts, folds: Path, indentations: Path, models: Path, results: Path
+) -> None:
     """Add pokes of every held-out board in pairs, and test networks that never saw it on the sums."""
     data = read_data(settings, indentations, folds)
-    section = read(settings)
     boards, drawn = zip(
         *(evaluate_board(data, fold, section, networks_held_out(models, fold.name)) for fold in data.folds_of("lobo")),
         strict=True,

@@ -22,7 +22,7 @@ from pipeline.experiments.results import read_captures, read_losses, write_resul
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, show, tabulate
 from pipeline.report.paper import FIGURE_5
-from pipeline.settings import Settings, Training
+from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.statistics import (
     SUPPORTED,
     UNDECIDED,
@@ -38,7 +38,6 @@ from pipeline.statistics import (
     verdict,
 )
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs
-from reskin.config import Strict
 from reskin.data import baseline
 from reskin.data.baseline import rank, subtract
 from reskin.data.rows import Selection
@@ -65,7 +64,7 @@ UNIT_COLUMN = {"indentation": "indentation", "pass": "pass_i"}
 Errors = Mapping[str, Float[np.ndarray, "u w"]]  # by metric; rows: networks (skin and seed); columns: windows
 
 
-class Drift(Strict):
+class Drift(SectionWithTraining):
     """Section drift: windows of contacts that are trained on and tested, and the no-load policies."""
 
     unit: Literal["indentation", "pass"]  # what the numbers below count
@@ -91,11 +90,6 @@ class Drift(Strict):
         return self
 
 
-def read(settings: Settings) -> Drift:
-    """Read section drift."""
-    return settings.with_training(Drift, "drift")
-
-
 # --- Stage ---
 
 
@@ -115,10 +109,10 @@ class WindowPredictions:
     predicted: Float[np.ndarray, "f 3"]
 
 
-def drift(settings: Settings, indentations: Path, results: Path) -> None:
+def drift(settings: Settings, section: Drift, indentations: Path, results: Path) -> None:
     """Train and test networks under every no-load policy, on every capture of a folder."""
     preload_training()
-    section, selection = read(settings), settings.section(Selection, "selection")
+    selection = settings.section(Selection, "selection")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
     if section.wander_uT and captures[0].source != "simulated":
         rule = "none in a recorded scene: a walk would be added to what was recorded"

@@ -13,7 +13,7 @@ from pipeline.experiments.results import read_captures, read_losses, write_resul
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, OF_PAPER, show, show_difference, tabulate
 from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
-from pipeline.settings import Settings
+from pipeline.settings import Adaptations, Settings
 from pipeline.simulation import simulation_settings
 from pipeline.statistics import statistic
 from pipeline.training.jobs import SceneData, adaptation_jobs, preload_training, read_data, read_pretrained
@@ -46,7 +46,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
     preload_training()
     data = read_data(settings, main, folds)
     starts, captures = read_pretrained(pretrained), read_captures(indentations)
-    adapting, first, trained_n = data.settings.adaptations(), data.folds_of("lobo")[0], len(data.rows)
+    adapting, first, trained_n = data.settings.section(Adaptations, "adapt"), data.folds_of("lobo")[0], len(data.rows)
     poked = gather(captures, data.settings.section(Selection, "selection"))
     data = replace(data, rows=stack(data.rows, poked))
     sides = (first.train, np.arange(trained_n, len(data.rows)))

@@ -82,18 +82,13 @@ class Press(NamedTuple):
     b_uT: Float64[np.ndarray, " ch"]
 
 
-def read(settings: Settings) -> Gripper:
-    """Read section gripper."""
-    return settings.section(Gripper, "gripper")
-
-
-def gripper(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
+def gripper(settings: Settings, section: Gripper, indentations: Path, models: Path, results: Path) -> None:
     """Hold objects by the estimated force on the skin of a gripper's finger."""
     load = load_protocol(settings, "grip")
     weight_N = load_steps_N(load.force_max_N, load.step_N)
     fingers = [make_finger(capture, weight_N) for capture in read_captures(indentations)]
     networks = {finger.board: networks_held_out(models, finger.board) for finger in fingers}
-    numbers, drawn = hold_all(fingers, networks, read(settings), seed=settings.seed)
+    numbers, drawn = hold_all(fingers, networks, section, seed=settings.seed)
     write_results(results, numbers, drawn, read_losses(indentations, {}))
     best = max(numbers["rows"], key=lambda row: row["held_pct"])
     say(

@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.experiments.compare import chip_rotations, make_setup, pool_skins, to_board_axes
-from pipeline.experiments.compare import read as read_compare
+from pipeline.experiments.compare import Compare, chip_rotations, make_setup, pool_skins, to_board_axes
 from pipeline.experiments.results import read_captures
 from pipeline.settings import Settings
 from pipeline.training.jobs import read_data
@@ -14,7 +13,7 @@ from reskin.physics.skin import SkinDesign
 
 def read_known_boards(settings: Settings, indentations: Path, folds: Path) -> KnownBoards:
     """Read the recorded boards of a scene, two or more; they lie as section compare says."""
-    data, section = read_data(settings, indentations, folds), read_compare(settings)
+    data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:
         raise ParamsError(f"scene {settings.scene}", "boards with known forces", "two or more", len(skins), "Add one.")

@@ -52,7 +52,7 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pret
     preload_training()
     data = read_data(settings, main, folds)
     starts = read_pretrained(pretrained)
-    adapting = data.settings.adaptations()
+    adapting = data.settings.section(Adaptations, "adapt")
     poked, found = hand_rows(read_captures(indentations))
     lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))

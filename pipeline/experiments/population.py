@@ -93,11 +93,6 @@ class PopulationSettings(Strict):
         return [CalibrationSize(n, 0) for n in self.unlabelled_n] + [CalibrationSize(most_n, n) for n in self.labels_n]
 
 
-def read(settings: Settings) -> PopulationSettings:
-    """Read section population."""
-    return settings.section(PopulationSettings, "population")
-
-
 @dataclass(frozen=True)
 class DesignedSkins:
     """Simulated skins about the design of a scene's skins, with the forces of its depths."""
@@ -408,9 +403,9 @@ def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
     return found
 
 
-def population(settings: Settings, folds: Path, indentations: Path, results: Path) -> None:
+def population(settings: Settings, section: PopulationSettings, folds: Path, indentations: Path, results: Path) -> None:
     """Score the universal model of simulated skins on every held-out skin of a simulated scene."""
-    data, section, simulation = read_data(settings, indentations, folds), read(settings), simulation_settings(settings)
+    data, simulation = read_data(settings, indentations, folds), simulation_settings(settings)
     kind, design = simulation.main_boards, settings.shared_section(SkinDesign, "skin")
     designed = designed_skins(design, kind, simulation.main.depths_mm, settings.seed)
     turn = Rotation.from_euler("z", np.array(kind.design.turns_deg)[:, None], degrees=True).as_matrix()

@@ -23,7 +23,7 @@ from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import write_results
 from pipeline.provenance import SECONDS
 from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
-from pipeline.settings import Settings, take
+from pipeline.settings import Row, SectionWithRows, Settings, take
 from pipeline.stage import say
 from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy
 from pipeline.training.jobs import SceneData, score_test
@@ -40,7 +40,6 @@ from pipeline.training.universal import (
 )
 from pipeline.training.universal_variants import KnownBoards, Variant, Variants, read_variants
 from reskin import io
-from reskin.config import Strict, parse
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold
 from reskin.errors import ParamsError
@@ -65,7 +64,7 @@ Point = dict[str, Any]  # scores of one method on one fold
 RNG = "rivals"  # name of the random draws, from an earlier name of this experiment
 
 
-class ReferenceMethods(Strict):
+class ReferenceMethods(SectionWithRows):
     """Section reference_methods: numbers of labels, models of known boards, and the share of false alarms."""
 
     labels_n: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]
@@ -74,19 +73,19 @@ class ReferenceMethods(Strict):
     adversarial_weight: Annotated[float, Field(gt=0)]
     false_alarm_fraction: Annotated[float, Field(gt=0, lt=1)]
 
-
-def read(settings: Settings) -> ReferenceMethods:
-    """Read section reference_methods, with the rows of params.yaml that it names."""
-    section, where = dict(settings["reference_methods"]), f"{settings.where}: reference_methods"
-    recipe = settings.row("recipes", take(section, "recipe", where))
-    recipe |= {"inputs": take(section, "inputs", where), "steps_n": take(section, "steps_n", where)}
-    methods = settings.row("methods", take(section, "methods", where))
-    return parse(ReferenceMethods, section | {"recipe": recipe, "methods": methods}, where)
+    @classmethod
+    def expand(cls, section: Row, settings: Settings, where: str) -> Row:
+        recipe = settings.row("recipes", take(section, "recipe", where))
+        recipe |= {"inputs": take(section, "inputs", where), "steps_n": take(section, "steps_n", where)}
+        methods = settings.row("methods", take(section, "methods", where))
+        return section | {"recipe": recipe, "methods": methods}
 
 
-def reference_methods(settings: Settings, indentations: Path, folds: Path, models: Path, results: Path) -> None:
+def reference_methods(
+    settings: Settings, section: ReferenceMethods, indentations: Path, folds: Path, models: Path, results: Path
+) -> None:
     """Score reference methods on every held-out board, on the rows that experiment labels tests."""
-    known, section = read_known_boards(settings, indentations, folds), read(settings)
+    known = read_known_boards(settings, indentations, folds)
     data, of_labels = known.data, known.data.folds_of(EXPERIMENT)
 
     points: list[Point] = []

@@ -647,18 +647,13 @@ class RunTime(Strict):
     repeats_n: Annotated[int, Field(ge=1, le=1000)]
 
 
-def read(settings: Settings) -> RunTime:
-    """Read section runtime."""
-    return settings.section(RunTime, "runtime")
-
-
-def runtime(settings: Settings, results: Path) -> None:
+def runtime(settings: Settings, section: RunTime, results: Path) -> None:
     """Compare quadratures and integrators; times differ between equal runs, so they are no output of DVC."""
-    of, tried = simulation_settings(settings), read(settings)
-    rows, calls = study_quadratures(_trials(of, tried.quadratures, settings.seed), tried.quadratures.rules_of())
-    more, more_calls = study_integrators(tried.integrators)
+    of = simulation_settings(settings)
+    rows, calls = study_quadratures(_trials(of, section.quadratures, settings.seed), section.quadratures.rules_of())
+    more, more_calls = study_integrators(section.integrators)
     choice = choose(rows, used=of.main_boards.quadrature.in_si())
-    seconds = time_calls([*calls, *more_calls], tried.repeats_n)
+    seconds = time_calls([*calls, *more_calls], section.repeats_n)
     io.write_json(SECONDS / settings.scene / "runtime.json", [asdict(row) for row in seconds])
     answer: dict[str, Any] = {"choice": asdict(choice)}
     answer |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}

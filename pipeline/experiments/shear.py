@@ -16,10 +16,9 @@ from pipeline.experiments.results import read_captures, read_losses, write_resul
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import show, tabulate
 from pipeline.report.paper import SHEAR
-from pipeline.settings import Settings, Training
+from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.statistics import over_units, tally
 from pipeline.training.jobs import SceneData, collapse_record, make_jobs, preload_training, train_jobs, write_timings
-from reskin.config import Strict
 from reskin.data.rows import SHEAR_TARGETS, Rows, Selection, gather
 from reskin.data.splits import NO_POOL, Fold, draw_sides
 from reskin.metrics import ACCURACY_LIMIT_MM
@@ -31,7 +30,7 @@ DRAWN_N = 400  # points in a panel
 FORCE_DECIMALS = 3  # of a newton that is drawn
 
 
-class Shear(Strict):
+class Shear(SectionWithTraining):
     """Section shear: the splits of dragged lines, and the training."""
 
     test_fraction: Annotated[float, Field(gt=0, lt=1)]
@@ -39,15 +38,9 @@ class Shear(Strict):
     training: Training
 
 
-def read(settings: Settings) -> Shear:
-    """Read section shear."""
-    return settings.with_training(Shear, "shear")
-
-
-def shear(settings: Settings, indentations: Path, results: Path) -> None:
+def shear(settings: Settings, section: Shear, indentations: Path, results: Path) -> None:
     """Train with five targets on both splits of every skin, and score what was held out."""
     preload_training()
-    section = read(settings)
     rows = gather(read_captures(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
     by_reading = make_folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
     by_line = make_folds(rows, rows.indentation, "line", section, settings.seed)

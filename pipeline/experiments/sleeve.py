@@ -18,12 +18,11 @@ from pipeline.experiments.results import read_captures, read_losses, write_resul
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, scores, show, tabulate
 from pipeline.report.paper import SLEEVE, SLEEVE_SKIN, SLEEVE_WORDS
-from pipeline.settings import Settings, Training
+from pipeline.settings import SectionWithTraining, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import tally
 from pipeline.training.jobs import SceneData, collapse_record, preload_training, train_jobs, write_timings
-from reskin.config import Strict
 from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
 from reskin.metrics import score
@@ -36,17 +35,12 @@ NEAR_MM = 4.0  # near a border between two boards: about twice the skin's thickn
 Stats = dict[str, dict[str, float]]
 
 
-class Sleeve(Strict):
+class Sleeve(SectionWithTraining):
     """Section sleeve: the share of pokes held out, k nearest neighbours, and the training."""
 
     test_fraction: Annotated[float, Field(gt=0, lt=1)]  # the last pokes of each capture
     neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
-
-
-def read(settings: Settings) -> Sleeve:
-    """Read section sleeve."""
-    return settings.with_training(Sleeve, "sleeve")
 
 
 @dataclass(frozen=True)
@@ -66,10 +60,10 @@ class Area:
         return near
 
 
-def sleeve(settings: Settings, indentations: Path, results: Path) -> None:
+def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Path) -> None:
     """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
     preload_training()
-    section, captures, area = read(settings), read_captures(indentations), area_of(settings)
+    captures, area = read_captures(indentations), area_of(settings)
     data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
     train, test = hold_out_last(data.rows, section.test_fraction)
     jobs = [

@@ -65,14 +65,9 @@ class Touches(Strict):
         return self
 
 
-def read(settings: Settings) -> Touches:
-    """Read section touches."""
-    return settings.section(Touches, "touches")
-
-
-def touches(settings: Settings, indentations: Path, results: Path) -> None:
+def touches(settings: Settings, section: Touches, indentations: Path, results: Path) -> None:
     """Evaluate touches at numbered places."""
-    section, selection = read(settings), settings.section(Selection, "selection")
+    selection = settings.section(Selection, "selection")
     sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
     found = sort_recordings(
         touched_rows(io.read_readings(file), io.read_ingest_counts(file), selection) for file in sources

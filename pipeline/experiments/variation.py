@@ -42,14 +42,8 @@ class Variation(Strict):
     contacts_n: Count  # contacts of the worn skin
 
 
-def read(settings: Settings) -> Variation:
-    """Read section variation."""
-    return settings.section(Variation, "variation")
-
-
-def variation(settings: Settings, main: Path, indentations: Path, results: Path) -> None:
+def variation(settings: Settings, section: Variation, main: Path, indentations: Path, results: Path) -> None:
     """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
-    section = read(settings)
     worn = read_captures(indentations)[0]
     boards: dict[str, str] = {}
     visits: dict[str, list[Visits]] = {}

@@ -15,7 +15,7 @@ from pipeline.experiments.results import write_results
 from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import COLUMNS, SHORT, show, tabulate
 from pipeline.report.paper import TABLE_2
-from pipeline.settings import Settings
+from pipeline.settings import Adaptations, Settings, Training
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say
 from pipeline.statistics import by_skin, over_boards, over_pairs, records, select, tidy, whole
@@ -183,15 +183,10 @@ def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> 
         yield Fold(fold.experiment, f"{world}.{fold.name}", *sides)
 
 
-def read(settings: Settings) -> Worlds:
-    """Read section worlds."""
-    return settings.section(Worlds, "worlds")
-
-
-def worlds(settings: Settings, results: Path) -> None:
+def worlds(settings: Settings, section: Worlds, results: Path) -> None:
     """Train the rows of table 2 in every world, and score them there."""
     preload_training()
-    section, split = read(settings), settings.section(Split, "split")
+    split = settings.section(Split, "split")
     listed = worlds_of(simulation_settings(settings), section)
     rows, folds = None, []
     for i, world in enumerate(listed):
@@ -209,16 +204,16 @@ def worlds(settings: Settings, results: Path) -> None:
 def _train(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
     """Train single, multi and triplet networks, adapt the last, and return their cards."""
     lobo = data.folds_of("lobo")
-    jobs = make_jobs(data, data.settings.training("train_single"), data.folds_of("transfer"))
-    jobs += make_jobs(data, data.settings.training("train_multi"), lobo)
-    jobs += make_jobs(data, data.settings.training("train_triplet"), lobo, experiment="triplet")
+    jobs = make_jobs(data, data.settings.section(Training, "train_single"), data.folds_of("transfer"))
+    jobs += make_jobs(data, data.settings.section(Training, "train_multi"), lobo)
+    jobs += make_jobs(data, data.settings.section(Training, "train_triplet"), lobo, experiment="triplet")
     trained = train_jobs(data, jobs, "worlds")
     starts: PretrainedNetworks = {
         (job.recipe_name, job.fold, job.seed_i): Pretrained(result.key, result.weights, result.scaler)
         for job, result in zip(jobs, trained, strict=True)
         if job.experiment == "triplet"
     }
-    adapt = data.settings.adaptations()
+    adapt = data.settings.section(Adaptations, "adapt")
     adapted: list[TrainingJob] = [
         job
         for fold in lobo
@@ -256,7 +251,7 @@ def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dic
         "skin_modulus": first.spreads.skin_modulus,
         "friction": first.skin.hold.friction if first.skin.hold is not None else 0.0,
         "rows_n": len(data.rows), "folds_n": len(data.folds_of("lobo")) // len(listed),
-        "steps_n": data.settings.training("train_multi").recipes[HEADLINE].steps_n,
+        "steps_n": data.settings.section(Training, "train_multi").recipes[HEADLINE].steps_n,
     }  # fmt: skip
 
 

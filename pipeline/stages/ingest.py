@@ -103,18 +103,13 @@ def describe(settings: Settings, indentations: Path, description: Path) -> None:
     say(f"{settings.scene}: {indentations}: {readings_n} readings of {len(captures)} captures described")
 
 
-def read_split(settings: Settings) -> Split:
-    """Parse section split."""
-    return settings.section(Split, "split")
-
-
-def split(settings: Settings, indentations: Path, folds: Path) -> None:
+def split(settings: Settings, section: Split, indentations: Path, folds: Path) -> None:
     """Draw the folds of every experiment of the scene that holds rows out."""
     captures = settings.captures_in(indentations)
     if not settings.held_out:
         io.write_json(folds, render_folds(captures, NO_ROWS, []))
         return say(f"{settings.scene}: no experiment on {len(captures)} captures holds rows out")
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], settings.section(Selection, "selection"))
-    drawn = draw_folds(rows, settings.held_out, read_split(settings), settings.seed)
+    drawn = draw_folds(rows, settings.held_out, section, settings.seed)
     io.write_json(folds, render_folds(captures, rows, drawn))
     say(f"{settings.scene}: {len(rows)} rows of {len(captures)} captures, {len(drawn)} folds; left out: {rows.dropped}")

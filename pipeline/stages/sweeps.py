@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from pipeline.settings import Settings
+from pipeline.settings import Adaptations, Settings, Training
 from pipeline.training.jobs import (
     adaptation_jobs,
     preload_training,
@@ -30,25 +30,22 @@ class PokesSweep(Strict):
     boards_n: Annotated[int, Field(ge=1)]
 
 
-def read_sweep_pokes(settings: Settings) -> PokesSweep:
-    """Parse section sweep_pokes."""
-    return settings.section(PokesSweep, "sweep_pokes")
-
-
-def sweep_pokes(settings: Settings, indentations: Path, folds: Path, pretrained: Path, scores: Path) -> None:
+def sweep_pokes(
+    settings: Settings, section: PokesSweep, indentations: Path, folds: Path, pretrained: Path, scores: Path
+) -> None:
     """Adapt with every number of unlabelled indentations and score (paper figure 6a)."""
     preload_training()
     data, networks = read_data(settings, indentations, folds), read_pretrained(pretrained)
-    sweep, recipe = read_sweep_pokes(settings), settings.adaptations().recipes[HEADLINE]
-    held_out = data.folds_of("lobo")[-sweep.boards_n :]
-    if sweep.boards_n > len(held_out):
+    recipe = settings.section(Adaptations, "adapt").recipes[HEADLINE]
+    held_out = data.folds_of("lobo")[-section.boards_n :]
+    if section.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, sweep.boards_n, "Ask for fewer.")
+        raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, section.boards_n, "Ask for fewer.")
     named = (HEADLINE, recipe)
     pairs = [
         (job, pokes_n)
         for fold in held_out
-        for pokes_n in sweep.pokes_n
+        for pokes_n in section.pokes_n
         if pokes_n
         for job in adaptation_jobs(data, fold, named, networks, experiment="pokes", pokes_n=pokes_n)
     ]
@@ -77,11 +74,11 @@ def _points_before_adaptation(pretrained: Path, base: str, held_out: set[str]) -
 def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
     """Train the headline recipes on every draw of skins, adapt to each held-out skin, and score (paper figure 6b)."""
     preload_training()
-    data, section = read_data(settings, indentations, folds), settings.adaptations()
+    data, section = read_data(settings, indentations, folds), settings.section(Adaptations, "adapt")
     adaptation = section.recipes[HEADLINE]
     recipes = {
-        "multi": settings.training("train_multi").recipes[HEADLINE],
-        "triplet": settings.training("train_triplet").recipes[adaptation.base],
+        "multi": settings.section(Training, "train_multi").recipes[HEADLINE],
+        "triplet": settings.section(Training, "train_triplet").recipes[adaptation.base],
     }
     # Most training skins first: finished trainings are cached by their whole stack, and only in this order do the
     # folds of all skins form the stacks of `train_multi`.

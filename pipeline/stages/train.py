@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.executors import make_executor
-from pipeline.settings import Adaptations, Settings, Training, take
+from pipeline.settings import Adaptations, Row, SectionWithRows, Settings, Training, take
 from pipeline.stage import say
 from pipeline.training.before_contact import BY_TIME, score_before_contact
 from pipeline.training.jobs import (
@@ -23,7 +23,6 @@ from pipeline.training.jobs import (
     write_timings,
 )
 from reskin import io
-from reskin.config import Strict, parse
 from reskin.data.rows import SCORED
 from reskin.data.splits import ONE_SKIN
 from reskin.models.classical import Classical, ClassicalJob, run_classical_jobs
@@ -33,12 +32,7 @@ from reskin.models.trained import networks_by_fold
 NO_LABELS = np.zeros(0, np.int64)
 
 
-def read_train_single(settings: Settings) -> Training:
-    """Parse section train_single."""
-    return settings.training("train_single")
-
-
-def train_single(settings: Settings, indentations: Path, folds: Path, models: Path) -> None:
+def train_single(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
     """Train on one skin at a time: splits within a skin, and transfer to other skins (paper sections 4 and 5.1).
 
     Also scores how well a place is known before the contact, on the folds within one skin.
@@ -46,47 +40,34 @@ def train_single(settings: Settings, indentations: Path, folds: Path, models: Pa
     preload_training()
     data = read_data(settings, indentations, folds)
     folds_of_one_skin = [fold for fold in data.folds if fold.experiment in ONE_SKIN]
-    jobs = make_jobs(data, read_train_single(settings), folds_of_one_skin)
+    jobs = make_jobs(data, section, folds_of_one_skin)
     write_models(models, data, jobs, train_jobs(data, jobs, "train_single"), "train_single")
     captures, networks = io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME)
     io.write_table(models / SCORED, score_before_contact(data, indentations, captures, networks))
 
 
-def read_train_multi(settings: Settings) -> Training:
-    """Parse section train_multi."""
-    return settings.training("train_multi")
-
-
-def train_multi(settings: Settings, indentations: Path, folds: Path, models: Path) -> None:
+def train_multi(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
     """Train on the skins of all boards but one (paper section 5.1)."""
     preload_training()
     data = read_data(settings, indentations, folds)
-    jobs = make_jobs(data, read_train_multi(settings), data.folds_of("lobo"))
+    jobs = make_jobs(data, section, data.folds_of("lobo"))
     write_models(models, data, jobs, train_jobs(data, jobs, "train_multi"), "train_multi")
 
 
-def read_train_triplet(settings: Settings) -> Training:
-    """Parse section train_triplet."""
-    return settings.training("train_triplet")
-
-
-def train_triplet(settings: Settings, indentations: Path, folds: Path, models: Path) -> None:
+def train_triplet(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
     """Train on the skins of all boards but one, with the triplet loss (paper section 5)."""
     preload_training()
     data = read_data(settings, indentations, folds)
-    jobs = make_jobs(data, read_train_triplet(settings), data.folds_of("lobo"), experiment="triplet")
+    jobs = make_jobs(data, section, data.folds_of("lobo"), experiment="triplet")
     write_models(models, data, jobs, train_jobs(data, jobs, "train_triplet"), "train_triplet")
 
 
-def read_adapt(settings: Settings) -> Adaptations:
-    """Parse section adapt."""
-    return settings.adaptations()
-
-
-def adapt(settings: Settings, indentations: Path, folds: Path, pretrained: Path, models: Path) -> None:
+def adapt(
+    settings: Settings, section: Adaptations, indentations: Path, folds: Path, pretrained: Path, models: Path
+) -> None:
     """Adapt the networks with triplet loss to each held-out skin by its unlabelled indentations (paper section 5)."""
     preload_training()
-    data, section = read_data(settings, indentations, folds), read_adapt(settings)
+    data = read_data(settings, indentations, folds)
     networks = read_pretrained(pretrained)
     jobs = [
         job
@@ -97,23 +78,22 @@ def adapt(settings: Settings, indentations: Path, folds: Path, pretrained: Path,
     write_models(models, data, jobs, train_jobs(data, jobs, "adapt"), "adapt")
 
 
-class ClassicalMethods(Strict):
+class ClassicalMethods(SectionWithRows):
     """Section train_classical: classical methods, each on at most `rows_max_n` training rows."""
 
     rows_max_n: Annotated[int, Field(ge=1)]
     methods: dict[Name, Classical]
 
-
-def read_train_classical(settings: Settings) -> ClassicalMethods:
-    """Parse section train_classical, with the set of methods that it names."""
-    section, where = dict(settings["train_classical"]), f"{settings.where}: train_classical"
-    methods = settings.row("methods", take(section, "methods", where))
-    return parse(ClassicalMethods, section | {"methods": methods}, where)
+    @classmethod
+    def expand(cls, section: Row, settings: Settings, where: str) -> Row:
+        return section | {"methods": settings.row("methods", take(section, "methods", where))}
 
 
-def train_classical(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
+def train_classical(
+    settings: Settings, section: ClassicalMethods, indentations: Path, folds: Path, scores: Path
+) -> None:
     """Fit classical methods on the folds of train_multi."""
-    data, section = read_data(settings, indentations, folds), read_train_classical(settings)
+    data = read_data(settings, indentations, folds)
     pairs = [(fold, name, method) for fold in data.folds_of("lobo") for name, method in section.methods.items()]
     jobs = [
         ClassicalJob(f"{name}.{fold.name}", method, fold.train, fold.test, NO_LABELS, section.rows_max_n, settings.seed)

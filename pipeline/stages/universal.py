@@ -27,15 +27,10 @@ from reskin.models.classical import run_classical_jobs
 from reskin.universal.training import TrainingSettings
 
 
-def read_few_labels(settings: Settings) -> FewLabels:
-    """Parse section few_labels."""
-    return few.read_few_labels(settings)
-
-
-def few_labels(settings: Settings, indentations: Path, folds: Path, scores: Path) -> None:
+def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds: Path, scores: Path) -> None:
     """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
     data = read_data(settings, indentations, folds)
-    study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, read_few_labels(settings))
+    study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, section)
     done: list[few.Done] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each starts from earlier networks
         pairs = step(study, done)
@@ -65,23 +60,20 @@ class UniversalSection(TrainingSettings):
     labels_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
-def read_universal(settings: Settings) -> UniversalSection:
-    """Parse section universal."""
-    return settings.section(UniversalSection, "universal")
-
-
-def universal(settings: Settings, indentations: Path, folds: Path, models: Path, scores: Path) -> None:
+def universal(
+    settings: Settings, section: UniversalSection, indentations: Path, folds: Path, models: Path, scores: Path
+) -> None:
     """Score the universal model on every held-out board, with every number of labels, on the rows of few_labels.
 
     The map alone, and with networks; knowing the other boards of the rig, and simulated skins alone.
     """
-    known, training = read_known_boards(settings, indentations, folds), read_universal(settings)
-    variants = make_variants(known, training)
-    write_networks(models, variants, training, settings.seed)
-    nominal_powers = calibrate_on_simulated(variants.nominal, training.labels_n, settings.seed)
+    known = read_known_boards(settings, indentations, folds)
+    variants = make_variants(known, section)
+    write_networks(models, variants, section, settings.seed)
+    nominal_powers = calibrate_on_simulated(variants.nominal, section.labels_n, settings.seed)
     benchmark, points = Benchmark(known, variants.nominal, {}, nominal_powers), []
-    benchmark = replace(benchmark, board_powers=calibrate_on_boards(benchmark, training.labels_n))
+    benchmark = replace(benchmark, board_powers=calibrate_on_boards(benchmark, section.labels_n))
     for fold in known.data.folds_of(EXPERIMENT):
-        points += score_fold(benchmark, fold, variants.rig, training.labels_n)
+        points += score_fold(benchmark, fold, variants.rig, section.labels_n)
         say(f"{settings.scene} universal: {fold.name} done")
     io.write_json(scores, points)

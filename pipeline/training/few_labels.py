@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Int64
 from pydantic import Field, model_validator
 
-from pipeline.settings import Settings, take
-from reskin.config import Strict, parse
+from pipeline.settings import Row, SectionWithRows, Settings, take
 from reskin.data.lines import grid_lines
 from reskin.data.rows import Rows
 from reskin.data.splits import Fold, labelling_order
@@ -26,7 +25,7 @@ EXPERIMENT = "labels"
 Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 
 
-class FewLabels(Strict):
+class FewLabels(SectionWithRows):
     """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
 
     adapted: recipes that are also adapted by unlabelled indentations, with the settings `adapting`.
@@ -39,6 +38,17 @@ class FewLabels(Strict):
     labelling: FineTuningRecipe
     rows_max_n: Annotated[int, Field(ge=1)]
     methods: dict[Name, Classical]
+
+    @classmethod
+    def expand(cls, section: Row, settings: Settings, where: str) -> Row:
+        base = settings.row("recipes", take(section, "recipe", where)) | {"steps_n": take(section, "steps_n", where)}
+        adapting, labelling = dict(take(section, "adapting", where)), dict(take(section, "labelling", where))
+        return section | {
+            "recipes": {name: base | changes for name, changes in take(section, "recipes", where).items()},
+            "adapting": settings.row("adaptations", take(adapting, "adaptation", where)) | adapting,
+            "labelling": settings.row("labellings", take(labelling, "labelling", where)) | labelling,
+            "methods": settings.row("methods", take(section, "methods", where)),
+        }
 
     @model_validator(mode="after")
     def _adapts_what_it_trains(self) -> "FewLabels":
@@ -68,20 +78,6 @@ class Entry:
 
 
 Done = tuple[Entry, TrainingJob, TrainingResult]
-
-
-def read_few_labels(settings: Settings) -> FewLabels:
-    """Read section few_labels, with the rows of params.yaml that it names."""
-    section, where = dict(settings["few_labels"]), f"{settings.where}: few_labels"
-    base = settings.row("recipes", take(section, "recipe", where)) | {"steps_n": take(section, "steps_n", where)}
-    adapting, labelling = dict(take(section, "adapting", where)), dict(take(section, "labelling", where))
-    resolved = {
-        "recipes": {name: base | changes for name, changes in take(section, "recipes", where).items()},
-        "adapting": settings.row("adaptations", take(adapting, "adaptation", where)) | adapting,
-        "labelling": settings.row("labellings", take(labelling, "labelling", where)) | labelling,
-        "methods": settings.row("methods", take(section, "methods", where)),
-    }
-    return parse(FewLabels, section | resolved, where)
 
 
 def network_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:

@@ -165,7 +165,7 @@ def adaptation_job(
     name, settings = named
     test = fold.test[data.rows.skin[fold.test] == pokes.skin]
     start = select_pretrained(pretrained, settings.base, fold)[pokes.seed_i]
-    recipe = data.settings.training("train_triplet").recipes[settings.base]
+    recipe = data.settings.section(Training, "train_triplet").recipes[settings.base]
     return TrainingJob(
         pokes.experiment, name, recipe, fold.name, data.settings.seed, pokes.seed_i, fold.train, test,
         Adaptation(start, settings, pokes.lines), pokes.skin, pokes.what,

@@ -9,6 +9,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from pipeline import statistics
+from pipeline.settings import Training
 from pipeline.training.jobs import (
     PretrainedNetworks,
     SceneData,
@@ -47,7 +48,7 @@ def predict_before(
     """Predict a skin's test rows with the networks as they are before adaptation."""
     from reskin.models.network import Predictor  # imports torch: only a stage that predicts needs it
 
-    recipe = data.settings.training("train_triplet").recipes[settings.base]
+    recipe = data.settings.section(Training, "train_triplet").recipes[settings.base]
     test = fold.test[data.rows.skin[fold.test] == skin]
     view = VIEW[recipe.inputs](data.rows.db_uT[test])
     for seed_i, start in select_pretrained(starts, settings.base, fold).items():

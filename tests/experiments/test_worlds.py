@@ -62,7 +62,7 @@ def files() -> Settings:
 
 
 def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, tmp_path):
-    worlds(files, results=tmp_path / "results.json")
+    worlds(files, files.section(Worlds, "worlds"), results=tmp_path / "results.json")
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [(one["factor"], one["value"]) for one in numbers["by_world"]] == [("default", 1.0), ("residual", 0.42)]
     for one in numbers["by_world"]:

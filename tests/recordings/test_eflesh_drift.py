@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from pipeline.experiments.drift import drift
+from pipeline.experiments.drift import Drift, drift
 from pipeline.settings import Settings, read_shared_files
 from reskin import io
 from reskin.recordings.readers import eflesh
@@ -27,8 +27,9 @@ def test_fresh_no_load_readings_keep_eflesh_accurate(shared_data, tmp_path, monk
     yaml = YAML(typ="safe")
     settings = yaml.load((ROOT / "pipeline/scenes/eflesh.yaml").read_text())
     settings["drift"]["training"]["steps_n"] = 300
+    of_scene = Settings("eflesh", "eflesh.yaml", settings, read_shared_files(ROOT), (readings.capture,))
     drift(
-        Settings("eflesh", "eflesh.yaml", settings, read_shared_files(ROOT), (readings.capture,)),
+        of_scene, of_scene.section(Drift, "drift"),
         indentations=tmp_path / "indentations", results=tmp_path / "results.json",
     )  # fmt: skip
     numbers = io.read_json(tmp_path / "results.json")["numbers"]

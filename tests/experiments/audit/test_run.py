@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.experiments.audit import audit
-from pipeline.settings import Settings
-from pipeline.stages.ingest import read_split
+from pipeline.experiments.audit import AuditSettings, audit
+from pipeline.settings import Adaptations, Settings, Training
 from pipeline.training import jobs as _training
 from pipeline.training.jobs import SceneData, adaptation_jobs, make_jobs, read_data, read_pretrained, write_models
 from reskin import io
 from reskin.data.rows import Selection, load_rows
-from reskin.data.splits import Fold, draw_folds, parse_folds, render_folds
+from reskin.data.splits import Fold, Split, draw_folds, parse_folds, render_folds
 from reskin.errors import LeakError
 from reskin.models.batches import prepare
 from reskin.models.inputs import FIT, VIEW
@@ -83,21 +82,24 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     rows = load_rows(
         [folder / f"indentations/{skin}.parquet" for skin in skins], parsed.section(Selection, "selection")
     )
-    drawn = draw_folds(rows, ("single_random", "lobo"), read_split(parsed), parsed.seed)
+    drawn = draw_folds(rows, ("single_random", "lobo"), parsed.section(Split, "split"), parsed.seed)
     io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
     data = scenery(folder)
     for arm, section, experiment in (
-        ("train_single", parsed.training("train_single"), "single_random"),
-        ("train_multi", parsed.training("train_multi"), "lobo"),
+        ("train_single", parsed.section(Training, "train_single"), "single_random"),
+        ("train_multi", parsed.section(Training, "train_multi"), "lobo"),
     ):
         write(folder, arm, data, make_jobs(data, section, data.folds_of(experiment)))
     write(
         folder,
         "train_triplet",
         data,
-        make_jobs(data, parsed.training("train_triplet"), data.folds_of("lobo"), experiment="triplet"),
+        make_jobs(data, parsed.section(Training, "train_triplet"), data.folds_of("lobo"), experiment="triplet"),
     )
-    starts, named = read_pretrained(folder / "models/train_triplet"), ("paper", parsed.adaptations().recipes["paper"])
+    starts, named = (
+        read_pretrained(folder / "models/train_triplet"),
+        ("paper", parsed.section(Adaptations, "adapt").recipes["paper"]),
+    )
     adapted = [
         adaptation_jobs(data, fold, named, starts, experiment="adapt", pokes_n=8) for fold in data.folds_of("lobo")
     ]
@@ -147,8 +149,10 @@ def settings_of(folder: Path) -> Settings:
 
 def audited(folder: Path) -> list[dict]:
     results = folder / "audit.json"
+    of_scene = settings_of(folder)
     audit(
-        settings_of(folder), folder / "indentations", folder / "folds.json", folder / "models", folder / "choice.json",
+        of_scene, of_scene.section(AuditSettings, "audit"), folder / "indentations",
+        folder / "folds.json", folder / "models", folder / "choice.json",
         results,
     )  # fmt: skip
     return io.read_json(results)

@@ -10,8 +10,8 @@ from ruamel.yaml import YAML
 
 from pipeline.experiments import drift as drift_pages
 from pipeline.experiments import variation as variation_pages
-from pipeline.experiments.drift import add_walk, drift
-from pipeline.experiments.variation import variation
+from pipeline.experiments.drift import Drift, add_walk, drift
+from pipeline.experiments.variation import Variation, variation
 from pipeline.settings import Settings, read_shared_files
 from reskin import io
 from reskin.data.grid import points_mm
@@ -64,8 +64,12 @@ def scene(tmp_path, monkeypatch) -> dict[str, Any]:
     }
 
 
+def drift_section(scene: dict[str, Any]) -> Drift:
+    return scene["settings"].section(Drift, "drift")
+
+
 def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(scene, tmp_path):
-    drift(indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
+    drift(section=drift_section(scene), indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
     results = io.read_json(scene["results"])
     numbers = results["numbers"]
     assert {name: numbers[name] for name in ("skins_n", "seeds_n", "train_n", "left_out_units_n")} == {
@@ -107,7 +111,7 @@ def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(sc
 def test_no_walk_is_added_to_recordings(scene, tmp_path):
     worn = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
     with pytest.raises(ParamsError, match="drift.wander_uT must be none in a recorded scene"):
-        drift(indentations=worn, **scene)
+        drift(section=drift_section(scene), indentations=worn, **scene)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +126,7 @@ def test_no_walk_is_added_to_recordings(scene, tmp_path):
 )
 def test_captures_without_order_or_windows_are_an_error_before_training(scene, tmp_path, captures, sentence):
     with pytest.raises(ParamsError, match=sentence):
-        drift(indentations=write(tmp_path / "wear", *captures), **scene)
+        drift(section=drift_section(scene), indentations=write(tmp_path / "wear", *captures), **scene)
     assert not (tmp_path / ".reskin").exists()
 
 
@@ -131,7 +135,7 @@ def test_variation_finds_the_drift_over_time_and_the_gain_between_skins(scene, t
     main = write(
         tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
     )
-    variation(main=main, indentations=worn, **scene)
+    variation(section=scene["settings"].section(Variation, "variation"), main=main, indentations=worn, **scene)
     results = io.read_json(scene["results"])
     assert results["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
     assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
