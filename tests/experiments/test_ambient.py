@@ -1,4 +1,4 @@
-"""Ambient fields and iron: readings of boards, what subtraction removes, scores, tables and figures."""
+"""Tests of ambient fields and iron: readings, compensation, scores, tables and figures."""
 
 from dataclasses import replace
 
@@ -44,39 +44,39 @@ def uniform(b_T, chips_n=5):
 
 
 @given(fields_T)
-def test_changes_of_readings_equal_those_of_simulated_chips(b_T):
+def test_readings_change_like_those_of_simulated_chips(b_T):
     chip = ChipDesign(gain_sel=6, noise_temperature_degC=0.0, **QUIET)
     at_rest, with_field = (
         read_field(uniform(field), REAL.board, design=chip, rng=rng_for(0, "x"))[0] for field in (0 * b_T, b_T)
     )
-    # Two readings, each rounded to half a step.
+    # Two readings, each with a rounding error of half a step.
     assert np.abs((with_field - at_rest) - readings_uT(REAL.board, uniform(b_T))).max() <= steps_uT(6).max() * 1.001
 
 
 @given(fields_T)
-def test_both_methods_remove_a_uniform_field_from_a_perfect_board(b_T):
+def test_perfect_board_removes_a_uniform_field(b_T):
     added_uT = readings_uT(PERFECT.board, uniform(b_T))
-    off = remove_common_part(PERFECT.turn)
-    assert np.abs(added_uT @ off.T).max() < ROUNDING_uT
+    projection = remove_common_part(PERFECT.turn)
+    assert np.abs(added_uT @ projection.T).max() < ROUNDING_uT
     silent = replace(PERFECT, noise_uT=np.zeros(3))
     guess = reference_uT(silent, b_T[None], rng_for(0, "silent"))
     np.testing.assert_allclose(guess, added_uT, rtol=0, atol=ROUNDING_uT)
 
 
-def test_of_a_real_board_its_unknown_gains_and_tilts_stay():
+def test_unknown_gains_and_tilts_leave_a_residual():
     added_uT = readings_uT(REAL.board, uniform(np.array([0, 0, 5e-5])))
-    left_uT = added_uT @ remove_common_part(REAL.turn).T
-    assert 0.1 < np.abs(left_uT).max() < 10  # gains of 2.5 % and tilts of 2 degrees, of 50 uT
+    residual_uT = added_uT @ remove_common_part(REAL.turn).T
+    assert 0.1 < np.abs(residual_uT).max() < 10  # gains of 2.5 % and tilts of 2 degrees in 50 uT
 
 
-def test_taking_the_common_part_off_twice_takes_no_more():
-    off = remove_common_part(REAL.turn)
-    np.testing.assert_allclose(off @ off, off, atol=1e-12)
-    np.testing.assert_allclose(off, off.T, atol=1e-12)
-    assert np.linalg.matrix_rank(off) == 15 - 3
+def test_common_mode_removal_is_idempotent():
+    projection = remove_common_part(REAL.turn)
+    np.testing.assert_allclose(projection @ projection, projection, atol=1e-12)
+    np.testing.assert_allclose(projection, projection.T, atol=1e-12)
+    assert np.linalg.matrix_rank(projection) == 15 - 3
 
 
-def test_the_common_part_is_the_mean_over_chips_in_the_boards_frame():
+def test_common_mode_is_the_mean_in_the_board_frame():
     db_uT = rng_for(0, "db").normal(0, 50, (4, 15)).astype(np.float32)
     naive = np.empty((4, 15))
     for i, row in enumerate(db_uT.reshape(4, 5, 3)):
@@ -85,24 +85,24 @@ def test_the_common_part_is_the_mean_over_chips_in_the_boards_frame():
     np.testing.assert_allclose(project(db_uT, remove_common_part(REAL.turn)), naive, atol=1e-4)  # float32 of 200 uT
 
 
-def test_the_chip_aside_is_as_noisy_as_the_means_of_its_readings():
-    drawn_uT = reference_uT(PERFECT, np.zeros((4000, 3)), rng_for(0, "noise")).reshape(4000, 5, 3)[:, 0]
+def test_reference_chip_noise_is_averaged():
+    read_uT = reference_uT(PERFECT, np.zeros((4000, 3)), rng_for(0, "noise")).reshape(4000, 5, 3)[:, 0]
     expected_uT = np.array([3.3, 3.3, 5.0]) * np.sqrt(1 / 3 + 1 / 4)  # readings and no-load frames of the scene
-    np.testing.assert_allclose(drawn_uT.std(axis=0), expected_uT, rtol=0.06)  # five sd of an sd from 4000
+    np.testing.assert_allclose(read_uT.std(axis=0), expected_uT, rtol=0.06)  # 5 standard errors
 
 
-def test_iron_is_felt_less_far_away_and_less_by_the_chip_aside():
+def test_iron_disturbance_falls_with_distance():
     skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
-    both = [iron_fields(REAL, skin, radius_mm=5.0, distance_mm=mm) for mm in (2.0, 5.0, 20.0, 80.0)]
-    chips_uT = [rms_uT(chips) for chips, _ in both]
+    disturbances = [iron_fields(REAL, skin, radius_mm=5.0, distance_mm=mm) for mm in (2.0, 5.0, 20.0, 80.0)]
+    chips_uT = [rms_uT(chips) for chips, _ in disturbances]
     assert chips_uT == sorted(chips_uT, reverse=True)
-    assert rms_uT(both[0][1]) < 0.2 * chips_uT[0]
-    # Far away only the earth magnetises it: its dipole is then at the same distance of all chips, within 10 %.
+    assert rms_uT(disturbances[0][1]) < 0.2 * chips_uT[0]
+    # Far away, the ball is magnetised by the earth alone, and its distance from all chips is equal within 10 %.
     dipole_uT = 2 * 50 * (5 / 87) ** 3
     assert 0.4 * dipole_uT < chips_uT[-1] < 1.1 * dipole_uT
 
 
-def test_each_row_keeps_its_direction_and_each_strength_adds_in_proportion():
+def test_rows_keep_direction_and_scale_with_strength():
     cases = list(uniform_fields(REAL, [10.0, 50.0], rows_n=60, rng=rng_for(0, "cases")))
     assert [case.keys["field_uT"] for case in cases] == [0.0, 10.0, 50.0]
     assert not cases[0].added_uT.any()
@@ -110,7 +110,7 @@ def test_each_row_keeps_its_direction_and_each_strength_adds_in_proportion():
     assert len(np.unique(cases[1].added_uT.round(6), axis=0)) == 60
 
 
-def test_each_row_has_the_iron_over_its_own_skin():
+def test_iron_is_placed_over_the_rows_own_skin():
     rule = SCENE.main_boards.quadrature.in_si()
     skins = [draw_skin(SCENE.skin, SCENE.spreads, seed=1, name=name, rule=rule) for name in ("b0_s0", "b0_s1")]
     (case,) = iron_balls(
@@ -122,7 +122,7 @@ def test_each_row_has_the_iron_over_its_own_skin():
     assert (case.added_uT[0] != case.added_uT[1]).all()
 
 
-def test_one_row_of_every_poke_is_kept():
+def test_one_row_of_each_poke_is_kept():
     indentation = np.repeat(np.arange(8), 5)
     own = np.arange(5, 35)
     kept = one_row_per_poke(indentation, own, rng_for(0, "kept"))
@@ -131,9 +131,9 @@ def test_one_row_of_every_poke_is_kept():
     assert len(set(kept % 5)) > 1  # not always the first reading
 
 
-def test_arms_are_put_together_over_the_boards_that_they_were_tried_on():
-    def point(board, arm, accuracy, **words):
-        return {"board": board, "arm": arm, "scores": {"accuracy_pct": accuracy, "mse_xy_mm2": 1.0}, **words}
+def test_variants_are_summarised_over_their_boards():
+    def point(board, method, accuracy, **keys):
+        return {"board": board, "arm": method, "scores": {"accuracy_pct": accuracy, "mse_xy_mm2": 1.0}, **keys}
 
     points = [
         point("b0", "a", 80.0, field_uT=5.0), point("b1", "a", 60.0, field_uT=5.0),
@@ -147,16 +147,16 @@ def test_arms_are_put_together_over_the_boards_that_they_were_tried_on():
         "mean": 70.0, "n": 2, "sd": pytest.approx(np.sqrt(200)), "values": [80.0, 60.0],
     }  # fmt: skip
     assert rows[1]["b"]["accuracy_pct"] == {"mean": 50.0, "n": 1}
-    again = [point("b0", "a", 84.0, field_uT=5.0), point("b1", "a", 60.0, field_uT=5.0)]  # of other seeds
-    both = scores_by_field([*points, *again], "field_uT", ["b0", "b1"])[1]["a"]["accuracy_pct"]
-    assert (both["mean"], both["n"]) == (71.0, 2)  # boards
-    assert both["sd_seeds"] == pytest.approx(np.sqrt(8) / 2)
+    again = [point("b0", "a", 84.0, field_uT=5.0), point("b1", "a", 60.0, field_uT=5.0)]  # other seeds
+    variant_a = scores_by_field([*points, *again], "field_uT", ["b0", "b1"])[1]["a"]["accuracy_pct"]
+    assert (variant_a["mean"], variant_a["n"]) == (71.0, 2)  # boards
+    assert variant_a["sd_seeds"] == pytest.approx(np.sqrt(8) / 2)
     (iron,) = scores_by_field(points, "distance_mm", ["b0", "b1"])
     assert iron["field_uT"] == pytest.approx(np.sqrt(12.5))
     assert scores_by_field(points, "field_uT", ["b0"])[1]["a"]["accuracy_pct"]["mean"] == 80.0
 
 
-def test_a_fields_size_is_that_of_its_vectors():
+def test_field_size_is_the_norm_of_its_vectors():
     assert rms_uT(np.array([[[3.0, 4.0, 0.0], [0.0, 0.0, 5.0]]]) * micro) == pytest.approx(5.0)
 
 
@@ -165,9 +165,9 @@ def scores(accuracy, boards_n):
 
 
 def rows(boards_n):
-    arms = {"a": scores(80.0, boards_n), "b": scores(70.0, boards_n), "c": scores(60.0, 1)}
+    methods = {"a": scores(80.0, boards_n), "b": scores(70.0, boards_n), "c": scores(60.0, 1)}
     iron = {"distance_mm": 2.0, "field_uT": 44.0, "aside_field_uT": 2.0}
-    return {"uniform": [{"field_uT": 0.0} | arms, {"field_uT": 50.0} | arms], "iron": [iron | arms]}
+    return {"uniform": [{"field_uT": 0.0} | methods, {"field_uT": 50.0} | methods], "iron": [iron | methods]}
 
 
 NUMBERS = {
@@ -177,7 +177,7 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def test_an_arm_of_one_board_stands_beside_others_on_that_board_alone():
+def test_single_board_variant_is_compared_on_that_board():
     table = tables(NUMBERS, "simulated")["ambient"]
     assert set(table[table["boards"] == "all held out"]["method"]) == {"a", "b"}
     assert table[table["boards"] == "b2"]["method"].tolist() == ["a", "b", "c"] * 3
@@ -186,9 +186,9 @@ def test_an_arm_of_one_board_stands_beside_others_on_that_board_alone():
     assert "20 mm across" in table.attrs["meaning"]
 
 
-def test_the_figure_names_arms_units_the_earth_the_board_and_the_source():
-    drawn = figures(NUMBERS, {}, "simulated")
-    words = texts_of(drawn["ambient.svg"])
-    for word in ("a", "b", "c", "uniform field / µT", "iron ball above the skin / mm", "earth", "b2", "(simulated)"):
-        assert word in words.split() or word in words
-    assert figures(NUMBERS, {}, "simulated") == drawn
+def test_figure_labels():
+    texts = figures(NUMBERS, {}, "simulated")
+    keys = texts_of(texts["ambient.svg"])
+    for label in ("a", "b", "c", "uniform field / µT", "iron ball above the skin / mm", "earth", "b2", "(simulated)"):
+        assert label in keys.split() or label in keys
+    assert figures(NUMBERS, {}, "simulated") == texts

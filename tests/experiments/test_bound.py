@@ -1,4 +1,4 @@
-"""The bound against simulated chips and a linear estimate, its slopes against those of a dipole, and its scaling."""
+"""Tests of the error bound against simulated chips, a linear estimate and a dipole, and of its scaling."""
 
 import math
 from dataclasses import replace
@@ -38,12 +38,12 @@ NO_LABEL_ERRORS = {"place_sd_mm": 0.0, "force_sd_N": 0.0}
 
 
 def linear_sensor(rng):
-    """15 channels that answer on a straight line, x and y coupled; force by depth alone."""
+    """Return slopes of 15 linear channels with coupled x and y, and of a force that depends on depth alone."""
     db_slopes = rng.normal(size=(1, 15, 3)) * np.array([2.0, 3.0, 8.0])
     return db_slopes + 0.7 * db_slopes[:, :, [1, 0, 2]], np.array([[0.0, 0.0, 1.7]])
 
 
-def test_the_best_linear_estimate_scores_what_the_bound_says():
+def test_linear_estimate_reaches_the_bound():
     rng = rng_for(1, "linear sensor")
     db_slopes, force_slopes = linear_sensor(rng)
     var_uT2 = np.tile([10.0, 10.0, 25.0], 5)
@@ -52,45 +52,45 @@ def test_the_best_linear_estimate_scores_what_the_bound_says():
     truth = rng.uniform(-8, 8, size=(ROWS_N, 3))
     db_uT = truth @ db_slopes[0].T + np.sqrt(var_uT2) * rng.standard_normal((ROWS_N, 15))
     weighted = db_slopes[0] / np.sqrt(var_uT2)[:, None]
-    found = np.linalg.lstsq(weighted, (db_uT / np.sqrt(var_uT2)).T, rcond=None)[0].T
-    found[:, 2] *= force_slopes[0, 2]
+    estimated = np.linalg.lstsq(weighted, (db_uT / np.sqrt(var_uT2)).T, rcond=None)[0].T
+    estimated[:, 2] *= force_slopes[0, 2]
     truth[:, 2] *= force_slopes[0, 2]
-    wrong = np.array([labels["place_sd_mm"]] * 2 + [labels["force_sd_N"]]) * rng.standard_normal((ROWS_N, 3))
-    scores = score(truth + wrong, found)
-    assert 20 < scores["accuracy_pct"] < 98  # else nothing is tested
+    label_errors = np.array([labels["place_sd_mm"]] * 2 + [labels["force_sd_N"]]) * rng.standard_normal((ROWS_N, 3))
+    scores = score(truth + label_errors, estimated)
+    assert 20 < scores["accuracy_pct"] < 98  # the test is meaningful
     assert expected["accuracy_pct"][0] == pytest.approx(scores["accuracy_pct"], abs=100 * SAMPLING / 2)
     assert expected["mse_xy_mm2"][0] == pytest.approx(scores["mse_xy_mm2"], rel=SAMPLING * math.sqrt(2))
     assert expected["mse_f_N2"][0] == pytest.approx(scores["mse_f_N2"], rel=SAMPLING * math.sqrt(2))
 
 
 @given(st.floats(0.05, 5.0), st.floats(0.05, 5.0))
-def test_without_correlation_the_probability_is_that_of_each_axis_times_the_other(h, k):
-    known = math.erf(h / math.sqrt(2)) * math.erf(k / math.sqrt(2))
-    assert probability_within(np.array([[h, k]]), np.zeros(1))[0] == pytest.approx(known, abs=1e-12)
+def test_uncorrelated_probability_factorises(h, k):
+    expected = math.erf(h / math.sqrt(2)) * math.erf(k / math.sqrt(2))
+    assert probability_within(np.array([[h, k]]), np.zeros(1))[0] == pytest.approx(expected, abs=1e-12)
 
 
 @given(st.floats(0.1, 3.0), st.floats(0.1, 3.0), st.floats(-0.95, 0.95))
-def test_with_correlation_the_probability_is_the_integral_over_one_axis(h, k, r):
+def test_correlated_probability_equals_an_integral(h, k, r):
     nodes, weights = np.polynomial.legendre.leggauss(200)
     x, root = h * nodes, math.sqrt(1 - r**2)
     reach = np.vectorize(math.erf)
     inner = (reach((k - r * x) / root / math.sqrt(2)) - reach((-k - r * x) / root / math.sqrt(2))) / 2
-    known = h * (weights * np.exp(-(x**2) / 2) * inner).sum() / math.sqrt(2 * math.pi)
-    assert probability_within(np.array([[h, k]]), np.array([r]))[0] == pytest.approx(known, abs=1e-10)
+    expected = h * (weights * np.exp(-(x**2) / 2) * inner).sum() / math.sqrt(2 * math.pi)
+    assert probability_within(np.array([[h, k]]), np.array([r]))[0] == pytest.approx(expected, abs=1e-10)
 
 
-def test_the_variance_is_that_of_rows_which_the_chips_read():
+def test_variance_equals_that_of_sampled_readings():
     board, readings_n, noload_n = draw_board(SCENE.main_boards.design, SCENE.spreads, seed=1, name="b0"), 2, 10
     still = np.zeros((ROWS_N // 4 * (readings_n + noload_n), 5, 3))
     b_uT = read_field(still, board, design=CHIP, rng=rng_for(1, "still"))[0].astype(float)
     dwells_uT = b_uT.reshape(-1, readings_n + noload_n, 15)
     db_uT = dwells_uT[:, :readings_n].mean(axis=1) - dwells_uT[:, readings_n:].mean(axis=1)
-    known = noise_var_uT2(CHIP, 5, readings_n=readings_n, noload_frames_n=noload_n)
-    np.testing.assert_allclose(db_uT.var(axis=0), known, rtol=SAMPLING * 2)
+    expected = noise_var_uT2(CHIP, 5, readings_n=readings_n, noload_frames_n=noload_n)
+    np.testing.assert_allclose(db_uT.var(axis=0), expected, rtol=SAMPLING * 2)
 
 
-def test_slopes_are_those_of_a_dipole_over_a_chip():
-    def read(mm):  # Bz on a chip under a moment along z, 3 mm above it and deeper by the poke
+def test_slopes_equal_those_of_a_dipole():
+    def read(mm):  # Bz at a chip 3 mm below a moment along z, which the poke moves down
         x, y, z = mm[:, 0], mm[:, 1], 3.0 - mm[:, 2]
         r2 = x**2 + y**2 + z**2
         return ((3 * z**2 - r2) / r2**2.5)[:, None]
@@ -100,12 +100,12 @@ def test_slopes_are_those_of_a_dipole_over_a_chip():
     r2 = x**2 + y**2 + z**2
     by_rho = (3 * r2 - 15 * z**2) / r2**3.5
     by_z = (9 * z * r2 - 15 * z**3) / r2**3.5
-    known = np.stack([x * by_rho, y * by_rho, -by_z], axis=1)[:, None]
-    np.testing.assert_allclose(slopes(read, pokes_mm), known, rtol=1e-3, atol=1e-6)  # of the square of the step
+    expected = np.stack([x * by_rho, y * by_rho, -by_z], axis=1)[:, None]
+    np.testing.assert_allclose(slopes(read, pokes_mm), expected, rtol=1e-3, atol=1e-6)  # quadratic in the step
 
 
 @given(st.floats(0.1, 10.0))
-def test_the_bound_falls_with_the_noise_and_as_one_over_the_square_root_of_the_readings(factor):
+def test_bound_scales_with_noise_and_readings(factor):
     db_slopes, force_slopes = linear_sensor(rng_for(2, "linear sensor"))
     one, four = (noise_var_uT2(CHIP, 5, readings_n=n, noload_frames_n=10 * n) for n in (1, 4))
     least = least_covariance(db_slopes, force_slopes, one)
@@ -116,7 +116,7 @@ def test_the_bound_falls_with_the_noise_and_as_one_over_the_square_root_of_the_r
     np.testing.assert_allclose(2 * sds[0], sds[1], rtol=1e-9)
 
 
-def test_every_place_is_bounded_and_deeper_presses_and_exact_labels_are_told_better():
+def test_bound_falls_with_depth_and_exact_labels():
     numbers = bound_errors(SCENE, seed=1)
     assert [row["depth_mm"] for row in numbers["by_depth"]] == sorted(SCENE.main.depths_mm)
     assert (numbers["places_n"], numbers["above_the_skin_n"]) == (65, 0)
@@ -127,7 +127,7 @@ def test_every_place_is_bounded_and_deeper_presses_and_exact_labels_are_told_bet
     assert scored["mse_f_N2"] - signal["mse_f_N2"] == pytest.approx(SCENE.rig.force_noise_N**2)
 
 
-def test_pokes_above_the_skin_are_marked_and_a_skin_out_of_reach_is_an_error():
+def test_pokes_above_the_skin_are_marked():
     skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
     depths_mm = np.array([0.2, 0.6])
     assert reach_skin(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
@@ -135,7 +135,7 @@ def test_pokes_above_the_skin_are_marked_and_a_skin_out_of_reach_is_an_error():
         reach_skin(replace(skin, depth_zero_m=-0.7e-3), depths_mm)
 
 
-def test_networks_of_another_skin_are_refused(tmp_path):
+def test_networks_of_another_skin_are_an_error(tmp_path):
     card = {"question": NETWORK, "recipe_name": "paper", "train_skins": ["b0_s1"]}
     io.write_json(tmp_path / "one.json", card)
     with pytest.raises(SchemaError, match="skin of single_pass must be b0_s0, as bounded; got"):
@@ -151,7 +151,7 @@ NUMBERS = {
 }  # fmt: skip
 
 
-def test_the_network_stands_beside_the_bound_over_all_depths():
+def test_network_is_compared_with_the_bound():
     table = tables(NUMBERS, "simulated")["bound"]
     assert table["depth, mm"].tolist() == ["0.2", "1.2", "all"]
     assert table["MSE_xy, mm² (bound)"].tolist() == ["0.01"] * 3
@@ -160,7 +160,7 @@ def test_the_network_stands_beside_the_bound_over_all_depths():
     assert set(table["source"]) == {"simulated"}
 
 
-def test_pokes_that_touch_nothing_are_told_of():
+def test_pokes_without_contact_are_noted():
     assert "left out" not in tables(NUMBERS, "simulated")["bound"].attrs["meaning"]
-    told = tables(NUMBERS | {"above_the_skin_n": 65}, "simulated")["bound"].attrs["meaning"]
-    assert "65 pokes that do not touch the skin are left out" in told
+    meaning = tables(NUMBERS | {"above_the_skin_n": 65}, "simulated")["bound"].attrs["meaning"]
+    assert "65 pokes that do not touch the skin are left out" in meaning

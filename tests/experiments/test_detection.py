@@ -1,4 +1,4 @@
-"""Scores of detectors against plain loops and scikit-learn's ROC area."""
+"""Tests of contact detectors against naive loops and scikit-learn's ROC area."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from reskin.seeds import rng_for
 SCORES = st.lists(st.integers(0, 9), min_size=1, max_size=30).map(lambda values: np.array(values, float))
 
 
-def drawn(name, *shape):
+def random_fields(name, *shape):
     return rng_for(0, "oddness", name).normal(0, 40, shape)
 
 
@@ -31,44 +31,44 @@ def nearest_by_loops(known, tested):
     return np.array(found)
 
 
-def test_neighbour_distance_is_what_loops_find():
-    known, tested = drawn("known", 40, 4) * [1, 10, 100, 1000], drawn("tested", 7, 4)
+def test_neighbour_distance_equals_loops():
+    known, tested = random_fields("known", 40, 4) * [1, 10, 100, 1000], random_fields("tested", 7, 4)
     scaled = nearest_by_loops(known / known.std(axis=0), tested / known.std(axis=0))
     np.testing.assert_allclose(neighbour_distance(known, tested), scaled, rtol=1e-9)
 
 
-def test_directions_are_compared_above_noise():
-    known, tested = drawn("known", 40, 4), drawn("tested", 7, 4)
+def test_direction_distance_equals_loops():
+    known, tested = random_fields("known", 40, 4), random_fields("tested", 7, 4)
     soft = [np.array([row / (np.sqrt((row**2).sum()) + NOISE_uT) for row in rows]) for rows in (known, tested)]
     np.testing.assert_allclose(direction_distance(known, tested), nearest_by_loops(*soft), rtol=1e-9)
 
 
-def test_direction_distance_of_strong_readings_does_not_depend_on_strength():
-    known, tested = 1e7 * drawn("known", 40, 4), 1e7 * drawn("tested", 7, 4)
+def test_direction_distance_does_not_depend_on_strength():
+    known, tested = 1e7 * random_fields("known", 40, 4), 1e7 * random_fields("tested", 7, 4)
     np.testing.assert_allclose(direction_distance(known, 2 * tested), direction_distance(known, tested), rtol=1e-5)
 
 
-def a_linear_skin(n):
+def linear_skin(n):
     rng = rng_for(0, "oddness", "skin")
     target = rng.uniform(0, 16, (n, 3))
     return target, target @ rng.normal(0, 30, (3, 15))
 
 
-def test_a_known_contact_has_no_residual_and_a_foreign_field_a_large_one():
-    target, db_uT = a_linear_skin(200)
+def test_residual_of_known_contact_and_foreign_field():
+    target, db_uT = linear_skin(200)
     np.testing.assert_allclose(residual((target, db_uT), target[:9], db_uT[:9]), 0, atol=1e-9)  # rounding
-    assert residual((target, db_uT), target[:9], -db_uT[:9]).min() > 1.5  # 2, less the noise's part
+    assert residual((target, db_uT), target[:9], -db_uT[:9]).min() > 1.5  # 2, less the share of the noise
 
 
-def test_without_forces_the_residual_uses_places_alone():
-    target, db_uT = a_linear_skin(200)
+def test_residual_without_forces_uses_places():
+    target, db_uT = linear_skin(200)
     unknown = np.column_stack([target[:, :2], np.full(200, np.nan)])
     ours = residual((unknown, db_uT), target[:9], db_uT[:9])
-    np.testing.assert_allclose(ours, 0, atol=1e-9)  # rounding: their own places are known
+    np.testing.assert_allclose(ours, 0, atol=1e-9)  # rounding
 
 
-def test_disagreement_is_the_rms_distance_from_the_mean_place():
-    predicted = drawn("predicted", 3, 5, 3)
+def test_disagreement_is_rms_distance_from_the_mean():
+    predicted = random_fields("predicted", 3, 5, 3)
     naive = []
     for i in range(5):
         mean = predicted[:, i, :2].mean(axis=0)
@@ -78,12 +78,12 @@ def test_disagreement_is_the_rms_distance_from_the_mean_place():
 
 
 @given(SCORES, SCORES)
-def test_roc_area_equals_that_of_scikit_learn(single, double):
+def test_roc_area_equals_scikit_learn(single, double):
     truth = np.repeat([0, 1], [len(single), len(double)])
     theirs = roc_auc_score(truth, np.concatenate([single, double]))
     assert roc_area(single, double) == pytest.approx(theirs, abs=1e-12)
 
 
 @given(SCORES, SCORES)
-def test_roc_areas_of_both_orders_add_up_to_one(single, double):
+def test_roc_areas_of_both_orders_sum_to_one(single, double):
     assert roc_area(single, double) + roc_area(double, single) == pytest.approx(1, abs=1e-12)

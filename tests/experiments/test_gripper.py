@@ -1,4 +1,4 @@
-"""A gripper on a skin of straight lines: the right estimate holds the force, a wrong one its own, a factor mends it."""
+"""Tests of a simulated gripper with force feedback from a linear skin."""
 
 import numpy as np
 import pytest
@@ -8,49 +8,51 @@ from pipeline.experiments.gripper import Finger, Gripper, Press, hold, hold_all,
 from reskin.seeds import rng_for
 
 FORCE_N = np.linspace(0, 3, 31)
-ALONG = np.arange(1.0, 16.0)
+DIRECTION = np.arange(1.0, 16.0)
 SKIN_N_MM, GAIN_uT_PER_N = 2.0, 200.0
-HOW = Gripper(aims_N=(0.5, 1.0), stiffness_N_mm=(0.3, 3.0), gain_mm_N=0.5)
+SETTINGS = Gripper(aims_N=(0.5, 1.0), stiffness_N_mm=(0.3, 3.0), gain_mm_N=0.5)
 
 
 def finger(noise_uT=0.0):
-    along = ALONG / np.linalg.norm(ALONG)
+    direction = DIRECTION / np.linalg.norm(DIRECTION)
     return Finger(
-        "b0", FORCE_N, FORCE_N / SKIN_N_MM, GAIN_uT_PER_N * FORCE_N[:, None] * along, np.full(15, 50.0), noise_uT
+        "b0", FORCE_N, FORCE_N / SKIN_N_MM, GAIN_uT_PER_N * FORCE_N[:, None] * direction, np.full(15, 50.0), noise_uT
     )
 
 
-def right(b_uT):
-    return (b_uT - 50.0) @ ALONG / np.linalg.norm(ALONG) / GAIN_uT_PER_N
+def true_force(b_uT):
+    return (b_uT - 50.0) @ DIRECTION / np.linalg.norm(DIRECTION) / GAIN_uT_PER_N
 
 
-def test_skin_and_object_bear_the_same_force_one_after_the_other():
+def test_skin_and_object_bear_the_same_force():
     closed_mm, stiffness_N_mm = np.array([0.4, 0.4]), np.array([0.3, 3.0])
     both_N_mm = 1 / (1 / SKIN_N_MM + 1 / stiffness_N_mm)
     np.testing.assert_allclose(finger().squeezed_N(closed_mm, stiffness_N_mm), both_N_mm * closed_mm)
 
 
 @pytest.mark.parametrize(("factor", "held"), [(1.0, 100.0), (1.3, 0.0)])
-def test_what_is_held_is_the_estimate(factor, held):
-    held_N = hold(finger(), lambda b_uT: factor * right(b_uT), 1.0, HOW, rng_for(0, "hold"))
+def test_gripper_holds_the_estimated_force(factor, held):
+    held_N = hold(finger(), lambda b_uT: factor * true_force(b_uT), 1.0, SETTINGS, rng_for(0, "hold"))
     np.testing.assert_allclose(held_N[50:].mean(), 1 / factor, rtol=0.05)
     assert judge({"b0": [held_N]}, 1.0)["held_pct"] == held
 
 
-def test_one_known_press_as_a_factor_mends_what_is_wrong_by_a_factor():
+def test_calibration_by_one_press_removes_a_factor():
     skin = finger(noise_uT=1.0)
     press = Press(1.0, skin.read(np.ones(5), rng_for(0, "press")).mean(axis=0))
-    forces = scale_to_press(lambda b_uT: 1.3 * right(b_uT), press)
-    assert judge({"b0": [hold(skin, forces, 1.0, HOW, rng_for(0, "hold"))]}, 1.0)["held_pct"] == 100.0
+    forces = scale_to_press(lambda b_uT: 1.3 * true_force(b_uT), press)
+    assert judge({"b0": [hold(skin, forces, 1.0, SETTINGS, rng_for(0, "hold"))]}, 1.0)["held_pct"] == 100.0
 
 
-def test_two_networks_that_err_to_either_side_hold_nothing_though_their_mean_is_right():
-    how = HOW.model_copy(update={"aims_N": (1.0,)})
-    networks = [lambda db_uT, by=by: by * right(db_uT + 50.0)[:, None] + np.zeros(3) for by in (0.7, 1.3)]
-    numbers, _ = hold_all([finger()], {"b0": networks}, how, seed=1)
+def test_opposite_errors_of_networks_do_not_cancel():
+    settings = SETTINGS.model_copy(update={"aims_N": (1.0,)})
+    networks = [
+        lambda db_uT, factor=factor: factor * true_force(db_uT + 50.0)[:, None] + np.zeros(3) for factor in (0.7, 1.3)
+    ]
+    numbers, _ = hold_all([finger()], {"b0": networks}, settings, seed=1)
     row = numbers["rows"][0]
     assert (row["feedback"], row["press"], row["held_pct"], row["runs_n"]) == ("networks", "none", 0.0, 4)
-    alone = [hold_all([finger()], {"b0": [one]}, how, seed=1)[0]["rows"][0]["error_pct"] for one in networks]
+    alone = [hold_all([finger()], {"b0": [one]}, settings, seed=1)[0]["rows"][0]["error_pct"] for one in networks]
     assert row["error_pct"]["mean"] == pytest.approx(np.mean([one["mean"] for one in alone]))
     assert row["error_pct"]["sd_seeds"] == pytest.approx(np.std([one["mean"] for one in alone], ddof=1))
     assert "sd_seeds" not in alone[0]
@@ -60,10 +62,10 @@ def test_two_networks_that_err_to_either_side_hold_nothing_though_their_mean_is_
     assert "over 2 network seeds" in table.attrs["meaning"]
 
 
-def test_each_aim_is_held_by_each_feedback_and_shown():
-    how = HOW.model_copy(update={"aims_N": (0.5,)})
-    networks = {"b0": [lambda db_uT: right(db_uT + 50.0)[:, None] + np.zeros(3)]}
-    numbers, drawn = hold_all([finger(noise_uT=1.0)], networks, how, seed=1)
+def test_tables_list_every_aim_and_feedback():
+    settings = SETTINGS.model_copy(update={"aims_N": (0.5,)})
+    networks = {"b0": [lambda db_uT: true_force(db_uT + 50.0)[:, None] + np.zeros(3)]}
+    numbers, drawn = hold_all([finger(noise_uT=1.0)], networks, settings, seed=1)
     assert [(row["aim_N"], row["feedback"], row["press"]) for row in numbers["rows"]] == [
         (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "map", "none"), (0.5, "map", "factor"),
         (0.5, "map", "label"),

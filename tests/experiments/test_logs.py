@@ -1,4 +1,4 @@
-"""Logs made by hand: quiet starts, contacts and truth found again; refusals; naive loops."""
+"""Tests of synthetic logs: quiet start, contacts, scores and errors; pitch in the earth's field."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,8 @@ RATE_HZ = 250.0
 NOISE_uT = 3.0
 
 
-def walk(quiet_s=2.0, steps_n=4, name="walk"):
-    """A board of 15 channels at rest in a field; 0.3 s in contact, 0.2 s off, by turns; 200 uT a newton."""
+def made_log(quiet_s=2.0, steps_n=4, name="walk"):
+    """Return a log of 15 channels: rest, then alternately 0.3 s in contact and 0.2 s off; 200 uT per newton."""
     quiet_n, on_n, off_n = round(quiet_s * RATE_HZ), 75, 50
     force_N = np.zeros(quiet_n + steps_n * (on_n + off_n))
     for step_i in range(steps_n):
@@ -39,7 +39,7 @@ def walk(quiet_s=2.0, steps_n=4, name="walk"):
     return (1 + np.arange(len(force_N))) / RATE_HZ, b_uT, force_N
 
 
-def answers(db_uT):
+def predict(db_uT):
     force_N = db_uT.mean(axis=1) / 200
     return np.stack([np.full(len(db_uT), 8.0), np.full(len(db_uT), 4.0), force_N], axis=1).astype(np.float32)
 
@@ -50,32 +50,32 @@ def truth(force_N):
 
 
 @pytest.mark.parametrize("quiet_s", [0.8, 2.0, 5.0])
-def test_the_quiet_start_lasts_until_the_window_of_the_first_step(quiet_s):
-    t_s, b_uT, _ = walk(quiet_s)
+def test_quiet_start_ends_before_the_first_step(quiet_s):
+    t_s, b_uT, _ = made_log(quiet_s)
     found_s = quiet_start(t_s, b_uT, where="log") / RATE_HZ
     assert quiet_s - 0.1 <= found_s <= quiet_s
 
 
-def test_a_log_without_a_quiet_start_is_refused():
-    t_s, b_uT, _ = walk(0.2)
+def test_log_without_quiet_start_is_an_error():
+    t_s, b_uT, _ = made_log(0.2)
     with pytest.raises(CaptureError, match=r"log: the start without contact lasts .* less than 0\.5 s"):
         quiet_start(t_s, b_uT, where="log")
     with pytest.raises(CaptureError, match="the start without contact lasts 0 s"):
         quiet_start(t_s[:40], b_uT[:40], where="log")
 
 
-def test_a_log_that_is_quiet_throughout_has_no_contact():
-    t_s, b_uT, _ = walk(5.0, steps_n=0)
-    found = estimate(t_s, b_uT, [answers], where="log")
+def test_quiet_log_has_no_contact():
+    t_s, b_uT, _ = made_log(5.0, steps_n=0)
+    found = estimate(t_s, b_uT, [predict], where="log")
     assert found.quiet_n >= 0.9 * len(t_s)
     numbers = describe(found)
     assert numbers["contacts_n"] == 0
     assert "force_max_N" not in numbers
 
 
-def test_steps_forces_and_noise_are_found_again():
-    t_s, b_uT, force_N = walk()
-    found = estimate(t_s, b_uT, [answers], where="log")
+def test_contacts_forces_and_noise_are_recovered():
+    t_s, b_uT, force_N = made_log()
+    found = estimate(t_s, b_uT, [predict], where="log")
     np.testing.assert_array_equal(found.contact, force_N > 0)
     numbers = describe(found)
     assert numbers["contacts_n"] == 4
@@ -87,46 +87,46 @@ def test_steps_forces_and_noise_are_found_again():
     assert scores["contacts_true_n"] == 4
     assert scores["missed_readings_n"] == scores["false_readings_n"] == 0
     assert scores["accuracy_pct"] == 100.0
-    # noise of the mean of 15 channels, in N, squared; the no-load reading adds 1 / 500 of it
+    # Noise variance of the mean of 15 channels in N^2; the no-load reading adds 1 / 500 of it.
     assert scores["mse_f_N2"] == pytest.approx((NOISE_uT / 200) ** 2 / 15, rel=0.3)
 
 
-def test_each_network_is_scored_by_itself_and_their_errors_do_not_cancel():
-    t_s, b_uT, force_N = walk()
-    off = [lambda db_uT, by=by: answers(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
-    found = estimate(t_s, b_uT, off, where="log")
+def test_network_errors_do_not_cancel():
+    t_s, b_uT, force_N = made_log()
+    networks = [lambda db_uT, by=by: predict(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
+    found = estimate(t_s, b_uT, networks, where="log")
     scores = score_contacts(found, truth(force_N))
-    assert scores["mse_f_N2"] == pytest.approx((1 + 1 + 4) / 3, rel=0.01)  # of the mean network: 0.44
+    assert scores["mse_f_N2"] == pytest.approx((1 + 1 + 4) / 3, rel=0.01)  # that of the mean network is 0.44
     assert scores["spread"]["mse_f_N2"] == pytest.approx(np.std([1, 1, 4], ddof=1), rel=0.02)
-    assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)  # three networks of 3, 5 and 6 N
-    assert "spread" not in score_contacts(estimate(t_s, b_uT, off[:1], where="log"), truth(force_N))
+    assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)  # three networks: 3, 5 and 6 N
+    assert "spread" not in score_contacts(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
 
 
-def test_a_drawn_series_is_the_first_networks_with_the_range_of_all():
-    t_s, b_uT, force_N = walk(steps_n=40)
-    off = [lambda db_uT, by=by: answers(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
-    drawn = thin(estimate(t_s, b_uT, off, where="log"), truth(force_N))
+def test_plotted_series_is_the_first_network_with_range():
+    t_s, b_uT, force_N = made_log(steps_n=40)
+    networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
+    drawn = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
     assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in drawn[which]["x_mm"] if x_mm is not None)
                                for which in ("low", "estimated", "high")}  # fmt: skip
-    assert "low" not in thin(estimate(t_s, b_uT, off[:1], where="log"), truth(force_N))
+    assert "low" not in thin(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
 
 
 @given(st.lists(st.booleans(), max_size=40))
-def test_contacts_are_runs_of_two_or_more_and_a_single_gap_parts_nothing(contact):
+def test_short_runs_and_gaps_are_ignored(contact):
     closed = [now or (0 < i < len(contact) - 1 and contact[i - 1] and contact[i + 1]) for i, now in enumerate(contact)]
-    words = "".join("x" if now else " " for now in closed).split()
-    assert contacts_n(np.array(contact, bool)) == sum(len(word) > 1 for word in words)
+    runs = "".join("x" if now else " " for now in closed).split()
+    assert contacts_n(np.array(contact, bool)) == sum(len(run) > 1 for run in runs)
 
 
-def test_truth_is_that_of_the_dwell_a_reading_lies_in():
+def test_truth_is_that_of_the_current_step():
     true = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     found = truth_at(np.array([0.0, 1.5, 2.5, 3.5, 9.0]), np.array([1.0, 3.0]), np.array([2.0, 4.0]), true)
     np.testing.assert_array_equal(found, [[np.nan] * 3, true[0], [np.nan] * 3, true[1], [np.nan] * 3])
 
 
-def test_a_drawn_series_is_thin_and_says_nothing_off_contact():
-    t_s, b_uT, force_N = walk(steps_n=40)
-    drawn = thin(estimate(t_s, b_uT, [answers], where="log"), truth(force_N))
+def test_plotted_series_is_thinned_and_empty_off_contact():
+    t_s, b_uT, force_N = made_log(steps_n=40)
+    drawn = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
     assert len(drawn["t_s"]) <= 1500
     assert drawn["t_s"][0] == pytest.approx(0.004)
     for which in ("estimated", "true"):
@@ -136,7 +136,7 @@ def test_a_drawn_series_is_thin_and_says_nothing_off_contact():
 
 
 def plain_board(name, chips_n):
-    """Chips that read the field as it is, none of them turned."""
+    """Return a board with perfect chips that are not rotated."""
     eyes = np.tile(np.eye(3), (chips_n, 1, 1))
     return Board(name, np.zeros((chips_n, 3)), eyes, eyes, np.zeros((chips_n, 3)))
 
@@ -146,43 +146,43 @@ def instrument(noise_uT=0.0):
     return Instrument(own, plain_board("aside", 1), own.turn, np.full(3, noise_uT))
 
 
-def turned(noise_uT=0.0):
-    t_s, b_uT, force_N = walk()
-    quiet_n = estimate(t_s, b_uT, [answers], where="log").quiet_n
+def pitched_log(noise_uT=0.0):
+    t_s, b_uT, force_N = made_log()
+    quiet_n = estimate(t_s, b_uT, [predict], where="log").quiet_n
     log = Log(t_s, b_uT, truth(force_N), quiet_n)
-    return log, score_pitches(log, instrument(noise_uT), [answers], rng_for(0, "aside"))
+    return log, score_pitches(log, instrument(noise_uT), [predict], rng_for(0, "aside"))
 
 
-def test_a_board_that_pitches_reads_the_earths_field_turned_the_other_way():
+def test_pitching_board_reads_the_rotated_earth_field():
     np.testing.assert_allclose(earth_in_board_T(np.array([0.0])), EARTH_T[None])
-    # nose down by the dip: what points north and down at the dip now lies along the board's own x axis
+    # Pitched by the dip, the board's x axis is parallel to the earth's field.
     along_T = earth_in_board_T(np.radians([EARTH_DIP_DEG]))
     np.testing.assert_allclose(along_T, [[EARTH_SIZE_T, 0, 0]], atol=1e-18)
 
 
 @given(st.floats(-1.5, 1.5))
-def test_the_field_changes_by_the_chord_of_its_turn_and_keeps_its_size(pitch_rad):
-    turned_T = earth_in_board_T(np.array([pitch_rad]))[0]
-    assert np.linalg.norm(turned_T) == pytest.approx(EARTH_SIZE_T)
+def test_field_change_is_the_chord_of_the_rotation(pitch_rad):
+    rotated_T = earth_in_board_T(np.array([pitch_rad]))[0]
+    assert np.linalg.norm(rotated_T) == pytest.approx(EARTH_SIZE_T)
     chord_T = 2 * EARTH_SIZE_T * np.sin(abs(pitch_rad) / 2)
-    assert np.linalg.norm(turned_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)  # rounding of 50 uT
+    assert np.linalg.norm(rotated_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)  # rounding of 50 uT
 
 
-def test_a_board_rests_until_it_swings_once_a_period():
+def test_board_rests_then_swings_periodically():
     t_s = np.array([0.0, 1.0, 1.125, 1.25, 1.375, 1.5])
     np.testing.assert_allclose(swing(t_s, start_s=1.0, period_s=0.5), [0, 0, 1, 0, -1, 0], atol=1e-12)
 
 
-def test_the_period_is_the_usual_time_between_starts_of_contact():
+def test_period_is_the_median_between_contacts():
     t_s = np.arange(12) / 10
     assert step_period_s(t_s, np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 0, 1, 1], bool)) == pytest.approx(0.45)
     assert step_period_s(t_s, np.arange(12) == 3) == PERIOD_S
     assert step_period_s(t_s, np.zeros(12, bool)) == PERIOD_S
 
 
-def test_a_board_that_does_not_pitch_is_read_as_if_there_were_no_earth():
-    log, rows = turned()
-    found = estimate(log.t_s, log.b_uT, [answers], where="log")
+def test_board_without_pitch_reads_no_earth_field():
+    log, rows = pitched_log()
+    found = estimate(log.t_s, log.b_uT, [predict], where="log")
     level = rows[0]
     assert level["pitch_deg"] == 0
     assert level["contacts_n"] == contacts_n(found.contact) == 4
@@ -191,13 +191,13 @@ def test_a_board_that_does_not_pitch_is_read_as_if_there_were_no_earth():
     assert level["mse_f_N2"] == pytest.approx(scores["mse_f_N2"], rel=1e-3)  # 1000 uT in float32: 6e-5 uT
 
 
-def test_false_contacts_grow_with_the_pitch_and_a_perfect_chip_aside_takes_them_away():
-    log, rows = turned()
+def test_reference_chip_removes_false_contacts_of_pitch():
+    log, rows = pitched_log()
     assert [row["pitch_deg"] for row in rows] == list(PITCHES_DEG)
     false_n = [row["false_readings_n"] for row in rows]
     assert false_n == sorted(false_n)
-    # At 45 degrees the field of all five chips swings by up to sqrt(5) 38 uT = 86 uT, against a threshold of
-    # sqrt(15) 3 uT + 18 uT = 30 uT: hidden while sin is small, for less than a third of the time.
+    # At 45 degrees the field of the five chips swings by up to sqrt(5) 38 uT = 86 uT. It is below the threshold of
+    # sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
     off_n = int((np.isnan(log.true[:, 2]) & (np.arange(len(log.t_s)) >= log.quiet_n)).sum())
     assert 0.6 * off_n < false_n[-1] < off_n
     for row in rows:
@@ -205,8 +205,8 @@ def test_false_contacts_grow_with_the_pitch_and_a_perfect_chip_aside_takes_them_
         assert row["reference_chip"]["false_readings_n"] == 0
 
 
-def test_the_noise_of_the_chip_aside_is_paid_in_readings_and_forces():
-    rows = turned(noise_uT=3.0)[1]
+def test_reference_chip_adds_noise():
+    rows = pitched_log(noise_uT=3.0)[1]
     assert all(row["reference_chip"]["mse_f_N2"] > 1.5 * rows[0]["mse_f_N2"] for row in rows)
     assert all(row["reference_chip"]["contacts_n"] == 4 for row in rows)
 
@@ -219,7 +219,7 @@ NUMBERS = {
 SERIES = {name: [None, 1.0, 2.0] for name in ("x_mm", "y_mm", "F_N")}
 
 
-def test_a_log_without_truth_has_no_scores_and_says_so():
+def test_log_without_truth_has_no_scores():
     table = tables(NUMBERS, "recorded")["logs"].set_index("what")["ours"]
     assert table["accuracy, %"] == table["contacts made"] == "unknown"
     assert table["readings lost to failed reads and stuck chips"] == "1"
@@ -229,9 +229,9 @@ def test_a_log_without_truth_has_no_scores_and_says_so():
 FOUND = {"contacts_n": 5, "false_readings_n": 7, "missed_readings_n": 2, "mse_f_N2": 0.25}
 
 
-def test_a_log_that_was_turned_has_a_table_of_its_own_with_the_remedy_beside_it():
-    told = {"pitch_deg": 20.0} | FOUND | {"accuracy_pct": 50.0, "reference_chip": FOUND | {"false_readings_n": 0}}
-    numbers = NUMBERS | {"contacts_true_n": 3, "turning": [told], "turning_period_s": 0.7, "earth_uT": 50.0}
+def test_pitched_log_has_its_own_table():
+    pitched = {"pitch_deg": 20.0} | FOUND | {"accuracy_pct": 50.0, "reference_chip": FOUND | {"false_readings_n": 0}}
+    numbers = NUMBERS | {"contacts_true_n": 3, "turning": [pitched], "turning_period_s": 0.7, "earth_uT": 50.0}
     table = tables(numbers, "simulated")["logs_turning"]
     assert list(table["readings without contact taken for one"]) == ["7", "0"]
     assert list(table["contacts made"]) == ["3", "3"]
@@ -241,13 +241,13 @@ def test_a_log_that_was_turned_has_a_table_of_its_own_with_the_remedy_beside_it(
     assert "logs_turning" not in tables(NUMBERS, "recorded")
 
 
-def test_the_rate_in_the_words_is_that_of_the_log():
+def test_text_has_the_rate_of_the_log():
     table = tables(NUMBERS | {"rate_hz": 133.0}, "recorded")["logs"]
     assert "A log at 133 Hz with" in table.attrs["meaning"]
     assert "The board keeps its place" in table.attrs["meaning"]
 
 
-def test_the_spread_over_networks_stands_beside_their_mean_and_in_the_figure():
+def test_spread_over_networks_is_shown():
     numbers = NUMBERS | {"accuracy_pct": 80.0, "spread": {"accuracy_pct": 2.5}}
     table = tables(numbers, "simulated")["logs"]
     assert table.set_index("what")["ours"]["accuracy, %"] == "80 ± 2.5"
@@ -256,7 +256,7 @@ def test_the_spread_over_networks_stands_beside_their_mean_and_in_the_figure():
     assert "range over 3 network seeds" in figures(numbers, drawn, "simulated")["logs.svg"]
 
 
-def test_the_figure_draws_the_truth_where_there_is_one():
+def test_figure_shows_the_truth_if_known():
     drawn = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
     assert ">true<" not in figures(NUMBERS, drawn, "recorded")["logs.svg"]
     both = figures(NUMBERS, drawn | {"true": SERIES}, "simulated")["logs.svg"]

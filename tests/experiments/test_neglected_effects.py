@@ -1,10 +1,10 @@
-"""Errors of neglected effects against closed forms of the terms, and how they scale."""
+"""Tests of the errors of neglected effects against closed forms, their scaling, and their table."""
 
 import numpy as np
 import pytest
 
 from pipeline.experiments import neglected_effects
-from pipeline.experiments.neglected_effects import AGEING, RELAXATION, measure
+from pipeline.experiments.neglected_effects import AGEING, RELAXATION, measure, neglected_effects_table
 from reskin.physics.aging import relaxed_share, softening
 from reskin.physics.board import draw_board
 from reskin.physics.magnet import Quadrature
@@ -29,7 +29,7 @@ def rows_of(scene):
 
 @pytest.fixture(scope="module")
 def rows(few_nodes):
-    """Rows of every term, measured once."""
+    """Return the rows of all terms."""
     return rows_of(with_protocol("grid", FEW))
 
 
@@ -39,34 +39,34 @@ def not_inside(monkeypatch):
     monkeypatch.setattr(neglected_effects, "_inside", lambda on: [])
 
 
-def test_effects_that_the_main_protocol_neglects(rows, not_inside):
+def test_effects_neglected_by_the_main_protocol(rows, not_inside):
     assert {term for term, row in rows.items() if row.done == "left out"} == {
         "ageing", "relaxation", "memory", "temperature", "friction", "the earth's field", "the skin's free edge",
         "the powder's own field",
     }  # fmt: skip
-    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # nothing is dragged
+    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # without drags
     aged = rows_of(with_protocol("grid", FEW | {"terms": ["ageing"]}, terms={"ageing": SIZES}))
     assert aged["ageing"].done == "kept"
 
 
-def test_each_effect_lists_the_protocols_that_neglect_and_compute_it(rows, not_inside):
+def test_protocols_of_each_effect(rows, not_inside):
     wear = FEW | {"skins_n": 1, "terms": ["ageing"]}
     found = rows_of(with_protocol("wear", wear, protocols={"grid": FEW, "wear": wear}, terms={"ageing": SIZES}))
     assert (found["ageing"].left_out_by, found["ageing"].computed_by) == (("grid",), ("wear",))
-    assert found["ageing"].done == "left out"  # by the main protocol, which costs are measured on
+    assert found["ageing"].done == "left out"  # by the main protocol
     assert found["ageing"].force_pct == rows["ageing"].force_pct
     assert (found["friction"].left_out_by, found["friction"].computed_by) == (("grid", "wear"), ())
     assert found["the powder's own field"].left_out_by == found["the chips' steps"].computed_by == ()
 
 
-def test_errors_of_the_force_without_ageing_and_relaxation(rows):
+def test_force_errors_of_ageing_and_relaxation(rows):
     left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
     assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
     assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / relaxed_share(RELAXATION) - 1), rel=1e-9)
     assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed
 
 
-def test_one_kelvin_changes_every_field_by_0_12_percent(rows):
+def test_one_kelvin_changes_the_field_by_0_12_percent(rows):
     of = synthesis()
     board = draw_board(of.main_boards.design, of.spreads, seed=1, name="b0")
     skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.in_si())
@@ -75,12 +75,12 @@ def test_one_kelvin_changes_every_field_by_0_12_percent(rows):
     assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)
 
 
-def test_a_steady_field_is_subtracted_with_the_no_load_reading(rows):
+def test_no_load_reading_removes_a_steady_field(rows):
     assert 0 < rows["the earth's field"].field_pct < 1e-6  # rounding
     assert rows["the earth's field"].rest_uT == pytest.approx(45)
 
 
-def test_effects_that_are_kept_matter(rows):
+def test_kept_effects_matter(rows):
     # Increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
     assert rows["increments"].field_pct > 2
     assert rows["rotation of the magnetisation"].field_pct > 5
@@ -88,7 +88,7 @@ def test_effects_that_are_kept_matter(rows):
     assert rows["the chips' steps"].field_pct < 0.5
 
 
-def test_the_hold_of_the_base_is_kept_where_there_is_one(rows, not_inside):
+def test_bonded_base_is_a_kept_effect(rows, not_inside):
     hold = {
         "give_um": (48.0, 7.0),
         "away_um_mm": 6.0,
@@ -102,13 +102,40 @@ def test_the_hold_of_the_base_is_kept_where_there_is_one(rows, not_inside):
     assert found["the base's hold"].field_pct > 10
 
 
-def test_the_error_of_the_powders_own_field_is_proportional_to_its_amount(rows, not_inside):
+def test_self_field_error_is_proportional_to_powder(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
-    # 10 %: the field that acts is half as strong, and the magnetisation is not quite linear in it
+    # 10 %: half as strong a field, and the magnetisation is not quite linear in it
     assert half["the powder's own field"].field_pct == pytest.approx(
         rows["the powder's own field"].field_pct / 2, rel=0.1
     )
 
 
-def test_every_row_says_how_it_was_measured(rows):
+def test_rows_describe_their_measurement(rows):
     assert all(row.how for row in rows.values())
+
+
+def table_row(term: str, done: str, left_out_by: list[str], computed_by: list[str]) -> dict:
+    sizes = {"field_pct": 12.3, "rest_uT": None, "force_pct": 0.5}
+    return {"term": term, "done": done, "how": "so"} | sizes | {"left_out_by": left_out_by, "computed_by": computed_by}
+
+
+TABLE_ROWS = [
+    table_row("temperature", "kept", [], ["grid", "wear"]),
+    table_row("ageing", "left out", ["grid", "flexible"], ["wear"]),
+    table_row("the earth's field", "left out", [], []),
+]
+
+
+def test_table_lists_the_protocols_of_each_effect():
+    table = neglected_effects_table(TABLE_ROWS, "simulated").set_index("effect")
+    assert table["in this scene"].to_dict() == {
+        "ageing": "neglected: grid, flexible; computed: wear",
+        "the earth's field": "neglected",
+        "temperature": "computed: grid, wear",
+    }
+    assert table.index[-1] == "temperature"  # effects that the main protocol neglects come first
+    assert table.loc["ageing"].tolist()[1:] == ["12", "–", "0.5", "so", "simulated"]
+
+
+def test_caption_names_the_main_protocol():
+    assert "under the main protocol" in neglected_effects_table(TABLE_ROWS, "simulated").attrs["meaning"]

@@ -1,4 +1,4 @@
-"""The prior is the skin as designed; a killed run continues; no press is used for calibration and scored."""
+"""Tests of the universal model on simulated skins: prior, resumed runs, pools, known weight and scores."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -54,23 +54,23 @@ def skins():
     return simulated_skins(made_population(3, rng_for(1, "population"), WEIGHT_N), rng_for(2, "population"))
 
 
-def test_the_prior_is_centred_on_the_law_that_its_scene_simulates():
+def test_prior_is_centred_on_the_simulated_law():
     designed = designed_skins(DESIGN, KIND, (0.2, 1.2), seed=0)
     law = designed.prior.centre
     assert (law.gap_mm, law.amplitude, law.away_um_mm) == (1.1, 1.0, DESIGN.hold.away_um_mm)
     assert (law.modulus_MPa, law.grip_N_mm) == (pytest.approx(1e-3 * DESIGN.modulus_kPa), pytest.approx(8.75))
-    assert designed.forces_N[0] < 0.05 < 5 < designed.forces_N[1]  # of 0.2 and 1.2 mm
+    assert designed.forces_N[0] < 0.05 < 5 < designed.forces_N[1]  # at 0.2 and 1.2 mm
     with pytest.raises(ValueError, match="hold must be"):
         designed_skins(DESIGN.model_copy(update={"hold": None}), KIND, (0.2,), seed=0)
 
 
-def test_a_killed_run_draws_no_part_again(monkeypatch):
+def test_interrupted_run_reuses_finished_parts(monkeypatch):
     drawn, shelf = [], {}
-    whole = made_population(7, rng_for(0, "skins"))
+    all_skins = made_population(7, rng_for(0, "skins"))
 
     def draw(_: DesignedSkins, name: str, which: slice) -> Population:
         drawn.append(which)
-        return Population(*(getattr(whole, name)[which] for name in Population.__annotations__))
+        return Population(*(getattr(all_skins, name)[which] for name in Population.__annotations__))
 
     monkeypatch.setattr(DesignedSkins, "draw", draw)
     monkeypatch.setattr(population, "PART_N", 3)
@@ -82,10 +82,10 @@ def test_a_killed_run_draws_no_part_again(monkeypatch):
     found = population.draw(designed, 7, lambda line: None)
     assert [which for which in drawn if which != slice(1)] == [slice(6, 7)]  # the first skin is part of the key
     for name in Population.__annotations__:
-        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+        np.testing.assert_array_equal(getattr(found, name), getattr(all_skins, name))
 
 
-def test_a_pool_is_one_press_at_each_place_and_none_of_it_is_tested():
+def test_pool_has_one_press_per_place_and_no_test_press():
     places_n, depths_n, readings_n = 4, 3, 2
     press = np.repeat(np.arange(2 * places_n * depths_n), readings_n)  # two passes
     target = np.stack([press % places_n, press % places_n, 1 + press], axis=1).astype(np.float32)
@@ -96,13 +96,13 @@ def test_a_pool_is_one_press_at_each_place_and_none_of_it_is_tested():
     data = SimpleNamespace(rows=rows, settings=SimpleNamespace(seed=0))
     (skin,) = scene_skins(data, fold, Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), {"b0_s0": np.zeros(3)})
     assert sorted((skin.pool.place_mm[:, 0] + 8).tolist()) == [0, 1, 2, 3]
-    np.testing.assert_array_equal(skin.pool.db_uT[:, 0] + 1, skin.pool.force_N)  # the readings of that press
+    np.testing.assert_array_equal(skin.pool.db_uT[:, 0] + 1, skin.pool.force_N)  # readings of the same press
     assert not set(skin.pool.force_N) & set(skin.true[:, 2])
     assert len(skin.true) == len(fold.test)
 
 
-def test_the_weight_is_the_press_of_the_middle_nearest_to_its_force():
-    force_N = np.repeat([1.0, 4.0, 8.0, 1.0, 4.5], 2).astype(np.float32)  # two readings of each of five presses
+def test_known_weight_is_the_central_press_of_nearest_force():
+    force_N = np.repeat([1.0, 4.0, 8.0, 1.0, 4.5], 2).astype(np.float32)  # five presses with two readings each
     x_mm = np.repeat([8.0, 8.0, 8.0, 10.0, 10.0], 2).astype(np.float32)
     target, press = np.stack([x_mm, np.full(10, 8.0, np.float32), force_N], axis=1), np.repeat(np.arange(5), 2)
     names = (np.full(10, name) for name in ("c", "b0", "b0_s0"))
@@ -110,12 +110,12 @@ def test_the_weight_is_the_press_of_the_middle_nearest_to_its_force():
     data = SimpleNamespace(rows=Rows(*names, db_uT, target, np.zeros(10, np.int32), press, {}))
     weight = find_weight(data, np.arange(10), Frame(np.eye(3)[None], (8.0, 8.0), mirrored=False), rng_for(0, "weight"))
     np.testing.assert_array_equal(weight.db_uT, [4, 8, 4])
-    assert 3.5 < weight.force_N < 4.5  # of 4 N, known to 2 %
+    assert 3.5 < weight.force_N < 4.5  # 4 N, known to 2 %
     assert weight.force_N != 4.0
 
 
 def weight_of_middle(force_N: list[float]):
-    """The weight among presses of the middle, one reading each."""
+    """Return the known weight chosen from central presses with one reading each."""
     force = np.array(force_N, np.float32)
     names = (np.full(len(force), name) for name in ("c", "b0", "b0_s0"))
     target, db_uT = np.full((len(force), 3), 8, np.float32), np.repeat(force[:, None], 3, axis=1)
@@ -126,7 +126,7 @@ def weight_of_middle(force_N: list[float]):
 
 
 @pytest.mark.parametrize("zero_N", [0.0, -0.01, -5.0, np.nan])
-def test_a_press_without_a_positive_force_is_no_known_weight(zero_N):
+def test_press_without_positive_force_is_no_known_weight(zero_N):
     assert weight_of_middle([zero_N, 4.0, 1.0]).db_uT[0] == 4
     with pytest.raises(
         SchemaError, match="skin b0_s0: the known weight must be of a press with a force above 0 N; got 2"
@@ -134,7 +134,7 @@ def test_a_press_without_a_positive_force_is_no_known_weight(zero_N):
         weight_of_middle([zero_N, zero_N])
 
 
-def test_tables_and_figure_show_every_way():
+def test_tables_and_figure_list_every_method():
     rows = [{"way": way, "pokes_n": 65, "labels_n": 0, **dict.fromkeys(METRICS, STAT)} for way in population.NAMES]
     numbers = {
         "told": rows, "scaling": [row | {"skins_n": n} for row in rows for n in (30, 3000)], "steps_n": 5,
@@ -157,21 +157,21 @@ def test_tables_and_figure_show_every_way():
     )
 
 
-def test_boards_are_the_unit():
-    told = {"way": "map", "pokes_n": 0, "labels_n": 0}
-    rows = pd.DataFrame(told | {"board": ["b0", "b0", "b1"], "accuracy_pct": [1.0, 3.0, 6.0]})
+def test_intervals_are_over_boards():
+    keys = {"way": "map", "pokes_n": 0, "labels_n": 0}
+    rows = pd.DataFrame(keys | {"board": ["b0", "b0", "b1"], "accuracy_pct": [1.0, 3.0, 6.0]})
     (found,) = over_boards(rows, "way", "pokes_n", "labels_n")
     assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (4.0, 2)
 
 
-def test_no_press_is_used_for_calibration_and_scored(skins):
+def test_calibration_and_test_presses_are_disjoint(skins):
     for skin in skins:
         pooled, tested = ({tuple(row) for row in part} for part in (skin.pool.db_uT, skin.test_uT))
         assert not pooled & tested
-        assert len(np.unique(skin.pool.place_mm.round(0), axis=0)) == len(skin.pool)  # one a place
+        assert len(np.unique(skin.pool.place_mm.round(0), axis=0)) == len(skin.pool)  # one per place
 
 
-def test_an_untrained_network_spoils_no_map_and_labels_improve_it(model, skins):
+def test_untrained_network_keeps_the_map_and_labels_improve_it(model, skins):
     sizes = CalibrationSize(0, 0), CalibrationSize(65, 40)
     calibration = calibrate_ways(model, skins, sizes[0])
     rows = [row for size in sizes for skin in skins for row in score_skin(model, skin, size, calibration)]
@@ -182,10 +182,10 @@ def test_an_untrained_network_spoils_no_map_and_labels_improve_it(model, skins):
     }
     assert off_N2["map", 40] < off_N2["map", 0] < off_N2["network", 0]
     for row in rows:
-        assert row["mse_f_factor_N2"] <= min(row["mse_f_N2"], row["mse_f_weight_N2"]) + 1e-9  # the best factor of all
+        assert row["mse_f_factor_N2"] <= min(row["mse_f_N2"], row["mse_f_weight_N2"]) + 1e-9  # the best factor
 
 
-def test_the_weight_is_estimated_last_and_its_force_is_nearly_known(model, skins):
+def test_weight_is_estimated_last(model, skins):
     skin, once = skins[0], dict.fromkeys(WAYS, 1.0)
     (found,) = estimate(model, skin, CalibrationSize(16, 0), [once])
     assert all(len(one.force_N) == len(skin.true) + 1 for one in found.values())
@@ -198,9 +198,9 @@ def test_the_weight_is_estimated_last_and_its_force_is_nearly_known(model, skins
     assert 0 < np.abs(off).max() < 5 * WEIGHT_SD
 
 
-def test_the_weight_share_is_that_at_the_chosen_power(skins, monkeypatch):
-    # Errors of force grow with the power; only intervals of one power cover 90 %.
-    def made_up(model, skin, size, powers):
+def test_weight_share_is_that_of_the_chosen_power(skins, monkeypatch):
+    # Force errors grow with the power; only one power has intervals that cover 90 %.
+    def estimate_made_up(model, skin, size, powers):
         found = []
         for one in powers:
             power = one["map"]
@@ -211,7 +211,7 @@ def test_the_weight_share_is_that_at_the_chosen_power(skins, monkeypatch):
             found.append(dict.fromkeys(WAYS, of))
         return found
 
-    monkeypatch.setattr(population, "estimate", made_up)
+    monkeypatch.setattr(population, "estimate", estimate_made_up)
     calibration = calibrate_ways(None, skins, CalibrationSize(0, 0))
     assert set(calibration.power.values()) == {BOARD_POWERS[1]}
     assert calibration.weight_share == pytest.approx(dict.fromkeys(WAYS, BOARD_POWERS[1] / 0.1))

@@ -1,4 +1,4 @@
-"""Pairs, foreign boards and controls of reference methods against closed forms; and their tables."""
+"""Tests of the reference methods: pairs, foreign boards and controls against closed forms, and tables."""
 
 from typing import Any
 
@@ -44,13 +44,13 @@ MAP = np.eye(6) + 0.2 * rng_for(0, "skins differ").standard_normal((6, 6))
 
 
 def old_uT(place_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
-    """Fields of the known board: linear in log F at a place."""
+    """Return fields of the known board, linear in log F at each place."""
     towards = np.cos(place_mm @ rng_for(0, "fields").standard_normal((2, 6)))
     return 100 * towards * (2 + np.log(force_N))[:, None]
 
 
 def recorded() -> Rows:
-    """Two boards with the same pokes, two readings each; what board b1 reads goes to b0's by `MAP`."""
+    """Return two boards with the same pokes, two readings each; `MAP` maps fields of b1 to those of b0."""
     place_mm = np.tile(np.repeat(PLACES_MM, 2, axis=0), (2, 1))
     force_N = np.tile(FORCES_N, 10)
     board = np.repeat(["b0", "b1"], 10)
@@ -70,11 +70,11 @@ DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), recorde
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 
-def test_pairs_are_fields_of_known_boards_at_the_same_place_and_force():
+def test_pairs_have_the_same_place_and_force():
     rows = recorded()
-    rows.target[20:22, 2] = 2.0  # between the two forces there
-    rows.target[22:24, 2] = 9.0  # past the strongest
-    rows.target[24:26, :2] = 50.0  # nobody poked there
+    rows.target[20:22, 2] = 2.0  # between the two known forces
+    rows.target[22:24, 2] = 9.0  # above the largest force
+    rows.target[24:26, :2] = 50.0  # not a known place
     found = pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
     place_mm = PLACES_MM[[0, 0]]
     np.testing.assert_allclose(found[:2], old_uT(place_mm, np.array([2.0, 4.0])), rtol=1e-5)
@@ -82,33 +82,33 @@ def test_pairs_are_fields_of_known_boards_at_the_same_place_and_force():
     np.testing.assert_allclose(found[3], rows.db_uT[6], rtol=1e-5)
 
 
-def test_enough_pairs_map_a_new_boards_fields_to_the_known_ones():
+def test_many_pairs_map_a_new_board_to_the_known_ones():
     back_uT = standardised_uT(DATA, FOLD, pool_rows(DATA, FOLD))
-    np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # the least ridge is not 0
+    np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # ridge penalty above 0
     nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
     with pytest.raises(ParamsError, match="labelled pokes must be within"):
         standardised_uT(DATA, nowhere, pool_rows(DATA, nowhere))
 
 
-def test_a_collapsed_network_is_trained_again_with_other_draws(monkeypatch):
+def test_collapsed_network_is_trained_again(monkeypatch):
     good = draw_weights(paper_layers(15), rng_for(0, "good"))
     known = rng_for(0, "known").normal(size=(20, 15)).astype(np.float32)
     target = Predictor(good, "paper", "cpu")(known)
     dead = {name: np.zeros_like(value) for name, value in good.items()}
     tries = iter([dead, good])
-    monkeypatch.setattr(reference_methods, "train_adversarial", lambda *words: next(tries))
+    monkeypatch.setattr(reference_methods, "train_adversarial", lambda *keys: next(tries))
     weights, record = reference_methods.train_until_converged(Domains(known, target, known), recipe(), 1.0, 0, "b1")
     assert weights is good
     assert record == {"collapsed": False, "collapsed_before_n": 1}
 
 
-def test_another_skins_pokes_are_those_of_the_next_board_in_the_same_draw():
+def test_control_pokes_are_those_of_the_next_board():
     names = "b0-draw0", "b0-draw1", "b1-draw0", "b1-draw1"
     folds = [fold(name, range(1), range(1), range(1)) for name in names]
     assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
 
 
-def test_foreign_boards_read_fields_of_equal_length_and_other_direction():
+def test_foreign_fields_keep_length_but_not_direction():
     chips = rng_for(0, "chips").standard_normal((3, 5, 3))
     for name, change in STRANGERS.items():
         np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))
@@ -119,7 +119,7 @@ def test_foreign_boards_read_fields_of_equal_length_and_other_direction():
     np.testing.assert_array_equal(exchanged, chips[:, [0, 2, 1, 3, 4]])
 
 
-def test_alarms_are_readings_above_each_boards_limit():
+def test_alarms_exceed_each_boards_limit():
     right = {"b0": np.array([0.1, 0.2, 0.3, 0.4]), "b1": np.array([0.1, 0.1, 0.2, 0.2])}
     stranger = {"b0": np.array([0.9, 0.9]), "b1": np.array([0.1, 0.9])}
     found = alarm_statistics(stranger, right, {"b0": 0.35, "b1": 0.15})
@@ -129,13 +129,13 @@ def test_alarms_are_readings_above_each_boards_limit():
     assert alarm_statistics(right, right, {"b0": 0.35, "b1": 0.15})["auc"]["mean"] == pytest.approx(0.5)
 
 
-def test_flagged_readings_and_all_others_are_scored_board_by_board():
+def test_flagged_readings_are_scored_by_board():
     value = {"b0": np.array([0.0, 1.0, 2.0, 9.0]), "b1": np.array([0.0, 1.0, 2.0, 3.0])}
     off_mm = {board: np.array([[0.0, 0.5], [0.5, 0.0], [0.0, 0.5], [2.0, 0.0]]) for board in value}
     assert limits_of(value, 0.0) == {"b0": 3.0, "b1": 9.0}
     found = score_flagged(value, off_mm, 0.0)
     assert found["flagged_pct"]["mean"] == pytest.approx((25 + 0) / 2)
-    assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}  # b1 flags none
+    assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}  # b1 has none
     assert found["mse_xy_mm2_flagged"]["mean"] == pytest.approx(2.0)
     assert found["accuracy_pct_others"]["mean"] == pytest.approx((100 + 75) / 2)
     assert found["mse_xy_mm2_others"]["n"] == 2
@@ -147,27 +147,27 @@ def points(method: str, given: str, off_mm: dict[str, float]) -> list[dict[str, 
     found = []
     for name, by_mm in off_mm.items():
         own = np.char.add(board, name)
-        words = {"method": method, "name": given, "labels_n": 0, "fold": f"b{name}", "seed_i": 0}
-        found.append(words | {"scores": score_groups(true, true + [[by_mm, 0, 0], [0, 0, 0]], own, own)})
+        keys = {"method": method, "name": given, "labels_n": 0, "fold": f"b{name}", "seed_i": 0}
+        found.append(keys | {"scores": score_groups(true, true + [[by_mm, 0, 0], [0, 0, 0]], own, own)})
     return found
 
 
 def numbers() -> dict[str, Any]:
     name = INVERSION
-    told_points = points(name, OWN, {"0": 0.0, "1": 0.5}) + points(name, FOREIGN, {"0": 2.0, "1": 0.5})
+    inversion_points = points(name, OWN, {"0": 0.0, "1": 0.5}) + points(name, FOREIGN, {"0": 2.0, "1": 0.5})
     others = points("ridge", NONE, {"0": 2.0, "1": 2.0}) + points("ridge, CORAL", OWN, {"0": 0.0, "1": 2.0})
     controls = unlabelled_controls() | {("ridge, CORAL", OWN, 0): ("ridge", NONE, 0)}
     stat = {"mean": 0.9, "n": 2, "ci95": [0.8, 1.0]}
     row = {"alarm_pct": stat, "auc": stat, "left_median": stat}
     strangers = [{"stranger": "north for south", "law": OF_RIGHT} | row]
     return {
-        "methods": summarise(told_points + others, controls), "unpaired_n": 2,
+        "methods": summarise(inversion_points + others, controls), "unpaired_n": 2,
         "alarm": {"asked_pct": 5.0, "limit": stat, "right": row, "strangers": strangers},
         "flagged": [{"method": name, "by": "left over", "flagged_pct": stat, "mse_xy_mm2_others": stat}],
     }  # fmt: skip
 
 
-def test_a_control_is_paired_board_by_board():
+def test_control_is_paired_by_board():
     rows = {(row["method"], row["pokes"]): row for row in numbers()["methods"]}
     over = rows[INVERSION, FOREIGN]["over"]
     assert over["by_board"]["b0"]["accuracy_pct"] == pytest.approx(-50.0)
@@ -176,13 +176,13 @@ def test_a_control_is_paired_board_by_board():
     assert "over" not in rows["ridge", NONE]
 
 
-def test_tables_give_gains_reasons_and_sources():
-    made = tables(numbers(), "recorded")
-    assert made["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
-    assert made["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
-    assert made["rivals"]["paired, accuracy, points"][1].startswith("+25")
-    assert made["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
-    assert made["rivals_alarm"]["law"].tolist() == [OF_RIGHT] * 2
-    assert made["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]  # none was
-    assert made["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")
-    assert all(set(table["source"]) == {"recorded"} for table in made.values())
+def test_tables_have_gains_reasons_and_sources():
+    tables_by_name = tables(numbers(), "recorded")
+    assert tables_by_name["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
+    assert tables_by_name["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]
+    assert tables_by_name["rivals"]["paired, accuracy, points"][1].startswith("+25")
+    assert tables_by_name["rivals_told"]["paired, accuracy, points"].tolist()[1].startswith("-25")
+    assert tables_by_name["rivals_alarm"]["law"].tolist() == [OF_RIGHT] * 2
+    assert tables_by_name["rivals_flagged"]["MSE_xy, mm² (flagged)"].tolist() == ["–"]  # no reading was flagged
+    assert tables_by_name["rivals"].attrs["meaning"].endswith("2 labelled pokes had no pair.")
+    assert all(set(table["source"]) == {"recorded"} for table in tables_by_name.values())

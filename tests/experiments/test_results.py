@@ -1,4 +1,4 @@
-"""Results of experiments: numbers, data of figures, and losses of their captures."""
+"""Tests of the results files of experiments: numbers, figure data and losses of captures."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from reskin.errors import SchemaError
 from tests.data import tables
 
 
-def test_every_capture_of_the_folder_is_accounted_for_beside_what_rows_lost(tmp_path):
+def test_every_capture_is_counted(tmp_path):
     for i in range(2):
         account = {"bytes_n": 82 * (i + 1), "skipped_resync_bytes_n": i}
         io.write_readings(tmp_path / f"b{i}_s0-wear.parquet", [tables.readings()], account)
@@ -21,19 +21,19 @@ def test_every_capture_of_the_folder_is_accounted_for_beside_what_rows_lost(tmp_
     assert losses["left_out"] == {"low_force_rows_n": 3}
 
 
-def test_results_of_the_main_captures_have_no_losses_of_their_own(tmp_path):
+def test_main_captures_have_no_separate_losses(tmp_path):
     write_results(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
     written = json.loads((tmp_path / "contacts.json").read_text())
     assert written["losses"] == {"accounts": [], "left_out": {}}
     assert (written["numbers"], written["drawn"]) == ({"pairs_n": 3}, {"along": [1.0]})
 
 
-def test_only_returns_the_one_capture_of_a_folder():
+def test_only_returns_the_single_capture():
     assert only(["b0_s0-glass"], Path("ci-glass")) == "b0_s0-glass"
 
 
 @pytest.mark.parametrize("captures", [[], ["b0_s0-glass", "b1_s0-glass"]])
-def test_none_or_several_captures_are_an_error(captures):
+def test_only_raises_for_none_or_several(captures):
     with pytest.raises(SchemaError, match=f"ci-glass: captures must be one, as .*; got {len(captures)}. Run its") as no:
         only(captures, Path("ci-glass"))
     assert "\n" not in str(no.value)

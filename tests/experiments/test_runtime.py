@@ -1,4 +1,4 @@
-"""Error against run time: closed forms, the flow and adaptive quadrature as truth; refinement and order as laws."""
+"""Tests of error against run time: quadratures and integrators against closed forms, refinement and order."""
 
 from dataclasses import replace
 from itertools import accumulate
@@ -88,17 +88,17 @@ def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
     return row.error
 
 
-def test_a_skin_laid_on_the_products_nodes_is_the_drawn_one_but_for_its_unevenness():
+def test_skin_on_quadrature_nodes_equals_the_drawn_one():
     even = spreads(skin_amplitude=0.0, skin_filler=0.0, skin_rotation_deg=0.0)
     drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
     ours = with_nodes(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
     np.testing.assert_array_equal(ours.nodes_m, drawn.nodes_m)
-    np.testing.assert_allclose(ours.moments_A_m2, drawn.moments_A_m2, rtol=1e-14)  # a factor of one less
+    np.testing.assert_allclose(ours.moments_A_m2, drawn.moments_A_m2, rtol=1e-14)  # the unperturbed factors are 1
     assert (ours.seat_m == drawn.seat_m).all()
     assert ours.depth_zero_m == drawn.depth_zero_m
 
 
-def test_pokes_sit_on_the_skins_pattern_wherever_that_sits_on_the_board():
+def test_pokes_follow_the_pattern_of_the_skin():
     one = trial(skin_seat_mm=1.0)
     assert np.abs(one.skin.seat_m).min() > 0
     places_mm = 1e3 * (one.pokes_m[:, :2] - one.skin.seat_m)
@@ -106,13 +106,13 @@ def test_pokes_sit_on_the_skins_pattern_wherever_that_sits_on_the_board():
     np.testing.assert_allclose(1e3 * one.pokes_m[:, 2], [0.6, 0.6, 1.2, 1.2])
 
 
-def test_a_poke_that_would_not_touch_is_refused():
+def test_poke_without_contact_is_an_error():
     with pytest.raises(ParamsError, match="skin s0: true depth of every poke must be above 0 m"):
         trial(pokes=Indentations.model_construct(places_mm=((0.0, 0.0),), depths_mm=(0.0,)), skin_depth_zero_mm=0.0)
 
 
 @pytest.mark.parametrize(("cell_mm", "layers_n"), [(0.5, 4), (3.0, 1)])
-def test_the_mean_square_over_midpoints_is_short_by_the_square_of_the_number_of_boxes(cell_mm, layers_n):
+def test_midpoint_error_is_quadratic_in_the_box_size(cell_mm, layers_n):
     rest = midpoints(2e-3, Quadrature(1e-3 * cell_mm, layers_n))
     volume_m3, boxes_n = SKIN_SIDE_M**2 * 2e-3, np.ceil(1e3 * SKIN_SIDE_M / cell_mm)
     assert rest.volumes_m3.sum() == pytest.approx(volume_m3, rel=1e-12)
@@ -122,7 +122,7 @@ def test_the_mean_square_over_midpoints_is_short_by_the_square_of_the_number_of_
         assert mean_m2 == pytest.approx(size_m**2 / 12 * (1 - 1 / parts_n**2), rel=1e-9, abs=1e-18)
 
 
-def test_the_boxes_of_a_lattice_touch_and_have_its_volumes():
+def test_boxes_fill_the_volume_of_the_lattice():
     rule = Quadrature(0.7e-3, 5)
     rest, sides_m = midpoints(2e-3, rule), box_m(2e-3, rule)
     for places_m, side_m in zip(rest.nodes_m.T, sides_m, strict=True):
@@ -130,8 +130,8 @@ def test_the_boxes_of_a_lattice_touch_and_have_its_volumes():
     np.testing.assert_allclose(rest.volumes_m3, np.prod(sides_m))
 
 
-def test_a_box_that_is_lifted_changes_the_field_as_charged_faces_do(monkeypatch):
-    # One box is the whole skin, far too wide for a dipole; in the middle of like poles it is magnetised along z.
+def test_lifted_box_equals_charged_faces(monkeypatch):
+    # A single box fills the skin, too wide for a dipole; between like poles it is magnetised along z.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(
@@ -154,7 +154,7 @@ def test_a_box_that_is_lifted_changes_the_field_as_charged_faces_do(monkeypatch)
     np.testing.assert_allclose(found_T, after_T - before_T, atol=1e-9 * abs(jz_T))
 
 
-def test_gauss_nodes_in_every_cell_integrate_polynomials_that_midpoints_cannot():
+def test_gauss_nodes_integrate_polynomials_exactly():
     rest = gauss_everywhere(2e-3, Quadrature(5e-3, 3), per_cell_n=3)
     x, y, z = 2 * rest.nodes_m.T / np.array([[SKIN_SIDE_M], [SKIN_SIDE_M], [4e-3]])
     share = rest.volumes_m3 / (SKIN_SIDE_M**2 * 2e-3)
@@ -163,25 +163,29 @@ def test_gauss_nodes_in_every_cell_integrate_polynomials_that_midpoints_cannot()
         assert share @ (x**power_x * y**power_y * z**power_z) == pytest.approx(mean, rel=1e-12, abs=1e-15)
 
 
-def test_a_path_goes_where_the_flow_carries_the_very_node():
+def test_path_follows_the_flow():
     one = trial()
     skin = with_nodes(one, place_nodes(one.skin.thickness_m, COARSE))
-    path, poke_m, few = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
-    away_m = skin.nodes_m[few, :2] - poke_m[:2]
-    r_m, z_m, depths_m = np.linalg.norm(away_m, axis=1), skin.nodes_m[few, 2], one.pokes_m[:, 2] + skin.depth_zero_m
+    path, poke_m, some = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
+    away_m = skin.nodes_m[some, :2] - poke_m[:2]
+    r_m, z_m, depths_m = (
+        np.linalg.norm(away_m, axis=1),
+        skin.nodes_m[some, 2],
+        one.pokes_m[:, 2] + skin.depth_zero_m,
+    )
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
     there = deformation.follow(r_m, z_m, deformation.depth_steps(tuple(np.unique(depths_m)), press), press=press)[-1]
-    outward_m = (path.nodes_m[3, few, :2] - poke_m[:2]) * away_m / r_m[:, None]
+    outward_m = (path.nodes_m[3, some, :2] - poke_m[:2]) * away_m / r_m[:, None]
     assert np.abs(there.r_m - r_m).max() > 20e-6
-    # 2 um: the spline between the places where the flow was computed; the material moves by up to 1 mm
+    # 2 um: error of the spline between the nodes of the flow; the material moves by up to 1 mm
     np.testing.assert_allclose(outward_m.sum(axis=1), there.r_m, atol=2e-6)
-    np.testing.assert_allclose(path.nodes_m[3, few, 2], there.z_m, atol=2e-6)
-    turn_rad = np.cross(path.turns_rad[3, few], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
+    np.testing.assert_allclose(path.nodes_m[3, some, 2], there.z_m, atol=2e-6)
+    turn_rad = np.cross(path.turns_rad[3, some], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
     np.testing.assert_allclose(angle_rad, deformation.rotation_angle(there.f), atol=5e-3)
 
 
-def test_errors_are_those_of_the_skin_that_is_worst_at_each_depth():
+def test_errors_are_those_of_the_worst_skin():
     trials = [trial(), trial(name="s1")]
     truth_T = [np.ones((4, 5, 3)), 2 * np.ones((4, 5, 3))]
     factors = [np.array([1.1, 0.9, 1.0, 1.0]), np.array([1.0, 1.0, 1.3, 1.3])]
@@ -194,7 +198,7 @@ def test_errors_are_those_of_the_skin_that_is_worst_at_each_depth():
     }
 
 
-def test_midpoint_layers_are_wrong_by_what_the_specification_says_and_gauss_layers_are_not(quadratures):
+def test_midpoint_layers_have_the_specified_error(quadratures):
     rows, _ = quadratures
     # 9-74 % at 0.5 mm x 4 layers; about 1 % with six Gauss nodes
     assert 0.09 < error_of(rows, "midpoint", 0.5, 4) < 0.74
@@ -202,7 +206,7 @@ def test_midpoint_layers_are_wrong_by_what_the_specification_says_and_gauss_laye
     assert error_of(rows, "midpoint", 0.5, 8) > 2 * error_of(rows, "Gauss in z", 0.5, 4)
 
 
-def test_refining_any_method_makes_it_better(quadratures):
+def test_refinement_reduces_the_error(quadratures):
     rows, _ = quadratures
     widths = [error_of(rows, "Gauss in z", cell_mm, 6) for cell_mm in (2, 1, 0.5)]
     assert widths[0] > 2 * widths[1] > 4 * widths[2]
@@ -212,29 +216,29 @@ def test_refining_any_method_makes_it_better(quadratures):
     assert error_of(rows, "magpylib cuboids", 2, 2) > error_of(rows, "magpylib cuboids", 1, 4)
 
 
-def test_the_reference_is_ten_times_as_good_as_a_rule_must_be(quadratures):
+def test_reference_is_ten_times_better_than_the_limit(quadratures):
     rows, _ = quadratures
     assert rows[0].method == REFERENCE
     assert 0 < rows[0].error < 0.1 * ERROR_MAX
 
 
-def test_magpylib_and_the_kernel_say_the_same_of_the_same_nodes(quadratures):
+def test_magpylib_equals_the_kernel(quadratures):
     _, calls = quadratures
     calls = {one.key[1]: one.call for one in calls if one.key[2] == rule_name(COARSE)}
     kernel_T = calls["kernel alone"]()
     for name in ("magpylib.core dipoles", "magpylib dipoles"):
-        # The others lose digits to the difference of two sums, and magpylib's mu_0 is of another year.
+        # magpylib's fields are differences of two sums, and its mu_0 is that of another CODATA year.
         np.testing.assert_allclose(calls[name](), kernel_T, atol=1e-7 * np.abs(kernel_T).max())
 
 
-def test_the_flow_of_the_product_and_that_of_the_paths_are_the_same():
+def test_flow_equals_that_of_the_paths():
     one = trial()
     ours_T, theirs_T = (METHODS[name](one, COARSE).call() for name in ("Gauss in z", "kernel alone"))
-    # 0.5 %: both interpolate, between other places; without the rotation dB would be wrong by more than itself
+    # 0.5 %: both interpolate, between different nodes; without the rotation the error of dB exceeds dB
     assert np.linalg.norm(ours_T - theirs_T) < 0.005 * np.linalg.norm(ours_T)
 
 
-def test_far_away_boxes_are_dipoles():
+def test_distant_boxes_are_dipoles():
     deep = replace(BOARD, chips_m=BOARD.chips_m - (0.0, 0.0, 40e-3))
     one = trial(deep)
     boxes_T = METHODS["magpylib cuboids"](one, Quadrature(2e-3, 2)).call()
@@ -243,18 +247,18 @@ def test_far_away_boxes_are_dipoles():
     assert np.linalg.norm(boxes_T - dipoles_T) < 0.01 * np.linalg.norm(dipoles_T)
 
 
-def test_every_rule_has_one_row_and_may_be_timed(quadratures):
+def test_each_rule_has_one_row_to_be_timed(quadratures):
     rows, calls = quadratures
-    asked = {(method, rule_name(rule)) for method, own in TRIED.items() for rule in own}
-    assert {(row.method, row.setting) for row in rows[1:]} == asked
-    assert len(rows) == 1 + len(asked)
+    expected = {(method, rule_name(rule)) for method, own in TRIED.items() for rule in own}
+    assert {(row.method, row.setting) for row in rows[1:]} == expected
+    assert len(rows) == 1 + len(expected)
     assert [one.key for one in calls] == [row.key for row in rows[1:]]
     assert all(row.error == max(row.parts.values()) for row in rows)
     nodes_n = {row.setting: row.work_n for row in rows if row.method == CANDIDATES}
     assert nodes_n[rule_name(DEFAULT_QUADRATURE)] == len(place_nodes(1e-3, DEFAULT_QUADRATURE).nodes_m)
 
 
-def test_a_method_nobody_knows_is_refused():
+def test_unknown_method_is_an_error():
     with pytest.raises(ParamsError, match="methods must be among"):
         study_quadratures([trial()], {"Simpson": rules((1, 4))})
 
@@ -268,11 +272,11 @@ ROWS = [
     row(CANDIDATES, 1, 4, 1936, 0.08),
     BETTER,
     GOOD,
-    row("midpoint", 2, 9, 900, 0.001),  # the product cannot lay these
+    row("midpoint", 2, 9, 900, 0.001),  # midpoint rules are not candidates
 ]
 
 
-def test_the_cheapest_rule_below_the_limit_is_chosen_and_compared_with_the_one_in_use():
+def test_cheapest_rule_below_the_limit_is_chosen():
     choice = choose(ROWS, used=DEFAULT_QUADRATURE)
     assert (choice.setting, choice.nodes_n, choice.error) == ("0.5 mm x 5", 8820, 0.015)
     assert (choice.used_setting, choice.used_nodes_n, choice.used_error) == ("0.5 mm x 6", 10584, 0.004)
@@ -280,13 +284,13 @@ def test_the_cheapest_rule_below_the_limit_is_chosen_and_compared_with_the_one_i
     assert not choose(ROWS, used=DEFAULT_QUADRATURE, error_max=0.01).differs
 
 
-def test_where_no_rule_is_good_enough_none_is_chosen():
+def test_no_rule_is_chosen_above_the_limit():
     choice = choose(ROWS, used=DEFAULT_QUADRATURE, error_max=0.001)
     assert choice.setting is None
     assert choice.differs
 
 
-def test_a_rule_in_use_that_was_not_tried_has_no_error():
+def test_untried_rule_in_use_has_no_error():
     assert choose(ROWS, used=Quadrature(0.1e-3, 20)).used_error is None
 
 
@@ -295,7 +299,7 @@ def test_a_rule_in_use_that_was_not_tried_has_no_error():
     st.floats(0, 1),
     st.floats(0, 1),
 )
-def test_who_accepts_more_error_never_pays_more(points, strict, extra):
+def test_looser_limit_never_costs_more(points, strict, extra):
     rows = [row(CANDIDATES, i, 1, nodes_n, error) for i, (nodes_n, error) in enumerate(points)]
     strictly, loosely = (choose(rows, used=DEFAULT_QUADRATURE, error_max=most) for most in (strict, strict + extra))
     if strictly.nodes_n is not None:
@@ -303,15 +307,15 @@ def test_who_accepts_more_error_never_pays_more(points, strict, extra):
         assert loosely.nodes_n <= strictly.nodes_n
 
 
-def test_contestants_run_in_turn_and_backwards_in_every_other_round():
+def test_timing_alternates_the_order_of_methods():
     ran = []
     calls = [TimedCall(("study", name, ""), lambda name=name: ran.append(name), 1) for name in "abc"]
     assert [one.method for one in time_calls(calls, 3)] == ["a", "b", "c"]
     assert "".join(ran) == "abc" + "cba" + "abc"
 
 
-def test_seconds_are_medians_an_indentation(monkeypatch):
-    now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])  # before and after each of three naps
+def test_times_are_medians_per_indentation(monkeypatch):
+    now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])  # before and after each of three calls
     monkeypatch.setattr("pipeline.experiments.runtime.perf_counter", lambda: next(now_s))
     (slow,) = time_calls([TimedCall(("study", "naps", "x"), lambda: None, 5)], 3)
     assert slow.key == ("study", "naps", "x")
@@ -319,7 +323,7 @@ def test_seconds_are_medians_an_indentation(monkeypatch):
     assert slow.repeats_n == 3
 
 
-def test_a_race_without_rounds_is_refused():
+def test_timing_without_rounds_is_an_error():
     with pytest.raises(ParamsError, match="repeats_n must be 1 or more"):
         time_calls([], 0)
 
@@ -329,7 +333,7 @@ STEPS = {"tolerances": (1e-3, 1e-6), "euler_steps_s": (1e-2, 1e-3)}
 SMALL = Integrators(ratios=RATIOS, **STEPS, pokes_n=1, calls_per_poke_max_n=5000)
 
 
-def few(**changes) -> Integrators:
+def settings(**changes) -> Integrators:
     return SMALL.model_copy(update=changes)
 
 
@@ -338,24 +342,24 @@ def relaxations():
     return study_integrators(SMALL)
 
 
-def of(rows, ratio, method) -> list[Precision]:
+def select(rows, ratio, method) -> list[Precision]:
     return [row for row in rows if row.study == runtime.study_name(ratio) and row.method == method]
 
 
-def test_the_skins_own_relaxation_has_its_own_stiffness():
+def test_skins_relaxation_has_its_own_stiffness():
     np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN_RELAXATION.tau_s, rtol=1e-12)
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_a_stiffness_is_the_ratio_of_the_slowest_relaxation_to_the_fastest(ratio):
+def test_stiffness_is_the_ratio_of_relaxation_times(ratio):
     prony = runtime.stiff(ratio)
     assert prony.tau_s.max() / prony.tau_s.min() == pytest.approx(ratio, rel=1e-9)
     assert prony.tau_s.max() == SKIN_RELAXATION.tau_s.max()
     assert (prony.share == SKIN_RELAXATION.share).all()
 
 
-def test_the_exact_force_is_the_convolution_with_the_relaxation_function():
-    # Lee & Radok 1960, by adaptive quadrature instead of by states
+def test_exact_force_equals_a_convolution():
+    # Lee & Radok 1960, by adaptive quadrature
     prony, (time_s, elastic) = runtime.stiff(1e5), repeated_presses(2)
     speeds = np.diff(elastic) / np.diff(time_s)
 
@@ -369,7 +373,7 @@ def test_the_exact_force_is_the_convolution_with_the_relaxation_function():
         assert force == pytest.approx(sum(parts), rel=1e-10, abs=1e-12)
 
 
-def test_a_history_of_twenty_pokes_takes_thirty_seconds():
+def test_twenty_pokes_take_thirty_seconds():
     time_s, elastic = repeated_presses(20)
     assert time_s[-1] == pytest.approx(30.0)
     assert len(time_s) == 61
@@ -378,42 +382,42 @@ def test_a_history_of_twenty_pokes_takes_thirty_seconds():
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_the_exact_update_is_exact_however_stiff(relaxations, ratio):
-    (exact,) = of(relaxations[0], ratio, EXACT)
+def test_exact_update_is_exact_at_any_stiffness(relaxations, ratio):
+    (exact,) = select(relaxations[0], ratio, EXACT)
     assert exact.error < 1e-14
     assert exact.work_n == 0
 
 
-def test_every_method_has_a_row_for_every_stiffness_and_setting(relaxations):
+def test_every_method_has_a_row_per_stiffness_and_setting(relaxations):
     rows, calls = relaxations
-    asked = [(EXACT, 1), *((name, 2) for name in SOLVERS), (EULER, 2)]
+    expected = [(EXACT, 1), *((name, 2) for name in SOLVERS), (EULER, 2)]
     for ratio in RATIOS:
-        for method, settings_n in asked:
-            assert len(of(rows, ratio, method)) == settings_n
+        for method, settings_n in expected:
+            assert len(select(rows, ratio, method)) == settings_n
     assert len({row.key for row in rows}) == len(rows) == 11 * len(RATIOS)
     assert {one.key for one in calls} == {row.key for row in rows if row.failure is None}
     assert all((row.error is None) == (row.failure is not None) for row in rows)
 
 
 @pytest.mark.parametrize("method", SOLVERS)
-def test_a_smaller_tolerance_costs_calls_and_gives_a_smaller_error(relaxations, method):
-    for ratio in RATIOS[1:5]:  # at 1e3 even a loose step is as exact as a solver can be
-        loose, tight = of(relaxations[0], ratio, method)
+def test_smaller_tolerance_costs_calls_and_reduces_the_error(relaxations, method):
+    for ratio in RATIOS[1:5]:  # at 1e3 even the loose tolerance reaches rounding error
+        loose, tight = select(relaxations[0], ratio, method)
         assert tight.error < loose.error
         assert tight.work_n > loose.work_n
 
 
 def test_euler_is_of_first_order(relaxations):
-    # 20 %: the next order, with a step of a thousandth of the shortest relaxation time
-    wide, narrow = of(relaxations[0], 1e3, EULER)
+    # 20 %: the second order term
+    wide, narrow = select(relaxations[0], 1e3, EULER)
     assert wide.error / narrow.error == pytest.approx(10, rel=0.2)
 
 
 @pytest.mark.parametrize(("step_over_fastest", "stable"), [(1.9, True), (2.1, False)])
-def test_euler_diverges_above_twice_the_fastest_relaxation_and_is_listed(step_over_fastest, stable):
-    sweep = few(ratios=(1e7,), tolerances=(), euler_steps_s=(1e-3 * step_over_fastest,), pokes_n=4)
+def test_euler_diverges_above_the_stability_limit(step_over_fastest, stable):
+    sweep = settings(ratios=(1e7,), tolerances=(), euler_steps_s=(1e-3 * step_over_fastest,), pokes_n=4)
     rows, calls = study_integrators(sweep)
-    (euler,) = of(rows, 1e7, EULER)
+    (euler,) = select(rows, 1e7, EULER)
     if stable:
         assert euler.error < 1e-2
     else:
@@ -422,41 +426,43 @@ def test_euler_diverges_above_twice_the_fastest_relaxation_and_is_listed(step_ov
         assert euler.key not in {one.key for one in calls}
 
 
-def test_euler_beyond_any_number_is_listed_as_diverged(relaxations):
-    assert of(relaxations[0], 1e8, EULER)[0].failure.startswith("diverged")
+def test_euler_overflow_is_reported_as_divergence(relaxations):
+    assert select(relaxations[0], 1e8, EULER)[0].failure.startswith("diverged")
 
 
 @pytest.mark.parametrize("method", [*SOLVERS, EULER])
-def test_who_works_too_long_is_stopped_and_listed(method):
-    rows, _ = study_integrators(few(ratios=(1e6,), calls_per_poke_max_n=20))
-    for stopped in of(rows, 1e6, method):
+def test_long_running_solver_is_stopped(method):
+    rows, _ = study_integrators(settings(ratios=(1e6,), calls_per_poke_max_n=20))
+    for stopped in select(rows, 1e6, method):
         assert (stopped.error, stopped.work_n) == (None, 20)
         assert stopped.failure == "stopped after 20 right-hand sides"
 
 
-def test_only_an_explicit_solver_is_stopped_at_the_highest_stiffness(relaxations):
-    failed = {name for name in SOLVERS for one in of(relaxations[0], 1e8, name) if one.failure}
+def test_only_explicit_solvers_are_stopped(relaxations):
+    failed = {name for name in SOLVERS for one in select(relaxations[0], 1e8, name) if one.failure}
     assert failed == {"RK45"}
 
 
-def test_a_solver_that_reports_failure_is_listed_with_its_words(monkeypatch):
-    class Gone:
+def test_solver_failure_is_reported(monkeypatch):
+    class Failed:
         success, message = False, "Required step size is less than spacing between numbers."
 
-    monkeypatch.setattr(runtime, "solve_ivp", lambda *_, **__: Gone)
-    rows, _ = study_integrators(few(ratios=(1e7,)))
-    assert {one.failure for one in of(rows, 1e7, "BDF")} == {Gone.message}
+    monkeypatch.setattr(runtime, "solve_ivp", lambda *_, **__: Failed)
+    rows, _ = study_integrators(settings(ratios=(1e7,)))
+    assert {one.failure for one in select(rows, 1e7, "BDF")} == {Failed.message}
 
 
-def test_more_pokes_leave_the_error_and_the_work_of_a_poke_nearly_as_they_are():
-    # So few pokes may stand for many; a factor of two, where errors span ten decades.
-    once, thrice = (study_integrators(few(ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6))
+def test_number_of_pokes_hardly_changes_the_error():
+    # A few pokes represent many within a factor of two, while errors span ten decades.
+    once, thrice = (
+        study_integrators(settings(ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6)
+    )
     for one, other in zip(once[1:], thrice[1:], strict=True):
         if one.failure is None:
             assert 0.5 < other.error / one.error < 2
             assert 0.8 < other.work_n / one.work_n / 3 < 1.25
 
 
-def test_the_same_sweep_gives_the_same_rows(relaxations):
-    again, study = study_integrators(few(ratios=(1e6,)))[0], runtime.study_name(1e6)
+def test_relaxation_sweep_is_reproducible(relaxations):
+    again, study = study_integrators(settings(ratios=(1e6,)))[0], runtime.study_name(1e6)
     assert again == [row for row in relaxations[0] if row.study == study]

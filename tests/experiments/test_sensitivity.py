@@ -1,4 +1,4 @@
-"""Resolved weights against naive loops, the normal distribution and scipy; scaling."""
+"""Tests of resolved weights against naive loops, the normal distribution and SciPy."""
 
 from itertools import pairwise
 
@@ -11,10 +11,12 @@ from scipy.stats import linregress, norm, spearmanr
 from pipeline.experiments.sensitivity import (
     analyse_levels,
     direction,
+    figures,
     group_by_level,
     monotonic,
     ordered_share,
     smallest_step_N,
+    tables,
 )
 from reskin.errors import SchemaError
 from reskin.seeds import rng_for
@@ -26,12 +28,12 @@ ALONG = np.array([0.6, 0.0, -0.8])
 
 
 def fillings(fillings_n=40, readings_n=5, noise_uT=NOISE_uT, name="glass"):
-    """A linear skin of three channels."""
+    """Return readings of a linear skin with three channels."""
     noise = noise_uT * rng_for(0, name).standard_normal((fillings_n, len(WEIGHT_N), readings_n, 3))
     return (GAIN_uT_PER_N * WEIGHT_N[:, None, None] * ALONG + noise).astype(np.float32)
 
 
-def test_shares_are_those_of_a_loop_over_all_pairs():
+def test_shares_equal_a_loop_over_pairs():
     response = rng_for(0, "pairs").integers(0, 4, size=(2, 5, 3)).astype(float)
     for steps_n in range(1, 5):
         right = [
@@ -44,18 +46,18 @@ def test_shares_are_those_of_a_loop_over_all_pairs():
         assert ordered_share(response)[steps_n - 1] == pytest.approx(np.mean(right))
 
 
-def test_on_a_linear_skin_a_difference_is_told_as_often_as_two_normal_readings_say():
-    told = analyse_levels(fillings(), WEIGHT_N)[1]["told"]
+def test_shares_equal_the_normal_distribution():
+    shares = analyse_levels(fillings(), WEIGHT_N)[1]["told"]
     z = GAIN_uT_PER_N * STEP_N * np.arange(1, 4) / (np.sqrt(2) * NOISE_uT)
-    np.testing.assert_allclose(told["one_reading"][:3], norm.cdf(z), atol=0.015)  # 12,500 pairs, sharing readings
-    np.testing.assert_allclose(told["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)  # 500 pairs
+    np.testing.assert_allclose(shares["one_reading"][:3], norm.cdf(z), atol=0.015)  # 12,500 dependent pairs
+    np.testing.assert_allclose(shares["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)  # 500 pairs
 
 
-def test_gain_and_noise_are_found_again():
+def test_gain_and_noise_are_recovered():
     numbers, drawn = analyse_levels(fillings(), WEIGHT_N)
-    assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)  # 0.5 uT of error a level of 150 uT
+    assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)  # an error of 0.5 uT in 150 uT
     assert numbers["noise_uT"] == pytest.approx(NOISE_uT, rel=0.05)  # 2080 degrees of freedom: 1.6 %
-    # the least difference that both shares reach: 1.645 sqrt(2) sd / gain, up to the next step
+    # The smallest resolved difference is 1.645 sqrt(2) sd / gain, rounded up to the next step.
     assert numbers["smallest_step_N"]["one_reading"] == pytest.approx(0.04)
     assert numbers["smallest_step_N"]["five_readings"] == pytest.approx(0.02)
     assert numbers["smallest_step_mL"]["five_readings"] == pytest.approx(
@@ -64,36 +66,36 @@ def test_gain_and_noise_are_found_again():
     assert len(drawn["response_uT"]) == numbers["levels_n"] == 26
 
 
-def test_the_direction_is_that_of_the_fitting_half_alone():
+def test_direction_is_fitted_on_the_first_half():
     uT = fillings(noise_uT=0.0)
     np.testing.assert_allclose(direction(uT[:20].astype(float)), ALONG, atol=1e-6)  # float32
     turned = uT.copy()
-    turned[20:] = turned[20:, :, :, [1, 0, 2]]  # what is held out points elsewhere
+    turned[20:] = turned[20:, :, :, [1, 0, 2]]  # the second half has another direction
     assert analyse_levels(turned, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
 
 
 @given(st.floats(0.1, 10.0))
-def test_a_stronger_skin_with_as_much_more_noise_tells_the_same(factor):
+def test_shares_are_scale_invariant(factor):
     uT = fillings(4)
     one, other = (analyse_levels((own * uT).astype(np.float32), WEIGHT_N)[0] for own in (1.0, factor))
     assert one["smallest_step_N"] == other["smallest_step_N"]
 
 
-def test_the_smallest_step_is_the_one_after_the_last_that_fails():
+def test_smallest_step_follows_the_last_failing_one():
     assert smallest_step_N(np.array([0.96, 0.94, 0.95, 1.0]), 0.1) == pytest.approx(0.3)
     assert smallest_step_N(np.array([0.95, 1.0]), 0.1) == pytest.approx(0.1)
     assert smallest_step_N(np.array([1.0, 0.9]), 0.1) is None
 
 
-def test_a_skin_that_tells_nothing_has_no_smallest_step():
+def test_skin_without_signal_has_no_smallest_step():
     numbers, _ = analyse_levels(fillings(noise_uT=1e6), WEIGHT_N)
     assert numbers["smallest_step_N"] == numbers["smallest_step_mL"] == {}
     assert not numbers["monotonic"]["holds"]
     assert "step_N" not in numbers["monotonic"]
 
 
-def alike(values, spread):
-    """Two fillings whose mean is `values`, told in steps of 0.1 N; every rise differs by as much."""
+def two_fillings(values, spread):
+    """Return two fillings with mean `values` in steps of 0.1 N, whose rises differ by `spread`."""
     wobble = spread / 2 * (-1.0) ** np.arange(len(values)) / 2
     return np.array([values + wobble, values - wobble]), 0.1 * np.arange(len(values))
 
@@ -102,10 +104,10 @@ def alike(values, spread):
     st.lists(st.integers(-5, 5), min_size=4, max_size=20).filter(lambda values: values[-1] > values[0]),
     st.floats(0.1, 5.0),
 )
-def test_falls_are_counted_at_a_step_that_stands_out_of_noise_and_ranks_correlate_as_scipy_says(values, spread):
-    found = monotonic(*alike(np.array(values, float), spread))
-    gain = linregress(np.arange(len(values)), values).slope  # a step
-    noise = spread / np.sqrt(2)  # two rises, `spread` apart
+def test_falls_and_rank_correlation(values, spread):
+    found = monotonic(*two_fillings(np.array(values, float), spread))
+    gain = linregress(np.arange(len(values)), values).slope  # per step
+    noise = spread / np.sqrt(2)  # of two rises that differ by `spread`
     steps_n = int(np.ceil(1.6448536 * noise / gain)) if gain > 0 else len(values)
     if steps_n < len(values):
         pairs = list(zip(values, values[steps_n:], strict=False))
@@ -119,25 +121,25 @@ def test_falls_are_counted_at_a_step_that_stands_out_of_noise_and_ranks_correlat
     assert found["spearman"] == pytest.approx(spearmanr(np.arange(len(values)), values).statistic)
 
 
-def test_a_skin_is_judged_alike_however_finely_the_glass_is_filled():
-    fine_N = 0.002 * np.arange(251)  # up to 0.5 N, as WEIGHT_N, ten times as fine
+def test_monotonicity_does_not_depend_on_the_filling_step():
+    fine_N = 0.002 * np.arange(251)  # the range of WEIGHT_N in steps of a tenth
     noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
     fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
     pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
     found, coarse = (analyse_levels(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
-    assert found["neighbours"]["falls_n"] > 0  # noise of a mean rise: 5 sqrt(2 / 100) = 0.7 uT, as much as a step's 0.6
+    assert found["neighbours"]["falls_n"] > 0  # a mean rise of 0.6 uT has noise of 5 sqrt(2 / 100) = 0.7 uT
     assert found["holds"]
     assert coarse["holds"]
     assert found["step_N"] <= coarse["step_N"] == pytest.approx(0.02)
 
 
-def test_a_response_that_falls_by_more_than_is_told_apart_is_not_monotonic():
+def test_significant_fall_is_not_monotonic():
     uT = fillings()
-    uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # drops by half of what it had reached
+    uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # drops by half
     assert not analyse_levels(uT, WEIGHT_N)[0]["monotonic"]["holds"]
 
 
-def test_falls_that_noise_makes_are_as_many_as_expected():
+def test_falls_by_noise_equal_their_expectation():
     rng = rng_for(0, "falls")
     rise_uT, noise_uT, fillings_n = 0.5, 2.0, 10
     response_uT = rise_uT * np.arange(2001) + noise_uT * rng.standard_normal((fillings_n, 2001))
@@ -147,10 +149,10 @@ def test_falls_that_noise_makes_are_as_many_as_expected():
     assert found["falls_n"] == pytest.approx(expected_n, abs=4 * np.sqrt(expected_n))
 
 
-def test_readings_are_sorted_by_filling_weight_and_reading():
+def test_readings_are_sorted_by_filling_weight():
     db_uT = np.arange(24, dtype=np.float32).reshape(12, 2)
     indentation = np.repeat([0, 1], 6).astype(np.int32)
-    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # the second begins as the first ends
+    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # two fillings
     levels = group_by_level(db_uT, indentation, force_N, levels_n=3, where="glass")
     assert levels.shape == (2, 3, 2, 2)
     np.testing.assert_array_equal(levels.reshape(12, 2), db_uT)
@@ -158,3 +160,42 @@ def test_readings_are_sorted_by_filling_weight_and_reading():
         group_by_level(db_uT, indentation, force_N, levels_n=4, where="glass")
     with pytest.raises(SchemaError, match=r"got 6 stops of \[1, 2\] readings"):
         group_by_level(db_uT[1:], indentation[1:], force_N[1:], levels_n=3, where="glass")
+
+
+RISES = "mean response rises at every step above the noise"
+
+
+def glass(noise_uT):
+    noise = noise_uT * rng_for(0, "glass").standard_normal((8, 11, 5, 3))
+    levels = np.arange(11)[:, None, None] * np.array([3.0, 4.0, 0.0]) + noise
+    return analyse_levels(levels.astype(np.float32), 0.1 * np.arange(11))
+
+
+def test_finest_tried_step_is_an_upper_limit():
+    table = tables(glass(0.0)[0], "simulated")["sensitivity"]
+    assert table["ours"][0] == "at most 0.1"
+    assert table["ours"][1] == "at most 10"  # 0.1 N is 10.2 mL
+    assert set(table["source"]) == {"simulated"}
+    assert table["paper"][0] == "< 0.2"
+
+
+def test_unresolved_steps_are_stated():
+    table = tables(glass(1e3)[0], "simulated")["sensitivity"]
+    assert table["ours"][0] == "none up to 1"
+    assert table["ours"][1] == "none"
+    assert "undecided: no step is above the noise" in table.set_index("what")["ours"][RISES]
+
+
+def test_monotonicity_is_judged_at_a_stated_step():
+    table = tables(glass(0.0)[0], "simulated")["sensitivity"]
+    found = table.set_index("what")["ours"]
+    assert found[RISES].startswith("not judged (fewer than 4 boards); rises on this one: 10 of 10 pairs 0.1 N apart")
+    assert found["falls from level to level, 0.1 N apart"] == "0 of 10"  # no noise, no error
+    assert "at least 95 % of the pairs" in table.attrs["meaning"]
+
+
+def test_figure_has_its_source_and_is_reproducible():
+    numbers, drawn = glass(0.0)
+    figure = figures(numbers, drawn, "simulated")["sensitivity.svg"]
+    assert "(simulated)" in figure
+    assert figure == figures(numbers, drawn, "simulated")["sensitivity.svg"]

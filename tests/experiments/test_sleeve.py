@@ -1,4 +1,4 @@
-"""Places on a large skin against scikit-learn and plain loops; what is held out, borders and rates as laws."""
+"""Tests of contact positions on a large skin: held-out indentations, borders, rates, scores, table and map."""
 
 import re
 from xml.etree import ElementTree
@@ -33,7 +33,7 @@ SIDES_MM = np.array(AREA.sides_mm)
 
 
 def rows_of(*pokes_n, readings_n=3):
-    """Rows of captures c0, c1, ..., each of so many indentations."""
+    """Return rows of captures c0, c1, ... with the given numbers of indentations."""
     capture = np.repeat([f"c{i}" for i in range(len(pokes_n))], [readings_n * n for n in pokes_n])
     f = len(capture)
     empty, who = np.zeros((f, 3), np.float32), np.array(["b0"] * f)
@@ -41,8 +41,8 @@ def rows_of(*pokes_n, readings_n=3):
     return Rows(capture, who, who, empty, empty, np.zeros(f, np.int32), indentation, {})
 
 
-def answered(seed=0, n=60, wrong_mm=1.0):
-    """True and predicted x, y, F of n indentations of three readings, and the number of each one's indentation."""
+def predictions(seed=0, n=60, wrong_mm=1.0):
+    """Return true and predicted x, y, F of n indentations with three readings each, and the indentation numbers."""
     rng = rng_for(seed, "answers")
     true = np.repeat(np.column_stack([rng.uniform((4, 4), SIDES_MM - 4, (n, 2)), rng.uniform(0, 3, n)]), 3, axis=0)
     return true, true + wrong_mm * rng.standard_normal(true.shape), np.repeat(np.arange(n), 3)
@@ -59,25 +59,25 @@ def readings_of(t_s, indentation, reading_i):
     )  # fmt: skip
 
 
-def test_two_rows_of_four_boards_of_an_inch_have_one_border_along_and_three_across():
+def test_borders_of_two_rows_of_four_boards():
     assert AREA.borders_mm[0] == pytest.approx((25.4,))
     assert AREA.borders_mm[1] == pytest.approx((25.4, 50.8, 76.2))
-    np.testing.assert_allclose(AREA.chips_mm[:2], [(12.7, 12.7), (19.7, 12.7)])  # the middle and the right of board 0
+    np.testing.assert_allclose(AREA.chips_mm[:2], [(12.7, 12.7), (19.7, 12.7)])  # centre and right chip of board 0
     np.testing.assert_allclose(AREA.chips_mm[-2:], [(38.1, 88.9), (45.1, 88.9)])
 
 
-def test_one_board_has_no_border():
+def test_single_board_has_no_border():
     assert lay_out((20.0, 20.0), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0).borders_mm == ((), ())
 
 
 @given(st.floats(0, 50.8), st.floats(0, 101.6))
-def test_near_a_border_is_nearer_than_the_limit_to_any_of_them(x_mm, y_mm):
+def test_border_band_equals_distance_to_any_border(x_mm, y_mm):
     to_border_mm = min(abs(x_mm - 25.4), *(abs(y_mm - border_mm) for border_mm in AREA.borders_mm[1]))
     assert AREA.near_border(np.array([[x_mm, y_mm]]))[0] == (to_border_mm < NEAR_MM)
 
 
 @given(st.lists(st.integers(6, 40), min_size=1, max_size=3), st.floats(0.1, 0.9))
-def test_the_last_indentations_of_each_capture_are_held_out_whole(pokes_n, test_fraction):
+def test_last_indentations_are_held_out(pokes_n, test_fraction):
     rows = rows_of(*pokes_n)
     train, test = hold_out_last(rows, test_fraction)
     np.testing.assert_array_equal(np.sort(np.concatenate([train, test])), np.arange(len(rows)))
@@ -88,26 +88,26 @@ def test_the_last_indentations_of_each_capture_are_held_out_whole(pokes_n, test_
 
 
 @pytest.mark.parametrize("test_fraction", [0.05, 0.99])
-def test_a_side_without_indentations_is_refused(test_fraction):
+def test_empty_side_is_an_error(test_fraction):
     with pytest.raises(ParamsError, match="indentations held out must be one or more, and not all"):
         hold_out_last(rows_of(9), test_fraction)
 
 
 @given(st.floats(10, 400), st.floats(0, 1e3))
-def test_the_rate_is_that_of_readings_within_an_indentation_whatever_lies_between(rate, pause_s):
+def test_rate_is_measured_within_indentations(rate, pause_s):
     t_s = np.concatenate([np.arange(5), 5 + rate * pause_s + np.arange(5)]) / rate
     reading_i = [0, 1, 2, 3, 4] * 2
     found_hz = rate_hz([readings_of(t_s, [0] * 5 + [1] * 5, reading_i)])
     assert found_hz == pytest.approx(rate, rel=1e-6)  # 1e3 s in double precision, over steps of 2.5 ms: 1e-10
 
 
-def test_a_rate_of_single_readings_is_refused():
+def test_rate_of_single_readings_is_an_error():
     with pytest.raises(ParamsError, match="readings must be two or more an indentation"):
         rate_hz([readings_of([0.0, 1.0], [0, 1], [0, 0])])
 
 
-def test_scores_are_what_scikit_learn_and_a_loop_over_readings_give():
-    true, predicted, indentation = answered()
+def test_scores_equal_scikit_learn_and_loops():
+    true, predicted, indentation = predictions()
     scored = score_places(true, [predicted], indentation, AREA)
     far_mm = [np.hypot(p[0] - t[0], p[1] - t[1]) for t, p in zip(true, predicted, strict=True)]
     assert scored["mse_xy_mm2"]["mean"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]))
@@ -121,30 +121,30 @@ def test_scores_are_what_scikit_learn_and_a_loop_over_readings_give():
 
 
 @given(st.floats(0, 20), st.integers(0, 100))
-def test_an_answer_that_is_off_by_one_step_everywhere_is_off_by_that_in_every_number(off_mm, seed):
-    true, _, indentation = answered(seed)
+def test_constant_offset_is_the_error_of_all_scores(off_mm, seed):
+    true, _, indentation = predictions(seed)
     scored = score_places(true, [true + (0.6 * off_mm, -0.8 * off_mm, 0.0)], indentation, AREA)
     for part in (scored, scored["near_seam"], scored["inside"]):
         assert part["median_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
     assert scored["p95_error_mm"]["mean"] == pytest.approx(off_mm, abs=1e-9)
 
 
-def test_without_a_poke_near_a_border_nothing_is_said_of_borders():
+def test_no_border_scores_without_pokes_near_a_border():
     alone = lay_out((50.8, 101.6), [(0.0, 0.0)], boards_n=(1, 1), pitch_mm=0.0)
-    true, predicted, indentation = answered()
+    true, predicted, indentation = predictions()
     scored = score_places(true, [predicted], indentation, alone)
     assert "near_seam" not in scored
     assert scored["inside"]["pokes_n"] == 60
 
 
-def test_over_seeds_there_is_a_mean_and_from_two_on_a_deviation():
+def test_seeds_have_a_mean_and_a_standard_deviation():
     assert over_seeds([{"a": 1.0}]) == {"a": {"mean": 1.0, "n": 1}}
     two = over_seeds([{"a": 1.0}, {"a": 3.0}])["a"]
     assert (two["mean"], two["n"], two["sd"]) == (2.0, 2, pytest.approx(np.sqrt(2)))
 
 
-def test_each_tested_indentation_is_drawn_once_with_the_mean_error_of_its_readings():
-    true, predicted, indentation = answered(n=20)
+def test_each_tested_indentation_is_plotted_once():
+    true, predicted, indentation = predictions(n=20)
     order = rng_for(0, "order").permutation(60)
     drawn = draw_errors(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
     np.testing.assert_allclose(drawn["x_mm"], true[::3, 0], atol=0.0051)  # rounded to 0.01 mm
@@ -157,8 +157,8 @@ def test_each_tested_indentation_is_drawn_once_with_the_mean_error_of_its_readin
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def answer(n=40):
-    true, predicted, indentation = answered(n=n)
+def numbers_and_figure_data(n=40):
+    true, predicted, indentation = predictions(n=n)
     others = {"shape": [predicted, true], "knn-raw": [predicted]}
     numbers = {
         "chips_n": 16, "rate_hz": 132.98, "area_mm": list(AREA.sides_mm), "pokes_n": 5 * n, "trained_n": 4 * n,
@@ -168,8 +168,8 @@ def answer(n=40):
     return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
 
 
-def test_every_method_is_a_row_that_says_its_source_and_that_the_paper_has_no_number():
-    numbers, _ = answer()
+def test_table_lists_methods_with_source_and_no_paper_number():
+    numbers, _ = numbers_and_figure_data()
     table = tables(numbers, "simulated")["sleeve"]
     assert table["method"].tolist() == ["the paper's network", "network, recipe shape", "k nearest neighbours (dB)"]
     assert set(table["source"]) == {"simulated"}
@@ -185,22 +185,22 @@ def test_every_method_is_a_row_that_says_its_source_and_that_the_paper_has_no_nu
     assert f"first {4 * 40} pokes" in table.attrs["meaning"]
 
 
-def test_a_part_without_pokes_is_a_dash_and_no_zero():
-    numbers, _ = answer()
+def test_part_without_pokes_is_a_dash():
+    numbers, _ = numbers_and_figure_data()
     del numbers["near_seam"]
     table = tables(numbers, "simulated")["sleeve"]
     assert table["median near a border of boards, mm"][0] == "–"
     assert "0 of them less than" in table.attrs["meaning"]
 
 
-def test_the_set_up_stands_beside_the_papers():
-    table = tables(answer()[0], "simulated")["sleeve_set_up"].set_index("what")
+def test_setup_is_compared_with_the_papers():
+    table = tables(numbers_and_figure_data()[0], "simulated")["sleeve_set_up"].set_index("what")
     assert table.loc["chips", ["ours", "paper"]].tolist() == ["16", "40"]
     assert table.loc["rate, Hz", ["ours", "paper"]].tolist() == ["133.0", "133"]
 
 
-def test_the_map_shows_every_tested_poke_and_every_chip_and_says_its_source():
-    numbers, drawn = answer()
+def test_map_shows_tested_pokes_chips_and_source():
+    numbers, drawn = numbers_and_figure_data()
     texts = figures(numbers, drawn, "simulated")
     assert list(texts) == ["sleeve.svg"]
     marks = [
@@ -209,13 +209,13 @@ def test_the_map_shows_every_tested_poke_and_every_chip_and_says_its_source():
     assert len(drawn["x_mm"]) == 40
     assert len(drawn["chips_x_mm"]) in marks
     assert 40 in marks
-    said = " ".join(re.findall(r">([^<>]+)</text>", texts["sleeve.svg"]))
-    for words in ("(simulated)", "x / mm", "y / mm", "place error", "border of two boards"):
-        assert words in said
+    text = " ".join(re.findall(r">([^<>]+)</text>", texts["sleeve.svg"]))
+    for label in ("(simulated)", "x / mm", "y / mm", "place error", "border of two boards"):
+        assert label in text
 
 
-def test_the_same_answer_gives_the_same_bytes_and_another_source_another_title():
-    numbers, drawn = answer()
+def test_figure_bytes_depend_only_on_predictions_and_source():
+    numbers, drawn = numbers_and_figure_data()
     once, again, other = (figures(numbers, drawn, source)["sleeve.svg"] for source in ("simulated", "simulated", "x"))
     assert once == again
     assert once != other

@@ -1,4 +1,4 @@
-"""Touches of a simulated pad whose fields add exactly."""
+"""Tests of single and double touches on a simulated pad with additive fields."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -32,15 +32,15 @@ NOISE_uT = 2.0
 
 
 def pad(rows_n=40):
-    """Recordings of every place and pair: dB is force times the place's own direction, plus noise."""
+    """Return recordings of all places and pairs: dB is force times the direction of the place, plus noise."""
     rng = rng_for(0, "touches", "pad")
-    ways = dict(zip(PLACES, 400 * rng.normal(size=(len(PLACES), 15)), strict=True))
-    found = []
+    directions = dict(zip(PLACES, 400 * rng.normal(size=(len(PLACES), 15)), strict=True))
+    result = []
     for places in [*((place,) for place in PLACES), *combinations(PLACES, 2)]:
         force_N = rng.uniform(1, 3, (rows_n, len(places)))
-        db_uT = force_N @ np.stack([ways[place] for place in places]) + rng.normal(0, NOISE_uT, (rows_n, 15))
-        found.append(Touched(str(places), places, db_uT.astype(np.float32), force_N.sum(axis=1).astype(np.float32)))
-    sorted_ = sort_recordings(found)
+        db_uT = force_N @ np.stack([directions[place] for place in places]) + rng.normal(0, NOISE_uT, (rows_n, 15))
+        result.append(Touched(str(places), places, db_uT.astype(np.float32), force_N.sum(axis=1).astype(np.float32)))
+    sorted_ = sort_recordings(result)
     return sorted_.single, sorted_.double
 
 
@@ -50,7 +50,7 @@ def cut():
     return [split_by_time(one, SECTION) for one in single], double
 
 
-def test_the_split_holds_every_row_once_in_order_of_time():
+def test_split_has_every_row_once_in_time_order():
     recording = pad()[0][0]
     blocks = split_by_time(recording, SECTION)
     parts = [blocks.train, blocks.aside, blocks.test]
@@ -58,7 +58,7 @@ def test_the_split_holds_every_row_once_in_order_of_time():
     np.testing.assert_array_equal(np.concatenate([part.db_uT for part in parts]), recording.db_uT)
 
 
-def test_the_residual_equals_that_of_bounded_least_squares():
+def test_residual_equals_bounded_least_squares():
     rng = rng_for(0, "touches", "left over")
     known = {place: rng.normal(size=15) for place in PLACES}
     db_uT = rng.normal(0, 100, (5, 15)).astype(np.float32)
@@ -68,25 +68,25 @@ def test_the_residual_equals_that_of_bounded_least_squares():
     np.testing.assert_allclose(left_over(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
 
 
-def test_where_fields_add_the_touched_pair_leaves_noise_alone(cut):
+def test_residual_of_the_touched_pair_is_noise(cut):
     blocks, double = cut
     numbers = evaluate_superposition(blocks, double)
     assert len(numbers["pairs"]) == 6
     for pair in numbers["pairs"]:
         assert pair["rank"] == 1
-        assert pair["left_over_pct"] < 2  # noise of 15 channels is 8 uT in some 4000
+        assert pair["left_over_pct"] < 2  # the noise of 15 channels is 8 uT in about 4000 uT
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_a_single_touch_at_an_unknown_place_is_called_two(cut):
-    found = evaluate_detection(*cut, SECTION, 0)
-    for name in found["detected_pct"]:
-        assert found["unseen_place_called_two_pct"][name] > 90
-    assert found["detected_pct"]["direction above noise"] > 90
-    assert found["sums_called_two_pct"]["direction above noise"] > 90
+def test_single_touch_at_an_unknown_place_is_called_two(cut):
+    result = evaluate_detection(*cut, SECTION, 0)
+    for name in result["detected_pct"]:
+        assert result["unseen_place_called_two_pct"][name] > 90
+    assert result["detected_pct"]["direction above noise"] > 90
+    assert result["sums_called_two_pct"]["direction above noise"] > 90
 
 
-def test_places_and_forces_of_a_linear_pad_are_predicted(cut):
+def test_places_and_forces_are_predicted(cut):
     blocks, double = cut
     place, force = evaluate_places(blocks, double), evaluate_forces(blocks, rng_for(0, "touches", "force"))
     assert place["by_time"]["mean"] == 100
@@ -96,47 +96,47 @@ def test_places_and_forces_of_a_linear_pad_are_predicted(cut):
 
 def test_recordings_need_numbered_places():
     readings = make_readings(f=60, Fz_N=np.linspace(0, 2, 60, dtype=np.float32))
-    found = touched_rows(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
-    assert found.places == (7,)
-    assert found.force_N.min() >= 1
+    result = touched_rows(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
+    assert result.places == (7,)
+    assert result.force_N.min() >= 1
     with pytest.raises(ParamsError, match="its places must be one or two, by number"):
         touched_rows(readings, {"rows_n": 60}, Selection(force_min_N=1.0))
 
 
-def test_unusable_recordings_are_left_out_with_a_reason():
+def test_unusable_recordings_are_skipped_with_a_reason():
     single, double = pad()
     short = replace(single[0][:19], name="short")
     again = replace(single[1], name="second of place 2")
-    found = sort_recordings([*single[1:], again, short, *double])
-    assert [one.name for one in found.single] == [one.name for one in single[1:]]
-    assert found.problem is None
-    assert found.left_out["short"] == "19 touched rows, fewer than 20"
-    assert found.left_out["second of place 2"] == "place 2 already recorded alone, by (2,)"
+    result = sort_recordings([*single[1:], again, short, *double])
+    assert [one.name for one in result.single] == [one.name for one in single[1:]]
+    assert result.problem is None
+    assert result.left_out["short"] == "19 touched rows, fewer than 20"
+    assert result.left_out["second of place 2"] == "place 2 already recorded alone, by (2,)"
     without_1 = [one for one in double if 1 not in one.places]
-    assert [one.name for one in found.double] == [one.name for one in without_1]
-    assert found.left_out["(1, 2)"] == "place 1 not recorded alone"
+    assert [one.name for one in result.double] == [one.name for one in without_1]
+    assert result.left_out["(1, 2)"] == "place 1 not recorded alone"
 
 
-def test_recordings_of_two_touches_alone_give_a_table_with_the_reason():
+def test_recordings_of_pairs_alone_give_a_reason():
     _, double = pad()
-    found = sort_recordings(double)
-    assert found.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
+    result = sort_recordings(double)
+    assert result.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
     numbers = {
         "force_min_N": 0.5, "single": {"recordings_n": 0, "rows_n": 0}, "double": {"recordings_n": 0, "rows_n": 0},
-        "left_out": found.left_out, "not_computed": found.problem,
+        "left_out": result.left_out, "not_computed": result.problem,
     }  # fmt: skip
     shown = tables(numbers, "recorded")
     assert list(shown) == ["touches"]
-    assert shown["touches"]["not used because"].tolist()[0] == found.problem
+    assert shown["touches"]["not used because"].tolist()[0] == result.problem
     assert len(shown["touches"]) == 1 + len(double)
 
 
-def test_fractions_must_leave_rows_to_test():
+def test_fractions_must_leave_test_rows():
     with pytest.raises(ValidationError, match="leave rows to test"):
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 
 
-def test_tables_show_pairs_only_where_two_were_touched(cut):
+def test_pairs_are_shown_only_where_touched(cut):
     blocks, double = cut
     for pairs in (double, []):
         numbers = {

@@ -22,7 +22,7 @@ from tests.data.tables import readings
 
 
 def capture(passes_n: int = 4):
-    """Passes over three places at two depths, two readings a contact, fields at random."""
+    """Return passes over three places at two depths, with two readings per contact and random fields."""
     stops = [(x_mm, depth_mm) for _ in range(passes_n) for depth_mm in (0.6, 1.2) for x_mm in (0, 2, 4)]
     x_mm, depth_mm = np.repeat(np.array(stops, np.float32), 2, axis=0).T
     f = len(x_mm)
@@ -39,7 +39,7 @@ def visits(b_uT: list, db_uT: list, contacts_n: list | None = None) -> Visits:
     return Visits(counted, np.array(b_uT, float), np.array(db_uT, float))
 
 
-def test_visits_are_what_a_loop_over_readings_finds():
+def test_visits_equal_a_loop_over_readings():
     one = capture()
     found = find_visits(one, (2.0, 2.0), 1.2)
     naive: dict[int, list[np.ndarray]] = {}
@@ -48,7 +48,7 @@ def test_visits_are_what_a_loop_over_readings_finds():
             naive.setdefault(int(one.n_contacts[i]), []).append(np.stack([one.b_uT[i], one.b_uT[i] - one.noload_uT[i]]))
     assert found.contacts_n.tolist() == list(naive) == [4, 10, 16, 22]
     expected = np.array([np.mean(pair, axis=0) for pair in naive.values()])
-    # float32 fields of 100 uT carry 1e-5 each
+    # float32 rounding of fields of 100 uT is 1e-5 uT
     np.testing.assert_allclose(found.b_uT, expected[:, 0], atol=1e-4)
     np.testing.assert_allclose(found.db_uT, expected[:, 1], atol=1e-4)
 
@@ -60,15 +60,15 @@ def test_visits_are_what_a_loop_over_readings_finds():
         ((3.0, 2.0), 1.2, "3 places, among them 0, 2; 2, 2; 4, 2"),
     ],
 )
-def test_a_place_that_was_never_visited_is_refused_with_what_was(place_mm, depth_mm, listed):
+def test_unvisited_place_is_an_error(place_mm, depth_mm, listed):
     with pytest.raises(ParamsError, match=listed) as caught:
         find_visits(capture(), place_mm, depth_mm)
     assert "\n" not in str(caught.value)
 
 
-def test_change_over_time_is_of_the_last_visit_among_the_first_contacts():
-    own = visits([[0, 0], [9, 9], [3, -1], [50, 50]], [[2, 2], [8, 8], [2, 4], [99, 99]], [7, 8, 9, 17])
-    numbers, drawn = over_time(own, 10)
+def test_change_over_time_uses_the_last_visit():
+    visited = visits([[0, 0], [9, 9], [3, -1], [50, 50]], [[2, 2], [8, 8], [2, 4], [99, 99]], [7, 8, 9, 17])
+    numbers, drawn = over_time(visited, 10)
     assert numbers == {
         "visits_n": 3, "contacts_n": 2, "first_db_uT": 2.0,
         "raw_change_uT": pytest.approx(5**0.5), "raw_change_pct": pytest.approx(50 * 5**0.5),
@@ -77,14 +77,14 @@ def test_change_over_time_is_of_the_last_visit_among_the_first_contacts():
     assert drawn == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
 
 
-def test_of_many_visits_some_are_drawn_first_and_last_among_them():
+def test_plotted_visits_include_first_and_last():
     _, drawn = over_time(visits([[i] for i in range(500)], [[1]] * 500), 10_000)
     assert len(drawn["contacts_n"]) == LINES_MAX_N
     assert (drawn["contacts_n"][0], drawn["contacts_n"][-1]) == (0, 499)
 
 
 @given(st.floats(-500, 500), st.floats(0.5, 3))
-def test_a_field_at_rest_that_drifts_changes_what_is_read_and_not_what_a_model_sees(drift_uT, scale):
+def test_no_load_drift_changes_only_raw_readings(drift_uT, scale):
     db_uT = np.tile(rng_for(0, "db").normal(0, 100, (1, 6)), (5, 1))
     rest_uT = drift_uT * np.arange(5)[:, None]
     numbers, _ = over_time(Visits(np.arange(5), db_uT + rest_uT, scale * db_uT), 100)
@@ -92,7 +92,7 @@ def test_a_field_at_rest_that_drifts_changes_what_is_read_and_not_what_a_model_s
     assert numbers["db_change_uT"] == 0
 
 
-def test_spread_between_skins_is_the_rms_over_all_pairs_and_channels():
+def test_spread_between_skins_is_rms_over_pairs():
     lines = {"s0": [1.0, 2.0], "s1": [4.0, 2.0], "s2": [1.0, 8.0]}
     numbers, drawn = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
     pairs = [(one, other) for one in lines for other in lines if one < other]
@@ -103,13 +103,13 @@ def test_spread_between_skins_is_the_rms_over_all_pairs_and_channels():
     assert drawn == lines
 
 
-def test_a_line_is_the_mean_over_a_skins_visits_and_one_skin_has_no_spread():
+def test_line_is_the_mean_over_visits():
     numbers, drawn = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
     assert drawn == {"s0": [2, 4]}
     assert "spread_uT" not in numbers
 
 
-def test_the_first_skin_of_each_board_comes_before_the_second_of_any():
+def test_skins_are_ordered_across_boards():
     boards = {"b0_s0": "b0", "b0_s1": "b0", "b1_s0": "b1", "b2_s0": "b2", "b2_s1": "b2"}
     assert first_of_each_board(boards, 4) == ["b0_s0", "b1_s0", "b2_s0", "b0_s1"]
     with pytest.raises(ParamsError, match="at most the 5 skins of the main captures; got 6"):
@@ -136,7 +136,7 @@ def drawn(last_uT: float = 40.0) -> dict:
     return {"places": [place | {"x_mm": x_mm, "y_mm": 8.0} for x_mm in (8.0, 4.0)]}
 
 
-def test_each_place_has_what_changes_as_read_what_a_model_sees_and_the_spread_of_skins():
+def test_places_have_changes_and_spread():
     table = tables(numbers(), "simulated")["variation"]
     assert table["place, mm"].tolist() == ["8, 8"] * 3 + ["4, 8"] * 3
     assert table["difference, µT"].tolist() == ["23.7", "5.21", "241"] * 2
@@ -145,36 +145,36 @@ def test_each_place_has_what_changes_as_read_what_a_model_sees_and_the_spread_of
     assert "obvious variation across the samples" in to_markdown(table)
 
 
-def test_the_pace_and_the_warmth_of_the_contacts_shown_stand_below():
-    said = to_markdown(tables(numbers(), "simulated")["variation"])
-    assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in said
-    assert "A real rig takes seconds a contact" in said
-    assert "take 575 s, in which the chips' temperature changes by +1.9 K" in said
+def test_pace_and_temperature_are_in_the_notes():
+    text = to_markdown(tables(numbers(), "simulated")["variation"])
+    assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in text
+    assert "A real rig takes seconds a contact" in text
+    assert "take 575 s, in which the chips' temperature changes by +1.9 K" in text
     cold = {name: value for name, value in numbers().items() if name != "warmer_K"}
     assert "temperature changes" not in to_markdown(tables(cold, "recorded")["variation"])
 
 
-def test_one_skin_has_no_spread_between_skins():
+def test_single_skin_has_no_spread():
     assert tables(numbers(("s0",)), "simulated")["variation"]["difference, µT"].tolist() == ["23.7", "5.21"] * 2
 
 
-def test_figures_name_fifteen_channels_places_and_skins():
+def test_figures_name_channels_places_and_skins():
     texts = figures(numbers(), drawn(), "simulated")
     assert sorted(texts) == ["variation_skins.svg", "variation_time.svg"]
     for text in texts.values():
         ET.fromstring(text)
-        for word in (
+        for label in (
             "(simulated)",
             "µT",
             "at x = 8 mm, y = 8 mm",
             "at x = 4 mm",
             *(f"B{a}{c}" for c in range(5) for a in "xyz"),
         ):
-            assert word in text
+            assert label in text
     assert "contacts before" in texts["variation_time.svg"]
     assert ">s1<" in texts["variation_skins.svg"]
 
 
-def test_same_lines_same_bytes_other_lines_other_bytes():
+def test_figures_are_reproducible():
     first, again, other = (figures(numbers(), lines, "simulated") for lines in (drawn(), drawn(), drawn(99.0)))
     assert first == again != other

@@ -1,4 +1,4 @@
-"""The simulator agrees with every independent reference, and a wrong simulator is told from a right one."""
+"""The simulator agrees with independent references, and planted faults of the simulator are detected."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +28,7 @@ DEPTHS_M = (0.4e-3, 1.2e-3)
 SEED = 2021
 
 
-def broken(checks):
+def failed(checks):
     return {f"{check.subject}: {check.law}" for check in checks if not check.holds}
 
 
@@ -38,10 +38,10 @@ def checks():
 
 
 def test_every_check_holds(checks):
-    assert broken(checks) == set()
+    assert failed(checks) == set()
 
 
-def test_every_row_says_what_why_and_how_much(checks):
+def test_rows_describe_their_check(checks):
     for check in checks:
         assert all((check.subject, check.law, check.against, check.unit, check.reason))
         assert np.isfinite(check.error)
@@ -49,63 +49,60 @@ def test_every_row_says_what_why_and_how_much(checks):
     assert len({(check.subject, check.law, check.against) for check in checks}) == len(checks)
 
 
-def test_each_reference_that_the_specification_names_is_there(checks):
+def test_specified_references_are_present(checks):
     against = " ".join(check.against for check in checks)
     names = "magpylib Cuboid", "magpylib Dipole", "Hertz", "Dimitriadis", "Long", "mpmath", "struct", "data sheet"
     assert [name for name in names if name not in against] == []
 
 
-def test_the_same_scene_and_seed_give_the_same_digits():
+def test_checks_are_reproducible():
     for check_all in (check_relaxation, lambda: check_field(DESIGN.skin, SEED), lambda: check_contact(DESIGN.skin)):
         assert check_all() == check_all()
 
 
-def test_an_error_past_its_tolerance_or_no_number_does_not_hold():
+def test_nan_and_exceeded_tolerance_do_not_hold():
     check = Check("a", "b", "c", error=1.0, unit="1", tolerance=1.0, reason="d")
     assert check.holds
     assert not replace(check, error=1.0 + 1e-12).holds
     assert not replace(check, error=np.nan).holds
 
 
-def test_without_spreads_nothing_differs_but_the_length_is_kept():
+def test_no_spread_gives_no_difference():
     exact = no_spread(DESIGN.spreads).model_dump()
     assert exact.pop("skin_filler_length_mm") == DESIGN.spreads.skin_filler_length_mm
     assert not any(exact.values())
 
 
-# Each fault is planted where the product has its number, and must show in the row that is about it.
+# Each of the following tests plants a fault in the simulator, which its row must detect.
 
 
-def test_a_field_of_the_wrong_sign_inside_magnets_is_seen(monkeypatch):
-    right = magnet._corner
-    monkeypatch.setattr(magnet, "_corner", lambda from_m: -right(from_m))
-    wrong = broken(check_field(DESIGN.skin, SEED))
+def test_wrong_sign_inside_magnets_is_detected(monkeypatch):
+    original = magnet._corner
+    monkeypatch.setattr(magnet, "_corner", lambda from_m: -original(from_m))
+    wrong = failed(check_field(DESIGN.skin, SEED))
     assert "field of a box: inside, J included" in wrong
     assert f"magnetising array, {DESIGN.skin.polarity}: field in the skin" in wrong
 
 
-def test_a_wrong_place_of_the_array_is_not_this_tables_business_but_a_wrong_size_of_its_cubes_breaks_maxwell(
-    monkeypatch,
-):
-    # The reference takes the sizes from the product's constants; Maxwell's laws do not.
-    right = magnet.array_field
-    monkeypatch.setattr(magnet, "array_field", lambda at_m, h_m, polarity: right(at_m, h_m, polarity) * (1, 1, 1.01))
-    assert f"magnetising array, {DESIGN.skin.polarity}: div B = 0" in broken(check_field(DESIGN.skin, SEED))
+def test_wrong_array_field_violates_maxwell(monkeypatch):
+    original = magnet.array_field
+    monkeypatch.setattr(magnet, "array_field", lambda at_m, h_m, polarity: original(at_m, h_m, polarity) * (1, 1, 1.01))
+    assert f"magnetising array, {DESIGN.skin.polarity}: div B = 0" in failed(check_field(DESIGN.skin, SEED))
 
 
-def test_a_constant_of_exactly_1e_7_is_below_and_one_of_1_001e_7_above_the_tolerance(monkeypatch):
+def test_tolerance_of_the_field_constant(monkeypatch):
     monkeypatch.setattr(change, "MU0_4PI", 1e-7)
-    assert broken(check_field(DESIGN.skin, SEED)) == set()  # 1.3e-10, less than between two years of CODATA
+    assert failed(check_field(DESIGN.skin, SEED)) == set()  # 1.3e-10, less than between two CODATA years
     monkeypatch.setattr(change, "MU0_4PI", 1.001e-7)
-    assert broken(check_field(DESIGN.skin, SEED)) == {
+    assert failed(check_field(DESIGN.skin, SEED)) == {
         "change of field: dipoles that move and turn",
         "dipole for a cube: error falls with (side / r)^4",
         "field of dipoles: at rest",
     }
 
 
-def test_a_layer_that_is_not_bonded_is_seen_by_every_reference(monkeypatch):
-    monkeypatch.setattr(layer, "bonded_compliance", np.ones_like)  # a half-space: no base at all
+def test_unbonded_layer_is_detected_by_every_reference(monkeypatch):
+    monkeypatch.setattr(layer, "bonded_compliance", np.ones_like)  # a half-space
     layer._force_curve.cache_clear()
     layer.contact_of_depth.cache_clear()
     try:
@@ -116,65 +113,65 @@ def test_a_layer_that_is_not_bonded_is_seen_by_every_reference(monkeypatch):
     assert {"Dimitriadis et al. 2002, bonded", "Long et al. 2011", "1.770"} <= wrong
 
 
-def test_waves_that_stretch_without_narrowing_lose_volume(monkeypatch):
-    right = layer.displacement
+def test_stretch_without_narrowing_loses_volume(monkeypatch):
+    original = layer.displacement
 
     def stretched(r_m, z_m, of):
-        u = right(r_m, z_m, of)
+        u = original(r_m, z_m, of)
         return replace(u, z_m=1.01 * u.z_m, z_z=1.01 * u.z_z, z_r=1.01 * u.z_r)
 
     monkeypatch.setattr(layer, "displacement", stretched)
-    wrong = broken(one_small_step(IndentedLayer(2e-3, 3e-3, DESIGN.skin.base), DEPTHS_M[-1]))
+    wrong = failed(one_small_step(IndentedLayer(2e-3, 3e-3, DESIGN.skin.base), DEPTHS_M[-1]))
     assert "one small step: div u = 0" in wrong
     assert "one small step: the surface lies on the tip" in wrong
 
 
-def test_moments_that_do_not_turn_with_the_material_are_seen(monkeypatch):
-    right = deformation.move_dipoles
+def test_moments_without_rotation_are_detected(monkeypatch):
+    original = deformation.move_dipoles
 
-    def unturned(table, rest, poke_m):
-        moved = right(table, rest, poke_m)
+    def without_rotation(table, rest, poke_m):
+        moved = original(table, rest, poke_m)
         return replace(moved, after=(moved.after[0], moved.before[1]))
 
     board = draw_board(DESIGN.boards["rigid"].design, DESIGN.spreads, seed=SEED, name="b0")
     skin = draw_skin(DESIGN.skin, DESIGN.spreads, seed=SEED, name="b0_s0", rule=mechanics.COARSE)
     assert mechanics.approximations(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
-    monkeypatch.setattr(deformation, "move_dipoles", unturned)
+    monkeypatch.setattr(deformation, "move_dipoles", without_rotation)
     assert not mechanics.approximations(board, skin, DEPTHS_M[-1], "deepest", mechanics.PLACES_M[:1]).holds
 
 
-def test_the_naive_quotient_of_a_small_step_is_seen(monkeypatch):
+def test_naive_small_step_quotient_is_detected(monkeypatch):
     def naive(x):
         return np.where(x > 0, (1 - np.exp(-x)) / np.where(x > 0, x, 1.0), 1.0)
 
     monkeypatch.setattr(aging, "_mean_decay", naive)
-    assert any("one step" in law for law in broken(check_relaxation()))
+    assert any("one step" in law for law in failed(check_relaxation()))
 
 
-def test_a_wrong_step_of_the_chip_is_seen(monkeypatch):
+def test_wrong_chip_step_is_detected(monkeypatch):
     monkeypatch.setattr(chip, "STEP_AT_GAIN_ONE_uT", (0.161, 0.161, 0.294))  # the data sheet's other HALLCONF
-    wrong = broken(check_electronics(DESIGN.chip, SEED))
+    wrong = failed(check_electronics(DESIGN.chip, SEED))
     assert "chip: uT a count, GAIN_SEL 6 and 7" in wrong
     assert "chip: past its range, GAIN_SEL 7, to 50 mT" in wrong
 
 
-def test_noise_that_no_recorded_board_has_is_seen():
+def test_unrecorded_noise_is_detected():
     quiet = DESIGN.chip.model_copy(update={"noise_xy_uT": 1.0})
-    assert any("outside the recorded" in law for law in broken(check_electronics(quiet, SEED)))
+    assert any("outside the recorded" in law for law in failed(check_electronics(quiet, SEED)))
 
 
-def test_frames_in_another_order_are_seen(monkeypatch):
-    encode, right = wire.encode, stream.FrameStream.feed
-    monkeypatch.setattr(wire, "encode", lambda frames, layout: encode(turned(frames), layout))
-    assert {law.split(": ")[1] for law in broken(check_frames(DESIGN.chip.gain_sel, 5, SEED))} == {
+def test_wrong_frame_order_is_detected(monkeypatch):
+    encode, original = wire.encode, stream.FrameStream.feed
+    monkeypatch.setattr(wire, "encode", lambda frames, layout: encode(rotate_chips(frames), layout))
+    assert {law.split(": ")[1] for law in failed(check_frames(DESIGN.chip.gain_sel, 5, SEED))} == {
         "what is written", "what struct reads of it",
     }  # fmt: skip
     monkeypatch.setattr(wire, "encode", encode)
-    monkeypatch.setattr(stream.FrameStream, "feed", lambda self, data: turned(right(self, data)))
-    wrong = broken(check_frames(DESIGN.chip.gain_sel, 5, SEED))
+    monkeypatch.setattr(stream.FrameStream, "feed", lambda self, data: rotate_chips(original(self, data)))
+    wrong = failed(check_frames(DESIGN.chip.gain_sel, 5, SEED))
     assert len(wrong) == 4
     assert all(": what is read" in law for law in wrong)
 
 
-def turned(frames):
+def rotate_chips(frames):
     return replace(frames, b_uT=np.roll(frames.b_uT, 1, axis=1))

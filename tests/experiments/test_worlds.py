@@ -1,4 +1,4 @@
-"""What decides table 2: the law's error is as large as asked, worlds differ in one thing, rows are scored."""
+"""Tests of the simulated worlds that show what decides table 2."""
 
 from pathlib import Path
 
@@ -16,53 +16,53 @@ from reskin.metrics import METRICS
 from tests.report.synthetic import texts_of
 
 ROOT = Path(__file__).resolve().parents[2]
-HOW = Residual(sizes=(0.4,), length_mm=3.5, length_log_N=1.2, own_share=0.5)
+RESIDUAL = Residual(sizes=(0.4,), length_mm=3.5, length_log_N=1.2, own_share=0.5)
 GRID_MM = np.stack(np.meshgrid(np.linspace(-8, 8, 33), np.linspace(-8, 8, 33)), axis=-1).reshape(-1, 2)
 AT = np.column_stack([GRID_MM, np.zeros(len(GRID_MM))])
 CHANGE_uT = 100 * np.sin(np.arange(15.0) + GRID_MM[:, :1])
 
 
-def added(skin: str = "b0_s0", how: Residual = HOW, size: float = 0.4) -> np.ndarray:
-    return with_residual(CHANGE_uT, AT, size, how, 1, skin) - CHANGE_uT
+def law_error(skin: str = "b0_s0", residual: Residual = RESIDUAL, size: float = 0.4) -> np.ndarray:
+    return with_residual(CHANGE_uT, AT, size, residual, 1, skin) - CHANGE_uT
 
 
-def test_the_error_is_as_large_as_asked_smooth_and_the_same_for_the_same_skin():
-    parts = [np.linalg.norm(added(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)]
+def test_law_error_has_size_and_smoothness_and_is_reproducible():
+    parts = [np.linalg.norm(law_error(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)]
     assert np.sqrt(np.mean(np.square(parts))) == pytest.approx(0.4, rel=0.1)
-    unit = added() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
-    step = np.linalg.norm(np.diff(unit.reshape(33, 33, 15), axis=1), axis=2)  # half a millimetre apart
+    unit = law_error() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
+    step = np.linalg.norm(np.diff(unit.reshape(33, 33, 15), axis=1), axis=2)  # 0.5 mm apart
     assert step.mean() < 0.25 * np.linalg.norm(unit, axis=1).mean()
-    np.testing.assert_array_equal(added(), added())
-    assert not np.allclose(added(), added("b1_s0"))
-    assert with_residual(CHANGE_uT, AT, 0.0, HOW, 1, "b0_s0") is CHANGE_uT
+    np.testing.assert_array_equal(law_error(), law_error())
+    assert not np.allclose(law_error(), law_error("b1_s0"))
+    assert with_residual(CHANGE_uT, AT, 0.0, RESIDUAL, 1, "b0_s0") is CHANGE_uT
 
 
-def test_what_is_no_skins_own_is_alike_on_all_and_what_is_shares_half_of_its_variance():
-    alike = HOW.model_copy(update={"own_share": 0.0})
-    np.testing.assert_array_equal(added("b0_s0", alike), added("b1_s0", alike))
-    pairs = [np.corrcoef(added(f"b{i}_s0").ravel(), added(f"b{i + 1}_s0").ravel())[0, 1] for i in range(8)]
+def test_law_error_shares_variance_between_skins():
+    alike = RESIDUAL.model_copy(update={"own_share": 0.0})
+    np.testing.assert_array_equal(law_error("b0_s0", alike), law_error("b1_s0", alike))
+    pairs = [np.corrcoef(law_error(f"b{i}_s0").ravel(), law_error(f"b{i + 1}_s0").ravel())[0, 1] for i in range(8)]
     assert np.mean(pairs) == pytest.approx(0.5, abs=0.15)
 
 
 @pytest.fixture(scope="module")
-def files() -> Settings:
-    """Scene decide with three boards of one skin, three pokes deep and a few steps."""
-    words = YAML(typ="safe").load((ROOT / "pipeline/scenes/decide.yaml").read_text())
-    words["simulate"]["boards"]["rigid"] |= {
+def decide_settings() -> Settings:
+    """Return a small version of the scene decide: three boards with one skin each, few steps."""
+    scene = YAML(typ="safe").load((ROOT / "pipeline/scenes/decide.yaml").read_text())
+    scene["simulate"]["boards"]["rigid"] |= {
         "boards_n": 3, "skins_per_board_n": 1, "quadrature": {"cell_mm": 3.0, "layers_n": 2},
     }  # fmt: skip
-    words["simulate"]["protocols"]["grid"] |= {"skins_n": 3, "passes_n": 2, "depths_mm": [0.6, 1.0]}
-    words["split"] = {"transfer_skins_n": 2, "pool_passes_n": 1}
+    scene["simulate"]["protocols"]["grid"] |= {"skins_n": 3, "passes_n": 2, "depths_mm": [0.6, 1.0]}
+    scene["split"] = {"transfer_skins_n": 2, "pool_passes_n": 1}
     for section in ("train_single", "train_multi", "train_triplet"):
-        words[section]["steps_n"] = 12
-    words["adapt"] |= {"steps_n": 3, "pokes_n": 65}
-    words["worlds"] |= {"skin_modulus": [0.1], "amplitude_and_gap": [1.0], "friction": [0.8]}
-    words["worlds"]["residual"]["sizes"] = [0.0, 0.42]
-    return Settings("decide", "decide.yaml", words, read_shared_files(ROOT))
+        scene[section]["steps_n"] = 12
+    scene["adapt"] |= {"steps_n": 3, "pokes_n": 65}
+    scene["worlds"] |= {"skin_modulus": [0.1], "amplitude_and_gap": [1.0], "friction": [0.8]}
+    scene["worlds"]["residual"]["sizes"] = [0.0, 0.42]
+    return Settings("decide", "decide.yaml", scene, read_shared_files(ROOT))
 
 
-def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, tmp_path):
-    worlds(files, files.section(Worlds, "worlds"), results=tmp_path / "results.json")
+def test_worlds_have_the_rows_of_table_2(decide_settings, tmp_path):
+    worlds(decide_settings, decide_settings.section(Worlds, "worlds"), results=tmp_path / "results.json")
     numbers = io.read_json(tmp_path / "results.json")["numbers"]
     assert [(one["factor"], one["value"]) for one in numbers["by_world"]] == [("default", 1.0), ("residual", 0.42)]
     for one in numbers["by_world"]:
@@ -74,20 +74,20 @@ def test_every_world_has_the_rows_of_table_2_board_by_board_and_is_shown(files, 
     assert table["row"].tolist()[:2] == ["single-sensor", "multi-sensor"]
     assert len(table) == 8
     drawn = show.figures(numbers, {}, "simulated")["worlds.svg"]
-    for words in ("What decides table 2 (simulated", "friction under the tip", "adapted"):
-        assert words in texts_of(drawn)
+    for scene in ("What decides table 2 (simulated", "friction under the tip", "adapted"):
+        assert scene in texts_of(drawn)
 
 
-def test_worlds_differ_in_one_thing_and_press_the_same_places(files):
-    settings = files
+def test_worlds_differ_in_one_setting(decide_settings):
+    settings = decide_settings
     section = parse(Worlds, read_yaml(ROOT / "pipeline/scenes/decide.yaml")["worlds"], "worlds")
     listed = worlds_of(simulation_settings(settings), section)
     assert [world.name for world in listed] == [
         "default-1", "residual-0.21", "residual-0.42", "skin_modulus-0", "skin_modulus-0.3", "amplitude_and_gap-0",
         "amplitude_and_gap-2", "friction-0.35", "friction-1.7",
     ]  # fmt: skip
-    own, erring, slippery = (rows_of(listed[i], section, 1) for i in (0, 2, 7))
-    np.testing.assert_array_equal(own.target, erring.target)  # places and forces stay
-    assert not np.allclose(own.db_uT, erring.db_uT, rtol=0.05)
-    np.testing.assert_array_equal(own.target, slippery.target)
-    assert np.linalg.norm(own.db_uT - slippery.db_uT) > 0.01 * np.linalg.norm(own.db_uT)
+    default, with_error, slippery = (rows_of(listed[i], section, 1) for i in (0, 2, 7))
+    np.testing.assert_array_equal(default.target, with_error.target)  # places and forces are equal
+    assert not np.allclose(default.db_uT, with_error.db_uT, rtol=0.05)
+    np.testing.assert_array_equal(default.target, slippery.target)
+    assert np.linalg.norm(default.db_uT - slippery.db_uT) > 0.01 * np.linalg.norm(default.db_uT)

@@ -1,15 +1,21 @@
-"""Numbers and provenance of a run that has every experiment's contract keys, with values that no run made."""
+"""Synthetic training cards, and the numbers of a run of every experiment."""
 
 import xml.etree.ElementTree as ET
+from typing import Any
 
+import numpy as np
 from scipy.stats import t
 
-from reskin.metrics import METRICS
+from reskin.metrics import METRICS, score_groups
+from reskin.seeds import rng_for
+from tests.scenes import RECIPE
 
 
 def texts_of(svg: str) -> str:
-    """Join the texts of a figure."""
-    return " ".join("".join(one.itertext()) for one in ET.fromstring(svg).iter() if one.tag.endswith("text"))
+    """Return all text of a figure."""
+    return " ".join(
+        "".join(element.itertext()) for element in ET.fromstring(svg).iter() if element.tag.endswith("text")
+    )
 
 
 def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:
@@ -17,7 +23,7 @@ def stat(mean: float = 1.0, sd: float = 0.5, n: int = 3) -> dict:
 
 
 def over_boards(low: float = 0.5, high: float = 1.5, n: int = 6) -> dict:
-    """A summary over boards with this 95 % interval."""
+    """Return a summary over boards with the given 95 % confidence interval."""
     reach, middle = (high - low) / 2, (low + high) / 2
     se = reach / t.ppf(0.975, n - 1)
     stat = {"mean": middle, "sd": se * n**0.5, "n": n, "ci95": [low, high]}
@@ -25,7 +31,7 @@ def over_boards(low: float = 0.5, high: float = 1.5, n: int = 6) -> dict:
 
 
 def difference(low: float = 0.5, high: float = 1.5) -> dict:
-    """A paired difference, of every metric alike."""
+    """Return a paired difference that is equal for all metrics."""
     by_board = {board: dict.fromkeys(METRICS, (low + high) / 2) for board in ("b0", "b1")}
     return {name: over_boards(low, high) for name in METRICS} | {"by_board": by_board}
 
@@ -44,7 +50,7 @@ def all_experiments(source: str = "simulated") -> dict:
     plain = dict.fromkeys(METRICS, 1.0)
     windows = [{"contacts_n": 5000, "accuracy_pct": 90.0, "mse_xy_mm2": 0.1, "mse_f_N2": 0.1}]
     names = ("higher_and_faster", "offset", "each_is_worse", "overestimates")
-    said = {
+    finding = {
         "finding": "errors grow",
         "holds": True,
         "verdict": "supported",
@@ -65,7 +71,7 @@ def all_experiments(source: str = "simulated") -> dict:
             "registered": scores(),
             "by_board": {"b0": {"trained_on_skins_n": 15, "as_labelled": plain, "registered": plain}},
         },
-        "table2": {arm: scores() for arm in ("single", "multi", "triplet", "adapted")},
+        "table2": {method: scores() for method in ("single", "multi", "triplet", "adapted")},
         "adapt": {"pokes_n": 390, "control": scores()},
         "paired": [
             {"of": of, "over": over, **difference()}
@@ -81,7 +87,7 @@ def all_experiments(source: str = "simulated") -> dict:
         "described": {"grid": {"source": source, "counts": {"captures_n": 2, "readings_n": 1000}, "over_skins": {}}},
         "drift": {
             "initial": windows, "regular": windows, "each": windows, "last_window": {"each": last},
-            "findings": [said | {"id": name} for name in names],
+            "findings": [finding | {"id": name} for name in names],
             "late": {"contacts_n": 45000, "bias_N": 0.1, "bias_pct": 5.0},
         },
         "variation": {"contacts_n": 10000},
@@ -106,3 +112,32 @@ def all_experiments(source: str = "simulated") -> dict:
         "dynamics": {"presses_n": 3, "rate_hz": 400.0},
         "runtime": {"stages": {"report": cost()}, "trainings_n": 1},
     }  # fmt: skip
+
+
+SKINS = [("b0", "s0"), ("b0", "s1"), ("b1", "s2"), ("b1", "s3")]
+
+
+def card(experiment: str, fold: str, scores: dict, recipe: str = "paper", seed_i: int = 0, **changes: Any) -> dict:
+    """Return the card of a training; adaptations used 390 pokes."""
+    values = {
+        "question": experiment, "recipe_name": recipe, "recipe": dict(RECIPE), "fold": fold, "seed_i": seed_i,
+        "scores": scores, "train_skins": ["s8", "s9"], "train_rows_n": 100,
+    }  # fmt: skip
+    tuning = {"tuning": {"pokes_n": 390, "settings": {"base": "paper"}}} if experiment == "adapt" else {}
+    return values | tuning | changes
+
+
+def adapted_card(fold: str, skin: str, seed_i: int, *, off_mm: float = 1.0, force: bool = True) -> dict:
+    """Return the card of a network adapted to one skin, with errors of about `off_mm`."""
+    rng = rng_for(seed_i, "adapted", fold, skin)
+    true = rng.uniform(0, 16, (10, 3))
+    predicted = true + rng.normal(0, off_mm, true.shape)
+    if not force:
+        true[:, 2] = np.nan
+    scores = score_groups(true, predicted, np.repeat(fold, 10), np.repeat(skin, 10))
+    return card("adapt", fold, scores, seed_i=seed_i)
+
+
+def adapted_cards(**changes: Any) -> list[dict]:
+    """Return the cards of three seeds, two boards and two skins per board."""
+    return [adapted_card(fold, skin, seed_i, **changes) for seed_i in range(3) for fold, skin in SKINS]

@@ -37,51 +37,51 @@ ROWS = read_rows()
 
 def leaves(name: str, value: Any) -> list[str]:
     if isinstance(value, dict):
-        return [leaf for key, own in value.items() for leaf in leaves(f"{name}.{key}", own)]
+        return [leaf for key, item in value.items() for leaf in leaves(f"{name}.{key}", item)]
     numbers = value if isinstance(value, tuple) else (value,)
     return [name] if all(isinstance(one, int | float) for one in numbers) else []
 
 
-def row(**words: Any) -> Row:
-    return Row(**{"id": "a", "where": "section 9", "what": "b", "paper": "SINGLE_SENSOR.accuracy_pct"} | words)
+def row(**fields: Any) -> Row:
+    return Row(**{"id": "a", "where": "section 9", "what": "b", "paper": "SINGLE_SENSOR.accuracy_pct"} | fields)
 
 
 def judged(
-    found: Any, printed: Any = None, *, pooled: bool = True, simulated: bool = True, **changes: Any
+    value: Any, printed: Any = None, *, pooled: bool = True, simulated: bool = True, **changes: Any
 ) -> Judgement:
-    return judge(row(**{"ours": "a.accuracy_pct"} | changes), printed, found, pooled=pooled, simulated=simulated)
+    return judge(row(**{"ours": "a.accuracy_pct"} | changes), printed, value, pooled=pooled, simulated=simulated)
 
 
 @pytest.mark.parametrize("one", ROWS, ids=lambda one: one.id)
-def test_every_row_finds_its_number_in_a_scene_that_asks_everything(one):
+def test_every_row_resolves_to_a_number(one):
     assert one.ours is None or resolve(all_experiments(), one.ours) is not None
     assert one.stage is None or one.stage in STAGES
     assert (one.paper is None) != (one.says is None)
 
 
-def test_every_number_of_the_paper_is_used_by_a_row():
+def test_every_number_of_the_paper_is_used():
     named = {name: value for name, value in vars(paper).items() if name.isupper()}
     printed = {leaf for name, value in named.items() for leaf in leaves(name, value)}
     used = {one.paper for one in ROWS} | {one.reach.paper for one in ROWS if one.reach}
     assert printed - used == set()
-    assert len(printed) > 30  # the walk above finds them
+    assert len(printed) > 30  # the loop found numbers
 
 
 def test_every_figure_and_table_of_the_paper_has_a_row():
-    there = {one.where for one in ROWS}
+    sections = {one.where for one in ROWS}
     figures = [f"figure 1{letter}" for letter in "ABCDEF"] + ["figure 2", "figure 3"]
     figures += [f"figure {i}{letter}" for i in (4, 5, 6) for letter in "ab"]
-    assert {*figures, "table 1", "table 2"} <= there
+    assert {*figures, "table 1", "table 2"} <= sections
     assert len({one.id for one in ROWS}) == len(ROWS)
 
 
 def line(numbers: dict, name: str) -> dict[str, str]:
-    """The line of the checklist with this id."""
+    """Return the row of the checklist with the given id."""
     (one,) = [one for one in ROWS if one.id == name]
     return checklist(numbers, [one]).to_dict("records")[0]
 
 
-def test_an_experiment_that_was_not_run_is_named_so():
+def test_missing_experiment_is_not_run():
     numbers = all_experiments()
     del numbers["shear"]
     shear = line(numbers, "shear-mse_xy_mm2")
@@ -92,14 +92,14 @@ def test_an_experiment_that_was_not_run_is_named_so():
 @given(
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
-def test_a_number_is_near_within_the_papers_sd_or_ten_percent(mean, sd, ours, path):
-    found = judged(stat(ours), (mean, sd), ours=f"a.{path}")
-    assert (found.criterion, found.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
+def test_number_is_met_within_paper_sd_or_ten_percent(mean, sd, ours, path):
+    judgement = judged(stat(ours), (mean, sd), ours=f"a.{path}")
+    assert (judgement.criterion, judgement.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
     alone = judged(stat(ours), mean, ours=f"a.{path}")
     assert (alone.criterion, alone.met) == (
         "within 10 % of the paper's", "yes" if abs(ours - mean) <= 0.1 * mean else "no",
     )  # fmt: skip
-    assert found.verdict == alone.verdict == "–"
+    assert judgement.verdict == alone.verdict == "–"
 
 
 @pytest.mark.parametrize(
@@ -111,13 +111,13 @@ def test_a_number_is_near_within_the_papers_sd_or_ten_percent(mean, sd, ours, pa
     ],
 )  # fmt: skip
 def test_limits_are_met_by_the_mean(rule, ours, paper, criterion, met):
-    found = judged(ours, paper, rule=rule)
-    assert (found.verdict, found.criterion, found.met) == (FEW_BOARDS, criterion, met)
+    judgement = judged(ours, paper, rule=rule)
+    assert (judgement.verdict, judgement.criterion, judgement.met) == (FEW_BOARDS, criterion, met)
 
 
-def test_a_finding_has_the_verdict_of_its_experiment():
-    found = judged({"verdict": "undecided", "of_trainings": SUPPORTED}, rule="finding")
-    assert (found.verdict, found.met) == ("undecided", "yes")
+def test_finding_has_the_verdict_of_its_experiment():
+    judgement = judged({"verdict": "undecided", "of_trainings": SUPPORTED}, rule="finding")
+    assert (judgement.verdict, judgement.met) == ("undecided", "yes")
     assert judged(False).met == "no"
 
 
@@ -130,20 +130,20 @@ def test_a_finding_has_the_verdict_of_its_experiment():
         ("positive", 0.1, 3.0, SUPPORTED), ("positive", -3.0, -0.1, CONTRADICTED), ("positive", -1.0, 3.0, UNDECIDED),
     ],
 )  # fmt: skip
-def test_claims_are_judged_by_their_interval_over_boards(rule, low, high, verdict):
+def test_claims_are_judged_by_interval_over_boards(rule, low, high, verdict):
     assert judged(over_boards(low, high), rule=rule).verdict == verdict
     assert judged({"mean": (low + high) / 2, "n": 1}, rule=rule).verdict == FEW_BOARDS
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
-def test_limits_are_judged_from_both_sides_alike(low, width, limit):
+def test_lower_and_upper_limits_are_judged_alike(low, width, limit):
     ours = over_boards(low, low + width)
     least, most = (judged(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
     assert (least, most) in {(SUPPORTED, CONTRADICTED), (CONTRADICTED, SUPPORTED), (UNDECIDED, UNDECIDED)}
     assert (least == SUPPORTED) == (low > limit)
 
 
-def test_less_of_an_error_is_a_gain():
+def test_decrease_of_an_error_is_a_gain():
     assert judged(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == SUPPORTED
     assert judged(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == CONTRADICTED
 
@@ -157,30 +157,28 @@ def test_less_of_an_error_is_a_gain():
         (-4.0, 2.9, CONTRADICTED, False),
     ],
 )
-def test_a_sizeable_gain_is_half_of_the_papers_and_one_below_that_may_be_equivalent_to_none(
-    low, high, verdict, equivalent
-):
-    found = judged(over_boards(low, high), 5.97, rule="sizeable")
-    assert (found.verdict, found.criterion) == (verdict, "gain above 2.98, half of the paper's")
-    assert (EQUIVALENT in found.notes) == equivalent == (max(-low, high) < 5.97 / 2)
+def test_sizeable_gain_is_half_of_the_papers(low, high, verdict, equivalent):
+    judgement = judged(over_boards(low, high), 5.97, rule="sizeable")
+    assert (judgement.verdict, judgement.criterion) == (verdict, "gain above 2.98, half of the paper's")
+    assert (EQUIVALENT in judgement.notes) == equivalent == (max(-low, high) < 5.97 / 2)
 
 
-def test_a_score_on_repeats_of_one_skin_is_one_board_however_many_repeats():
+def test_repeats_of_one_skin_are_one_board():
     assert judged(stat(96.3, 0.1, 5), 90.0, rule="at_least").verdict == FEW_BOARDS
 
 
-def test_what_is_to_hold_at_every_number_of_skins_fails_where_one_fails():
+def test_each_rule_fails_where_one_count_fails():
     sweep = [
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
-    found = judged(sweep, rule="each")
-    assert (found.verdict, found.met) == (UNDECIDED, "yes")
-    assert found.notes == ("1 skins: supported, 6 skins: undecided, 15 skins: supported",)
+    judgement = judged(sweep, rule="each")
+    assert (judgement.verdict, judgement.met) == (UNDECIDED, "yes")
+    assert judgement.notes == ("1 skins: supported, 6 skins: undecided, 15 skins: supported",)
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
     assert judged(sweep, rule="each").verdict == CONTRADICTED
 
 
-def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
+def test_simulated_calibration_target_is_no_evidence():
     target = {"ours": "table2.single.accuracy_pct", "rule": "target"}
     assert judged(stat(25.0), (25.0, 10.0), **target).notes == (TARGET,)
     assert judged(stat(25.0), (25.0, 10.0), simulated=False, **target).notes == ()
@@ -189,7 +187,7 @@ def test_a_calibration_target_is_no_evidence_where_it_was_simulated():
     }
 
 
-def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
+def test_every_claim_has_a_verdict():
     table = checklist(all_experiments())
     claims = table["result"].str.startswith("claim")
     assert set(table.loc[claims, "verdict"]) <= {SUPPORTED, CONTRADICTED, UNDECIDED, FEW_BOARDS}
@@ -197,7 +195,7 @@ def test_every_claim_of_the_paper_has_a_verdict_in_the_one_vocabulary():
     assert set(table["verdict"]) <= {SUPPORTED, CONTRADICTED, UNDECIDED, FEW_BOARDS, "–"}
 
 
-def test_a_sweep_that_does_not_go_as_far_as_a_claim_is_named_so():
+def test_sweep_too_short_for_a_claim_is_not_reached():
     numbers = all_experiments()
     del numbers["contrasts"]["pokes_plateau"]
     assert line(numbers, "plateau")["note"] == NOT_REACHED
@@ -205,56 +203,56 @@ def test_a_sweep_that_does_not_go_as_far_as_a_claim_is_named_so():
     assert line(numbers, "plateau")["note"] == NOT_RUN
 
 
-def test_one_training_skin_is_not_compared_with_pooled_networks():
-    own = {"ours": "table2.multi.accuracy_pct"}
-    assert judged(stat(90.0), (85.0, 1.0), pooled=False, **own).notes == (ONE_SKIN,)
-    assert judged(stat(90.0), (85.0, 1.0), **own).met == "no"
+def test_single_training_skin_is_not_compared_with_pooled():
+    item = {"ours": "table2.multi.accuracy_pct"}
+    assert judged(stat(90.0), (85.0, 1.0), pooled=False, **item).notes == (ONE_SKIN,)
+    assert judged(stat(90.0), (85.0, 1.0), **item).met == "no"
 
 
-def test_a_reason_is_given_only_where_ours_differs():
+def test_reason_is_shown_only_where_ours_differs():
     numbers = all_experiments()
-    mine = [row(ours="single_random.accuracy_pct", why="Because.")]
-    assert checklist(numbers, mine)["note"][0] == "Because."
+    rows = [row(ours="single_random.accuracy_pct", why="Because.")]
+    assert checklist(numbers, rows)["note"][0] == "Because."
     numbers["single_random"]["accuracy_pct"] = stat(99.5)
-    assert checklist(numbers, mine)["note"][0] == "–"
+    assert checklist(numbers, rows)["note"][0] == "–"
 
 
-def test_where_ours_did_not_go_as_far_as_the_paper_the_note_begins_so():
+def test_short_run_is_noted_as_not_reached():
     numbers = all_experiments()
     assert line(numbers, "figure-5b")["note"] == "45,000 contacts, paper 45,000"
     numbers["drift"]["late"]["contacts_n"] = 18_000
     assert line(numbers, "figure-5b")["note"] == "not reached: 18,000 contacts, paper 45,000"
     numbers["drift"]["late"]["bias_N"] = -0.1
-    found = line(numbers, "figure-5b")
-    assert found["met"] == "no"
-    assert found["note"].startswith("not reached: 18,000 contacts, paper 45,000. The paper explains")
+    bias = line(numbers, "figure-5b")
+    assert bias["met"] == "no"
+    assert bias["note"].startswith("not reached: 18,000 contacts, paper 45,000. The paper explains")
     del numbers["drift"]
     assert line(numbers, "figure-5b")["note"] == NOT_RUN
 
 
 @pytest.mark.parametrize("name", ["rate", "temporal-resolution", "logs", "sleeve-chips", "sleeve-rate"])
-def test_settings_of_a_simulated_rig_are_no_agreement_with_the_paper(name):
+def test_settings_of_a_simulated_rig_are_not_judged(name):
     assert line(all_experiments("simulated"), name)["note"] == SETTING
     assert line(all_experiments("recorded"), name)["met"] in ("yes", "–")
 
 
-def test_the_flexible_bias_is_judged_after_adaptation():
+def test_flexible_bias_is_judged_after_adaptation():
     numbers = all_experiments()
     numbers["flexible"]["bias_f_N"] = {"before": stat(1.0), "after": stat(-0.2)}
     assert line(numbers, "flexible-bias")["met"] == "no"
 
 
-def test_reasons_about_simulation_are_given_of_simulated_scenes_alone():
+def test_reasons_about_simulation_only_in_simulated_scenes():
     simulation = ("simulat", "assumed", "a possible reason")
     for source in ("simulated", "recorded"):
-        found = checklist(all_experiments(source))["note"]
+        notes = checklist(all_experiments(source))["note"]
         shown = [one for one in ROWS if one.only in (None, source)]
-        named = found[[one.rule not in ("input", "target") for one in shown]].str.contains("|".join(simulation))
+        named = notes[[one.rule not in ("input", "target") for one in shown]].str.contains("|".join(simulation))
         assert named.any() == (source == "simulated")
     assert not any(word in one.why for one in ROWS for word in simulation)
 
 
-def test_a_reason_names_numbers_of_the_paper_and_of_ours():
+def test_reason_fills_in_numbers():
     assert "80 % nearer to the skin, ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
 
 
@@ -265,28 +263,28 @@ def test_a_reason_names_numbers_of_the_paper_and_of_ours():
         ({"mean": 99.0, "n": 1}, "–"),
     ],
 )  # fmt: skip
-def test_the_papers_number_is_compared_with_our_interval_over_boards(ours, within):
+def test_papers_number_is_compared_with_our_interval(ours, within):
     numbers = all_experiments() | {"a": {"accuracy_pct": ours}}
     assert checklist(numbers, [row(ours="a.accuracy_pct")])["paper in our interval"][0] == within
 
 
 def with_p(p: float, mean: float = 1.0) -> dict:
-    """A difference over boards whose two-sided p-value is p."""
+    """Return a difference over boards with the two-sided p-value p."""
     se = mean / t.isf(p / 2, 5)
     return {"mean": mean, "sd": se * 6**0.5, "n": 6, "ci95": [mean - 2.571 * se, mean + 2.571 * se], "se": se, "df": 5}
 
 
-def test_a_family_of_claims_is_judged_by_holm_and_other_rows_are_not():
+def test_family_of_claims_is_corrected_by_holm():
     claim = {"what": "claim: x", "paper": None, "says": "claimed", "rule": "gain"}
     rows = [row(id=f"r{i}", ours=f"d{i}.accuracy_pct", family=i < 3, **claim) for i in range(4)]
     numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
-    # Of three, 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: no longer significant, though their intervals exclude 0.
+    # Three claims: 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: not significant although their intervals exclude 0.
     assert table["verdict"].tolist() == [SUPPORTED, UNDECIDED, UNDECIDED, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
 
 
-def test_claims_stand_in_a_table_of_their_own_if_they_are_judged():
+def test_claims_table_lists_only_judged_claims():
     claims = claims_table(checklist(all_experiments()))
     assert len(claims) > 15
     assert not claims["claim"].str.startswith("claim").any()
@@ -296,26 +294,26 @@ def test_claims_stand_in_a_table_of_their_own_if_they_are_judged():
     assert all(name.endswith("accuracy_pct") or name.startswith(("pokes", "sensors")) for name in family)
 
 
-def test_a_misspelt_constant_is_named():
+def test_unknown_constant_is_an_error():
     with pytest.raises(
         SchemaError, match="must be a constant of pipeline.report.paper, or a path in numbers.json; got SHEARS.x"
     ):
         look_up({}, "SHEARS.x")
 
 
-def test_a_row_of_a_list_is_picked_by_its_value():
+def test_resolve_picks_list_items_by_value():
     assert resolve(all_experiments(), "sweep_pokes.pokes_n=390.accuracy_pct") == stat()
     assert resolve(all_experiments(), "paired.of=adapted,over=multi.over") == "multi"
     assert resolve(all_experiments(), "sweep_pokes.pokes_n=391.accuracy_pct") is None
 
 
-def test_a_claim_of_several_parts_is_denied_by_one_part_with_bonferronis_p_and_affirmed_by_the_largest():
+def test_p_value_of_a_claim_of_several_parts():
     claim = row(rule="each", ours="x.accuracy_pct")
 
     def parts(*means: float) -> list[dict]:
         return [{"accuracy_pct": {"mean": mean, "se": se, "df": 5}} for mean, se in zip(means, (0.5, 1.0), strict=True)]
 
     alone = [p_of(claim, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
-    assert p_of(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the 0.85 of the other
+    assert p_of(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the second part's 0.85
     assert p_of(claim, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
     assert p_of(claim, None, []) is None

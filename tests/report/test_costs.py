@@ -1,4 +1,4 @@
-"""Error against run time: the Pareto front, failures, what was not timed, and the same bytes for the same numbers."""
+"""Tests of the figures and tables of error against run time."""
 
 import re
 from dataclasses import asdict
@@ -48,45 +48,52 @@ STIFF = [
 
 
 def timed(rows: list[Precision]) -> list[dict]:
-    """Rows of a study as numbers.json joined with its times has them; neither failures nor references are timed."""
+    """Return the rows of a study with run times, except for failures and references."""
     done = [row for row in rows if row.error is not None and row.method != REFERENCE]
     times = {row.key: {"median_s": 1e-4 * (i + 1), "repeats_n": 5} for i, row in enumerate(done)}
     return [asdict(row) | times.get(row.key, {}) for row in rows]
 
 
-def draw_sums(rows=SUMS, **limits) -> str:
+def draw_quadratures(rows=SUMS, **limits) -> str:
     return quadratures(timed(rows), asdict(choose(rows, used=DEFAULT_QUADRATURE, **limits)), "simulated")
 
 
-def draw_stiff(rows=STIFF) -> str:
+def draw_integrators(rows=STIFF) -> str:
     return integrators(timed(rows))
 
 
-def test_the_figure_of_quadratures_says_units_limit_choice_source_and_how_good_its_reference_is():
-    words = texts_of(draw_sums())
-    for word in ("median time an indentation / ms", "rms error / rms dB", "2 %", "simulated", "Gauss in z", "midpoint"):
-        assert word in words
-    assert "cheapest below it: 0.7 mm x 5" in words
-    assert "in use: 0.5 mm x 6" in words
-    assert "reference's own error, at most" in words
+def test_quadrature_figure_labels():
+    text = texts_of(draw_quadratures())
+    for label in (
+        "median time an indentation / ms",
+        "rms error / rms dB",
+        "2 %",
+        "simulated",
+        "Gauss in z",
+        "midpoint",
+    ):
+        assert label in text
+    assert "cheapest below it: 0.7 mm x 5" in text
+    assert "in use: 0.5 mm x 6" in text
+    assert "reference's own error, at most" in text
 
 
-def test_where_no_rule_is_good_enough_only_the_one_in_use_is_ringed():
-    words = texts_of(draw_sums(error_max=1e-6))
-    assert "cheapest" not in words
-    assert "in use: 0.5 mm x 6" in words
+def test_only_the_rule_in_use_is_marked_without_a_good_enough_one():
+    text = texts_of(draw_quadratures(error_max=1e-6))
+    assert "cheapest" not in text
+    assert "in use: 0.5 mm x 6" in text
 
 
-def test_the_figure_of_integrators_has_a_panel_a_stiffness_and_lists_every_failure():
-    words = texts_of(draw_stiff())
-    for word in ("stiffness 1e+03", "stiffness 1e+08", "exact update", "Radau", "rms error / rms force"):
-        assert word in words
+def test_integrator_figure_labels():
+    text = texts_of(draw_integrators())
+    for label in ("stiffness 1e+03", "stiffness 1e+08", "exact update", "Radau", "rms error / rms force"):
+        assert label in text
     for line in failures(timed(STIFF)):
-        for word in line.split():
-            assert word in words
+        for label in line.split():
+            assert label in text
 
 
-def test_failures_are_gathered_by_method_and_kind_and_none_is_dropped():
+def test_failures_are_grouped_by_method_and_kind():
     diverged, stopped = failures(timed(STIFF))
     assert diverged == (
         "Failed: explicit Euler, diverged: relaxation, stiffness 1e+03 (1e-02 s, 1e-03 s);"
@@ -96,17 +103,17 @@ def test_failures_are_gathered_by_method_and_kind_and_none_is_dropped():
     assert failures(timed(SUMS)) == []
 
 
-def test_what_failed_or_was_not_timed_is_no_point_of_the_figure():
-    # Each point is one use of a marker; without these rows there are as many.
+def test_failed_and_untimed_rows_are_not_drawn():
+    # Each point is one <use> of a marker.
     done = [row for row in STIFF if row.failure is None]
-    assert drawn(draw_stiff()) == drawn(draw_stiff(done))
+    assert drawn(draw_integrators()) == drawn(draw_integrators(done))
     last = {key: value for key, value in timed(SUMS)[-1].items() if key != "median_s"}
     choice = asdict(choose(SUMS, used=DEFAULT_QUADRATURE))
     untimed, without = (quadratures([*timed(SUMS)[:-1], *more], choice, "simulated") for more in ([last], []))
     assert drawn(untimed) == drawn(without)
 
 
-def test_pages_hold_the_studies_that_a_scene_ran():
+def test_pages_match_the_studies_of_the_scene():
     stages = {"stages": {"simulate": cost()}}
     assert set(cost_pages(stages, "simulated")) == {"stages.md"}
     assert set(cost_pages(stages | {"integrators": timed(STIFF)}, "simulated")) == {
@@ -114,7 +121,7 @@ def test_pages_hold_the_studies_that_a_scene_ran():
     }  # fmt: skip
 
 
-def test_what_a_stage_cost_stands_beside_its_last_run_and_what_that_reused():
+def test_stage_costs_columns():
     (line,) = stage_costs({"train_multi": cost(seconds=0.25)}).to_dict("records")
     assert line == {
         "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "CPU of it, s": "–",
@@ -122,16 +129,16 @@ def test_what_a_stage_cost_stands_beside_its_last_run_and_what_that_reused():
     }  # fmt: skip
 
 
-def test_same_rows_same_bytes_other_seconds_other_bytes():
-    assert draw_sums() == draw_sums()
-    stiff = draw_stiff()
-    assert draw_stiff() == stiff
+def test_figure_bytes_depend_only_on_rows():
+    assert draw_quadratures() == draw_quadratures()
+    stiff = draw_integrators()
+    assert draw_integrators() == stiff
     slower = [row | ({"median_s": row["median_s"] ** 2} if "median_s" in row else {}) for row in timed(STIFF)]
     assert integrators(slower) != stiff
 
 
 @given(st.lists(st.tuples(st.floats(1e-6, 1), st.floats(1e-16, 1)), max_size=12))
-def test_on_the_front_who_takes_longer_is_more_exact_and_beats_all_that_are_left_out(points):
+def test_front_dominates_all_other_points(points):
     kept = front(points)
     assert set(kept) <= set(points)
     times, errors = np.array(kept).reshape(-1, 2).T
@@ -141,7 +148,7 @@ def test_on_the_front_who_takes_longer_is_more_exact_and_beats_all_that_are_left
         assert any(t <= time and e <= error for t, e in kept)
 
 
-def test_seven_methods_differ_in_colour_and_in_marker():
+def test_seven_methods_differ_in_colour_and_marker():
     assert len(set(COLOURS)) == len(set(MARKERS)) == 7
 
 
@@ -160,7 +167,7 @@ PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, m
 
 
 @given(PLACES)
-def test_the_numbered_methods_are_those_that_no_other_dominates(places):
+def test_labelled_points_are_not_dominated(places):
     points = trade_off_points(rows_of(places), "train_s")
     naive = set()
     for place in places:
@@ -174,7 +181,7 @@ def test_the_numbered_methods_are_those_that_no_other_dominates(places):
 
 
 @given(PLACES)
-def test_numbers_of_the_front_rise_with_cost_and_fall_with_error(places):
+def test_labels_follow_the_front(places):
     members = [point for point in trade_off_points(rows_of(places), "train_s") if point.label]
     numbered = {int(point.label): point.place for point in members}
     assert sorted(numbered) == list(range(1, len(numbered) + 1))
@@ -184,14 +191,14 @@ def test_numbers_of_the_front_rise_with_cost_and_fall_with_error(places):
         assert error > next_error
 
 
-def test_the_figure_names_every_method_and_numbers_the_front():
-    words = texts_of(trade_off(rows_of([(1, 3), (2, 2), (3, 2.5)]), "train_s", title="t", cost="c"))
-    for word in ("1  m0 (raw)", "2  m1 (raw)", "m2 (raw)", "Pareto front"):
-        assert word in words
+def test_trade_off_figure_lists_every_method():
+    text = texts_of(trade_off(rows_of([(1, 3), (2, 2), (3, 2.5)]), "train_s", title="t", cost="c"))
+    for label in ("1  m0 (raw)", "2  m1 (raw)", "m2 (raw)", "Pareto front"):
+        assert label in text
 
 
-def test_a_step_of_the_front_promises_no_error_before_it_was_reached():
-    # With more time the error stays (to the right) until the next method reaches less (down).
+def test_front_is_drawn_as_steps():
+    # The error is constant (a horizontal line) up to the time of the next method, then drops (a vertical line).
     svg = trade_off(rows_of([(1, 3), (2, 2)]), "train_s", title="t", cost="c")
     (step,) = re.findall(r'<path d="([^"]+)"[^>]*stroke: #666666', svg.split('id="legend_1"')[0])
     first, corner, last = re.findall(r"[ML] (\S+) (\S+)", step)
@@ -199,7 +206,7 @@ def test_a_step_of_the_front_promises_no_error_before_it_was_reached():
     assert corner[0] == last[0]
 
 
-def test_raw_and_other_inputs_of_a_method_share_colour_and_marker_and_differ_in_filling():
+def test_raw_and_other_inputs_differ_in_fill():
     raw_row, other_row = rows_of([(1, 3), (2, 2)])
     rows = [raw_row | {"method": "ridge"}, other_row | {"method": "ridge", "inputs": "shape"}]
     raw, shape = (point.look for point in trade_off_points(rows, "train_s"))
@@ -207,7 +214,7 @@ def test_raw_and_other_inputs_of_a_method_share_colour_and_marker_and_differ_in_
     assert shape["markerfacecolor"] == "white"
 
 
-def test_forty_nine_methods_differ_in_colour_or_marker():
+def test_looks_of_49_methods_are_distinct():
     assert len({(look_of(i)["color"], look_of(i)["marker"]) for i in range(49)}) == 49
 
 
@@ -238,7 +245,7 @@ def costs() -> dict[str, str]:
     return cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated")
 
 
-def test_pages_of_costs_hold_what_was_asked_for_and_no_figure_of_what_was_not_timed(costs):
+def test_cost_pages_have_no_figure_of_untimed_rows(costs):
     assert set(costs) == {"training.svg", "inference.svg", "adaptation.svg", "learning.md", "adaptation.md"}
     untimed = [{key: value for key, value in one.items() if key != "train_s"} for one in LEARNING]
     assert set(cost_pages({"learning": untimed}, "simulated")) == {"inference.svg", "learning.md"}
@@ -247,7 +254,7 @@ def test_pages_of_costs_hold_what_was_asked_for_and_no_figure_of_what_was_not_ti
     assert cost_pages({"choice": {}}, "simulated") == {}
 
 
-def test_what_was_not_timed_is_left_out_of_the_figure_and_stays_in_the_table():
+def test_untimed_method_is_only_in_the_table():
     untimed = {key: value for key, value in LEARNING[2].items() if key != "train_s"}
     pages = cost_pages({"learning": [*LEARNING[:2], untimed, *LEARNING[3:]]}, "simulated")
     assert "kNN" not in texts_of(pages["training.svg"])
@@ -256,33 +263,33 @@ def test_what_was_not_timed_is_left_out_of_the_figure_and_stays_in_the_table():
     assert [cell.strip() for cell in line.split("|")][3] == "–"
 
 
-def test_costs_name_units_and_source_and_label_every_number_of_pokes():
+def test_cost_figures_have_units_source_and_poke_counts():
     pages = cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "recorded")
     for name, unit in (("training", " / s"), ("inference", " / µs"), ("adaptation", " / s")):
-        words = texts_of(pages[f"{name}.svg"])
-        assert unit in words
-        assert "MSE_xy / mm²" in words
-        assert "recorded" in words
+        text = texts_of(pages[f"{name}.svg"])
+        assert unit in text
+        assert "MSE_xy / mm²" in text
+        assert "recorded" in text
     assert {"65", "390", "3900"} <= set(texts_of(pages["adaptation.svg"]).split())
 
 
-def test_one_point_more_is_one_mark_more(costs):
+def test_each_point_adds_one_mark(costs):
     few, all_ = cost_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
     ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
-    # A mark stands in the panel and in the legend; a tick is one mark; every label is text and no mark.
+    # Each point has a mark in the panel and one in the legend. Each tick is a mark too.
     assert drawn(all_) - ticks["all"] - (drawn(few) - ticks["few"]) == 2
 
 
-def test_pages_of_costs_are_the_same_bytes_for_the_same_numbers(costs):
+def test_cost_pages_are_reproducible(costs):
     assert cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated") == costs
 
 
 def drawn(svg: str) -> int:
-    """Count marks: each is one use of a path."""
+    """Return the number of marks: each is a <use> of a path."""
     return len(re.findall("<use ", svg))
 
 
-def test_what_was_not_timed_here_has_a_dash():
+def test_untimed_cells_are_dashes():
     timed = {"method": "ridge", "inputs": "raw", "train_s": 0.0123, "inference_us": 4.56, **row(30.0)}
     untimed = {name: value for name, value in timed.items() if name not in ("train_s", "inference_us")}
     rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]
@@ -292,7 +299,7 @@ def test_what_was_not_timed_here_has_a_dash():
     assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
 
 
-def test_reference_methods_have_their_errors_beside_their_seconds():
+def test_reference_methods_have_times_and_errors():
     methods = [
         {"method": method, "pokes": pokes, "labels_n": 0, "as_labelled": row(accuracy_pct)}
         for method, pokes, accuracy_pct in (("map", "none", 20.0), ("map", "its own", 40.0), ("ridge", "its own", 30.0))

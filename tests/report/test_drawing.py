@@ -1,4 +1,4 @@
-"""What marks say: the numbers that were drawn, each at its own mark, and nothing where that is not sure."""
+"""Tests of the titles of marks in figures, which show their values."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -15,19 +15,19 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def titles(text: str) -> list[list[str]]:
-    """The lines of every title, in order."""
+    """Return the lines of each title, in order."""
     return [unescape(title).split("\n") for title in re.findall(r"<title>(.*?)</title>", text, re.DOTALL)]
 
 
-def draw(plot, **words) -> str:
+def draw(plot, **labels) -> str:
     with drawing(4.0, 3.0) as figure:
         axes = figure.subplots()
         plot(axes)
-        axes.set(**words)
+        axes.set(**labels)
         return svg(figure)
 
 
-def test_a_mark_says_its_line_and_both_values_with_the_names_of_the_axes():
+def test_title_of_a_mark_has_label_and_values():
     text = draw(lambda axes: axes.plot([1, 2], [30, 45.5], "o-", label="ours"), xlabel="pokes", ylabel="accuracy / %")
     assert titles(text) == [
         ["ours", "pokes = 1", "accuracy / % = 30"],
@@ -37,28 +37,28 @@ def test_a_mark_says_its_line_and_both_values_with_the_names_of_the_axes():
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=12))
-def test_marks_further_right_say_larger_values(points):
+def test_titles_increase_with_position(points):
     x, y = np.array(points).round(1).T
     text = draw(lambda axes: axes.plot(x, y, "s"), xlabel="x", ylabel="y")
     marks = [use for use in ET.fromstring(text).iter(f"{SVG}use") if use.find(f"{SVG}title") is not None]
-    said = [float(mark.find(f"{SVG}title").text.split("\n")[0].removeprefix("x = ")) for mark in marks]
+    shown = [float(mark.find(f"{SVG}title").text.split("\n")[0].removeprefix("x = ")) for mark in marks]
     at = [float(mark.get("x")) for mark in marks]
-    assert said == pytest.approx(x)
-    assert np.all(np.diff(np.array(at)[np.argsort(said, kind="stable")]) >= -0.02)  # places are cut at two digits
+    assert shown == pytest.approx(x)
+    assert np.all(np.diff(np.array(at)[np.argsort(shown, kind="stable")]) >= -0.02)  # positions have two decimals
 
 
-def test_a_bar_says_from_where_to_where():
+def test_title_of_a_bar_has_its_ends():
     text = draw(lambda axes: axes.errorbar([1, 2], [5, 6], [[1, 0], [2, 0]], fmt="o", label="ours"))
-    assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 7", "y = 6"]  # the other has no length
+    assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 7", "y = 6"]  # the second bar has no length
     text = draw(lambda axes: axes.errorbar([5, 6], [1, 2], xerr=[1, 2], fmt="o", capsize=3))
     assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 6", "bar from 4 to 8"]
 
 
-def test_errors_without_bars_are_marks_like_others():
+def test_errorbar_without_bars_has_titles():
     assert len(titles(draw(lambda axes: axes.errorbar([1, 2], [5, 6], None, fmt="o")))) == 2
 
 
-def test_a_tick_with_a_name_says_it_and_a_tick_with_a_number_does_not_stand_for_its_neighbours():
+def test_named_ticks_are_used_in_titles():
     def plot(axes):
         axes.plot([3.1, 3.2], [0.9, 2.1], "o")
         axes.set_yticks([1, 2], ["one\nskin", "two skins"])
@@ -67,7 +67,7 @@ def test_a_tick_with_a_name_says_it_and_a_tick_with_a_number_does_not_stand_for_
     assert titles(draw(plot, xlabel="n")) == [["n = 3.1", "one skin"], ["n = 3.2", "two skins"]]
 
 
-def test_a_panel_that_shares_an_axis_says_its_name():
+def test_shared_axis_uses_its_label():
     with drawing(4.0, 3.0) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         left.set(ylabel="accuracy / %")
@@ -75,7 +75,7 @@ def test_a_panel_that_shares_an_axis_says_its_name():
         assert titles(svg(figure)) == [["x = 1", "accuracy / % = 2"]]
 
 
-def test_colours_of_a_cloud_are_values_too():
+def test_colour_values_are_in_titles():
     def plot(axes):
         points = axes.scatter([1, 2], [3, 4], c=[0.25, 0.5])
         axes.figure.colorbar(points, label="error / mm")
@@ -83,7 +83,7 @@ def test_colours_of_a_cloud_are_values_too():
     assert titles(draw(plot)) == [["x = 1", "y = 3", "error / mm = 0.25"], ["x = 2", "y = 4", "error / mm = 0.5"]]
 
 
-def test_a_line_without_marks_says_its_name_alone_and_a_nameless_one_nothing():
+def test_line_without_marks_has_only_its_label():
     text = draw(lambda axes: (axes.plot([1, 2], [3, 4], label="a & b"), axes.axhline(3)))
     assert titles(text) == [["a & b"]]
     ET.fromstring(text)
@@ -92,12 +92,12 @@ def test_a_line_without_marks_says_its_name_alone_and_a_nameless_one_nothing():
 @pytest.mark.parametrize(
     "values",
     [np.arange(MARKS_MAX_N + 1.0), np.array([1.0, np.nan, 3.0])],
-    ids=["more than one would read", "one of them not drawn"],
+    ids=["too many", "one not drawn"],
 )
-def test_where_it_is_not_sure_or_too_much_marks_say_nothing(values):
+def test_no_titles_for_too_many_or_missing_values(values):
     assert titles(draw(lambda axes: axes.plot(values, values, "o"))) == []
     assert titles(draw(lambda axes: axes.scatter(values, values))) == []
 
 
-def test_what_is_not_drawn_changes_nothing():
+def test_invisible_marks_have_no_titles():
     assert titles(draw(lambda axes: axes.plot([1], [2], "o", visible=False))) == []

@@ -1,4 +1,4 @@
-"""Figures: marks, units, source, the paper's numbers, and the same bytes for the same numbers."""
+"""Tests of the report's figures: marks, units, source, the paper's numbers and reproducible bytes."""
 
 import io
 import json
@@ -29,32 +29,32 @@ def draw_grid(error_mm: float = 0.5) -> str:
     return error_grid(PLACES_MM, PLACES_MM + error_mm, title="lab (recorded), lobo")
 
 
-def test_a_figure_is_svg_with_units_on_its_axes_and_its_source_in_the_title():
+def test_error_grid_has_units_and_source():
     text = draw_grid()
     ET.fromstring(text)
-    for word in ("x / mm", "y / mm", "mean place error / mm", "recorded"):
-        assert word in text
+    for label in ("x / mm", "y / mm", "mean place error / mm", "recorded"):
+        assert label in text
 
 
-def test_every_place_is_drawn_once_however_often_it_was_poked():
+def test_each_place_is_drawn_once():
     assert draw_grid().count("<title>x / mm") == 4
 
 
-def test_a_skin_and_its_chips_are_drawn_where_places_lie_on_the_papers_grid_and_nowhere_else():
+def test_skin_and_chips_are_drawn_only_on_the_papers_grid():
     elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
-    # Five chips and a skin, and these two in the legend; axes without a spine on two sides.
+    # Five chips, a skin and two legend entries; the axes lack two spines.
     assert draw_grid().count('id="patch_') - elsewhere.count('id="patch_') == 5 + 1 + 2 - 2
     assert "chip" in draw_grid()
     assert "chip" not in elsewhere
 
 
-def test_the_worst_place_is_named():
+def test_title_has_the_worst_place():
     errors_mm = np.zeros_like(PLACES_MM)
     errors_mm[PLACES_MM[:, 0] + PLACES_MM[:, 1] == 4, 0] = 3.0
     assert "worst 3.00 mm at x = 2, y = 2" in error_grid(PLACES_MM, PLACES_MM + errors_mm, title="t")
 
 
-def test_what_nobody_sees_is_left_out_and_words_keep_their_digits():
+def test_svg_is_reduced_but_text_keeps_its_digits():
     with drawing(3.0, 2.0) as figure:
         axes = figure.subplots()
         axes.plot([0, 1], [0.123456, 2], "o")
@@ -67,7 +67,7 @@ def test_what_nobody_sees_is_left_out_and_words_keep_their_digits():
     assert re.search(r"^ ", text, re.MULTILINE) is None
 
 
-def test_letters_of_formulas_have_another_family_to_fall_back_on():
+def test_formula_fonts_have_a_fallback():
     with drawing(3.0, 2.0) as figure:
         figure.subplots().set_yscale("log")
         families = re.findall(r"font-family: ([^\";]*)", svg(figure))
@@ -75,12 +75,12 @@ def test_letters_of_formulas_have_another_family_to_fall_back_on():
     assert all(family.endswith("sans-serif") for family in families)
 
 
-def test_same_data_same_bytes_other_data_other_bytes():
+def test_error_grid_is_reproducible():
     assert draw_grid() == draw_grid()
     assert draw_grid() != error_grid(PLACES_MM, PLACES_MM + np.arange(12)[:, None], title="lab (recorded), lobo")
 
 
-def test_axes_lie_where_matplotlib_lays_them_out_when_it_saves():
+def test_layout_equals_matplotlibs_on_save():
     def places(save) -> list[tuple[float, ...]]:
         with drawing(5.0, 3.0) as figure:
             for axes, scale in zip(figure.subplots(1, 2), ("linear", "log"), strict=True):
@@ -108,20 +108,20 @@ SENSORS = [
 ]
 
 
-def test_the_sweep_over_pokes_shows_none_at_all_units_source_and_the_two_points_of_the_paper():
-    words = texts_of(sweep_pokes(POKES, "simulated"))
-    for word in ("0", "65", "3900", "simulated", "%", "mm²", "paper (table 2)", "pokes"):
-        assert word in words
+def test_sweep_pokes_labels():
+    labels = texts_of(sweep_pokes(POKES, "simulated"))
+    for label in ("0", "65", "3900", "simulated", "%", "mm²", "paper (table 2)", "pokes"):
+        assert label in labels
 
 
-def test_the_sweep_over_sensors_has_a_line_for_each_method_that_was_asked():
-    words = texts_of(sweep_sensors(SENSORS, "recorded"))
-    for word in ("multi-sensor + triplet", "adapted", "training skins", "recorded"):
-        assert word in words
+def test_sweep_sensors_has_a_line_for_each_method():
+    labels = texts_of(sweep_sensors(SENSORS, "recorded"))
+    for label in ("multi-sensor + triplet", "adapted", "training skins", "recorded"):
+        assert label in labels
     assert "adapted" not in texts_of(sweep_sensors([one for one in SENSORS if one["method"] == "multi"], "recorded"))
 
 
-def test_bars_are_one_sd_cut_where_no_score_can_be():
+def test_bars_are_cut_to_possible_scores():
     accuracy = [row(95.0, sd=10.0, n=6), row(50.0, sd=10.0, n=6), row(5.0, sd=10.0, n=6)]
     means, lengths = bars(accuracy, "accuracy_pct")
     np.testing.assert_array_equal(means, [95.0, 50.0, 5.0])
@@ -137,7 +137,7 @@ def test_bars_are_one_sd_cut_where_no_score_can_be():
         ({"sd_seeds": 1.5, "n": 1}, 1.5, 1.5), ({"n": 1}, 0.0, 0.0),
     ],
 )  # fmt: skip
-def test_bars_are_the_interval_over_boards_else_the_range_of_boards_else_the_sd_over_seeds(spread, down, up):
+def test_bar_lengths_by_available_spread(spread, down, up):
     _, lengths = bars([row(50.0, **spread)], "accuracy_pct")
     np.testing.assert_array_equal(lengths, [[down], [up]])
 
@@ -150,32 +150,32 @@ def test_only_sweeps_with_numbers_are_drawn():
 
 
 @pytest.mark.parametrize("draw", [sweep_pokes, sweep_sensors])
-def test_same_numbers_same_bytes_other_numbers_other_bytes(draw):
+def test_sweeps_are_reproducible(draw):
     rows = POKES if draw is sweep_pokes else SENSORS
     figure, again, other = (draw(some, "simulated") for some in (rows, rows, [*rows[:-1], rows[-1] | row(70.0)]))
     assert figure == again != other
     ET.fromstring(figure)
 
 
-def test_each_row_of_table_2_is_drawn_and_named_with_source_and_boards():
+def test_headline_figure_has_all_rows_of_table_2():
     numbers = all_experiments()
-    said = texts_of(headline_figures(numbers, "simulated")[HEADLINE])
+    labels = texts_of(headline_figures(numbers, "simulated")[HEADLINE])
     for name in numbers["table2"]:
-        assert models(numbers)[name].title.split(",")[0] in said
-    for word in ("simulated", "paper", "accuracy", "MSE_xy", "boards held out"):
-        assert word in said
+        assert models(numbers)[name].title.split(",")[0] in labels
+    for label in ("simulated", "paper", "accuracy", "MSE_xy", "boards held out"):
+        assert label in labels
 
 
-def test_same_numbers_same_bytes_and_no_experiment_about_boards_no_figure():
+def test_headline_figure_is_reproducible():
     numbers = all_experiments()
     assert headline_figures(numbers, "simulated") == headline_figures(numbers, "simulated")
     assert headline_figures({name: numbers[name] for name in ("provenance",)}, "recorded") == {}
 
 
 @pytest.mark.parametrize("scene", ["lab"])
-def test_labels_of_a_new_board_are_drawn_for_each_method(scene):
+def test_labels_figure_has_each_method(scene):
     numbers = json.loads((ROOT / "reports" / scene / "numbers.json").read_text())
-    said = texts_of(headline_figures(numbers, "recorded")[HEADLINE])
-    assert all(f"{row['method']} ({row['inputs']})" in said for row in numbers["labels"])
-    assert "recorded" in said
-    assert "as labelled" in said
+    labels = texts_of(headline_figures(numbers, "recorded")[HEADLINE])
+    assert all(f"{row['method']} ({row['inputs']})" in labels for row in numbers["labels"])
+    assert "recorded" in labels
+    assert "as labelled" in labels

@@ -1,4 +1,4 @@
-"""Tables of trainings on many skins, and the blocks of README and docs that show them."""
+"""Tests of the tables of trainings on many skins, and of the blocks of README and docs that show them."""
 
 from itertools import pairwise
 
@@ -35,7 +35,7 @@ def paired(of: str, over: str, **scores) -> dict:
 
 
 def between(accuracy_pct: tuple[float, float], error: tuple[float, float]) -> dict:
-    """Paired differences with these 95 % intervals over boards; of both errors alike."""
+    """Return paired differences with the given 95 % intervals over boards."""
     own = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": error, "mse_f_N2": error}
     by_board = {board: {name: ends[i] for name, ends in own.items()} for i, board in enumerate(("b0", "b1"))}
     return {name: over_boards(*ends) for name, ends in own.items()} | {"by_board": by_board}
@@ -53,14 +53,14 @@ PAIRED = [
 NUMBERS = {"table2": PAPER_AS_OURS, "lobo": {"by_board": BOARDS}, "paired": PAIRED}
 
 
-def test_differences_are_published_board_by_board():
+def test_paired_boards_table_lists_each_board():
     table = paired_boards_table(NUMBERS, "simulated")
     own = table[table["difference"] == "adapted − multi-sensor + triplet"]
     assert own["held-out board"].tolist() == ["b0", "b1"]
     assert own["accuracy, %"].tolist() == ["+5", "+7"]
 
 
-def test_paired_differences_stand_beside_the_difference_of_the_papers_means():
+def test_paired_table_has_the_papers_difference_of_means():
     table = paired_table(NUMBERS, "simulated")
     assert table["difference"].tolist() == [
         "multi-sensor − single-sensor", "multi-sensor + triplet − multi-sensor", "adapted − multi-sensor + triplet",
@@ -72,13 +72,13 @@ def test_paired_differences_stand_beside_the_difference_of_the_papers_means():
         "+6 [5, 7]",
         "+0.1 [-2.9, 3.1]",
     ]
-    # 81.03 - 84.43, 87.00 - 81.03 of table 2; it has no control.
+    # 81.03 - 84.43 and 87.00 - 81.03 of the paper's table 2, which has no control.
     assert table["accuracy, % (paper: difference of means)"].tolist() == ["+59.19", "-3.4", "+5.97", "–"]
     assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["-5.72", "+0.023", "-0.242", "–"]
     assert "95 % interval over n boards" in to_markdown(table)
 
 
-def test_with_one_training_skin_nothing_is_called_multi_sensor_and_no_pooled_number_stands_beside_it():
+def test_one_training_skin_is_not_called_multi_sensor():
     numbers = NUMBERS | {"lobo": {"by_board": ALONE}, "paired": PAIRED[1:]}
     text = to_markdown(paired_table(numbers, "recorded"))
     assert "multi-sensor" not in text
@@ -86,8 +86,8 @@ def test_with_one_training_skin_nothing_is_called_multi_sensor_and_no_pooled_num
     assert set(paired_table(numbers, "recorded")["accuracy, % (paper: difference of means)"]) == {"–"}
 
 
-def test_table_2_has_the_papers_rows_in_its_order_and_the_control_below():
-    numbers = everything() | {"adapt": {"pokes_n": 390, "control": row(82.0)}}
+def test_table_2_rows_follow_the_paper():
+    numbers = all_numbers() | {"adapt": {"pokes_n": 390, "control": row(82.0)}}
     table = make_tables(numbers)["table2"]
     assert table["model"].tolist() == [
         "Single-sensor", "Multi-sensor without triplet loss", "Multi-sensor with triplet loss",
@@ -103,13 +103,13 @@ def test_table_2_has_the_papers_rows_in_its_order_and_the_control_below():
     assert table["accuracy, % (ours)"].tolist()[-1] == "82 ± 1"
 
 
-def test_another_number_of_pokes_than_the_papers_is_named():
-    numbers = everything() | {"adapt": {"pokes_n": 65, "control": row(82.0)}}
+def test_other_number_of_pokes_is_stated():
+    numbers = all_numbers() | {"adapt": {"pokes_n": 65, "control": row(82.0)}}
     (name,) = [name for name in make_tables(numbers)["table2"]["model"] if "adapted" in name]
     assert name.endswith("adapted using 65 indentations (paper: 390)")
 
 
-def test_sweeps_are_in_order_of_their_counts_beside_the_two_numbers_that_the_paper_prints():
+def test_sweeps_are_sorted_by_count():
     table = sweep_pokes_table([{"pokes_n": n, **row(80.0 + n / 100)} for n in (390, 0, 65)], "simulated")
     assert table["pokes"].tolist() == ["0", "65", "390"]
     assert table["accuracy, % (ours)"].tolist() == ["80 ± 1", "80.7 ± 1", "83.9 ± 1"]
@@ -121,7 +121,7 @@ def test_sweeps_are_in_order_of_their_counts_beside_the_two_numbers_that_the_pap
 
 
 @given(st.lists(st.floats(0, 100), min_size=1, max_size=9))
-def test_baselines_are_sorted_by_accuracy_and_none_is_lost(accuracies):
+def test_baselines_are_sorted_by_accuracy(accuracies):
     rows = [{"method": f"m{i}", "inputs": "raw", "rows_n": 9, **row(value)} for i, value in enumerate(accuracies)]
     methods = baselines_table(rows, "recorded")["method"].tolist()
     assert sorted(methods) == sorted(f"m{i}" for i in range(len(rows)))
@@ -129,7 +129,7 @@ def test_baselines_are_sorted_by_accuracy_and_none_is_lost(accuracies):
     assert all(a >= b for a, b in pairwise(shown))
 
 
-def test_labelled_pokes_show_both_ways_of_scoring_places():
+def test_labels_table_has_both_scores():
     one = {"method": "ridge", "inputs": "shape", "labels_n": 20, "as_labelled": row(30.0), "registered": row(42.0, 0.2)}
     (line,) = labels_table([one], "recorded").to_dict("records")
     assert line == {
@@ -142,7 +142,7 @@ def test_labelled_pokes_show_both_ways_of_scoring_places():
     assert (line["in 90 % intervals, %"], line["half of them, mm (median)"]) == ("91", "–")
 
 
-def test_a_leak_that_nobody_knew_of_stands_out():
+def test_unknown_leak_is_highlighted_in_the_audit():
     check = {"what": "skins", "where": "lobo", "rule": "on one side", "found": 0, "holds": True, "known": False}
     rows = [check, check | {"holds": False, "known": True, "found": 6}, check | {"holds": False}]
     table = audit_table(rows, "simulated")
@@ -150,16 +150,16 @@ def test_a_leak_that_nobody_knew_of_stands_out():
     assert table["found"].tolist() == ["0", "6", "0"]
 
 
-def test_all_candidates_are_listed_and_the_chosen_one_is_marked_with_what_decided():
+def test_chosen_candidate_is_marked():
     candidates = [
         {"recipe_name": name, "settings": "", **row(80.0, error)} for name, error in (("slow", 0.4), ("fast", 0.3))
     ]
-    arms = {"triplet": {"recipe_name": "fast", "by": "MSE_xy", "candidates": candidates}}
-    table = chosen_table(arms, "simulated")
+    choices = {"triplet": {"recipe_name": "fast", "by": "MSE_xy", "candidates": candidates}}
+    table = chosen_table(choices, "simulated")
     assert dict(zip(table["candidate"], table["chosen"], strict=True)) == {"slow": "", "fast": "yes, by MSE_xy"}
 
 
-def everything() -> dict:
+def all_numbers() -> dict:
     provenance = {
         "source": "simulated",
         "scene": "x",
@@ -196,8 +196,8 @@ def part() -> dict:
     return {"as_labelled": scores, "registered": scores}
 
 
-def test_an_experiment_that_was_asked_has_its_table_and_every_row_says_where_it_comes_from():
-    asked = {
+def test_each_experiment_has_its_table_with_source():
+    expected = {
         "claims",
         "paired",
         "paired_boards",
@@ -208,27 +208,27 @@ def test_an_experiment_that_was_asked_has_its_table_and_every_row_says_where_it_
         "audit",
         "chosen",
     }
-    tables = make_tables(everything())
-    assert asked < set(tables)
-    for name in asked:
+    tables = make_tables(all_numbers())
+    assert expected < set(tables)
+    for name in expected:
         assert set(tables[name]["source"]) == {"simulated"}
-    nothing = {name: everything()[name] for name in ("provenance", "variants", "capture")}
-    assert not asked & set(make_tables(nothing))
+    nothing = {name: all_numbers()[name] for name in ("provenance", "variants", "capture")}
+    assert not expected & set(make_tables(nothing))
 
 
-def test_in_the_readme_the_claims_stand_right_below_table_2():
+def test_readme_has_claims_below_table_2():
     described = {
         "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
     }
-    tables = make_tables(everything())
-    results = blocks_of([everything() | {"described": described, "trainings": {}}], [], {}, None)["results"]
+    tables = make_tables(all_numbers())
+    results = blocks_of([all_numbers() | {"described": described, "trainings": {}}], [], {}, None)["results"]
     table2, claims = to_markdown(tables["table2"]), to_markdown(tables["claims"])
     assert f"{table2}\n\n{claims}" in results
 
 
-def test_the_readme_takes_what_a_scene_costs_from_its_provenance():
+def test_readme_costs_come_from_provenance():
     described = {"grid": {"source": "simulated", "over_skins": {}}}
-    numbers = everything() | {"described": described, "trainings": {}}
+    numbers = all_numbers() | {"described": described, "trainings": {}}
     numbers["provenance"] |= {"seconds": 5400.0, "scene": "paper"}
     row = next(line for line in blocks_of([numbers], [], {}, None)["costs"].splitlines() if "`paper`" in line)
     assert [cell.strip() for cell in row.split("|")[1:5]] == ["`paper`", "90", "0", "0"]

@@ -1,15 +1,21 @@
-"""Numbers of the experiments about many skins, from cards small enough to be added up by hand."""
+"""Tests of the numbers and contrasts of the experiments on many skins, calculated by hand."""
 
 import json
 
 import pytest
 
-from pipeline.report.numbers import PAIRS, learning_numbers, learning_times
+from pipeline.report.numbers import (
+    PAIRS,
+    contrasts_of_pokes,
+    contrasts_of_sensors,
+    learning_numbers,
+    learning_times,
+)
 from pipeline.statistics import tidy
-from tests.report import cards
+from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
-BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # points that adaptation gains on each skin
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # gain by adaptation on each skin, percentage points
 
 
 BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
@@ -17,25 +23,25 @@ BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
 
 def scores(by_skin: dict[str, float]) -> dict:
     own = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
-    every = {"accuracy_pct": sum(by_skin.values()) / len(by_skin), "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
-    return {"all": every, "registered": every, "by_skin": own, "rows_n": 10 * len(own)} | {
+    mean = {"accuracy_pct": sum(by_skin.values()) / len(by_skin), "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
+    return {"all": mean, "registered": mean, "by_skin": own, "rows_n": 10 * len(own)} | {
         "board_of": {skin: BOARD_OF[skin] for skin in own}
     }
 
 
 def card(experiment: str, fold: str, by_skin: dict[str, float], recipe: str = "paper", seed_i: int = 0) -> dict:
-    return cards.card(experiment, fold, scores(by_skin), recipe, seed_i)
+    return synthetic.card(experiment, fold, scores(by_skin), recipe, seed_i)
 
 
-def point(by_skin: dict[str, float], fold: str = "b1", seed_i: int = 0, **words: object) -> dict:
-    return {"fold": fold, "seed_i": seed_i, "scores": scores(by_skin)} | words
+def point(by_skin: dict[str, float], fold: str = "b1", seed_i: int = 0, **keys: object) -> dict:
+    return {"fold": fold, "seed_i": seed_i, "scores": scores(by_skin)} | keys
 
 
-def of_boards(experiment: str, pct: float, recipe: str = "paper") -> list[dict]:
+def board_cards(experiment: str, pct: float, recipe: str = "paper") -> list[dict]:
     return [card(experiment, fold, dict.fromkeys(skins, pct), recipe) for fold, skins in HELD_OUT.items()]
 
 
-def of_skins(recipe: str, base_pct: float, times: float) -> list[dict]:
+def adapted_cards(recipe: str, base_pct: float, times: float) -> list[dict]:
     return [
         card("adapt", fold, {skin: base_pct + times * BETTER[skin]}, recipe)
         for fold, skins in HELD_OUT.items()
@@ -44,9 +50,9 @@ def of_skins(recipe: str, base_pct: float, times: float) -> list[dict]:
 
 
 CARDS = [
-    *of_boards("lobo", 80.0), *of_boards("triplet", 78.0),
-    *of_skins("paper", 78.0, 1.0), *of_skins("control", 78.0, 0.5),
-    *of_boards("lobo", 1.0, "released"), *of_boards("triplet", 2.0, "other"), *of_skins("other", 3.0, 1.0),
+    *board_cards("lobo", 80.0), *board_cards("triplet", 78.0),
+    *adapted_cards("paper", 78.0, 1.0), *adapted_cards("control", 78.0, 0.5),
+    *board_cards("lobo", 1.0, "released"), *board_cards("triplet", 2.0, "other"), *adapted_cards("other", 3.0, 1.0),
 ]  # fmt: skip
 
 
@@ -59,15 +65,15 @@ def paired(of: str, over: str) -> dict:
     return one
 
 
-def test_table_2_is_over_boards_and_adapted_skins_are_pooled_by_board():
+def test_table_2_pools_skins_by_board():
     table2 = numbers()["table2"]
     assert table2.keys() == {"multi", "triplet", "adapted"}
     assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "values": [78.0, 78.0]}
-    # board b0: 80 and 82, board b1: 84 and 86
+    # board b0: 80 and 82; board b1: 84 and 86
     assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
 
 
-def test_the_control_stands_beside_adaptation_with_the_number_of_pokes():
+def test_control_has_its_number_of_pokes():
     assert numbers()["adapt"]["pokes_n"] == 390
     assert numbers()["adapt"]["control"]["accuracy_pct"] == over(79.5, 81.5)
 
@@ -77,7 +83,7 @@ def over(*boards: float) -> dict:
     return {"mean": sum(boards) / 2, "n": 2, "sd": pytest.approx(sd), "values": pytest.approx(list(boards))}
 
 
-def test_pairs_are_over_the_held_out_boards_and_of_one_method_over_another():
+def test_paired_differences_by_board():
     assert [(one["of"], one["over"]) for one in numbers()["paired"]] == [one for one in PAIRS if "single" not in one]
     # gains of 2 and 4 points on the skins of b0, of 6 and 8 on those of b1
     assert paired("adapted", "triplet")["accuracy_pct"] == over(3.0, 7.0)
@@ -89,33 +95,33 @@ def test_pairs_are_over_the_held_out_boards_and_of_one_method_over_another():
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 
 
-def test_many_skins_are_compared_with_one_on_the_skins_that_one_was_tested_on():
+def test_multi_minus_single_uses_shared_skins():
     single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
     (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
     assert {board: own["accuracy_pct"] for board, own in one["by_board"].items()} == {"b1": 80.0 - 30.0}
     assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
-def test_an_experiment_that_was_not_asked_is_absent_and_not_null():
+def test_missing_experiment_is_absent():
     assert numbers([]) == {"variants": {}}
-    assert numbers(of_boards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
-    without = numbers([*of_boards("lobo", 80.0), *of_boards("triplet", 78.0)])
+    assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
+    without = numbers([*board_cards("lobo", 80.0), *board_cards("triplet", 78.0)])
     assert without.keys() == {"table2", "lobo", "paired", "variants"}
     assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
-    alone = numbers(of_skins("paper", 78.0, 1.0))
+    alone = numbers(adapted_cards("paper", 78.0, 1.0))
     assert alone.keys() == {"table2", "adapt", "variants"}
     assert alone["adapt"] == {"pokes_n": 390}  # with no control
     assert "null" not in json.dumps(numbers())
 
 
-def test_other_recipes_are_in_no_number_but_the_variants():
+def test_other_recipes_appear_only_in_variants():
     alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
     assert numbers() == alone | {"variants": numbers()["variants"]}
     assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
     assert numbers()["variants"]["adapt"]["other"]["accuracy_pct"] == over(6.0, 10.0)
 
 
-def test_a_sweep_over_pokes_is_in_their_order_and_starts_with_none():
+def test_sweep_over_pokes_is_sorted():
     points = [
         *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((390, "s2", 90.0), (390, "s3", 94.0))),
         *(point({skin: pct}, pokes_n=n) for n, skin, pct in ((65, "s2", 80.0), (65, "s3", 86.0))),
@@ -126,7 +132,7 @@ def test_a_sweep_over_pokes_is_in_their_order_and_starts_with_none():
     assert sweep[0]["accuracy_pct"] == {"mean": 73.0, "n": 1, "sd_seeds": pytest.approx(8**0.5)}
 
 
-def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
+def test_sweep_over_sensors_by_method():
     points = [
         point(by_skin, f"b1-{skins_n:02d}skins-draw{draw_i}", method=method, trained_on_skins_n=skins_n)
         for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
@@ -147,7 +153,7 @@ def test_a_sweep_over_sensors_has_a_curve_for_each_method_over_draws():
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
 
-def test_a_method_has_its_own_times_and_an_adapted_network_those_of_its_base_too():
+def test_learning_times_are_medians():
     rows = [
         {"method": "ridge", "inputs": "raw", "name": "ridge"},
         {"method": "ridge", "inputs": "shape", "name": "ridge-shape"},
@@ -164,11 +170,64 @@ def test_a_method_has_its_own_times_and_an_adapted_network_those_of_its_base_too
         "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
-    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; what was not timed has no time
+    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; the last was not timed
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 
 
-def test_an_adaptation_is_timed_by_its_number_of_pokes():
+def test_adaptation_times_by_number_of_pokes():
     numbers = {"sweep_pokes": [{"pokes_n": 0}, {"pokes_n": 6}, {"pokes_n": 65}]}
     seconds = {"sweep_pokes": [{"name": f"pokes.paper.b0.s.{n}pokes.seed0", "train_s": float(n)} for n in (6, 65)]}
     assert [row.get("seconds") for row in learning_times(numbers, seconds)["adaptation"]] == [None, 6.0, 65.0]
+
+
+def points(key: str, by_count: dict[int, tuple[float, float]], **keys: str) -> list[dict]:
+    """Return the points of two boards, from their accuracies at each count."""
+    return [
+        point(dict.fromkeys(skins, float(pct)), board, **{key: count}, **keys)
+        for count, both in by_count.items()
+        for (board, skins), pct in zip(HELD_OUT.items(), both, strict=True)
+    ]
+
+
+def gains(contrast: dict) -> dict[str, float]:
+    return {board: own["accuracy_pct"] for board, own in contrast["by_board"].items()}
+
+
+def test_poke_contrasts_of_gain_and_plateau():
+    found = contrasts_of_pokes(
+        tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 780: (80, 84), 3900: (81, 83)})})
+    )
+    assert {name: (one["from_pokes_n"], one["to_pokes_n"]) for name, one in found.items()} == {
+        "pokes_first": (0, 65), "pokes_gain": (0, 780), "pokes_plateau": (780, 3900),
+    }  # fmt: skip
+    assert gains(found["pokes_gain"]) == {"b0": 10.0, "b1": 4.0}
+    assert gains(found["pokes_plateau"]) == {"b0": 1.0, "b1": -1.0}
+    assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
+
+
+def test_unreached_contrasts_are_absent():
+    found = contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})}))
+    assert found.keys() == {"pokes_first", "pokes_gain"}
+    assert found["pokes_gain"]["to_pokes_n"] == 390
+    assert contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80)})})) == {}
+    only = points("trained_on_skins_n", {1: (50, 60)}, method="multi")
+    others = [point | {"method": method} for method in ("triplet", "adapted") for point in only]
+    assert contrasts_of_sensors(tidy([], {"sensors": [*only, *others]})).keys() == {
+        "sensors_adapted_over_multi", "sensors_adapted_over_triplet",
+    }  # fmt: skip
+
+
+def test_sensor_contrasts_of_methods_and_gains():
+    scores = {
+        "multi": {1: (50, 60), 15: (80, 84)}, "triplet": {1: (48, 58), 15: (78, 82)},
+        "adapted": {1: (58, 64), 15: (80, 83)},
+    }  # fmt: skip
+    rows = [row for name, own in scores.items() for row in points("trained_on_skins_n", own, method=name)]
+    found = contrasts_of_sensors(tidy([], {"sensors": rows}))
+    assert gains(found["sensors_more_multi"]) == {"b0": 30.0, "b1": 24.0}
+    over = found["sensors_adapted_over_triplet"]
+    assert [(one["skins_n"], gains(one)) for one in over] == [
+        (1, {"b0": 10.0, "b1": 6.0}), (15, {"b0": 2.0, "b1": 1.0}),
+    ]  # fmt: skip
+    assert gains(found["sensors_gain_fewer"]) == {"b0": 8.0, "b1": 5.0}
+    assert found["sensors_gain_fewer"]["accuracy_pct"]["mean"] == 6.5

@@ -37,7 +37,7 @@ VOID = {"meta", "img", "br"}
 
 
 class Reader(HTMLParser):
-    """Every element with its attributes and ancestors; raises where tags do not nest."""
+    """Parse a page into elements with attributes and ancestors; fail if tags do not nest."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class Reader(HTMLParser):
 
 def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     numbers = all_experiments() if numbers is None else numbers
-    # Experiments have synthetic numbers here, which no real table could be made of.
+    # The synthetic numbers of experiments are too small for their tables.
     plain = {name: value for name, value in numbers.items() if name not in ANALYSES}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
@@ -81,7 +81,7 @@ def read() -> Reader:
     return Reader(render(surprise=pd.DataFrame({"<b>": ["a & b", None], "n": ["1", "2"]})))
 
 
-def test_the_page_needs_no_network_and_no_script(read):
+def test_page_needs_no_network_or_script(read):
     assert [one for one in ("script", "link", "svg") if read.all(one)] == []
     names = ("src", "href", "data")
     fetched = [attributes[name] for _, attributes, _ in read.elements for name in names if name in attributes]
@@ -92,19 +92,19 @@ def test_the_page_needs_no_network_and_no_script(read):
     assert "@import" not in render()
 
 
-def test_links_lead_to_ids_and_no_id_stands_twice(read):
+def test_links_lead_to_unique_ids(read):
     ids = Counter(attributes["id"] for _, attributes, _ in read.elements if "id" in attributes)
     assert max(ids.values()) == 1
     links = {attributes["href"] for attributes, _ in read.all("a")}
     assert {link[1:] for link in links if link.startswith("#")} <= set(ids)
     assert [link for link in links if link.startswith("../../") and not (ROOT / link[6:]).exists()] == [
-        "../../pipeline/scenes/x.yaml"  # no such scene: its numbers are synthetic
+        "../../pipeline/scenes/x.yaml"  # the synthetic scene has no file
     ]
     labels = {attributes["aria-labelledby"] for _, attributes, _ in read.elements if "aria-labelledby" in attributes}
     assert labels <= set(ids)
 
 
-def test_every_table_scrolls_in_its_own_box_and_names_its_columns(read):
+def test_tables_scroll_and_name_their_columns(read):
     tables = read.all("table")
     assert len(tables) > 8
     assert all(above[-1] == "div.box" for _, above in tables)
@@ -112,7 +112,7 @@ def test_every_table_scrolls_in_its_own_box_and_names_its_columns(read):
     assert all(attributes.get("scope") in ("col", "row") for attributes, _ in read.all("th"))
 
 
-def test_every_figure_is_a_document_on_a_white_card_with_words_for_it_and_else_an_image(read):
+def test_figures_have_text_alternatives(read):
     objects, images = read.all("object"), read.all("img")
     assert len(objects) == len(images) == 3
     assert all(attributes["aria-label"].strip() and above[-1] == "div.card" for attributes, above in objects)
@@ -121,22 +121,22 @@ def test_every_figure_is_a_document_on_a_white_card_with_words_for_it_and_else_a
     assert [attributes.get("class") for attributes, _ in read.all("figure")].count("wide") == 1
 
 
-def test_figures_stand_before_the_papers_results_and_these_before_tables():
+def test_order_of_figures_results_and_tables():
     for part in render().split("<section id=")[1:]:
         places = [part.index(mark) for mark in ("<figure", "Beside the paper", "<details") if mark in part]
         assert places == sorted(places)
 
 
-def test_a_figure_may_shrink_until_its_smallest_letters_are_as_small_as_one_can_read():
+def test_smallest_width_of_a_figure_is_legible():
     letters = '<svg width="300.0pt" height="150.0pt"><g style="font-size: 10px"/><g style="font: 6px Arial"/></svg>'
     drawing = measure("figures/a.svg", letters)
     assert (drawing.width_px, drawing.height_px) == (400, 200)
-    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # there a letter of 6 of 300 points is so high
-    assert drawing.scrolls  # on a telephone
+    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # the smallest letters are 6 pt high in a figure of 300 pt
+    assert drawing.scrolls  # on a phone
     assert not measure("figures/a.svg", letters.replace("6px", "9px")).scrolls
 
 
-def test_a_figure_without_a_size_is_refused():
+def test_figure_without_size_is_an_error():
     with pytest.raises(SchemaError, match=r"figures/a\.svg: size"):
         measure("figures/a.svg", '<svg viewBox="0 0 1 1"/>')
 
@@ -150,17 +150,17 @@ def test_a_figure_without_a_size_is_refused():
         ("a ± b, [low, high]", "a ± b, [low, high]"),
     ],
 )
-def test_a_number_and_its_interval_are_not_parted(text, kept):
+def test_numbers_do_not_break_across_lines(text, kept):
     assert unbroken(text) == kept.replace("_", "\u00a0")
 
 
-def test_the_summary_stands_in_the_first_section_before_its_figure():
+def test_summary_is_in_the_first_section():
     text = render(all_experiments())
     first = text.split("<section")[1]
     assert text.count(SUMMARY) == first.count(SUMMARY) == 1
 
 
-def test_counts_of_the_main_captures_are_listed():
+def test_about_lists_counts():
     numbers = all_experiments()
     counts = next(iter(numbers["described"].values()))["counts"]
     counts.clear()
@@ -168,7 +168,7 @@ def test_counts_of_the_main_captures_are_listed():
     assert about(numbers).endswith("captures 1, readings 2,000.")
 
 
-def test_a_section_lists_results_beside_the_papers_and_verdicts_come_first():
+def test_results_with_verdicts_come_first():
     table, section = checklist(all_experiments()), next(one for one in read_sections() if one.key == "skins")
     shown = beside_paper(section, table)
     assert 0 < len(shown.rows) <= BESIDE_N
@@ -177,7 +177,7 @@ def test_a_section_lists_results_beside_the_papers_and_verdicts_come_first():
     assert judged == sorted(judged, reverse=True)
 
 
-def test_results_that_cannot_be_compared_are_not_listed_beside_the_papers():
+def test_incomparable_results_are_omitted():
     section = next(one for one in read_sections() if one.key == "drift")
     row = {"result": "r", "paper": "90 %", "ours": "92 %", "verdict": "yes", "stage": "drift", "shown in": "drift"}
     (shown,) = beside_paper(section, pd.DataFrame([row | {"note": "not reached: 8,000 contacts"}])).rows
@@ -187,25 +187,25 @@ def test_results_that_cannot_be_compared_are_not_listed_beside_the_papers():
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_the_badge_says_where_the_readings_come_from(source):
+def test_badge_has_the_source(source):
     text = render(all_experiments(source))
     assert f'<strong class="badge {source}">{source.upper()}</strong>' in text
     assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text
 
 
-def test_the_page_says_first_what_the_scene_is(read):
-    words = next(i for i, word in enumerate(read.words) if "captures 2, readings 1,000" in word)
-    assert words < read.words.index(read_sections()[0].title)
+def test_page_starts_with_the_scene(read):
+    place = next(i for i, word in enumerate(read.words) if "captures 2, readings 1,000" in word)
+    assert place < read.words.index(read_sections()[0].title)
 
 
-def test_what_no_section_names_is_still_shown(read):
+def test_tables_without_a_section_are_shown(read):
     assert "Surprise" in read.words
     assert "<b>" in read.words  # as text, not as a tag
     assert "a & b" in read.words
     assert "Unheard of (simulated)" in read.words
 
 
-def test_an_experiment_that_was_not_asked_leaves_no_section():
+def test_missing_experiment_has_no_section():
     keys = [section.key for section in arrange(["table2", "captures"], [])]
     assert keys == ["headline", "captures"]
     assert [section.key for section in arrange(["shear", "paired", "drift"], ["training.svg"])] == [
@@ -213,17 +213,17 @@ def test_an_experiment_that_was_not_asked_leaves_no_section():
     ]  # fmt: skip
 
 
-def test_the_page_of_a_run_shows_its_whole_provenance_and_its_run_times():
+def test_run_page_has_provenance_and_run_times():
     numbers = all_experiments()
-    words = Reader(render_run(numbers)).words
+    text = Reader(render_run(numbers)).words
     provenance = numbers["provenance"] | {"versions": "numpy 1, torch 2"}
-    assert set(provenance) <= set(words)
-    assert {str(value) for value in provenance.values()} <= set(words)
-    assert any("Cost of each stage" in word for word in words)
+    assert set(provenance) <= set(text)
+    assert {str(value) for value in provenance.values()} <= set(text)
+    assert any("Cost of each stage" in word for word in text)
     assert [figure["data"] for figure, _ in Reader(render_run(numbers)).all("object")] == ["training.svg"]
 
 
-def test_the_page_embeds_that_of_its_run_and_is_the_same_for_another(read):
+def test_page_does_not_depend_on_its_run(read):
     assert [frame["src"] for frame, _ in read.all("iframe")] == ["runtime/index.html"]
     other = all_experiments()
     other["provenance"] |= {"git": "other", "trained": "other", "device": "other", "versions": {}, "seconds": 9.0}
@@ -232,20 +232,20 @@ def test_the_page_embeds_that_of_its_run_and_is_the_same_for_another(read):
     assert render_run(other) != render_run(all_experiments())
 
 
-def test_the_same_inputs_give_the_same_bytes():
+def test_page_is_reproducible():
     assert render() == render()
 
 
-def test_numbers_stand_on_the_right_and_words_on_the_left():
+def test_numbers_are_right_aligned():
     table = pd.DataFrame({"a": ["x"], "b": ["1.5 ± 0.2"], "c": ["–"], "d": ["3 of 4"], "e": ["-0.1 mm²"]})
     assert lay_out("t", "T", table).looks == ["text", "number", "text", "text", "number"]
 
 
-def test_notes_of_a_table_stand_below_it(read):
-    assert any("within 1 mm" in words for words in read.words)
+def test_table_notes_are_shown(read):
+    assert any("within 1 mm" in text for text in read.words)
 
 
-def test_no_table_or_figure_stands_in_two_sections():
+def test_each_table_and_figure_has_one_section():
     sections = read_sections()
     named = Counter(name for section in sections for name in section.captions)
     assert max(named.values()) == 1
@@ -253,13 +253,13 @@ def test_no_table_or_figure_stands_in_two_sections():
 
 
 def luminance(colour: str) -> float:
-    """WCAG 2.2, relative luminance."""
+    """Return the relative luminance (WCAG 2.2)."""
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
     return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
-def test_letters_stand_out_from_what_is_behind_them():
+def test_contrast_meets_wcag():
     text = render()
     light, dark = (dict(zip(*[iter(part)] * 2, strict=True)) for part in colours(text))
     for theme in (light, light | dark):
@@ -283,35 +283,35 @@ def colours(text: str) -> list[list[str]]:
 HEADLINE_SVG = '<svg width="600.0pt" height="200.0pt"><text style="font-size: 9px">a</text></svg>'
 
 
-def of_scene(scene: str, source: str) -> dict:
+def scene_numbers(scene: str, source: str) -> dict:
     found = all_experiments(source) | {"trainings": {}}
     return found | {"provenance": found["provenance"] | {"scene": scene}}
 
 
-def test_recorded_scenes_come_first_and_no_scene_stands_under_the_other_word():
-    text = index([of_scene("here", "simulated"), of_scene("there", "recorded")], {"here": HEADLINE_SVG})
+def test_recorded_scenes_come_first():
+    text = index([scene_numbers("here", "simulated"), scene_numbers("there", "recorded")], {"here": HEADLINE_SVG})
     recorded, simulated = text.split('<section id="simulated">')
     assert 'href="there/index.html"' in recorded
     assert 'href="here/index.html"' in simulated
     assert "there/" not in simulated
     assert "here/" not in recorded.replace("there/", "")
-    assert "there/figures" not in text  # no file, no image
+    assert "there/figures" not in text  # has no figure
 
 
-def test_each_scene_says_how_it_does_on_boards_never_seen_or_that_it_held_out_none():
-    # "a" comes before "here", and held out no board.
-    alone = {name: value for name, value in of_scene("a", "simulated").items() if name != "table2"}
-    both = index([alone, of_scene("here", "simulated")], {})
+def test_scenes_without_held_out_boards_come_last():
+    # "a" precedes "here" in the alphabet, but held out no board.
+    alone = {name: value for name, value in scene_numbers("a", "simulated").items() if name != "table2"}
+    both = index([alone, scene_numbers("here", "simulated")], {})
     assert both.index("Scene here") < both.index("Scene a")
-    one_board = {name: value for name, value in of_scene("there", "recorded").items() if name != "table2"}
-    text = index([of_scene("here", "simulated"), one_board], {})
+    one_board = {name: value for name, value in scene_numbers("there", "recorded").items() if name != "table2"}
+    text = index([scene_numbers("here", "simulated"), one_board], {})
     recorded, simulated = text.split('<section id="simulated">')
     assert f"{SUMMARY}</span>" in simulated
     assert "No board was held out" in recorded
 
 
-def test_the_page_needs_nothing_but_the_pages_beside_it():
-    text = index([of_scene("here", "simulated")], {"here": HEADLINE_SVG})
+def test_index_needs_no_network_or_script():
+    text = index([scene_numbers("here", "simulated")], {"here": HEADLINE_SVG})
     addresses = re.findall(r'(?:src|href|data)="([^"]+)"', text)
     assert addresses
     assert all(address.startswith("here/") for address in addresses)

@@ -1,4 +1,4 @@
-"""Scores over boards: scipy's t tests and plain loops as truth; order, sign, shift and equal test rows as laws."""
+"""Tests of the statistics over boards against SciPy and naive loops, and of their symmetries."""
 
 import io
 
@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import t, ttest_rel
 
+from pipeline.experiments.audit import audit_collapse
 from pipeline.statistics import (
     AS_LABELLED,
     CONTRADICTED,
@@ -33,6 +34,7 @@ from pipeline.statistics import (
     select,
     statistic,
     t_interval,
+    tally,
     tidy,
     to_csv,
     two_way_error,
@@ -45,7 +47,7 @@ from reskin.errors import SchemaError
 from reskin.metrics import METRICS, score_groups
 from reskin.seeds import rng_for
 from tests.data.test_splits import six_by_three_in_passes
-from tests.report.cards import SKINS, card, every
+from tests.report.synthetic import SKINS, adapted_cards, card
 
 FEW = settings(max_examples=25, deadline=None)  # tables take milliseconds
 DOUBLE = 1e-9  # sums of doubles of tens
@@ -62,12 +64,12 @@ def shifted(fold: str, off_mm: float) -> dict:
     return card("lobo", fold, score_groups(TRUE, TRUE + off_mm, np.repeat(fold, 30), SKIN))
 
 
-def of_skins(**changes: object) -> pd.DataFrame:
-    return by_skin(tidy(every(**changes)))
+def skin_scores(**changes: object) -> pd.DataFrame:
+    return by_skin(tidy(adapted_cards(**changes)))
 
 
-def scored(values: dict[str, list[list[float]]]) -> pd.DataFrame:
-    """Scores by board, skin and network."""
+def score_table(values: dict[str, list[list[float]]]) -> pd.DataFrame:
+    """Return a table of scores by board, skin and network."""
     rows = [
         {"board": board, "skin": f"{board}_s{i}", "accuracy_pct": value}
         for board, skins in values.items() for i, networks in enumerate(skins) for value in networks
@@ -75,11 +77,11 @@ def scored(values: dict[str, list[list[float]]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def of_boards(values: list[float]) -> pd.DataFrame:
-    return scored({f"b{i}": [[value]] for i, value in enumerate(values)})
+def board_scores(values: list[float]) -> pd.DataFrame:
+    return score_table({f"b{i}": [[value]] for i, value in enumerate(values)})
 
 
-def test_seeds_of_one_fold_are_averaged_before_folds_are_counted():
+def test_seeds_of_a_fold_are_averaged_first():
     # squared errors: fold b0 has 0 and 4 (two seeds), fold b1 has 16
     cards = [shifted("b0", 0), shifted("b0", 2) | {"seed_i": 1}, shifted("b1", 4)]
     summary = over_folds(tidy(cards))["mse_xy_mm2"]
@@ -90,29 +92,29 @@ def test_seeds_of_one_fold_are_averaged_before_folds_are_counted():
     assert "sd" not in over_folds(tidy(cards[:2]))["mse_xy_mm2"]
 
 
-def test_the_spread_over_seeds_is_that_within_a_unit_and_one_row_has_none():
-    rows = scored({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
+def test_sd_over_seeds_is_within_a_unit():
+    rows = score_table({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
     found = add_seed_sd({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
     assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}
     alone = {"accuracy_pct": {"mean": 8.0, "n": 1}}
     assert add_seed_sd(alone, select(rows, board="b1"), "board", "skin") == alone
 
 
-def test_networks_adapted_to_one_skin_each_have_a_row_for_all_skins_by_fold_and_seed():
-    rows = whole(tidy(every()))
+def test_adapted_networks_are_pooled_by_fold_and_seed():
+    rows = whole(tidy(adapted_cards()))
     assert list(zip(rows.fold, rows.seed, strict=True)) == [(fold, i) for i in range(3) for fold in ("b0", "b1")]
     assert set(rows.rows_n) == {20}
     for places, part in ((AS_LABELLED, "all"), (REGISTERED, "registered")):
-        for _, row in whole(tidy(every()), places).iterrows():
-            own = [one for one in every() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
-            for name in METRICS[:3]:  # R^2: test_skins_of_unequally_many_rows
+        for _, row in whole(tidy(adapted_cards()), places).iterrows():
+            own = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
+            for name in METRICS[:3]:  # R^2: see test_unequal_skins_pool_to_the_score_of_all_rows
                 total = 0.0
                 for one in own:
                     total += one["scores"][part][name]
                 assert row[name] == pytest.approx(total / 2, rel=1e-12)  # float64
 
 
-def test_skins_of_unequally_many_rows_pool_to_the_score_of_all_their_rows():
+def test_unequal_skins_pool_to_the_score_of_all_rows():
     predicted = TRUE + RNG.normal(0, 1, TRUE.shape)
     board = np.repeat("b0", 30)
     parts = [slice(0, 10), slice(10, 30)]
@@ -122,12 +124,12 @@ def test_skins_of_unequally_many_rows_pool_to_the_score_of_all_their_rows():
     assert [row[name] for name in METRICS] == pytest.approx([whole_board[name] for name in METRICS], rel=1e-12)
 
 
-def test_the_table_is_one_row_a_training_and_skin_and_survives_csv():
+def test_tidy_table_survives_csv():
     points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
-                          "scores": every()[0]["scores"]}]}  # fmt: skip
-    table = tidy([shifted("b0", 1), *every()], points)
+                          "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
+    table = tidy([shifted("b0", 1), *adapted_cards()], points)
     assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
-    assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # as labelled and registered, and each skin
+    assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # as labelled, registered, and each skin
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
     assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")
     again = pd.read_csv(io.StringIO(to_csv(table)), keep_default_na=False, na_values={name: "" for name in METRICS})
@@ -136,20 +138,20 @@ def test_the_table_is_one_row_a_training_and_skin_and_survives_csv():
 
 
 @given(VALUES)
-def test_the_interval_is_that_of_scipy(values):
+def test_interval_equals_scipy(values):
     low, high = t.interval(0.95, len(values) - 1, np.mean(values), np.std(values, ddof=1) / np.sqrt(len(values)))
     assert interval(values) == pytest.approx([low, high], abs=DOUBLE)
 
 
-def test_one_value_has_no_spread():
+def test_single_value_has_no_spread():
     assert statistic([5.0]) == statistic([5.0], boards=True) == {"mean": 5.0, "n": 1}
     assert statistic([80.0, 90.0]) == {"mean": 85.0, "n": 2, "sd": pytest.approx(50**0.5)}
 
 
 @FEW
 @given(PAIRS)
-def test_paired_boards_are_judged_as_by_the_paired_t_test(pairs):
-    stat = paired(*(of_boards([pair[side] for pair in pairs]) for side in (0, 1)))["accuracy_pct"]
+def test_paired_equals_scipys_paired_t_test(pairs):
+    stat = paired(*(board_scores([pair[side] for pair in pairs]) for side in (0, 1)))["accuracy_pct"]
     test = ttest_rel(*np.array(pairs).T)
     low, high = test.confidence_interval(0.95)
     assert stat["ci95"] == pytest.approx([low, high], abs=DOUBLE)
@@ -157,16 +159,16 @@ def test_paired_boards_are_judged_as_by_the_paired_t_test(pairs):
         assert (verdict(stat) == UNDECIDED) == (test.pvalue > 0.05)
 
 
-def test_differences_are_of_skins_then_boards_each_the_mean_of_its_networks():
-    of = scored({"b0": [[1.0, 3.0], [10.0]], "b1": [[5.0]]})  # of b0: 2 and 10; unequal numbers of networks
-    over = scored({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # of b0: 1 and 2
+def test_differences_are_means_over_networks_then_skins():
+    of = score_table({"b0": [[1.0, 3.0], [10.0]], "b1": [[5.0]]})  # of b0: 2 and 10; unequal numbers of networks
+    over = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # of b0: 1 and 2
     found = paired(of, over)
     assert found["by_board"] == {"b0": {"accuracy_pct": (1 + 8) / 2}, "b1": {"accuracy_pct": -4.0}}
     assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (0.25, 2)
 
 
 def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str, float]:
-    """Per held-out skin, the mean over seeds of one side less that of the other; then the mean of a board; plainly."""
+    """Return the mean difference of each board, by loops over skins and seeds."""
     found: dict[str, list[float]] = {}
     for board, skin in SKINS:
         sides = [
@@ -177,10 +179,10 @@ def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str,
     return {board: sum(own) / len(own) for board, own in found.items()}
 
 
-def test_paired_differences_of_cards_are_those_of_naive_loops():
-    found = paired(of_skins(), of_skins(off_mm=2.0))
+def test_paired_equals_naive_loops():
+    found = paired(skin_scores(), skin_scores(off_mm=2.0))
     for name in METRICS:
-        looped = looped_boards(every(), every(off_mm=2.0), name)
+        looped = looped_boards(adapted_cards(), adapted_cards(off_mm=2.0), name)
         assert {board: one[name] for board, one in found["by_board"].items()} == pytest.approx(looped)
         mean = sum(looped.values()) / 2
         sd = sum((one - mean) ** 2 for one in looped.values()) ** 0.5
@@ -188,32 +190,37 @@ def test_paired_differences_of_cards_are_those_of_naive_loops():
             "mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 2,
             "values": pytest.approx([looped[board] for board in sorted(looped)]),
         }  # fmt: skip
-    assert found["mse_xy_mm2"]["mean"] < 0  # the first side is the better one
+    assert found["mse_xy_mm2"]["mean"] < 0  # the first side is better
 
 
-def test_nothing_differs_from_itself_and_other_numbers_of_seeds_are_no_matter():
-    assert paired(of_skins(), of_skins())["accuracy_pct"] == {"mean": 0.0, "sd": 0.0, "n": 2, "values": [0.0, 0.0]}
-    assert paired(of_skins(), by_skin(tidy(every(off_mm=2.0)[:4])))["accuracy_pct"]["n"] == 2
+def test_paired_with_itself_is_zero():
+    assert paired(skin_scores(), skin_scores())["accuracy_pct"] == {
+        "mean": 0.0,
+        "sd": 0.0,
+        "n": 2,
+        "values": [0.0, 0.0],
+    }
+    assert paired(skin_scores(), by_skin(tidy(adapted_cards(off_mm=2.0)[:4])))["accuracy_pct"]["n"] == 2
 
 
-def test_more_skins_or_networks_of_equal_scores_make_no_board_surer():
+def test_more_skins_of_equal_scores_change_nothing():
     once, thrice = ({f"b{i}": [[float(i)]] * n for i in range(3)} for n in (1, 3))
     nothing = {board: [[0.0]] * 3 for board in thrice}
-    assert paired(scored(thrice), scored(nothing)) == paired(scored(once), of_boards([0.0] * 3))
+    assert paired(score_table(thrice), score_table(nothing)) == paired(score_table(once), board_scores([0.0] * 3))
 
 
 @FEW
 @given(VALUES, st.integers(0, 99))
-def test_the_order_of_boards_and_scores_is_no_matter(values, seed):
-    of = scored({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
-    over = scored({f"b{i}": [[1.0], [0.0]] for i in range(len(values))})
+def test_order_of_rows_does_not_matter(values, seed):
+    of = score_table({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
+    over = score_table({f"b{i}": [[1.0], [0.0]] for i in range(len(values))})
     assert paired(of.sample(frac=1, random_state=seed), over[::-1]) == paired(of, over)
 
 
 @FEW
 @given(VALUES)
-def test_swapped_sides_turn_the_difference_and_the_verdict_round(values):
-    of, over = of_boards(values), of_boards([1.0] * len(values))
+def test_swapping_sides_negates_the_difference(values):
+    of, over = board_scores(values), board_scores([1.0] * len(values))
     ahead, back = paired(of, over)["accuracy_pct"], paired(over, of)["accuracy_pct"]
     turned = negate(ahead)
     assert back["ci95"] == pytest.approx(turned["ci95"], abs=DOUBLE)
@@ -224,22 +231,22 @@ def test_swapped_sides_turn_the_difference_and_the_verdict_round(values):
 
 @FEW
 @given(VALUES, st.floats(-50, 50))
-def test_a_threshold_is_a_shift_of_all_boards(values, above):
+def test_threshold_is_a_shift(values, above):
     stat, moved = (statistic(own, boards=True) for own in (values, [value - above for value in values]))
     if min(abs(end) for end in moved["ci95"]) > DOUBLE:
         assert verdict(stat, above=above) == verdict(moved)
 
 
 @pytest.mark.parametrize(
-    ("ends", "word"),
+    ("ends", "expected"),
     [([0.1, 4.0], SUPPORTED), ([-4.0, -0.1], CONTRADICTED), ([-0.1, 4.0], UNDECIDED), ([0.0, 1.0], UNDECIDED)],
 )
-def test_an_interval_that_includes_0_concludes_nothing(ends, word):
-    assert verdict({"mean": 1.0, "n": 6, "ci95": ends}) == word
+def test_verdict_is_undecided_if_the_interval_has_zero(ends, expected):
+    assert verdict({"mean": 1.0, "n": 6, "ci95": ends}) == expected
 
 
 @pytest.mark.parametrize(
-    ("ends", "word"),
+    ("ends", "expected"),
     [
         ([-4.9, 4.9], SUPPORTED),
         ([5.1, 9.0], CONTRADICTED),
@@ -248,35 +255,35 @@ def test_an_interval_that_includes_0_concludes_nothing(ends, word):
         ([-9.0, 9.0], UNDECIDED),
     ],
 )
-def test_small_is_what_lies_wholly_between_both_limits(ends, word):
-    assert verdict_within({"mean": 1.0, "n": 6, "ci95": ends}, 5.0) == word
+def test_verdict_within_limits(ends, expected):
+    assert verdict_within({"mean": 1.0, "n": 6, "ci95": ends}, 5.0) == expected
 
 
-def test_one_board_has_no_interval_and_concludes_nothing():
-    stat = paired(scored({"b0": [[3.0], [4.0]]}), scored({"b0": [[1.0], [1.0]]}))["accuracy_pct"]
+def test_single_board_has_no_verdict():
+    stat = paired(score_table({"b0": [[3.0], [4.0]]}), score_table({"b0": [[1.0], [1.0]]}))["accuracy_pct"]
     assert stat == {"mean": 2.5, "n": 1}
     assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negate(stat)) == FEW_BOARDS
 
 
-def test_repeats_on_one_skin_are_no_boards():
+def test_repeats_on_one_skin_are_not_boards():
     assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS  # n with no interval over boards
 
 
-def test_a_claim_of_several_parts_holds_where_all_do_and_fails_where_one_does():
+def test_combined_verdicts():
     assert combine_verdicts([SUPPORTED, SUPPORTED]) == SUPPORTED
     assert combine_verdicts([SUPPORTED, UNDECIDED, CONTRADICTED]) == CONTRADICTED
     assert combine_verdicts([SUPPORTED, UNDECIDED]) == UNDECIDED
     assert combine_verdicts([SUPPORTED, FEW_BOARDS]) == FEW_BOARDS
 
 
-def test_sides_with_other_skins_make_no_pair():
-    few, many = scored({"b0": [[1.0]]}), scored({"b0": [[2.0], [3.0]], "b1": [[4.0]]})
+def test_paired_needs_equal_skins():
+    few, many = score_table({"b0": [[1.0]]}), score_table({"b0": [[2.0], [3.0]], "b1": [[4.0]]})
     with pytest.raises(SchemaError, match="held-out skins must be the same on both sides; got .*'b1_s0'"):
         paired(few, many)
 
 
-def crossed(values: dict[str, dict[str, float]]) -> pd.DataFrame:
-    """Scores by training skin (fold) and test board, one skin a board."""
+def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
+    """Return a table of scores by training skin (fold) and test board, one skin per board."""
     rows = [
         {"fold": fold, "board": board, "skin": f"{board}_s0", "accuracy_pct": value}
         for fold, boards in values.items() for board, value in boards.items()
@@ -284,32 +291,32 @@ def crossed(values: dict[str, dict[str, float]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_one_skin_against_many_counts_the_training_skins_as_a_sample_too():
+def test_paired_with_single_counts_training_skins():
     boards = [f"b{i}" for i in range(4)]
-    alike = crossed({fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")})
-    apart = crossed({f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)})
-    many = of_boards([80.0, 81.0, 82.0, 83.0])
+    alike = transfer_scores({fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")})
+    apart = transfer_scores({f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)})
+    many = board_scores([80.0, 81.0, 82.0, 83.0])
     sure, unsure = (paired_with_single(many, one)["accuracy_pct"] for one in (alike, apart))
     assert sure["mean"] == pytest.approx(60.0)
-    assert sure["ci95"] == pytest.approx([60.0, 60.0])  # every skin of every board gains as much
-    # Boards gain 50 each; training skins gain 60, 50, 40: a variance of 100 / 3, and two degrees of freedom.
+    assert sure["ci95"] == pytest.approx([60.0, 60.0])  # equal gains
+    # Boards gain 50 each; training skins gain 60, 50, 40: variance 100 / 3 with two degrees of freedom.
     low, high = t.interval(0.95, 2, 50, np.sqrt(100 / 3))
     assert unsure["ci95"] == pytest.approx([low, high])
     assert unsure["p"] == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
-    assert paired_with_single(of_boards([80.0] * 4), crossed({"t0": {"b1": 79.0}}))["by_board"] == {
+    assert paired_with_single(board_scores([80.0] * 4), transfer_scores({"t0": {"b1": 79.0}}))["by_board"] == {
         "b1": {"accuracy_pct": 1.0}
     }
     with pytest.raises(SchemaError, match="held-out skins must be the same"):
-        paired_with_single(of_boards([80.0]), alike)
+        paired_with_single(board_scores([80.0]), alike)
 
 
 @FEW
 @given(VALUES, VALUES)
-def test_the_variance_of_a_crossed_mean_is_at_least_that_of_either_factor(rows, columns):
+def test_crossed_variance_is_at_least_that_of_either_factor(rows, columns):
     table = pd.DataFrame(np.add.outer(rows, columns))
     se, freedom = two_way_error(table)
-    of_rows, of_columns = (np.var(part, ddof=1) / len(part) for part in (rows, columns))
-    assert se**2 == pytest.approx(of_rows + of_columns)
+    row_variance, column_variance = (np.var(part, ddof=1) / len(part) for part in (rows, columns))
+    assert se**2 == pytest.approx(row_variance + column_variance)
     assert min(len(rows), len(columns)) - 1 <= freedom * (1 + 1e-9)
     assert freedom <= (len(rows) + len(columns) - 2) * (1 + 1e-9)
     assert two_way_error(table[[0, 1]]) is None  # two boards
@@ -317,7 +324,7 @@ def test_the_variance_of_a_crossed_mean_is_at_least_that_of_either_factor(rows, 
 
 @FEW
 @given(st.lists(st.floats(1, 99), min_size=4, max_size=9))
-def test_intervals_stay_in_the_range_of_their_metric_and_hold_the_mean(values):
+def test_intervals_stay_in_the_range_of_the_metric(values):
     mean = float(np.mean(values))
     for metric, low, high in (("accuracy_pct", 0, 100), ("mse_xy_mm2", 0, np.inf)):
         ends = interval(values, metric)
@@ -330,52 +337,53 @@ def test_intervals_stay_in_the_range_of_their_metric_and_hold_the_mean(values):
 
 @FEW
 @given(st.lists(st.floats(49.9, 50.1), min_size=4, max_size=9))
-def test_where_boards_agree_the_bounded_interval_is_students(values):
+def test_bounded_interval_tends_to_students(values):
     plain, bounded = np.array(interval(values)), np.array(interval(values, "accuracy_pct"))
     np.testing.assert_allclose(bounded, plain, atol=0.02 * np.ptp(plain) + 1e-9)
 
 
 @FEW
 @given(st.dictionaries(st.text(min_size=1, max_size=3), st.floats(0, 1), min_size=1, max_size=8))
-def test_holms_p_values_are_those_of_the_step_down_definition(p_values):
+def test_holm_equals_the_step_down_definition(p_values):
     adjusted, names = holm(p_values), sorted(p_values, key=lambda name: p_values[name])
     for rank, name in enumerate(names):
         worst = max((len(names) - i) * p_values[names[i]] for i in range(rank + 1))
         assert adjusted[name] == min(1.0, worst)
 
 
-def test_a_score_that_some_skins_or_all_lack_is_of_those_that_have_it():
+def test_missing_scores_are_ignored():
     known = pd.DataFrame([
         {"board": "b0", "skin": "s0", "mse_f_N2": 1.0, "mse_xy_mm2": 2.0},
         {"board": "b0", "skin": "s1", "mse_xy_mm2": 4.0},
     ])  # fmt: skip
     assert board_means(known).to_dict("index") == {"b0": {"mse_f_N2": 1.0, "mse_xy_mm2": 3.0}}
-    assert set(paired(of_skins(force=False), of_skins(force=False))) == {"accuracy_pct", "mse_xy_mm2", "by_board"}
+    assert set(paired(skin_scores(force=False), skin_scores(force=False))) == {"accuracy_pct", "mse_xy_mm2", "by_board"}
 
 
-def test_boards_are_summarised_as_folds_are_and_have_an_interval():
-    rows = tidy(every())
+def test_over_boards_equals_over_folds():
+    rows = tidy(adapted_cards())
     for name, stat in over_boards(rows).items():
         plain = over_folds(rows)[name]
         assert stat.keys() == {"mean", "n", "sd", "values"}
         assert [stat[key] for key in ("mean", "sd", "n")] == [plain[key] for key in ("mean", "sd", "n")]
         means = [
-            np.mean([one["scores"]["all"][name] for one in every() if one["fold"] == board]) for board in ("b0", "b1")
+            np.mean([one["scores"]["all"][name] for one in adapted_cards() if one["fold"] == board])
+            for board in ("b0", "b1")
         ]
-        if name != "r2_f":  # of the skins of a board together, test_skins_of_unequally_many_rows
+        if name != "r2_f":  # R^2: see test_unequal_skins_pool_to_the_score_of_all_rows
             assert stat["values"] == pytest.approx(means)
 
 
-def test_draws_of_one_board_are_no_boards():
-    cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in every()]
-    assert over_boards(tidy(cards)) == over_boards(tidy(every()))
+def test_draws_of_one_board_are_pooled():
+    cards = [one | {"fold": f"{one['fold']}-draw{one['seed_i']}"} for one in adapted_cards()]
+    assert over_boards(tidy(cards)) == over_boards(tidy(adapted_cards()))
     alone = over_boards(tidy([one for one in cards if one["fold"].startswith("b0")]))["accuracy_pct"]
     assert alone["n"] == 1
     assert "ci95" not in alone
     assert alone["sd_seeds"] > 0
 
 
-def test_one_skin_on_others_counts_pairs_as_the_paper_does_and_its_interval_knows_both_samples():
+def test_over_pairs_counts_pairs():
     rng = rng_for(0, "transfer")
     tested = [f"b{i}" for i in range(1, 5)]
     boards, skins = np.repeat(tested, 20), np.repeat([f"{board}_s{i}" for board in tested for i in range(2)], 10)
@@ -396,7 +404,7 @@ def test_one_skin_on_others_counts_pairs_as_the_paper_does_and_its_interval_know
     assert stat["ci95"][0] > 0
 
 
-def test_one_skin_on_others_and_many_skins_are_tested_on_the_same_rows():
+def test_transfer_and_lobo_have_equal_test_rows():
     split = Split(transfer_skins_n=3, pool_passes_n=2)
     table = six_by_three_in_passes(5)
     many = {skin: fold for fold in draw_folds(table, ["lobo"], split, 0) for skin in np.unique(table.skin[fold.test])}
@@ -406,3 +414,28 @@ def test_one_skin_on_others_and_many_skins_are_tested_on_the_same_rows():
         for skin in skins:
             pooled = many[skin].test
             assert fold.test[table.skin[fold.test] == skin].tolist() == pooled[table.skin[pooled] == skin].tolist()
+
+
+TRAININGS = st.lists(st.fixed_dictionaries({"collapsed": st.booleans(), "collapsed_before_n": st.integers(0, 2)}))
+
+
+@given(TRAININGS)
+def test_tally_counts_every_attempt(done):
+    attempts = [[True] * one["collapsed_before_n"] + [one["collapsed"]] for one in done]
+    assert tally(done) == {
+        "trainings_n": sum(map(len, attempts)),
+        "collapsed_n": sum(map(sum, attempts)),
+        "kept_collapsed_n": sum(own[-1] for own in attempts),
+    }
+
+
+def test_collapsed_network_is_listed_in_the_audit():
+    def trained(seed_i: int, **collapses: object) -> dict:
+        return card("lobo", "b0", {}, seed_i=seed_i, collapsed=False, collapsed_before_n=0) | collapses
+
+    check = audit_collapse(
+        "train_multi", [trained(0, collapsed_before_n=2), trained(1, collapsed=True, collapsed_before_n=2)]
+    )
+    assert check.found == "1 of 2 collapsed: lobo.paper.b0.seed1; 4 trained again"
+    assert (check.holds, check.known) == (False, True)
+    assert audit_collapse("train_multi", [trained(0)]).holds

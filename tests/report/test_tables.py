@@ -1,4 +1,4 @@
-"""Tables: numbers as they were given beside the paper's, in its order, with their source."""
+"""Tests of the report's tables: our numbers beside the paper's, with their source."""
 
 import json
 
@@ -29,7 +29,7 @@ from pipeline.statistics import tidy
 from pipeline.training.universal import METHODS, WAYS
 from reskin.errors import ParamsError, SchemaError
 from reskin.io import read_json
-from tests.report import cards
+from tests.report import synthetic
 from tests.report.synthetic import all_experiments, over_boards, stat, texts_of
 from tests.stages.checkout import ROOT
 
@@ -39,14 +39,14 @@ def card(experiment: str, fold: str, accuracy_pct: float, recipe: str = "paper")
     skins = {"s0": one, "s1": {**one, "accuracy_pct": accuracy_pct + 10}}
     board = fold if experiment == "lobo" else "b0"
     scores = {"all": one, "registered": one, "by_skin": skins, "board_of": dict.fromkeys(skins, board)}
-    return cards.card(experiment, fold, scores | {"rows_n": 20}, recipe)
+    return synthetic.card(experiment, fold, scores | {"rows_n": 20}, recipe)
 
 
 CARDS = [
     card("lobo", "b0", 80.0), card("lobo", "b1", 90.0), card("lobo", "b0", 1.0, "released"),
     card("transfer", "s0", 20.0),
 ]  # fmt: skip
-ACCOUNTS = [
+COUNTS = [
     {
         "bytes_n": 85,
         "frames_n": 1,
@@ -60,11 +60,11 @@ ACCOUNTS = [
 
 def numbers(made: list[dict] = CARDS, source: str = "recorded") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
-    capture = add_up(ACCOUNTS) | {"left_out": {"low_force_rows_n": 3}}
+    capture = add_up(COUNTS) | {"left_out": {"low_force_rows_n": 3}}
     return {"provenance": provenance, "capture": capture, **learning_numbers(tidy(made), headline="paper")}
 
 
-def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
+def test_pooled_scores_are_over_boards_and_single_ones_over_pairs():
     table2 = numbers()["table2"]
     spread = pytest.approx(50**0.5)
     assert table2["multi"]["accuracy_pct"] == {"mean": 85.0, "n": 2, "sd": spread, "values": [80.0, 90.0]}
@@ -72,7 +72,7 @@ def test_pooled_numbers_are_over_boards_and_single_ones_over_pairs_of_skins():
     assert table2["single"]["accuracy_pct"] == pairs
 
 
-def test_places_predicted_without_any_change_of_field_stand_below_the_split_that_it_was_scored_on():
+def test_before_touch_rows_are_below_their_split():
     columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
     predicted = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
     shown = numbers([card("single_temporal", "s0", 95.0)])
@@ -84,7 +84,7 @@ def test_places_predicted_without_any_change_of_field_stand_below_the_split_that
     assert len(make_tables(shown)["single_sensor"]) == 1
 
 
-def test_an_experiment_that_was_not_asked_is_absent_and_not_null():
+def test_missing_experiment_is_absent():
     only_single = numbers([card("single_temporal", "s0", 99.0)])
     assert "table2" not in only_single
     assert "lobo" not in only_single
@@ -92,7 +92,7 @@ def test_an_experiment_that_was_not_asked_is_absent_and_not_null():
     assert "null" not in json.dumps(only_single)
 
 
-def test_three_ways_to_split_one_skin_stand_side_by_side_and_the_papers_first():
+def test_splits_of_one_skin_start_with_the_papers():
     ways = {"single_pass": 70.0, "single_indentation": 80.0, "single_random": 90.0}
     shown = numbers([card(experiment, "repeat0", accuracy_pct) for experiment, accuracy_pct in ways.items()])
     single = shown["single_sensor"]
@@ -105,50 +105,50 @@ def test_three_ways_to_split_one_skin_stand_side_by_side_and_the_papers_first():
     assert "the paper's way" in table["model"][0]
 
 
-def test_variants_stand_apart_from_the_headline():
+def test_variants_are_separate_from_the_headline():
     assert numbers()["variants"]["lobo"]["released"]["accuracy_pct"]["mean"] == 1.0
 
 
-def test_accounts_add_up():
-    assert add_up(ACCOUNTS) == {
+def test_capture_counts_add_up():
+    assert add_up(COUNTS) == {
         "captures_n": 2, "bytes_n": 249, "frames_n": 3, "skipped_resync_bytes_n": 1, "skipped_truncated_bytes_n": 2,
         "lost_bytes_n": 3,
     }  # fmt: skip
 
 
-def test_losses_of_further_protocols_stand_under_their_names_and_not_under_the_main_ones():
-    wear = {"accounts": ACCOUNTS, "left_out": {}}
+def test_capture_counts_by_protocol():
+    wear = {"accounts": COUNTS, "left_out": {}}
     losses = {
         "drift": wear | {"left_out": {"low_force_rows_n": 4}},
-        "variation": wear,  # of the same captures: counted once
-        "shear": {"accounts": ACCOUNTS[1:], "left_out": {"low_force_rows_n": 7}},
-        "contacts": {"accounts": [], "left_out": {}},  # asks the main captures
+        "variation": wear,  # the same captures, counted once
+        "shear": {"accounts": COUNTS[1:], "left_out": {"low_force_rows_n": 7}},
+        "contacts": {"accounts": [], "left_out": {}},  # uses the main captures
     }
     found = lost_by_protocol(losses)
     assert set(found) == {"wear", "drag"}
-    assert found["wear"] == add_up(ACCOUNTS) | {"left_out": {"low_force_rows_n": 4}}
+    assert found["wear"] == add_up(COUNTS) | {"left_out": {"low_force_rows_n": 4}}
     assert (found["drag"]["captures_n"], found["drag"]["bytes_n"]) == (1, 164)
     shown = make_tables(numbers() | {"capture_by_protocol": found})["captures"].set_index(["protocol", "what"])["count"]
     assert shown["main", "bytes_n"] == shown["wear", "bytes_n"] == "249"
     assert shown["drag", "left out of training: low_force_rows_n"] == "7"
-    assert ("drag", "lost_bytes_n") not in shown  # nothing was lost
+    assert ("drag", "lost_bytes_n") not in shown  # no bytes were lost
     assert shown["wear", "lost_bytes_n"] == "3"
 
 
-def test_every_table_says_where_its_rows_come_from():
+def test_every_row_has_its_source():
     for source in ("simulated", "recorded"):
         tables = make_tables(numbers(source=source))
-        ours = tables.pop("table1")[OURS]  # the paper's own table, our column beside it
+        ours = tables.pop("table1")[OURS]  # the paper's table with our column
         assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
         assert any(cell != NOT_GIVEN for cell in ours)
         for table in tables.values():
             assert set(table["source"]) == {source}
 
 
-def test_the_papers_numbers_stand_beside_ours():
+def test_table_2_has_the_papers_numbers():
     text = to_markdown(make_tables(numbers())["table2"])
     for value in TABLE_2["multi"].values():
-        assert f"{value[0]:g} ± {value[1]:g}" in text  # as published, no digit less
+        assert f"{value[0]:g} ± {value[1]:g}" in text  # with the published digits
     assert "85 ± 7.1" in text
 
 
@@ -159,27 +159,27 @@ def test_one_training_skin_is_not_called_pooled():
     assert "84.43" not in to_markdown(make_tables(alone)["table2"])
 
 
-def test_a_table_of_scores_says_what_they_mean():
+def test_score_tables_explain_the_metric():
     tables = make_tables(numbers())
     assert "within 1 mm" in to_markdown(tables["table2"])
     assert "within 1 mm" not in to_markdown(tables["captures"])
 
 
-def test_a_number_that_is_not_known_is_a_dash():
+def test_unknown_number_is_a_dash():
     unknown = card("single_temporal", "s0", 99.0)
     del unknown["scores"]["all"]["mse_f_N2"]
     table = make_tables(numbers([unknown]))["single_sensor"]
     assert table["MSE_F, N² (ours)"].tolist() == ["–"]
 
 
-def test_a_spread_over_seeds_is_shown_and_called_so():
+def test_format_of_spread_over_seeds():
     assert show({"mean": 99.7, "n": 1, "sd_seeds": 0.04}) == "99.7 ± 0.04 (seeds)"
     assert show({"mean": 99.7, "n": 2, "sd": 1.0, "sd_seeds": 0.04}) == "99.7 ± 1 ± 0.04 (seeds)"
-    of_boards = {"mean": 99.7, "n": 2, "sd": 1.0, "ci95": [90.7, 108.7], "sd_seeds": 0.04}
-    assert show(of_boards) == "99.7 [90.7, 108.7] ± 0.04 (seeds)"
+    boards = {"mean": 99.7, "n": 2, "sd": 1.0, "ci95": [90.7, 108.7], "sd_seeds": 0.04}
+    assert show(boards) == "99.7 [90.7, 108.7] ± 0.04 (seeds)"
     few = {"mean": 85.0, "n": 2, "sd": 7.0, "values": [80.0, 90.0]}
     assert (show(few), show_digits(few, 1)) == ("85 (80; 90)", "85.0 (80.0; 90.0)")
-    assert show_digits(of_boards, 2) == "99.70 [90.70, 108.70] ± 0.04 (seeds)"
+    assert show_digits(boards, 2) == "99.70 [90.70, 108.70] ± 0.04 (seeds)"
 
 
 @pytest.mark.parametrize(("value", "kept"), [(1234567.8, 1234570.0), (0.000123456789, 0.000123457), (0.0, 0.0)])
@@ -187,7 +187,7 @@ def test_rounding_keeps_six_digits(value, kept):
     assert rounded({"a": [value, 3]}) == {"a": [kept, 3]}
 
 
-def test_generated_blocks_replace_only_what_is_between_their_marks():
+def test_fill_replaces_only_marked_blocks():
     pages = {"one.md": "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n", "other.md": "a\n"}
     assert fill(pages, {"a": "new"}) == pages | {"one.md": "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"}
     assert fill(fill(pages, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(pages, {"a": r"\1 new"})
@@ -201,7 +201,7 @@ def test_all_metrics_have_a_column():
     assert {metric for row in TABLE_2.values() for metric in row} == set(OF_PAPER)
 
 
-def test_the_summary_holds_ours_and_the_papers_means_and_the_control():
+def test_summary_has_ours_the_papers_and_the_control():
     numbers = all_experiments()
     table = summary_table(numbers).set_index("boards never seen")
     assert len(table) == len(numbers["table2"]) + 1
@@ -214,7 +214,7 @@ def test_the_summary_holds_ours_and_the_papers_means_and_the_control():
     assert "R² of F" in table
 
 
-def test_the_universal_model_without_labels_and_with_most_pokes_stands_first():
+def test_summary_starts_with_the_universal_model():
     numbers = all_experiments()
     rows = [
         {"way": way, "pokes_n": pokes_n, "labels_n": labels_n, "accuracy_pct": over_boards(*accuracy), "n": 2}
@@ -231,7 +231,7 @@ def test_the_universal_model_without_labels_and_with_most_pokes_stands_first():
     assert "65 unlabelled" in texts_of(headline_figures(numbers, "simulated")[HEADLINE])
 
 
-def test_the_summary_with_labels_is_of_the_calibrated_models_and_the_first_method():
+def test_summary_of_recordings_has_labels():
     numbers = read_json(ROOT / "reports/lab/numbers.json")
     table, usual = summary_table(numbers), numbers["labels"][0]["method"]
     lines = table.set_index("boards never seen").to_dict("index")
@@ -242,7 +242,7 @@ def test_the_summary_with_labels_is_of_the_calibrated_models_and_the_first_metho
             assert shown == show(row["as_labelled"]["accuracy_pct"])
 
 
-def test_without_boards_held_out_there_is_no_summary():
+def test_no_summary_without_held_out_boards():
     assert summary_table({name: own for name, own in all_experiments().items() if name != "table2"}) is None
 
 
@@ -250,21 +250,23 @@ TABLE_1 = read_table1()
 PROPERTIES = (*TABLE_1.rows, LOCALISATION)
 
 
-def test_the_columns_are_the_papers_and_each_has_a_source_with_its_year():
+def test_table_1_columns_have_sources_with_years():
     assert list(TABLE_1.columns) == ["ReSkin", "DIGIT", "GelSlim", "BioTac", "RSkin"]
     for name, year in zip(TABLE_1.columns, (2021, 2020, 2018, 2019, 2013), strict=True):
         assert f"{year}" in TABLE_1.columns[name]
 
 
-def test_as_the_caption_says_only_reskin_meets_every_requirement():
-    asked = [name for name in TABLE_1.rows if name not in ("Type", "Frequency")]
-    met = {column: all(TABLE_1.rows[name][i] == "yes" for name in asked) for i, column in enumerate(TABLE_1.columns)}
+def test_only_reskin_meets_every_requirement():
+    requirements = [name for name in TABLE_1.rows if name not in ("Type", "Frequency")]
+    met = {
+        column: all(TABLE_1.rows[name][i] == "yes" for name in requirements) for i, column in enumerate(TABLE_1.columns)
+    }
     assert [column for column, all_met in met.items() if all_met] == ["ReSkin"]
-    assert {cell for name in asked for cell in TABLE_1.rows[name]} == {"yes", "no", "?"}
+    assert {cell for name in requirements for cell in TABLE_1.rows[name]} == {"yes", "no", "?"}
 
 
 @given(st.dictionaries(st.sampled_from(PROPERTIES), st.text(max_size=9)))
-def test_the_papers_cells_are_never_overwritten(measured):
+def test_table_1_keeps_the_papers_cells(measured):
     table = table1(TABLE_1, measured)
     for (name, cells), (_, row) in zip(TABLE_1.rows.items(), table.iterrows(), strict=False):
         assert [row["property"], *(row[column] for column in TABLE_1.columns)] == [name, *cells]
@@ -273,7 +275,7 @@ def test_the_papers_cells_are_never_overwritten(measured):
     assert table.iloc[-1]["property"] == LOCALISATION
 
 
-def test_what_was_set_in_a_simulated_rig_is_not_called_measured():
+def test_simulated_settings_are_not_called_measured():
     for source, rate, area in (
         ("simulated", "400 Hz, a setting read back from the captures, simulated", "mm, a setting, simulated"),
         ("recorded", "400 Hz, recorded", "mm, recorded"),
@@ -286,18 +288,18 @@ def test_what_was_set_in_a_simulated_rig_is_not_called_measured():
         assert cells["Area coverage"] == f"40 chips under 50.8 x 101.6 {area}"
 
 
-def test_every_source_is_named_below_the_table():
+def test_table_1_lists_every_source():
     meaning = table1(TABLE_1, {}).attrs["meaning"]
     assert all(source in meaning for source in TABLE_1.columns.values())
 
 
-def test_a_measured_row_that_the_table_lacks_is_refused():
+def test_unknown_property_is_an_error():
     with pytest.raises(ParamsError, match="Weight"):
         table1(TABLE_1, {"Weight": "5 g"})
 
 
 @pytest.mark.parametrize(("rows", "fault"), [("{Type: [Magnetic]}", "2 cells, not 1"), ("{Type: [1, 2]}", "string")])
-def test_a_broken_file_is_refused(tmp_path, rows, fault):
+def test_invalid_table_1_is_an_error(tmp_path, rows, fault):
     file = tmp_path / "table1.yaml"
     file.write_text(f"columns: {{a: x, b: y}}\nrows: {rows}\n")
     with pytest.raises(ParamsError, match=fault):
@@ -315,7 +317,7 @@ SIMULATED = described("simulated", noise_xy_uT=3.3, force_max_N=40.0, step_z_uT=
 RECORDED = described("recorded", noise_xy_uT=3.1, force_max_N=4.0)
 
 
-def test_each_quantity_shows_mean_range_and_number_of_skins():
+def test_skins_table_has_mean_range_and_count():
     table = skins_table({"quick (simulated)": SIMULATED})
     assert table["quick (simulated)"].tolist() == [
         "3.3 [1.65 … 6.6] (3)",
@@ -325,7 +327,7 @@ def test_each_quantity_shows_mean_range_and_number_of_skins():
     assert "simulated / nearest recorded" not in table
 
 
-def test_simulated_and_recorded_skins_are_compared_row_by_row():
+def test_simulated_skins_are_compared_with_recorded():
     table = skins_table({"quick (simulated)": SIMULATED, "lab (recorded)": RECORDED})
     ratios = dict(zip(table["quantity"], table["simulated / nearest recorded"], strict=True))
     assert ratios["noise of one reading, x and y, µT"] == "1.1"
@@ -343,21 +345,21 @@ CASE = {
 }  # fmt: skip
 
 
-def test_a_check_is_a_row_with_its_error_beside_what_is_allowed():
+def test_verification_table_has_error_and_tolerance():
     table = verification_table([CHECK, CHECK | {"unit": "1", "error": 1.5e-15}], "simulated")
     assert table["error"].tolist() == ["3.3e-05 uT", "1.5e-15"]
     assert table["allowed"].tolist() == ["5e-05 uT", "5e-05"]
     assert table["why so much"].tolist() == ["four decimals"] * 2
 
 
-def test_a_case_without_a_number_has_a_dash():
+def test_stability_table_has_dashes_without_numbers():
     table = stability_table([CASE, CASE | {"error": None, "limit": None}], "simulated")
     assert table["error"].tolist() == ["1", "–"]
     assert table["allowed"].tolist() == ["1", "–"]
 
 
 @pytest.mark.parametrize(("layout", "row"), [(verification_table, CHECK), (stability_table, CASE)])
-def test_a_row_that_does_not_hold_stands_out_and_each_names_its_source(layout, row):
+def test_failed_rows_are_highlighted(layout, row):
     table = layout([row, row | {"holds": False}], "simulated")
     assert table["holds"].tolist() == ["yes", "NO"]
     assert table["source"].tolist() == ["simulated"] * 2

@@ -1,4 +1,4 @@
-"""The choice of settings, on cards made by hand."""
+"""Tests of the choice of settings from synthetic cards."""
 
 from typing import Any
 
@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 
 from pipeline.training.choice import choose, to_record
 from reskin.errors import ParamsError
-from tests.report import cards
+from tests.report import synthetic
 from tests.scenes import RECIPE
 
 Card = dict[str, Any]
 
 
 def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
-    """A card with one skin a board; accuracy and force speak for the worst place."""
+    """Return a card with one skin per board, whose accuracy and force error rank opposite to the place error."""
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
     scores = {
         "all": score,
@@ -24,9 +24,9 @@ def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **chan
         "board_of": {f"{fold}_s0": fold},
         "rows_n": 4,
     }
-    who = {"scene": "tuning", "test_boards": [fold], "test_skins": [f"{fold}_s0"]}
-    went = {"collapsed": False, "collapsed_before_n": 0}
-    return cards.card(experiment, fold, scores, name) | who | went | changes
+    data = {"scene": "tuning", "test_boards": [fold], "test_skins": [f"{fold}_s0"]}
+    outcome = {"collapsed": False, "collapsed_before_n": 0}
+    return synthetic.card(experiment, fold, scores, name) | data | outcome | changes
 
 
 def adapted(name: str, mse_xy_mm2: float, base: str, *, unlabelled_weight: float = 0.1, **changes: Any) -> Card:
@@ -54,34 +54,34 @@ def names(chosen: dict[str, Any]) -> dict[str, str]:
     return {stage: one["recipe_name"] for stage, one in chosen.items()}
 
 
-def test_the_least_error_of_places_wins_and_adaptation_chooses_its_base():
+def test_smallest_place_error_is_chosen_with_the_base_of_adaptation():
     chosen = choose(CARDS)
     assert names(chosen) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
     assert chosen["train_multi"]["settings"]["rate_max"] == 6e-3
-    assert chosen["train_triplet"]["settings"]["triplet_weight"] == 1.0  # light was better alone, heavy once adapted
+    assert chosen["train_triplet"]["settings"]["triplet_weight"] == 1.0  # light is better alone, heavy after adaptation
     assert chosen["adapt"]["settings"]["unlabelled_weight"] == 0.1
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.permutations(CARDS))
-def test_the_order_of_cards_chooses_nothing(cards):
+def test_choice_does_not_depend_on_the_order_of_cards(cards):
     assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
 
 
-def test_every_candidate_is_told_with_its_score():
-    told = {
+def test_all_candidates_are_listed_with_scores():
+    scores = {
         stage: {one["recipe_name"]: one["mse_xy_mm2"]["mean"] for one in chosen["candidates"]}
         for stage, chosen in choose(CARDS).items()
     }
-    assert told == {
+    assert scores == {
         "train_multi": {"slow": 0.5, "fast": 0.3, "fastest": 0.4},
         "train_triplet": {"light": 0.35, "heavy": 0.6},
         "adapt": {"from-light": 0.34, "from-heavy": 0.25},
     }
 
 
-def test_the_mean_over_boards_decides_each_the_mean_of_its_seeds():
-    """Two seeds of a board do not count twice: (0.4 + 0.9) / 2 is less than 0.695, (0.4 + 0.9 + 0.9) / 3 is not."""
+def test_mean_over_boards_decides():
+    # Seeds of a board are averaged first: (0.4 + 0.9) / 2 is less than 0.695, (0.4 + 0.9 + 0.9) / 3 is not.
     boards = [
         card("lobo", "fast", 0.29, "b0", recipe=RECIPE | {"rate_max": 6e-3}),
         card("lobo", "fast", 1.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}),
@@ -95,16 +95,16 @@ def test_the_mean_over_boards_decides_each_the_mean_of_its_seeds():
     assert chosen["recipe_name"] == "even"
 
 
-def test_skins_adapted_to_by_themselves_are_one_score_of_their_board():
-    """Two skins of board b0 (0.2, 0.4) and one of b1 (0.9): (0.3 + 0.9) / 2, and not the mean of three."""
+def test_adapted_skins_are_pooled_by_board():
+    # Two skins of board b0 (0.2, 0.4) and one of b1 (0.9): (0.3 + 0.9) / 2, not the mean of three.
     skins = [
         adapted("from-light", error, "light", fold=fold, test_skins=[skin])
         for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))
     ]
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
-    told = chosen["candidates"][0]["mse_xy_mm2"]
-    assert told["mean"] == pytest.approx(0.6)
-    assert "sd_seeds" not in told  # skins are no seeds
+    scores = chosen["candidates"][0]["mse_xy_mm2"]
+    assert scores["mean"] == pytest.approx(0.6)
+    assert "sd_seeds" not in scores  # skins are not seeds
 
 
 SHAPED = {"inputs": "shape"}
@@ -120,11 +120,11 @@ SHAPED = {"inputs": "shape"}
     ],
     ids=["shape", "triplet shape", "adapted shape", "another experiment"],
 )
-def test_other_inputs_and_other_experiments_are_no_candidates_however_good(better):
+def test_other_inputs_and_experiments_are_no_candidates(better):
     assert choose([better, *CARDS]) == choose(CARDS)
 
 
-def test_how_long_and_what_a_base_is_called_are_no_settings():
+def test_steps_and_base_are_no_settings():
     for one in choose(CARDS).values():
         assert "steps_n" not in one["settings"]
         assert "base" not in one["settings"]
@@ -143,12 +143,12 @@ def test_how_long_and_what_a_base_is_called_are_no_settings():
     ],
     ids=["nothing", "nothing pooled", "nothing adapted", "a control alone"],
 )
-def test_nothing_to_choose_from_is_one_sentence(cards, stage):
+def test_missing_candidates_are_an_error(cards, stage):
     with pytest.raises(ParamsError, match=f"candidates of {stage} must be one or more; got none. Run lobo"):
         choose(cards)
 
 
-def test_the_record_names_every_board_and_skin_that_was_looked_at_and_the_settings_alone():
+def test_record_lists_boards_skins_and_settings():
     cards = [*CARDS, card("lobo", "slow", 0.5, "b2"), card("lobo", "slow", 0.5, "b1")]
     record = to_record(choose(CARDS), cards, source="simulated", seed=777, physics="abc")
     assert record["physics"] == "abc"
@@ -158,12 +158,12 @@ def test_the_record_names_every_board_and_skin_that_was_looked_at_and_the_settin
 
 
 def longer(one: Card, steps_n: int, **scores: float) -> Card:
-    """The same settings with another budget of steps, and another error."""
+    """Return a card with the same settings, another number of steps and another error."""
     return card(one["question"], f"{one['recipe_name']}-{steps_n}", scores["mse_xy_mm2"],
                 recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
 
 
-def test_no_setting_wins_by_training_longer():
+def test_candidates_need_equal_steps():
     slow, fast = (card("lobo", name, mse, recipe=RECIPE | {"rate_max": rate, "steps_n": 100})
                   for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
     others = [one for one in CARDS if one["question"] != "lobo"]
@@ -174,7 +174,7 @@ def test_no_setting_wins_by_training_longer():
     assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3  # 0.275 against 0.3
 
 
-def test_a_control_is_a_candidate_that_is_listed_and_never_chosen():
+def test_control_is_listed_but_not_chosen():
     control = adapted("from-heavy-control", 0.2, "heavy", unlabelled_weight=0.0)
     chosen = choose([*CARDS, control])["adapt"]
     assert chosen["recipe_name"] == "from-heavy"
@@ -183,16 +183,16 @@ def test_a_control_is_a_candidate_that_is_listed_and_never_chosen():
     assert "control" not in choose(CARDS)["adapt"]
 
 
-@pytest.mark.parametrize("fate", [{"collapsed": True}, {"collapsed_before_n": 1}])
-def test_settings_with_which_a_training_collapsed_are_not_chosen_however_good(fate):
-    """Another board went well with the same settings; that one did not is enough."""
-    again = card("lobo", "fast", 0.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}, **fate)
+@pytest.mark.parametrize("failure", [{"collapsed": True}, {"collapsed_before_n": 1}])
+def test_settings_of_a_collapsed_training_are_not_chosen(failure):
+    # The other board of the same settings did not collapse.
+    again = card("lobo", "fast", 0.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}, **failure)
     assert names(choose([*CARDS, again]))["train_multi"] == "fastest"
-    every = [one | fate if one["question"] == "lobo" else one for one in CARDS]
+    collapsed_cards = [one | failure if one["question"] == "lobo" else one for one in CARDS]
     with pytest.raises(ParamsError, match="candidates of train_multi must be one or more without a collapsed"):
-        choose(every)
+        choose(collapsed_cards)
 
 
-def test_a_network_that_collapsed_is_chosen_for_no_adaptation():
+def test_collapsed_network_is_no_base_of_adaptation():
     cards = [one | {"collapsed_before_n": 1} if one["recipe_name"] == "heavy" else one for one in CARDS]
     assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-light", "train_triplet": "light"}

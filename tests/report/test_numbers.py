@@ -1,0 +1,127 @@
+"""Tests of numbers.json, which equal runs share, of provenance.json, and of the headline scores that DVC shows."""
+
+import copy
+import json
+
+import pytest
+
+from pipeline.manage.compare import leaves
+from pipeline.report.numbers import TIMES, headline_scores, join, learning_times, split
+from pipeline.scenes import ANALYSES
+from reskin.io import read_json
+from tests.report.synthetic import all_experiments, cost, scores, stat
+from tests.stages.checkout import ROOT
+
+SWEPT = [{"pokes_n": pokes_n, **scores()} for pokes_n in (0, 390)]
+METHODS = [{"method": name, "inputs": "raw", "name": name, **scores()} for name in ("ridge", "knn")]
+STUDY = {"study": "field", "method": "Gauss in z", "setting": "1 mm x 5", "work_n": 9, "error": 0.1, "failure": None}
+
+
+def run(seconds: float) -> dict:
+    """Return the numbers of a run with all kinds of times; one method is not timed."""
+    trainings = {
+        "sweep_pokes": [{"name": f"pokes.paper.b0.{n}pokes.seed0", "train_s": seconds} for n in (0, 390)],
+        "train_classical": [{"name": "ridge.b0", "train_s": seconds, "one_reading_s": seconds / 1e3}],
+    }
+    numbers = all_experiments() | {"sweep_pokes": SWEPT, "baselines": METHODS}
+    numbers["provenance"] |= {"git": f"code {seconds}", "device": f"machine {seconds}", "seconds": seconds}
+    numbers["runtime"] = {
+        "trainings_n": 1, "stages": {"report": cost(seconds)}, "choice": {"setting": "1 mm x 5"},
+        "quadratures": [STUDY | {"median_s": seconds, "repeats_n": 3}, STUDY | {"method": "reference"}],
+        **learning_times(numbers, trainings),
+    }  # fmt: skip
+    return numbers
+
+
+def test_runs_differ_only_in_provenance():
+    (numbers, provenance), (other_numbers, other) = split(run(1.0)), split(run(2.0))
+    assert numbers == other_numbers
+    assert provenance != other
+    assert all(row.keys() & set(TIMES) for row in provenance["runtime"]["adaptation"])
+
+
+def test_numbers_have_no_commit_machine_or_times():
+    numbers = split(run(1.0))[0]
+    assert set(numbers["provenance"]) == {"scene", "source", "seed"}
+    assert "stages" not in numbers["runtime"]
+    assert [name for name, _ in leaves(numbers["runtime"]) if name.rsplit(".", 1)[-1] in TIMES] == []
+    assert numbers["runtime"]["quadratures"][0] == STUDY
+
+
+def test_split_and_join_are_inverse():
+    numbers = run(1.0)
+    before = copy.deepcopy(numbers)
+    assert join(*split(numbers)) == before
+    assert numbers == before
+
+
+@pytest.mark.parametrize("folder", sorted(file.parent for file in ROOT.glob("reports/*/numbers.json")), ids=str)
+def test_committed_reports_are_split(folder):
+    numbers, provenance = (read_json(folder / name) for name in ("numbers.json", "provenance.json"))
+    assert split(join(numbers, provenance)) == (numbers, provenance)
+    assert {"git", "trained", "device", "seconds", "runtime"} <= set(provenance)
+
+
+def test_table_2_and_control_are_shown_by_their_means():
+    numbers = {"provenance": {"source": "simulated"}, "table2": {"multi": scores()}, "adapt": {"control": scores()}}
+    numbers["table2"]["multi"]["accuracy_pct"] = stat(82.2)
+    assert headline_scores(numbers) == {
+        "table2": {
+            "multi": {"accuracy_pct": 82.2, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0, "r2_f": 1.0},
+            "control": {"accuracy_pct": 1.0, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0, "r2_f": 1.0},
+        }
+    }
+
+
+def test_drift_is_shown_at_its_end():
+    windows = [{"contacts_n": n, "accuracy_pct": 100.0 - n, "mse_xy_mm2": 1.0} for n in (10, 20)]
+    numbers = {"provenance": {"source": "recorded"}, "drift": {"each": windows, "findings": [{"finding": "x"}]}}
+    assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}  # there is no force
+
+
+def test_recorded_scenes_show_registered_scores_and_best_methods():
+    def row(method: str, labels_n: int, accuracy_pct: float) -> dict:
+        fields = {"method": method, "inputs": "raw", "labels_n": labels_n, "registered": scores()}
+        return fields | {"as_labelled": {"accuracy_pct": stat(accuracy_pct)}}
+
+    rows = [row("a", 0, 20.0), row("b", 0, 30.0), row("a", 10, 99.0), row("a", 40, 50.0), row("b", 40, 40.0)]
+    numbers = {"provenance": {"source": "recorded"}, "lobo": {"registered": scores()}, "labels": rows}
+    assert headline_scores(numbers) == {
+        "lobo": {"registered": {"accuracy_pct": 1.0, "mse_xy_mm2": 1.0, "mse_f_N2": 1.0, "r2_f": 1.0}},
+        "labels": {
+            "best_of_0_labels": {"method": "b (raw)", "accuracy_pct": 30.0},
+            "best_of_40_labels": {"method": "a (raw)", "accuracy_pct": 50.0},
+        },
+    }
+
+
+def test_runtime_and_provenance_change_no_score():
+    numbers = all_experiments()
+    before = headline_scores(numbers)
+    numbers["provenance"] |= {"git": "other", "trained": "other", "device": "other", "seconds": 9.0}
+    numbers["runtime"] = {}
+    assert headline_scores(numbers) == before
+    assert not any(word in json.dumps(before) for word in ("seconds", '_s"', "git", "device"))
+
+
+def test_empty_scene_has_no_scores():
+    assert headline_scores({"provenance": {"source": "simulated"}}) == {}
+
+
+@pytest.mark.parametrize("without", ANALYSES)
+def test_missing_experiment_has_no_scores(without):
+    numbers = all_experiments()
+    numbers.pop(without, None)  # compare is only run for recordings
+    assert not any(name.startswith(without) for name in headline_scores(numbers))
+
+
+@pytest.mark.parametrize("file", sorted(ROOT.glob("reports/*/numbers.json")), ids=lambda file: file.parent.name)
+def test_scores_of_committed_reports(file):
+    numbers = read_json(file)
+    known = {value for _, value in leaves(numbers) if isinstance(value, float)}
+    shown = dict(leaves(headline_scores(numbers)))
+    assert 0 < len(shown) < 50
+    for name, value in shown.items():
+        if not name.endswith(".method"):
+            assert value in known
+            assert name.endswith(("_pct", "_mm2", "_N2", ".r2_f"))  # R² has no unit
