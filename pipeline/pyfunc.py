@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from reskin.models.trained import Network
-from reskin.predicting import read_network
+from reskin.models.trained import Network, read_network
 
 COLUMNS = ("x_mm", "y_mm", "force_N")
 

@@ -325,7 +325,7 @@ def load_model(file: Path | str) -> Model:
     >>> model = reskin.load_model(file).zero(noload_uT)  # doctest: +SKIP
     >>> x_mm, y_mm, force_N = model.predict(b_uT)[0]  # doctest: +SKIP
     """
-    from reskin.predicting import read_network
+    from reskin.models.trained import read_network
 
     return Model(read_network(Path(file)))
 

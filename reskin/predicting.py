@@ -1,24 +1,20 @@
-"""Estimate contacts, places and forces in a log with a trained model, as a CSV; and read trained models.
+"""Estimate contacts, places and forces in a log with a trained model, as a CSV.
 
 The user has to know whether the model was trained on the log's own board.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from pydantic import Field
 
 from reskin import io
 from reskin.board.stream import decode_all
-from reskin.config import Strict, parse
-from reskin.data.rows import TARGETS
-from reskin.errors import CaptureError, ParamsError, SchemaError, require
-from reskin.live.contacts import Estimator, LogEstimates, describe, estimate, quiet_start
-from reskin.models.inputs import VIEW
-from reskin.models.trained import FORMAT, Network
+from reskin.errors import CaptureError, ParamsError, SchemaError
+from reskin.logs import Estimator, LogEstimates, describe, estimate, quiet_start
+from reskin.models.trained import Network, read_network
 from reskin.recordings import tables
 from reskin.recordings.decode import read_frames
 from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
@@ -28,31 +24,6 @@ from reskin.universal.calibration import CHANNELS_N, is_calibration
 from reskin.universal.model import Universal, load_universal
 
 PARQUET_MAGIC = b"PAR1"
-
-
-class CardRecipe(Strict, extra="ignore"):
-    """The part of a model's recipe that its use depends on."""
-
-    architecture: Literal["paper", "released"]
-    inputs: Literal["raw", "shape"]
-
-
-class CardInput(Strict, extra="ignore"):
-    """The input of a model."""
-
-    quantity: Literal["change of field"]
-    unit: Literal["uT"]
-    channels_n: Annotated[int, Field(ge=3, le=192, multiple_of=3)]  # of at most 64 chips
-
-
-class Card(Strict, extra="ignore"):
-    """The part of a model's card that its use depends on; the rest says where it comes from."""
-
-    format: str
-    recipe: CardRecipe
-    input: CardInput
-    output: dict[str, str]
-    collapsed: bool
 
 
 def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
@@ -129,56 +100,6 @@ def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
     if len(files) > 1:
         raise ParamsError(f"{calibrations[0]}: a calibration cannot be combined with other models. Give it alone.")
     return load_universal(calibrations[0])
-
-
-def read_network(model: Path) -> Network:
-    """Read a trained network and the card beside it.
-
-    Raises
-    ------
-    ParamsError
-        If a file is missing, or it is a calibration of the universal model.
-    SchemaError
-        If the card is invalid or does not fit the weights, or the network has collapsed.
-    """
-    card_file = model.with_suffix(".json")
-    if not model.is_file():
-        raise ParamsError(f"{model}: model file not found. {_find_models(model)}")
-    if is_calibration(model):
-        raise ParamsError(f"{model}: a calibration of the universal model. Load it with reskin.load_universal.")
-    if not card_file.is_file():
-        raise ParamsError(f"{card_file}: card of the model not found. Copy it with its .safetensors file.")
-    content = io.read_json(card_file)
-    form = content.get("format") if isinstance(content, dict) else None
-    if form != FORMAT:
-        raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
-    card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
-    if tuple(card.output) != TARGETS:
-        outputs = ", ".join(card.output) or "nothing"
-        raise SchemaError(f"{card_file}: the model predicts {outputs}, not {', '.join(TARGETS)}. Give another model.")
-    if card.collapsed:
-        raise SchemaError(
-            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use another seed."
-        )
-    inputs_n = VIEW[card.recipe.inputs](np.zeros((1, card.input.channels_n), np.float32)).shape[1]
-    weights_n = tensors["input_shift"].size if "input_shift" in tensors else 0
-    if inputs_n != weights_n:
-        raise SchemaError(
-            f"{card_file}: {card.input.channels_n} channels with inputs {card.recipe.inputs} give {inputs_n} inputs, "
-            f"but the weights take {weights_n}. Is this the card of this model?"
-        )
-    require("torch", model)
-    return Network(content, tensors)
-
-
-def _find_models(missing: Path) -> str:
-    """Return how to get a missing model file; stages write them to data/models/SCENE/STAGE."""
-    if found := sorted(file.name for file in missing.parent.glob("*.safetensors")):
-        return f"Models in its folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
-    if missing.parts[-5:-3] != ("data", "models"):
-        return "Give the path of a trained .safetensors file."
-    scene = missing.parts[-3]
-    return f"Scene {scene} trains it: in the checkout, run `reskin scenes use {scene}` and then `make repro`."
 
 
 def render(found: LogEstimates) -> str:

@@ -14,7 +14,7 @@ from reskin import io
 from reskin.config import read_yaml
 from reskin.data.rows import Selection, load_rows
 from reskin.errors import ReskinError
-from reskin.predicting import read_network
+from reskin.models.trained import read_network
 from reskin.seeds import rng_for
 from reskin.simulation.capture import simulate_capture
 from reskin.simulation.defaults import nominal

@@ -22,7 +22,7 @@ from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.settings import Settings
 from pipeline.simulation import simulation_settings
 from pipeline.stage import say
-from reskin.live.contacts import (
+from reskin.logs import (
     Estimator,
     contacts_n,
     describe,

@@ -29,8 +29,8 @@ from reskin.board.wire import Frames, concatenate
 from reskin.config import parse
 from reskin.data.grid import CENTRE_MM
 from reskin.errors import CaptureError, ParamsError, SchemaError
-from reskin.live.contacts import CONTACT_SDS, quiet_start
 from reskin.live.health import LIVE_POLICY, Health
+from reskin.logs import CONTACT_SDS, quiet_start
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import Network
 from reskin.recordings.fault_policy import FaultPolicy

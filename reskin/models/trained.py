@@ -4,13 +4,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
+from pydantic import Field
 
 from reskin import io
-from reskin.errors import SchemaError, missing_package
+from reskin.config import Strict, parse
+from reskin.data.rows import TARGETS
+from reskin.errors import ParamsError, SchemaError, missing_package, require
 from reskin.models.inputs import VIEW, DB_FLOOR_uT, Scaler
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device
@@ -21,6 +24,31 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
     from reskin.models.network import Predictor
+
+
+class CardRecipe(Strict, extra="ignore"):
+    """The part of a model's recipe that its use depends on."""
+
+    architecture: Literal["paper", "released"]
+    inputs: Literal["raw", "shape"]
+
+
+class CardInput(Strict, extra="ignore"):
+    """The input of a model."""
+
+    quantity: Literal["change of field"]
+    unit: Literal["uT"]
+    channels_n: Annotated[int, Field(ge=3, le=192, multiple_of=3)]  # of at most 64 chips
+
+
+class Card(Strict, extra="ignore"):
+    """The part of a model's card that its use depends on; the rest says where it comes from."""
+
+    format: str
+    recipe: CardRecipe
+    input: CardInput
+    output: dict[str, str]
+    collapsed: bool
 
 
 @dataclass(frozen=True)
@@ -42,6 +70,57 @@ class Network:
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
         return Predictor(weights, self.card["recipe"]["architecture"], device())
+
+
+def read_network(model: Path) -> Network:
+    """Read a trained network and the card beside it.
+
+    Raises
+    ------
+    ParamsError
+        If the network or its card is missing.
+    SchemaError
+        If the card is invalid or does not fit the weights, or the network has collapsed.
+    """
+    card_file = model.with_suffix(".json")
+    if not model.is_file():
+        raise ParamsError(f"{model}: model file not found. {_find_models(model)}")
+    if not card_file.is_file():
+        raise ParamsError(
+            f"{card_file}: card of the model not found. Copy it with its .safetensors file. If {model.name} is a "
+            "calibration of the universal model, load it with reskin.load_universal."
+        )
+    content = io.read_json(card_file)
+    form = content.get("format") if isinstance(content, dict) else None
+    if form != FORMAT:
+        raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
+    card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
+    if tuple(card.output) != TARGETS:
+        outputs = ", ".join(card.output) or "nothing"
+        raise SchemaError(f"{card_file}: the model predicts {outputs}, not {', '.join(TARGETS)}. Give another model.")
+    if card.collapsed:
+        raise SchemaError(
+            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use another seed."
+        )
+    inputs_n = VIEW[card.recipe.inputs](np.zeros((1, card.input.channels_n), np.float32)).shape[1]
+    weights_n = tensors["input_shift"].size if "input_shift" in tensors else 0
+    if inputs_n != weights_n:
+        raise SchemaError(
+            f"{card_file}: {card.input.channels_n} channels with inputs {card.recipe.inputs} give {inputs_n} inputs, "
+            f"but the weights take {weights_n}. Is this the card of this model?"
+        )
+    require("torch", model)
+    return Network(content, tensors)
+
+
+def _find_models(missing: Path) -> str:
+    """Return how to get a missing model file; stages write them to data/models/SCENE/STAGE."""
+    if found := sorted(file.name for file in missing.parent.glob("*.safetensors")):
+        return f"Models in its folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
+    if missing.parts[-5:-3] != ("data", "models"):
+        return "Give the path of a trained .safetensors file."
+    scene = missing.parts[-3]
+    return f"Scene {scene} trains it: in the checkout, run `reskin scenes use {scene}` and then `make repro`."
 
 
 def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:

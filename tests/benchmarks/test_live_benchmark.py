@@ -25,7 +25,7 @@ from aiohttp import web
 from reskin.live.server import Server
 from reskin.live.session import LATENCIES_N, Session, Traces
 from reskin.live.tracker import Estimates, LiveSkin, layout_of
-from reskin.predicting import read_network
+from reskin.models.trained import read_network
 from tests.benchmarks import size
 from tests.live.boards import make_script, write_model, write_script
 from tests.live.test_browser import BROWSER, Tab, in_browser

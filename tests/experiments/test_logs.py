@@ -18,7 +18,7 @@ from pipeline.experiments.logs import (
     tables,
 )
 from reskin.errors import CaptureError
-from reskin.live.contacts import contacts_n, describe, estimate, quiet_start, score_contacts, thin, truth_at
+from reskin.logs import contacts_n, describe, estimate, quiet_start, score_contacts, thin, truth_at
 from reskin.physics.ambient import EARTH_DIP_DEG, EARTH_SIZE_T, EARTH_T
 from reskin.physics.board import Board
 from reskin.seeds import rng_for

@@ -21,7 +21,7 @@ from reskin.board.wire import Wire
 from reskin.errors import ReskinError
 from reskin.live.server import Server, receive
 from reskin.live.session import Session
-from reskin.predicting import read_network
+from reskin.models.trained import read_network
 from reskin.recordings import clocks, header, probe
 from reskin.recordings.header import PROBE_FILE
 from reskin.recordings.label_sources import Prompts, parse_places

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from reskin.live.session import PRESSES_N
-from reskin.predicting import read_network
+from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE
 from reskin.universal.model import load_universal
 from tests.live.boards import PLACES, make_script, plugged_in, write_model, zeros_asked

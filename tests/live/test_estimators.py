@@ -163,7 +163,7 @@ def test_a_calibration_is_refused_for_several_boards(simulated, tmp_path):
     with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):
         reskin.open(["/dev/a", "/dev/b"], model=learnt)
     learnt.save(tmp_path / "s3.safetensors")
-    with pytest.raises(ParamsError, match="a calibration of the universal model. Load it with reskin.load_univ"):
+    with pytest.raises(ParamsError, match="is a calibration of the universal model, load it with reskin.load_univ"):
         reskin.load_model(tmp_path / "s3.safetensors")
     with pytest.raises(ParamsError, match="a calibration cannot be combined with other models"):
         read_models([tmp_path / "s3.safetensors"] * 2)

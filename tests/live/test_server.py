@@ -15,7 +15,7 @@ from aiohttp import web
 from reskin.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
 from reskin.live.session import BINS_N, HEAD, NUMBERS_N, open_sessions
 from reskin.live.tracker import Models
-from reskin.predicting import read_network
+from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE, parse
 from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zeros_asked
 

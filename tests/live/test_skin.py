@@ -18,7 +18,7 @@ from reskin.board.port import open_port
 from reskin.errors import ReskinError
 from reskin.live.emulator import inject, make_port, parse_fault, play
 from reskin.live.tracker import TAKING_NOLOAD, LiveSkin
-from reskin.predicting import read_network
+from reskin.models.trained import read_network
 from reskin.seeds import rng_for
 from tests.live.boards import (
     PLACES,

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 from pipeline import plan
 from reskin.board.wire import Frames
 from reskin.live.emulator import Script, encode_pieces, inject, parse_fault
-from reskin.predicting import read_network
+from reskin.models.trained import read_network
 from reskin.recordings import clocks, probe
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, STREAM_FILE, parse, seal
 from reskin.recordings.probe import ProbeLog
