@@ -17,7 +17,7 @@ from reskin.models.network import draw_weights, paper_layers
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe
 from reskin.seeds import rng_for
 
-ROWS_N = 48  # twelve a skin
+ROWS_N = 48  # twelve per skin
 TRAIN, TEST, POKED, OWN = np.arange(24), np.arange(42, 48), np.arange(36, 42), np.arange(36, 39)
 SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 
@@ -47,7 +47,7 @@ def some_rows(n: int, *names: str | int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: str | int = "draws") -> PreparedJob:
-    """A fresh job, the same for the same name; with `terms`, it holds all that a loss can stand on."""
+    """A fresh job, equal for equal names; with `terms`, it has the data for all loss terms."""
     inputs, targets = some_rows(n, name)
     start, rng = some_weights(name), rng_for(0, draws, name)
     if not terms:
@@ -55,7 +55,7 @@ def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: st
     places = rng_for(0, "places", name).integers(0, 5, (n, 2)).astype(np.float64)
     labelled = LabelledRows(inputs, targets, triplet_points(places, np.arange(n) % 2))
     poked, _ = some_rows(20, name, "poked")
-    row = np.concatenate([np.arange(20), np.arange(10)])  # the first ten rows lie on two lines
+    row = np.concatenate([np.arange(20), np.arange(10)])  # the first ten rows are on two lines
     line_i = np.repeat([0, 1, 2], 10)
     order = triplet_points(np.tile(np.arange(10) // 2, 3)[:, None].astype(np.float64), line_i)
     own = LabelledRows(*some_rows(6, name, "own"), None)
@@ -69,8 +69,8 @@ def example_data() -> TrainingData:
     return TrainingData(db_uT, target, np.repeat(["b0_s0", "b0_s1", "b1_s0", "b1_s1"], 12))
 
 
-def changed(rows: TrainingData, part: str, at: np.ndarray, to: object) -> TrainingData:
-    """The same scene, with other values in some rows."""
+def with_values(rows: TrainingData, part: str, at: np.ndarray, to: object) -> TrainingData:
+    """The same scene with other values in some rows."""
     values = getattr(rows, part).copy()
     values[at] = to
     return replace(rows, **{part: values})
@@ -85,7 +85,7 @@ def without_triplets() -> TrainingJob:
 
 
 def lines(row: np.ndarray = POKED) -> Lines:
-    """Pokes by hand along one line of places with two visits each, over the rows that are named."""
+    """Pokes by hand along one line of places with two visits each, over the given rows."""
     one = hand_lines(np.zeros(len(row), np.int32), np.repeat(np.arange(len(row) // 2), 2).astype(np.int32))
     return replace(one, row=row[one.row])
 

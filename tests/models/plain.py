@@ -1,4 +1,4 @@
-"""The network of the paper and its loop in PyTorch's own words, one network at a time: what stacks must equal."""
+"""Reference for stacked networks: the paper's network and its training loop in plain PyTorch, one at a time."""
 
 from collections.abc import Callable, Iterable, Mapping
 
@@ -18,7 +18,7 @@ PRINTED = {"paper": PAPER, "released": RELEASED}
 
 
 def plain_net(architecture: str, weights: Mapping[str, np.ndarray]) -> nn.Sequential:
-    """A plain network, with these weights in its linear layers."""
+    """A plain network with these weights in its linear layers."""
     parts: list[nn.Module] = []
     layer_n = 0
     for word in PRINTED[architecture]:
@@ -39,7 +39,7 @@ def features_of(net: nn.Sequential) -> nn.Sequential:
 
 
 def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarray]:
-    """The weights of a plain network, or their gradients, named as models name them."""
+    """The weights of a plain network, or their gradients, with the names that models use."""
     linear = [part for part in net if isinstance(part, nn.Linear)]
     return {
         f"layer{i}.{name}": (values.grad if gradient else values.detach()).numpy().copy()
@@ -77,7 +77,7 @@ def plain_train(
 def hinge(
     features: Callable[[torch.Tensor], torch.Tensor], anchor: torch.Tensor, near: torch.Tensor, far: torch.Tensor
 ) -> torch.Tensor:
-    """Mean over a batch of the printed triplet loss, a row at a time."""
+    """Mean over a batch of the printed triplet loss, row by row."""
     a, p, n = features(anchor), features(near), features(far)
     rows = [torch.clamp((a[i] - p[i]).dot(a[i] - p[i]) - (a[i] - n[i]).dot(a[i] - n[i]), min=0) for i in range(len(a))]
     return torch.stack(rows).mean()

@@ -1,4 +1,4 @@
-"""Domain-adversarial training: the gradient that is turned back, its control, and what it is trained for."""
+"""Domain-adversarial training: gradient reversal, the control, and the effect on features."""
 
 import numpy as np
 import torch
@@ -20,14 +20,14 @@ def trained(
     return dict(train_adversarial(Domains(KNOWN, TARGET, new), schedule, weight, rng_for(seed, "adversarial")))
 
 
-def apart(weights: dict[str, np.ndarray]) -> float:
-    """How far the middles of both skins' features are from each other, in their deviations."""
+def feature_distance(weights: dict[str, np.ndarray]) -> float:
+    """Distance between the mean features of both skins, in standard deviations."""
     net = Stack(paper_layers(15), [weights])
     known, new = (net.features(torch.from_numpy(part)[None])[0].detach().numpy() for part in (KNOWN, NEW))
     return float(np.linalg.norm(known.mean(axis=0) - new.mean(axis=0)) / np.linalg.norm(known.std(axis=0)))
 
 
-def test_values_pass_and_gradients_come_back_turned_and_weighed():
+def test_gradient_reversal():
     values = torch.tensor([[[1.0, -2.0]]], requires_grad=True)
     passed = reverse_gradient(values, 0.25)
     torch.testing.assert_close(passed, values)
@@ -35,20 +35,22 @@ def test_values_pass_and_gradients_come_back_turned_and_weighed():
     torch.testing.assert_close(values.grad, torch.tensor([[[-0.75, -1.25]]]))
 
 
-def test_the_weight_rises_from_nothing_to_all():
+def test_weight_rises_from_0_to_1():
     assert ramp(0.0) == 0.0
     assert np.all(np.diff([ramp(part) for part in np.linspace(0, 1, 9)]) > 0)
     assert abs(ramp(1.0) - 1) < 1e-4
 
 
-def test_features_of_both_skins_come_nearer_to_each_other():
-    # Over 12 seeds the ratio is 0.30 with a standard deviation of 0.12, so that the mean of three is 4 of its own
-    # (0.068) below 0.6. After 150 steps the ratio was 1.05 +- 0.45: nothing can be said then.
-    ratios = [apart(trained(1.0, seed=seed)) / apart(trained(0.0, seed=seed)) for seed in range(3)]
+def test_features_of_both_skins_converge():
+    # Over 12 seeds the ratio is 0.30 with a standard deviation of 0.12, so that the mean of three is four standard
+    # errors (0.068) below 0.6. After 150 steps the ratio is 1.05 +- 0.45, which is inconclusive.
+    ratios = [
+        feature_distance(trained(1.0, seed=seed)) / feature_distance(trained(0.0, seed=seed)) for seed in range(3)
+    ]
     assert np.mean(ratios) < 0.6
 
 
-def test_the_control_does_not_depend_on_the_new_skin():
+def test_control_ignores_the_new_skin():
     short = SCHEDULE.model_copy(update={"steps_n": 20})
     control, elsewhere = trained(0.0, schedule=short), trained(0.0, NEW + np.float32(3.0), schedule=short)
     for name, value in control.items():

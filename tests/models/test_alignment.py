@@ -1,4 +1,4 @@
-"""Alignments beside their definitions: SciPy's square roots, a map that is known, pairs left out one by one."""
+"""Alignment methods compared with SciPy's matrix roots, a known map and leave-one-out errors."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from reskin.seeds import rng_for
 
 
 def drawn(name: str, n: int = 80, c: int = 4) -> np.ndarray:
-    """Inputs of a skin: channels that go together, of other sizes, about other means."""
+    """Inputs of a skin: correlated channels with different scales and means."""
     rng = rng_for(0, "alignment", name)
     return rng.standard_normal((n, c)) @ rng.standard_normal((c, c)) * rng.uniform(1, 30, c) + rng.normal(0, 20, c)
 
@@ -17,24 +17,24 @@ def drawn(name: str, n: int = 80, c: int = 4) -> np.ndarray:
 OF, TO = drawn("of"), drawn("to", n=70)
 
 
-def test_matched_channels_have_the_other_skins_means_and_deviations():
+def test_matched_channels_have_the_means_and_deviations():
     moved = match_channels(OF, TO)(OF)
     np.testing.assert_allclose(moved.mean(axis=0), TO.mean(axis=0))
     np.testing.assert_allclose(moved.std(axis=0, ddof=1), TO.std(axis=0, ddof=1))
 
 
-def test_gains_and_offsets_of_channels_are_undone():
+def test_gains_and_offsets_are_undone():
     gains, offsets = np.array([0.5, 2.0, 1.3, 0.9]), np.array([3.0, -7.0, 0.0, 40.0])
     np.testing.assert_allclose(match_channels(OF, OF * gains + offsets)(OF), OF * gains + offsets)
 
 
-def test_coral_gives_the_other_skins_covariance():
+def test_coral_matches_the_covariance():
     moved = coral(OF, TO, ridge=0.0)(OF)
     np.testing.assert_allclose(np.cov(moved, rowvar=False), np.cov(TO, rowvar=False))
     np.testing.assert_allclose(moved.mean(axis=0), TO.mean(axis=0))
 
 
-def test_coral_whitens_and_colours_by_roots_of_covariances():
+def test_coral_uses_square_roots_of_covariances():
     scale = OF.std(axis=0, ddof=1)
     of, to = (np.cov(side / scale, rowvar=False) + np.eye(4) for side in (OF, TO))
     expected = (OF - OF.mean(axis=0)) / scale @ np.linalg.inv(sqrtm(of)) @ sqrtm(to) * scale + TO.mean(axis=0)
@@ -42,30 +42,30 @@ def test_coral_whitens_and_colours_by_roots_of_covariances():
 
 
 @pytest.mark.parametrize("align", [match_channels, coral])
-def test_a_skin_that_is_aligned_with_itself_stays(align):
+def test_alignment_with_itself_is_the_identity(align):
     np.testing.assert_allclose(align(OF, OF)(OF), OF)
 
 
-def test_a_constant_channel_is_moved_and_not_stretched():
+def test_constant_channel_is_moved_but_not_scaled():
     of, to = OF.copy(), TO.copy()
     of[:, 1], to[:, 1] = 3.0, 5.0
     np.testing.assert_allclose(match_channels(of, to)(of)[:, 1], 5.0)
 
 
-def test_direct_standardisation_recovers_a_known_linear_map():
+def test_direct_standardisation_recovers_a_linear_map():
     known = np.eye(4) + 0.3 * rng_for(0, "known map").standard_normal((4, 4))
     np.testing.assert_allclose(direct(OF, OF @ known, 1e-12).matrix, known, rtol=1e-6)
     np.testing.assert_allclose(direct(OF, OF @ known, 1e12).matrix, np.eye(4), atol=1e-6)
 
 
-def test_what_no_pair_tells_stays_as_it_is():
+def test_undetermined_directions_stay():
     pairs = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     found = direct(pairs, 3 * pairs, 1e-9)
     np.testing.assert_allclose(found(np.eye(4)), np.diag([3.0, 3.0, 1.0, 1.0]), atol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.01, 30.0])
-def test_the_ridge_errs_least_on_pairs_left_out_one_by_one(noise):
+def test_ridge_minimises_the_leave_one_out_error(noise):
     of = drawn("pairs", n=9)
     to = of @ np.diag([1.5, 0.5, 1.0, 1.2]) + noise * rng_for(0, "noise").standard_normal(of.shape)
 
@@ -73,7 +73,7 @@ def test_the_ridge_errs_least_on_pairs_left_out_one_by_one(noise):
         total = 0.0
         for i in range(len(of)):
             rest = np.delete(np.arange(len(of)), i)
-            held = ridge * (of**2).sum() / of.shape[1]  # as of all pairs
+            held = ridge * (of**2).sum() / of.shape[1]  # relative to all pairs
             gain = np.linalg.solve(of[rest].T @ of[rest] + held * np.eye(4), of[rest].T @ (to - of)[rest])
             total += float((((to - of)[i] - of[i] @ gain) ** 2).sum())
         return total

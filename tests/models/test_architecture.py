@@ -8,41 +8,41 @@ from tests.models.plain import PRINTED
 
 
 @pytest.mark.parametrize("name", sorted(LAYERS))
-def test_the_networks_are_those_that_are_printed_and_released(name):
-    words = []
+def test_layers_of_printed_and_released_networks(name):
+    layers = []
     for layer in LAYERS[name](15):
-        words += [f"{layer.in_n}-{layer.out_n}"] + ["ReLU"] * layer.relu
-    assert tuple(words) == PRINTED[name]
+        layers += [f"{layer.in_n}-{layer.out_n}"] + ["ReLU"] * layer.relu
+    assert tuple(layers) == PRINTED[name]
 
 
-def test_inputs_may_have_any_number_of_channels():
+def test_any_number_of_channels():
     assert [layer.in_n for layer in paper_layers(120)] == [120, 200, 200, 40, 200, 200]
 
 
-def test_a_network_that_also_feels_shear_has_five_outputs_and_is_the_same_before_them():
+def test_shear_adds_two_outputs():
     assert paper_layers(15, 5)[:-1] == paper_layers(15)[:-1]
     assert paper_layers(15, 5)[-1].out_n == 5
 
 
-def test_the_third_layer_ends_in_forty_features_without_a_relu():
+def test_third_layer_gives_forty_features_without_relu():
     for layers in LAYERS.values():
         third = layers(15)[FEATURE_LAYERS_N - 1]
         assert (third.out_n, third.relu) == (FEATURES_N, False) == (40, False)
 
 
-def test_weights_come_from_the_generator_alone():
+def test_weights_depend_on_the_generator_only():
     one, other, third = (draw_weights(paper_layers(15), rng_for(seed, "net")) for seed in (0, 0, 1))
     assert all((one[name] == other[name]).all() for name in one)
     assert all((one[name] != third[name]).any() for name in one)
 
 
-def test_no_two_layers_share_their_draws():
+def test_layers_do_not_share_draws():
     weights = draw_weights(paper_layers(15), rng_for(0, "net"))
     assert not np.isin(weights["layer2.weight"].ravel()[:50], weights["layer5.weight"]).any()
 
 
 @pytest.mark.parametrize("i", range(1, 7))
-def test_first_weights_are_spread_as_pytorch_spreads_those_of_a_linear_layer(i):
+def test_initial_weights_follow_pytorch(i):
     layer = paper_layers(15)[i - 1]
     weights = draw_weights(paper_layers(15), rng_for(0, "net"))
     theirs = nn.Linear(layer.in_n, layer.out_n)

@@ -13,25 +13,25 @@ def rows() -> np.ndarray:
     return rng_for(0, "rows").normal(0, 100, (5, 6)).astype(np.float32)
 
 
-def asked(**changes: float) -> Augmentation:
+def augmentation(**changes: float) -> Augmentation:
     return Augmentation.model_validate({"copies_n": 3, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0} | changes)
 
 
-def test_boards_that_do_not_differ_read_the_same():
-    copies, skin = virtual_boards(rows(), SKIN, asked(), rng_for(1, "draw"))
+def test_equal_boards_read_the_same():
+    copies, skin = virtual_boards(rows(), SKIN, augmentation(), rng_for(1, "draw"))
     np.testing.assert_array_equal(copies, np.tile(rows(), (3, 1)))
     assert len(np.unique(skin)) == 2 * 3
 
 
-def test_a_lean_turns_each_chips_field_and_keeps_its_length():
-    copies, _ = virtual_boards(rows(), SKIN, asked(lean_sd_deg=20.0), rng_for(1, "draw"))
+def test_lean_rotates_each_chips_field():
+    copies, _ = virtual_boards(rows(), SKIN, augmentation(lean_sd_deg=20.0), rng_for(1, "draw"))
     before, after = (np.linalg.norm(values.reshape(-1, 2, 3), axis=2) for values in (np.tile(rows(), (3, 1)), copies))
     np.testing.assert_allclose(after, before, rtol=1e-5)  # float32 rotations
     assert np.abs(copies - np.tile(rows(), (3, 1))).max() > 10
 
 
-def test_readings_of_one_copy_of_a_skin_share_one_board_and_other_copies_do_not():
-    copies, skin = virtual_boards(rows(), SKIN, asked(gain_sd=0.3), rng_for(1, "draw"))
+def test_each_copy_of_a_skin_is_one_board():
+    copies, skin = virtual_boards(rows(), SKIN, augmentation(gain_sd=0.3), rng_for(1, "draw"))
     gain = copies / np.tile(rows(), (3, 1))
     for name in np.unique(skin):
         own = gain[skin == name]
@@ -40,15 +40,15 @@ def test_readings_of_one_copy_of_a_skin_share_one_board_and_other_copies_do_not(
     assert len(np.unique(np.round(one_of_each, 4), axis=0)) == 6
 
 
-def test_noise_has_the_deviation_that_is_asked_for():
+def test_noise_has_the_given_deviation():
     still = np.zeros((2000, 15), np.float32)
-    copies, _ = virtual_boards(still, np.array(["s"] * 2000), asked(noise_uT=5.0), rng_for(1, "draw"))
-    assert abs(copies.std() - 5.0) < 0.05  # 90,000 draws: their deviation is known to 0.012
+    copies, _ = virtual_boards(still, np.array(["s"] * 2000), augmentation(noise_uT=5.0), rng_for(1, "draw"))
+    assert abs(copies.std() - 5.0) < 0.05  # 90,000 draws: sampling error 0.012
 
 
 @given(st.floats(0.1, 10))
-def test_copies_grow_with_the_field(factor):
-    words = asked(gain_sd=0.2, lean_sd_deg=10.0)
-    one, _ = virtual_boards(rows(), SKIN, words, rng_for(1, "draw"))
-    other, _ = virtual_boards(np.float32(factor) * rows(), SKIN, words, rng_for(1, "draw"))
+def test_copies_are_linear_in_the_field(factor):
+    settings = augmentation(gain_sd=0.2, lean_sd_deg=10.0)
+    one, _ = virtual_boards(rows(), SKIN, settings, rng_for(1, "draw"))
+    other, _ = virtual_boards(np.float32(factor) * rows(), SKIN, settings, rng_for(1, "draw"))
     np.testing.assert_allclose(other, np.float32(factor) * one, rtol=1e-4, atol=1e-3)  # float32 sums of three terms

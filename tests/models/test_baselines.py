@@ -27,8 +27,8 @@ TRAIN, OWN, TEST = np.arange(0, 60, 2), np.arange(60, 66), np.arange(70, 90)
 NONE = np.zeros(0, np.int64)
 
 
-class Elsewhere(Executor):
-    """Runs a call as another process would: by a copy that went through pickle."""
+class PicklingExecutor(Executor):
+    """Run a call on a copy that went through pickle, as another process does."""
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -56,24 +56,24 @@ def task(one: Classical | None = None, **changes: Any) -> ClassicalJob:
     return ClassicalJob(**values | {"rows_max_n": 1000, "seed": 3} | changes)
 
 
-def answered(*tasks: ClassicalJob, rows: TrainingData = ROWS) -> list[ClassicalResult]:
-    return run_classical_jobs(tasks, rows, Elsewhere(), lambda line: None)
+def results_of(*tasks: ClassicalJob, rows: TrainingData = ROWS) -> list[ClassicalResult]:
+    return run_classical_jobs(tasks, rows, PicklingExecutor(), lambda line: None)
 
 
 @pytest.fixture
 def fits(monkeypatch) -> list[dict[str, Any]]:
-    """What every method was fitted to, in turn."""
+    """The arguments of every fit, in order."""
     seen: list[dict[str, Any]] = []
 
-    def listening(one, inputs, target, rng, *, weight):
+    def recording_fit(one, inputs, target, rng, *, weight):
         seen.append({"inputs": inputs, "target": target, "weight": weight})
         return fit(one, inputs, target, rng, weight=weight)
 
-    monkeypatch.setattr(classical, "fit", listening)
+    monkeypatch.setattr(classical, "fit", recording_fit)
     return seen
 
 
-def seen_by_hand(inputs: str, db_uT: np.ndarray) -> np.ndarray:
+def inputs_by_hand(inputs: str, db_uT: np.ndarray) -> np.ndarray:
     if inputs == "raw":
         return db_uT
     length_uT = np.sqrt((db_uT.astype(float) ** 2).sum(axis=1))[:, None]
@@ -82,43 +82,43 @@ def seen_by_hand(inputs: str, db_uT: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("inputs", ["raw", "shape"])
 @pytest.mark.parametrize("name", SETTINGS)
-def test_a_task_answers_as_its_method_called_by_hand(name, inputs):
+def test_job_equals_direct_call(name, inputs):
     one = method(name, inputs)
-    (got,) = answered(task(one))
-    train, test = (seen_by_hand(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
+    (got,) = results_of(task(one))
+    train, test = (inputs_by_hand(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
     by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
-    # the last bit of a float32 input of 1 uT to 200 uT may differ; no place is taken to more than 1e-5 of a unit
+    # the last bit of a float32 input of 1 uT to 200 uT may differ; the targets change by at most 1e-5
     np.testing.assert_allclose(got.predicted, by_hand.predict(test), atol=1e-5)
     assert got.rows_n == 30
     assert got.seconds > 0
     assert got.one_reading_s > 0
 
 
-def test_labelled_rows_of_a_new_skin_weigh_together_as_much_as_all_others():
-    (got,) = answered(task(few_labels=OWN))
+def test_labels_of_a_new_skin_weigh_as_much_as_all_others():
+    (got,) = results_of(task(few_labels=OWN))
     train = np.concatenate([TRAIN, OWN])
     mean, sd = ROWS.db_uT[train].mean(axis=0, dtype=float), ROWS.db_uT[train].std(axis=0, dtype=float)
     middle, spread = ROWS.target[train].mean(axis=0, dtype=float), ROWS.target[train].std(axis=0, dtype=float)
-    weight = [1.0] * 30 + [5.0] * 6  # 6 of 5 are the 30 others
+    weight = [1.0] * 30 + [5.0] * 6  # 6 rows of weight 5 equal 30 others
     plane = Ridge(1.0).fit((ROWS.db_uT[train] - mean) / sd, (ROWS.target[train] - middle) / spread, weight)
     wanted = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
-    np.testing.assert_allclose(got.predicted, wanted, atol=1e-5)  # float32 of some units
+    np.testing.assert_allclose(got.predicted, wanted, atol=1e-5)  # float32 rounding
     assert got.rows_n == 36
-    assert np.abs(got.predicted - answered(task())[0].predicted).max() > 1e-3
+    assert np.abs(got.predicted - results_of(task())[0].predicted).max() > 1e-3
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 30), st.integers(1, 40))
-def test_the_weights_of_both_kinds_sum_to_the_same_however_many_there_are(own_n, rows_max_n):
+def test_weights_of_both_groups_have_the_same_sum(own_n, rows_max_n):
     with pytest.MonkeyPatch.context() as patch:
         weights = []
 
-        def listening(one, inputs, target, rng, *, weight):
+        def recording_fit(one, inputs, target, rng, *, weight):
             weights.append(weight)
             return fit(one, inputs, target, rng, weight=weight)
 
-        patch.setattr(classical, "fit", listening)
-        answered(task(few_labels=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
+        patch.setattr(classical, "fit", recording_fit)
+        results_of(task(few_labels=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
     (weight,) = weights
     others, own = weight[:-own_n], weight[-own_n:]
     assert len(others) == min(30, rows_max_n)
@@ -126,18 +126,18 @@ def test_the_weights_of_both_kinds_sum_to_the_same_however_many_there_are(own_n,
     assert own.sum() == pytest.approx(len(others), rel=1e-6)  # sums of float32
 
 
-def test_without_labels_of_a_new_skin_no_row_is_weighed(fits):
-    answered(task())
+def test_rows_are_unweighted_without_labels_of_a_new_skin(fits):
+    results_of(task())
     assert fits[0]["weight"] is None
 
 
 def rows_of(fits: list[dict[str, Any]]) -> list[list[int]]:
-    """The row numbers that each fit was given, told by their fields."""
+    """The row numbers passed to each fit, identified by their fields."""
     return [[int(np.flatnonzero((ROWS.db_uT == row).all(axis=1))[0]) for row in one["inputs"]] for one in fits]
 
 
-def test_many_rows_are_thinned_to_different_training_rows_of_the_number_asked(fits):
-    done = answered(task(rows_max_n=12), task(rows_max_n=12, few_labels=OWN), task(rows_max_n=30))
+def test_thinning_keeps_the_given_number_of_rows(fits):
+    done = results_of(task(rows_max_n=12), task(rows_max_n=12, few_labels=OWN), task(rows_max_n=30))
     thinned, with_own, whole = rows_of(fits)
     assert len(set(thinned)) == len(thinned) == 12
     assert set(thinned) < set(TRAIN)
@@ -148,31 +148,31 @@ def test_many_rows_are_thinned_to_different_training_rows_of_the_number_asked(fi
         assert (one["target"] == ROWS.target[numbers]).all()
 
 
-def test_thinning_is_drawn_by_seed_and_name_alone(fits):
+def test_thinning_depends_on_seed_and_name_only(fits):
     others = {"seed": 4}, {"name": "other"}
-    answered(task(rows_max_n=12), task(rows_max_n=12, method=method("knn")))
-    answered(*(task(rows_max_n=12, **other) for other in others))
+    results_of(task(rows_max_n=12), task(rows_max_n=12, method=method("knn")))
+    results_of(*(task(rows_max_n=12, **other) for other in others))
     first, same, *different = rows_of(fits)
     assert same == first
     assert all(numbers != first for numbers in different)
 
 
-def test_answers_come_in_the_order_of_tasks_and_each_is_told_of():
+def test_results_are_in_order_and_reported():
     lines: list[str] = []
     names = {"first": TEST, "second": TEST[:5], "third": TEST[5:]}
     tasks = [task(name=name, test=test) for name, test in names.items()]
-    done = run_classical_jobs(tasks, ROWS, Elsewhere(), lines.append)
+    done = run_classical_jobs(tasks, ROWS, PicklingExecutor(), lines.append)
     assert lines == ["1/3 first", "2/3 second", "3/3 third"]
     np.testing.assert_array_equal(np.concatenate([one.predicted for one in done[1:]]), done[0].predicted)
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_no_target_but_those_of_training_rows_and_labels_changes_an_answer(name):
+def test_other_targets_do_not_matter(name):
     used = np.concatenate([TRAIN, OWN])
     others = ROWS.target.copy()
     others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6
     (got,), (other,) = (
-        answered(task(method(name), few_labels=OWN), rows=rows)
+        results_of(task(method(name), few_labels=OWN), rows=rows)
         for rows in (ROWS, TrainingData(ROWS.db_uT, others, ROWS.skin))
     )
     assert (got.predicted == other.predicted).all()

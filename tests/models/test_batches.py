@@ -14,13 +14,13 @@ def batches(jobs: list[PreparedJob], steps_n: int = STEPS_N, batch_n: int = BATC
 
 
 def rows_of(batch: torch.Tensor, rows: np.ndarray) -> list[int]:
-    """The numbers of the rows that a batch of one network holds; rows are all different."""
+    """The row numbers of one network's batch (all rows differ)."""
     (found,) = [np.argmax((rows[None] == batch.numpy()[:, None]).all(axis=2), axis=1)]
     assert (rows[found] == batch.numpy()).all()
     return found.tolist()
 
 
-def test_a_step_has_a_batch_of_every_kind_for_every_network():
+def test_every_step_has_all_batches():
     steps = batches([some_job(i, terms=True) for i in range(3)])
     assert len(steps) == STEPS_N
     for step in steps:
@@ -30,11 +30,11 @@ def test_a_step_has_a_batch_of_every_kind_for_every_network():
         }
 
 
-def test_nothing_is_drawn_of_what_a_job_does_not_hold():
+def test_missing_data_is_not_drawn():
     assert batches([some_job()])[0].keys() == {"inputs", "targets"}
 
 
-def test_targets_stand_beside_their_own_rows_and_networks_see_their_own_rows_only():
+def test_targets_belong_to_their_rows():
     jobs = [some_job(i, n=n, terms=True) for i, n in enumerate((12, 32, 17))]
     for step in batches(jobs):
         for i, job in enumerate(jobs):
@@ -45,7 +45,7 @@ def test_targets_stand_beside_their_own_rows_and_networks_see_their_own_rows_onl
             rows_of(step["unlabelled"][i], job.unlabelled.inputs)
 
 
-def test_near_and_far_are_triplets_of_the_labelled_rows():
+def test_labelled_triplets_are_near_and_far():
     job = some_job(terms=True)
     place, group = job.labelled.points.place, job.labelled.points.group
     for step in batches([job]):
@@ -57,7 +57,7 @@ def test_near_and_far_are_triplets_of_the_labelled_rows():
             assert ((place[anchor] - place[near]) ** 2).sum() < ((place[anchor] - place[far]) ** 2).sum()
 
 
-def test_pokes_are_triplets_of_one_line_by_index_and_a_row_on_two_lines_takes_part_in_both():
+def test_poke_triplets_are_ordered_along_one_line():
     job = some_job(terms=True)
     points, row = job.unlabelled.points, job.unlabelled.row
     lines_of = {r: {(points.group[q], points.place[q, 0]) for q in np.flatnonzero(row == r)} for r in range(20)}
@@ -74,13 +74,13 @@ def test_pokes_are_triplets_of_one_line_by_index_and_a_row_on_two_lines_takes_pa
     assert met == {0, 1, 2}
 
 
-def test_every_row_is_drawn_about_equally_often():
+def test_rows_are_drawn_equally_often():
     job, n = some_job(n=8), 400 * BATCH_N
     drawn = np.concatenate([rows_of(step["inputs"][0], job.labelled.inputs) for step in batches([job], 400)])
     assert (np.abs(np.bincount(drawn, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()  # six binomial sd
 
 
-def test_a_networks_batches_do_not_depend_on_its_neighbours():
+def test_batches_do_not_depend_on_the_stack():
     (alone, beside) = (
         batches(jobs) for jobs in ([some_job(1, terms=True)], [some_job(i, terms=True) for i in range(3)])
     )
@@ -88,8 +88,8 @@ def test_a_networks_batches_do_not_depend_on_its_neighbours():
         assert all(torch.equal(one[name][0], other[name][1]) for name in one)
 
 
-def test_one_more_term_leaves_all_other_batches_as_they_are():
-    """Methods are compared in pairs: in every block, not only in the first."""
+def test_additional_term_keeps_other_batches():
+    """Methods are compared on equal batches, in every block and not only in the first."""
     full = some_job(terms=True)
     without = {
         "triplet": PreparedJob(
@@ -107,7 +107,7 @@ def test_one_more_term_leaves_all_other_batches_as_they_are():
                 assert all(torch.equal(one[name], other[name]) for name in one)
 
 
-def test_blocks_and_networks_draw_rows_of_their_own():
+def test_blocks_and_networks_draw_different_rows():
     same_rows = some_job(0)
     other = PreparedJob(same_rows.initial_weights, some_job(1).rng, same_rows.labelled)
     feed = BatchSampler([same_rows, other], BATCH_N, "cpu")

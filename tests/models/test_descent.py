@@ -15,7 +15,7 @@ def weights() -> list[torch.Tensor]:
 
 @pytest.mark.parametrize("steps_n", [1, 2, 3, 10, 150])
 @pytest.mark.parametrize("weight_decay", [0.0, 0.1])
-def test_it_moves_weights_as_torch_does_bit_for_bit(steps_n, weight_decay):
+def test_steps_equal_torch_bit_for_bit(steps_n, weight_decay):
     ours, theirs = weights(), weights()
     optimizer = torch.optim.AdamW(theirs, 1.2e-2, weight_decay=weight_decay, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1.2e-2, total_steps=max(steps_n, 2))
@@ -32,7 +32,7 @@ def test_it_moves_weights_as_torch_does_bit_for_bit(steps_n, weight_decay):
 
 
 def test_training_imports_no_compiler():
-    """It takes a process that trains two seconds, and nothing here is compiled."""
+    """Importing torch's compiler costs two seconds per process, and nothing here is compiled."""
     code = (
         "import sys\nfrom reskin.models.train import train\nfrom reskin.models.job import LossWeights\n"
         "from tests.models.example_jobs import some_job\nfrom tests.models.example_jobs import recipe\n"

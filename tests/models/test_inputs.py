@@ -8,21 +8,21 @@ from hypothesis import strategies as st
 from reskin.models.inputs import VIEW, DB_FLOOR_uT
 from reskin.seeds import rng_for
 
-SHAPE_ATOL = 1e-6  # a component is at most 1, and is rounded to float32 (6e-8) a few times
-LOG_ATOL = 1e-5  # a log of up to 17, rounded to float32 (6e-8 of it) a few times
+SHAPE_ATOL = 1e-6  # components up to 1, rounded to float32 (6e-8) a few times
+LOG_ATOL = 1e-5  # logs up to 17, rounded to float32 a few times
 
 
 def rows(seed: int = 0, n: int = 20, ch: int = 15) -> np.ndarray:
-    """Changes of some 120 uT, far above the floor."""
+    """Changes of about 120 uT, far above the floor."""
     return rng_for(seed, "rows").normal(3, 30, (n, ch)).astype(np.float32)
 
 
-def test_raw_is_the_change_of_field_itself():
+def test_raw_is_the_change_of_field():
     db_uT = rows()
     assert (VIEW["raw"](db_uT) == db_uT).all()
 
 
-def test_a_shape_is_the_change_over_its_length_and_the_log_of_its_length():
+def test_shape_is_direction_and_log_length():
     db_uT = rows()
     seen = VIEW["shape"](db_uT)
     assert seen.shape == (20, 16)
@@ -35,7 +35,7 @@ def test_a_shape_is_the_change_over_its_length_and_the_log_of_its_length():
 
 
 @given(st.integers(0, 10_000), st.floats(1, 1e6))
-def test_a_stronger_magnet_has_the_same_shape_and_a_longer_log(seed, times):
+def test_stronger_magnet_changes_the_log_only(seed, times):
     db_uT = rows(seed)
     seen, stronger = VIEW["shape"](db_uT), VIEW["shape"]((db_uT * times).astype(np.float32))
     np.testing.assert_allclose(stronger[:, :-1], seen[:, :-1], atol=SHAPE_ATOL)
@@ -43,7 +43,7 @@ def test_a_stronger_magnet_has_the_same_shape_and_a_longer_log(seed, times):
 
 
 @given(st.integers(0, 10_000), st.floats(1e-3, 1e6))
-def test_a_shape_is_of_unit_length_wherever_it_is_above_the_floor(seed, times):
+def test_shape_has_unit_length(seed, times):
     db_uT = (rows(seed) * times).astype(np.float32)
     above = np.linalg.norm(db_uT.astype(float), axis=1) >= DB_FLOOR_uT
     length = np.linalg.norm(VIEW["shape"](db_uT)[:, :-1].astype(float), axis=1)
@@ -51,12 +51,12 @@ def test_a_shape_is_of_unit_length_wherever_it_is_above_the_floor(seed, times):
     assert (length[~above] < 1).all()
 
 
-def test_no_change_at_all_is_zeros_and_the_log_of_the_floor():
+def test_zero_change():
     seen = VIEW["shape"](np.zeros((2, 15), np.float32))
     assert (seen[:, :-1] == 0).all()
     assert (seen[:, -1] == math.log(DB_FLOOR_uT)).all()
 
 
 @given(st.floats(0, 2.0**100))
-def test_a_change_of_any_length_is_seen_as_finite_numbers(length_uT):
+def test_inputs_are_finite(length_uT):
     assert np.isfinite(VIEW["shape"](np.array([[length_uT, -length_uT, 0]], np.float32))).all()

@@ -18,17 +18,17 @@ from tests.models.example_jobs import (
     TEST,
     TRAIN,
     adaptation,
-    changed,
     example_data,
     fine_tuning,
     lines,
     pooled,
     recipe,
     start,
+    with_values,
     without_triplets,
 )
 
-NEW = np.arange(24, ROWS_N)  # every row of a skin that is not trained on
+NEW = np.arange(24, ROWS_N)  # rows of the skins that are not trained on
 KINDS = {"pooled": pooled, "adapting": adaptation, "few labels": fine_tuning}
 
 
@@ -37,45 +37,45 @@ def trained(job: TrainingJob, rows: TrainingData) -> TrainingResult:
 
 
 def alike(one: TrainingResult, other: TrainingResult) -> bool:
-    """Bit for bit: weights, scaler, curve."""
+    """Equal bit for bit: weights, scaler, curve."""
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     scaler, again = one.scaler.arrays(), other.scaler.arrays()
     return weights and one.curve == other.curve and all((scaler[name] == again[name]).all() for name in scaler)
 
 
-# What adaptation may see
+# Data that adaptation may use
 
 
 @pytest.mark.parametrize("new", [np.nan, 1e3, -7.0], ids=str)
 @pytest.mark.parametrize("at", [POKED, TEST, NEW], ids=["poked", "tested", "all"])
-def test_adaptation_cannot_see_places_and_forces_of_the_new_skin(at, new):
+def test_adaptation_ignores_places_and_forces_of_the_new_skin(at, new):
     once, blind = (
         trained(adaptation(), example_data()),
-        trained(adaptation(), changed(example_data(), "target", at, new)),
+        trained(adaptation(), with_values(example_data(), "target", at, new)),
     )
     assert alike(once, blind)
     assert (once.predicted == blind.predicted).all()
 
 
-def test_adaptation_cannot_see_which_skin_its_pokes_are_on():
+def test_adaptation_ignores_the_skin_of_its_pokes():
     assert alike(
-        trained(adaptation(), example_data()), trained(adaptation(), changed(example_data(), "skin", NEW, "b0_s0"))
+        trained(adaptation(), example_data()), trained(adaptation(), with_values(example_data(), "skin", NEW, "b0_s0"))
     )
 
 
-def test_adaptation_sees_fields_and_order_of_the_pokes_that_lines_name():
+def test_adaptation_uses_fields_and_order_of_the_lines():
     once, along = trained(adaptation(), example_data()), lines()
     backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
     assert not alike(once, trained(adaptation(along=backwards), example_data()))
-    assert not alike(once, trained(adaptation(), changed(example_data(), "db_uT", POKED[0], 0)))
-    assert not alike(once, trained(adaptation(), changed(example_data(), "target", TRAIN[0], 0)))
+    assert not alike(once, trained(adaptation(), with_values(example_data(), "db_uT", POKED[0], 0)))
+    assert not alike(once, trained(adaptation(), with_values(example_data(), "target", TRAIN[0], 0)))
 
 
 def test_lines_have_no_place_and_no_force():
     assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
 
 
-def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
+def test_pokes_use_the_scaler_of_the_start():
     line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
     along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
     scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
@@ -91,39 +91,39 @@ def test_pokes_are_scaled_as_the_start_was_and_each_point_names_its_row():
 
 
 @pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
-def test_the_control_looks_at_nothing_of_the_new_skin(at):
+def test_control_uses_nothing_of_the_new_skin(at):
     control = adaptation(unlabelled_weight=0.0)
     once = trained(control, example_data())
     for part, new in (("db_uT", 1e4), ("target", np.nan)):
-        assert alike(once, trained(control, changed(example_data(), part, at, new)))
+        assert alike(once, trained(control, with_values(example_data(), part, at, new)))
     assert not alike(once, trained(adaptation(), example_data()))
 
 
-def test_a_few_labels_are_seen_and_no_others():
+def test_fine_tuning_uses_its_labels_only():
     once = trained(fine_tuning(), example_data())
     others = np.setdiff1d(NEW, OWN)
-    assert alike(once, trained(fine_tuning(), changed(example_data(), "target", others, np.nan)))
-    assert not alike(once, trained(fine_tuning(), changed(example_data(), "target", OWN, 0)))
+    assert alike(once, trained(fine_tuning(), with_values(example_data(), "target", others, np.nan)))
+    assert not alike(once, trained(fine_tuning(), with_values(example_data(), "target", OWN, 0)))
     assert not alike(once, trained(fine_tuning(own_weight=0.0), example_data()))
 
 
-# What is held out
+# Held-out data
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 @pytest.mark.parametrize("view", ["raw", "shape"])
-def test_a_planted_leak_would_show_nothing_of_a_test_row_reaches_the_model(scaling, view):
+def test_no_test_row_reaches_the_model(scaling, view):
     job = pooled(scaling=scaling, inputs=view)
     once = trained(job, example_data())
-    planted = changed(changed(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
+    planted = with_values(with_values(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
     again = trained(job, planted)
     assert alike(once, again)
     assert (once.predicted != again.predicted).any()
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_a_scaler_is_that_of_the_rows_trained_on(kind):
-    _, scaler = prepare(KINDS[kind](), changed(example_data(), "db_uT", NEW, 1e6))
+def test_scaler_uses_training_rows(kind):
+    _, scaler = prepare(KINDS[kind](), with_values(example_data(), "db_uT", NEW, 1e6))
     np.testing.assert_allclose(scaler.input_shift, example_data().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
     np.testing.assert_allclose(scaler.target_scale, example_data().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
 
@@ -141,7 +141,7 @@ def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
     )
 
 
-def test_terms_weigh_what_the_recipe_and_the_tuning_say():
+def test_loss_weights_follow_the_recipe():
     assert pooled().loss_weights == LossWeights(0.5)
     assert adaptation(unlabelled_weight=0.25).loss_weights == LossWeights(0.5, unlabelled=0.25)
     assert fine_tuning(own_weight=0.75).loss_weights == LossWeights(0.5, few_labels=0.75)
@@ -149,7 +149,7 @@ def test_terms_weigh_what_the_recipe_and_the_tuning_say():
     assert pooled().schedule == pooled().recipe
 
 
-# Pairs
+# Paired comparisons
 
 
 def first_batches(job: TrainingJob) -> list[np.ndarray]:
@@ -166,19 +166,19 @@ def first_batches(job: TrainingJob) -> list[np.ndarray]:
     ],
     ids=["another name", "another schedule", "no triplets"],
 )
-def test_recipes_are_compared_from_equal_starts_on_equal_batches(other):
+def test_recipes_share_start_and_batches(other):
     one, two = (prepare(job, example_data())[0].initial_weights for job in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
-def test_adaptation_is_compared_with_its_control_on_equal_batches():
+def test_adaptation_and_control_share_batches():
     pairs = zip(first_batches(adaptation()), first_batches(adaptation(unlabelled_weight=0.0)), strict=True)
     assert all((a == b).all() for a, b in pairs)
 
 
 @pytest.mark.parametrize("changes", [{"seed": 8}, {"seed_i": 1}, {"fold": "b0"}], ids=str)
-def test_folds_and_seeds_start_and_draw_differently(changes):
+def test_folds_and_seeds_differ(changes):
     other = replace(pooled(), **changes)
     assert (
         prepare(pooled(), example_data())[0].initial_weights["layer1.weight"]
@@ -187,7 +187,7 @@ def test_folds_and_seeds_start_and_draw_differently(changes):
     assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
-# JobKeys
+# Cache keys
 
 
 def key(job: TrainingJob, rows: TrainingData | None = None) -> str:
@@ -199,7 +199,7 @@ def tuned(job: TrainingJob, **changes: object) -> TrainingJob:
 
 
 def with_row(part: str, row: int, to: object) -> Callable[[], TrainingData]:
-    return lambda: changed(example_data(), part, np.array([row]), to)
+    return lambda: with_values(example_data(), part, np.array([row]), to)
 
 
 DECISIVE_ROWS = {
@@ -222,13 +222,13 @@ IDLE_ROWS = {
 
 
 @pytest.mark.parametrize("what", sorted(DECISIVE_ROWS))
-def test_a_key_changes_with_every_row_that_decides_the_result(what):
+def test_key_changes_with_what_decides_the_result(what):
     kind, rows = DECISIVE_ROWS[what]
     assert key(KINDS[kind](), rows()) != key(KINDS[kind]())
 
 
 @pytest.mark.parametrize("what", sorted(IDLE_ROWS))
-def test_a_key_does_not_change_with_what_decides_nothing(what):
+def test_key_ignores_what_decides_nothing(what):
     kind, rows = IDLE_ROWS[what]
     assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
 
@@ -258,7 +258,7 @@ def test_no_two_settings_share_a_key():
     assert len({key(job) for job in jobs}) == len(jobs)
 
 
-def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_its_own():
+def test_restart_after_collapse_differs():
     again = replace(pooled(), attempt_i=1)
     assert key(again) != key(pooled())
     (one, _), (other, _) = prepare(pooled(), example_data()), prepare(again, example_data())
@@ -267,13 +267,13 @@ def test_a_training_after_one_that_collapsed_has_a_key_a_start_and_batches_of_it
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
-def test_a_network_begins_with_the_mean_of_the_targets_as_its_last_bias(scaling):
+def test_last_bias_starts_at_the_mean_target(scaling):
     job = replace(without_triplets(), recipe=recipe(scaling=scaling))
-    rows = changed(example_data(), "target", np.arange(3), np.nan)
-    prepared, scaler = prepare(job, changed(rows, "target", (slice(None), 2), np.nan))
+    rows = with_values(example_data(), "target", np.arange(3), np.nan)
+    prepared, scaler = prepare(job, with_values(rows, "target", (slice(None), 2), np.nan))
     predicted = scaler.decode(prepared.initial_weights["layer6.bias"][None])[0]
     np.testing.assert_allclose(predicted[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
-    assert prepared.initial_weights["layer6.bias"][2] == 0  # a target that nobody knows
+    assert prepared.initial_weights["layer6.bias"][2] == 0  # an unknown target
 
 
 NOT_DECIDING = {
@@ -290,7 +290,7 @@ NOT_DECIDING = {
 }
 
 
-def test_all_code_that_a_training_runs_through_is_part_of_its_key():
+def test_key_covers_the_code_of_training():
     graph = grimp.build_graph("reskin", cache_dir=None)
     modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
     imported = {module for module in modules if not graph.find_children(module)}
@@ -299,48 +299,48 @@ def test_all_code_that_a_training_runs_through_is_part_of_its_key():
     assert others <= imported
 
 
-def test_experiments_and_names_do_not_enter_a_key():
+def test_key_ignores_experiments_and_names():
     assert key(replace(pooled(), experiment="sensors", recipe_name="other", what="multi")) == key(pooled())
 
 
-def test_rows_that_nobody_uses_may_come_and_go():
+def test_key_ignores_unused_rows():
     rows = example_data()
     fewer = TrainingData(*(getattr(rows, field.name)[6:] for field in fields(rows)))
     moved = replace(pooled(), train=TRAIN[6:] - 6, test=TEST - 6)
     assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
 
 
-def test_keys_are_the_same_from_one_book_of_keys_and_from_many():
+def test_keys_do_not_depend_on_their_cache():
     book, jobs = JobKeys(example_data()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adaptation()]
     assert [book.key(job) for job in jobs] == [key(job) for job in jobs]
 
 
-def test_a_key_changes_with_the_code_that_trains(monkeypatch):
+def test_key_changes_with_the_code_that_trains(monkeypatch):
     before = key(pooled())
     monkeypatch.setattr(job_module, "digest", lambda name: f"another {name}")
     assert key(pooled()) != before
 
 
-def test_a_name_says_what_tells_a_job_apart():
+def test_name_describes_the_job():
     assert pooled().name == "triplet.paper.b1.seed0"
     assert replace(adaptation(), what="65pokes").name == "adapt.paper.b1.b1_s1.65pokes.seed0"
 
 
-def test_copies_of_rows_keep_their_targets_and_are_skins_of_their_own():
-    words = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
+def test_augmented_copies_keep_targets_and_are_new_skins():
+    settings = {"copies_n": 2, "gain_sd": 0.0, "lean_sd_deg": 0.0, "noise_uT": 0.0}
     plain = pooled()
-    recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": words})
+    recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": settings})
     (one, _), (more, _) = (prepare(job, example_data()) for job in (plain, replace(plain, recipe=recipe)))
-    # Boards that do not differ: the same rows three times over, with the same targets.
+    # Boards without spread: the same rows three times, with the same targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
     assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()
 
 
-def test_copies_are_drawn_anew_in_every_fold_and_seed_and_enter_the_key():
-    words = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
-    recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words})
-    other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": words | {"gain_sd": 0.2}})
+def test_augmentation_is_drawn_per_fold_and_seed():
+    settings = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
+    recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings})
+    other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings | {"gain_sd": 0.2}})
     job = replace(pooled(), recipe=recipe)
     drawn = [
         prepare(one, example_data())[0].labelled.inputs

@@ -14,7 +14,7 @@ M, B, D = 3, 7, 40
 SUM_RTOL = 1e-5  # float32 sums of up to 280 terms
 
 
-def answers(*names: str | int) -> torch.Tensor:
+def predictions(*names: str | int) -> torch.Tensor:
     return torch.from_numpy(rng_for(0, *names).normal(size=(M, B, 3)).astype(np.float32))
 
 
@@ -27,7 +27,7 @@ def three(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def looped_triplet(anchor: torch.Tensor, positive: torch.Tensor, negative: torch.Tensor) -> list[float]:
-    """Max(0, |a - p|^2 - |a - n|^2) as printed, in float64, by three nested loops."""
+    """Max(0, |a - p|^2 - |a - n|^2) in float64, by three nested loops."""
     losses = []
     for member_i in range(len(anchor)):
         total = 0.0
@@ -42,46 +42,46 @@ def looped_triplet(anchor: torch.Tensor, positive: torch.Tensor, negative: torch
     return losses
 
 
-def test_the_l2_loss_is_the_mean_of_squares_as_nested_loops_find():
-    answer, truth = answers("answer"), answers("truth")
+def test_l2_loss_equals_nested_loops():
+    predicted, truth = predictions("answer"), predictions("truth")
     for i in range(M):
-        total = sum((float(answer[i, j, k]) - float(truth[i, j, k])) ** 2 for j in range(B) for k in range(3))
-        assert math.isclose(float(squared_error(answer, truth)[i]), total / (3 * B), rel_tol=SUM_RTOL)
+        total = sum((float(predicted[i, j, k]) - float(truth[i, j, k])) ** 2 for j in range(B) for k in range(3))
+        assert math.isclose(float(squared_error(predicted, truth)[i]), total / (3 * B), rel_tol=SUM_RTOL)
 
 
-def test_unknown_targets_neither_count_nor_pull():
-    answer, truth = answers("answer").requires_grad_(), answers("truth")
+def test_unknown_targets_are_ignored():
+    predicted, truth = predictions("answer").requires_grad_(), predictions("truth")
     truth[1, :, 2] = math.nan
     truth[2, :4] = math.nan
-    loss = squared_error(answer, truth)
+    loss = squared_error(predicted, truth)
     loss.sum().backward()
     for i in range(M):
         known = [(j, k) for j in range(B) for k in range(3) if not math.isnan(truth[i, j, k])]
-        total = sum((float(answer[i, j, k].detach()) - float(truth[i, j, k])) ** 2 for j, k in known)
+        total = sum((float(predicted[i, j, k].detach()) - float(truth[i, j, k])) ** 2 for j, k in known)
         assert math.isclose(loss[i].item(), total / len(known), rel_tol=SUM_RTOL)
     unknown = torch.isnan(truth)
-    assert (answer.grad[unknown] == 0).all()
-    assert (answer.grad[~unknown] != 0).all()
-    assert torch.isfinite(answer.grad).all()
+    assert (predicted.grad[unknown] == 0).all()
+    assert (predicted.grad[~unknown] != 0).all()
+    assert torch.isfinite(predicted.grad).all()
 
 
-def test_known_targets_pull_towards_themselves():
-    answer, truth = answers("answer").requires_grad_(), answers("truth")
-    squared_error(answer, truth).sum().backward()
-    torch.testing.assert_close(answer.grad, 2 * (answer.detach() - truth) / (3 * B), rtol=SUM_RTOL, atol=1e-7)
+def test_gradient_points_to_the_target():
+    predicted, truth = predictions("answer").requires_grad_(), predictions("truth")
+    squared_error(predicted, truth).sum().backward()
+    torch.testing.assert_close(predicted.grad, 2 * (predicted.detach() - truth) / (3 * B), rtol=SUM_RTOL, atol=1e-7)
 
 
 @given(st.floats(-100, 100))
-def test_a_shift_of_answer_and_truth_changes_nothing(shift):
-    answer, truth = answers("answer"), answers("truth")
+def test_shift_invariance_of_l2(shift):
+    predicted, truth = predictions("answer"), predictions("truth")
     # float32 numbers up to 100 carry about 1e-5 of absolute rounding
     torch.testing.assert_close(
-        squared_error(answer + shift, truth + shift), squared_error(answer, truth), rtol=1e-3, atol=0
+        squared_error(predicted + shift, truth + shift), squared_error(predicted, truth), rtol=1e-3, atol=0
     )
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_triplet_loss_is_what_three_nested_loops_find(seed):
+def test_triplet_loss_equals_nested_loops(seed):
     anchor, positive, negative = three(seed)
     assert any(0 < one for one in looped_triplet(anchor, positive, negative))
     np.testing.assert_allclose(
@@ -89,14 +89,14 @@ def test_the_triplet_loss_is_what_three_nested_loops_find(seed):
     )
 
 
-def test_a_positive_that_is_nearer_by_however_little_costs_nothing():
+def test_satisfied_triplet_costs_nothing():
     anchor = torch.zeros(1, 1, 2)
     positive, negative = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[0.0, 1.0 + 1e-6]]])
     assert float(triplet_loss(anchor, positive, negative)) == 0  # no margin
     assert float(triplet_loss(anchor, negative, positive)) > 0
 
 
-def test_a_violated_triplet_pulls_the_positive_in_and_pushes_the_negative_out():
+def test_gradient_of_a_violated_triplet():
     # loss 2^2 - 1^2: d/dp = -2 (a - p), d/dn = 2 (a - n), d/da = 2 (a - p) - 2 (a - n)
     a, p, n = (torch.tensor([[[x]]], requires_grad=True) for x in (0.0, 2.0, 1.0))
     loss = triplet_loss(a, p, n)
@@ -104,7 +104,7 @@ def test_a_violated_triplet_pulls_the_positive_in_and_pushes_the_negative_out():
     assert [float(one) for one in (loss.detach(), a.grad, p.grad, n.grad)] == [3.0, -2.0, 4.0, -2.0]
 
 
-def test_identical_points_cost_nothing_and_pull_nowhere():
+def test_identical_points_have_no_gradient():
     points = [features("anchor").clone().requires_grad_() for _ in range(3)]
     loss = triplet_loss(*points)
     loss.sum().backward()
@@ -112,7 +112,7 @@ def test_identical_points_cost_nothing_and_pull_nowhere():
     assert all((one.grad == 0).all() for one in points)
 
 
-def test_networks_of_a_stack_are_each_charged_their_own_triplets():
+def test_networks_of_a_stack_have_their_own_losses():
     anchor, positive, negative = three()
     before = triplet_loss(anchor, positive, negative)
     positive[1] += 10
@@ -121,7 +121,7 @@ def test_networks_of_a_stack_are_each_charged_their_own_triplets():
 
 
 @given(st.integers(0, 1000), st.floats(-5, 5))
-def test_turning_and_shifting_the_features_changes_nothing(seed, shift):
+def test_invariance_under_rotation_and_shift(seed, shift):
     turn = torch.from_numpy(special_ortho_group.rvs(D, random_state=rng_for(seed, "turn")).astype(np.float32))
     moved = [one @ turn + shift for one in three()]
     # differences of sums of about 80, in float32 numbers of up to 10
@@ -129,7 +129,7 @@ def test_turning_and_shifting_the_features_changes_nothing(seed, shift):
 
 
 @given(st.floats(0.01, 100))
-def test_the_triplet_loss_grows_with_the_square_of_the_features(k):
+def test_triplet_loss_scales_with_the_square(k):
     stretched = [one * k for one in three()]
     torch.testing.assert_close(
         triplet_loss(*stretched), triplet_loss(*three()) * k**2, rtol=1e-4, atol=0
@@ -137,7 +137,7 @@ def test_the_triplet_loss_grows_with_the_square_of_the_features(k):
 
 
 @given(st.integers(0, 1000))
-def test_swapping_positive_and_negative_changes_the_sign_of_what_is_hinged(seed):
+def test_swapping_positive_and_negative_changes_the_sign(seed):
     anchor, positive, negative = three(seed)
     both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
     mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)

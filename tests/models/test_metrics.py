@@ -9,7 +9,7 @@ from reskin.metrics import METRICS, register, score, score_groups
 TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
 
 
-def test_a_perfect_prediction_has_no_error():
+def test_perfect_prediction():
     found = score(TRUE, TRUE)
     assert {name: found[name] for name in METRICS} == {
         "accuracy_pct": 100.0, "mse_xy_mm2": 0.0, "mse_f_N2": 0.0, "r2_f": 1.0,
@@ -18,7 +18,7 @@ def test_a_perfect_prediction_has_no_error():
 
 @given(st.lists(st.tuples(st.floats(0, 10), st.floats(0, 10)), min_size=2, max_size=20))
 @example([(5.357178012399851, 0.0)] * 3)
-def test_r2_of_the_force_is_that_of_scikit_learn_and_0_for_the_mean(forces):
+def test_r2_of_force_equals_scikit_learn(forces):
     true, predicted = (np.column_stack([np.zeros((len(forces), 2)), part]) for part in zip(*forces, strict=True))
     found, constant = score(true, predicted), true.copy()
     constant[:, 2] = true[:, 2].mean()
@@ -29,12 +29,12 @@ def test_r2_of_the_force_is_that_of_scikit_learn_and_0_for_the_mean(forces):
         assert "r2_f" not in score(true, constant)
 
 
-def test_both_axes_must_be_within_one_millimetre():
+def test_accuracy_needs_both_axes_within_one_millimetre():
     error = np.array([[1.0, -1.0, 0.0], [1.01, 0.0, 0.0], [0.0, -1.01, 0.0], [0.5, 0.5, 0.0]])
     assert score(TRUE, TRUE + error)["accuracy_pct"] == 50.0
 
 
-def test_place_error_is_the_mean_over_axes_as_a_naive_loop_finds():
+def test_place_error_equals_naive_loop():
     rng = np.random.default_rng(0)
     predicted = TRUE + rng.normal(size=TRUE.shape)
     total = 0.0
@@ -45,7 +45,7 @@ def test_place_error_is_the_mean_over_axes_as_a_naive_loop_finds():
     assert score(TRUE, predicted)["mse_xy_mm2"] == pytest.approx(total / (2 * len(TRUE)), rel=1e-12)
 
 
-def test_unknown_force_is_left_out_and_all_unknown_gives_no_number():
+def test_unknown_force_is_ignored():
     true = TRUE.copy()
     true[1:, 2] = np.nan
     assert score(true, TRUE + [0, 0, 2.0])["mse_f_N2"] == 4.0
@@ -54,7 +54,7 @@ def test_unknown_force_is_left_out_and_all_unknown_gives_no_number():
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5))
-def test_a_constant_offset_is_all_registration(dx_mm, dy_mm):
+def test_constant_offset_is_removed_by_registration(dx_mm, dy_mm):
     shifted = TRUE + [dx_mm, dy_mm, 0.0]
     # exact but for the rounding of means of numbers below 32
     assert score(TRUE, register(TRUE, shifted))["mse_xy_mm2"] == pytest.approx(0.0, abs=1e-24)
@@ -72,7 +72,7 @@ BOARD = np.repeat(["b0", "b1"], 2)
 SKIN = np.array(["s0", "s1", "s1", "s2"])
 
 
-def test_groups_are_scored_as_if_they_were_alone():
+def test_groups_are_scored_separately():
     predicted = TRUE + np.random.default_rng(1).normal(size=TRUE.shape)
     scores = score_groups(TRUE, predicted, BOARD, SKIN)
     assert scores["rows_n"] == 4
@@ -80,7 +80,7 @@ def test_groups_are_scored_as_if_they_were_alone():
     assert scores["by_skin"]["s1"] == score(TRUE[1:3], predicted[1:3])
 
 
-def test_one_offset_a_board_is_registration_and_the_true_places_do_not_change_the_result():
+def test_registration_uses_one_offset_per_board():
     offset = np.where(BOARD == "b0", 3.0, -2.0)[:, None] * [1.0, 1.0, 0.0]
     scores = score_groups(TRUE, TRUE + offset, BOARD, SKIN)
     assert scores["all"]["accuracy_pct"] == 0.0

@@ -25,20 +25,20 @@ def stack(members_n: int, architecture: str = "paper") -> Stack:
 
 
 def descend(net: nn.Module, inputs: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    answer = net(inputs)
-    (answer**2).sum().backward()
-    return answer.detach(), [one.grad for one in net.parameters()]
+    output = net(inputs)
+    (output**2).sum().backward()
+    return output.detach(), [one.grad for one in net.parameters()]
 
 
 @pytest.mark.parametrize("architecture", sorted(LAYERS))
 @pytest.mark.parametrize("members_n", [1, 3])
-def test_each_network_of_a_stack_is_the_plain_network_that_is_printed(architecture, members_n):
+def test_stacked_networks_equal_plain_networks(architecture, members_n):
     net, inputs = stack(members_n, architecture), batch(members_n)
-    answers, _ = descend(net, inputs)
+    outputs, _ = descend(net, inputs)
     for i in range(members_n):
         alone = plain_net(architecture, drawn(architecture, i))
-        answer, _ = descend(alone, inputs[i])
-        torch.testing.assert_close(answers[i], answer, **CLOSE)
+        output, _ = descend(alone, inputs[i])
+        torch.testing.assert_close(outputs[i], output, **CLOSE)
         features = features_of(alone)(inputs[i])
         torch.testing.assert_close(net.features(inputs)[i], features, **CLOSE)
         gradients = _with_gradients_for_weights(net).weights_of(i)
@@ -54,27 +54,27 @@ def _with_gradients_for_weights(net: Stack) -> Stack:
     return twin
 
 
-def test_networks_of_a_stack_never_touch_each_other():
+def test_stacked_networks_are_independent():
     inputs = batch(3)
-    answers, gradients = descend(stack(3), inputs)
+    outputs, gradients = descend(stack(3), inputs)
     others = Stack(LAYERS["paper"](15), [drawn(name=0), drawn(name=9), drawn(name=2)])
     inputs[1] = 1e3 * inputs[1] + 5
     again, again_gradients = descend(others, inputs)
     for i, same in enumerate([True, False, True]):
-        assert torch.equal(again[i], answers[i]) == same
+        assert torch.equal(again[i], outputs[i]) == same
         assert all(torch.equal(a[i], b[i]) == same for a, b in zip(again_gradients, gradients, strict=True))
 
 
-def test_numbers_that_are_not_finite_stay_in_their_network():
+def test_nan_stays_in_its_network():
     inputs = batch(3)
     _, gradients = descend(stack(3), inputs)
     inputs[1] = torch.nan
-    answers, poisoned = descend(stack(3), inputs)
-    assert torch.isfinite(answers).flatten(1).all(1).tolist() == [True, False, True]
+    outputs, poisoned = descend(stack(3), inputs)
+    assert torch.isfinite(outputs).flatten(1).all(1).tolist() == [True, False, True]
     assert all(torch.equal(a[[0, 2]], b[[0, 2]]) for a, b in zip(poisoned, gradients, strict=True))
 
 
-def test_a_network_is_taken_out_of_a_stack_as_it_was_put_in():
+def test_network_round_trip_through_a_stack():
     net = stack(3)
     for i in range(3):
         put, taken = drawn(name=i), net.weights_of(i)
@@ -82,7 +82,7 @@ def test_a_network_is_taken_out_of_a_stack_as_it_was_put_in():
         assert all((taken[name] == put[name]).all() for name in put)
 
 
-def test_what_is_taken_out_does_not_change_when_the_stack_goes_on():
+def test_extracted_network_is_a_copy():
     net = stack(2)
     taken = net.weights_of(1)
     with torch.no_grad():
@@ -92,13 +92,13 @@ def test_what_is_taken_out_does_not_change_when_the_stack_goes_on():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_one_weight_that_is_not_finite_tells_on_its_network_alone(bad):
+def test_nan_weight_affects_its_network_only(bad):
     members = [drawn(name=i) for i in range(3)]
     members[1]["layer4.bias"][7] = bad
     assert Stack(LAYERS["paper"](15), members).is_finite().tolist() == [True, False, True]
 
 
-def test_features_are_forty_numbers_and_the_answer_is_made_of_them_alone():
+def test_output_depends_on_forty_features():
     net, inputs = stack(2), batch(2)
     features = net.features(inputs)
     assert features.shape == (2, 16, 40)
@@ -106,9 +106,9 @@ def test_features_are_forty_numbers_and_the_answer_is_made_of_them_alone():
     assert torch.equal(net.head(features), net(inputs))
 
 
-def test_the_released_network_answers_no_number_below_zero():
-    answers, plain = stack(1, "released")(batch(1)), stack(1)(batch(1))
-    assert (answers >= 0).all()
+def test_released_network_is_nonnegative():
+    outputs, plain = stack(1, "released")(batch(1)), stack(1)(batch(1))
+    assert (outputs >= 0).all()
     assert (plain < 0).any()
 
 
@@ -117,7 +117,7 @@ def test_prediction_does_not_depend_on_the_block(monkeypatch, block_n):
     inputs = batch(1)[0].numpy()
     monkeypatch.setattr(network, "BLOCK_ROWS_N", block_n)
     predict = Predictor(drawn(), "paper", "cpu")
-    answers = predict(inputs)
+    outputs = predict(inputs)
     one_by_one = np.concatenate([predict(row[None]) for row in inputs])
-    np.testing.assert_allclose(answers, one_by_one, **CLOSE)
-    np.testing.assert_allclose(answers, plain_net("paper", drawn())(torch.from_numpy(inputs)).detach(), **CLOSE)
+    np.testing.assert_allclose(outputs, one_by_one, **CLOSE)
+    np.testing.assert_allclose(outputs, plain_net("paper", drawn())(torch.from_numpy(inputs)).detach(), **CLOSE)

@@ -19,11 +19,11 @@ from reskin.models.train import CHECKED_STEPS_N, train_stack
 from tests.models.example_jobs import TRAIN, adaptation, example_data, fine_tuning, pooled, recipe, without_triplets
 
 SIZE_N = STACK_N["cpu"]
-STACKED_ATOL = 1e-3  # mm, N: a job in another stack is the same to float32 rounding of its weights (test_train.py)
+STACKED_ATOL = 1e-3  # mm, N: float32 rounding between stacks (test_train.py)
 
 
-class Here(Executor):
-    """Runs at once, in this process, and counts; from the `die_after`-th call on, workers are dead."""
+class InlineExecutor(Executor):
+    """Run at once in this process and count calls; from the `die_after`-th call on, workers are dead."""
 
     def __init__(self, die_after: int = 10**9, error: type[Exception] = BrokenProcessPool) -> None:
         self.calls_n = 0
@@ -44,7 +44,7 @@ class Here(Executor):
 
 
 def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
-    """A fold leaves some rows of each of two skins out."""
+    """Each fold leaves some rows of two skins out."""
     everyone = np.arange(24)
     held = [np.array([i, i + 12]) for i in range(folds_n)]
     one = replace(pooled(**changes), experiment="lobo")
@@ -52,15 +52,15 @@ def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
 
 
 def run(
-    some: list[TrainingJob], cache: Path, executor: Executor | None = None, said: list[str] | None = None
+    some: list[TrainingJob], cache: Path, executor: Executor | None = None, log: list[str] | None = None
 ) -> list[TrainingResult]:
-    tell = (lambda line: None) if said is None else said.append
-    return run_jobs(some, example_data(), executor=executor or Here(), cache=cache, log=tell)
+    tell = (lambda line: None) if log is None else log.append
+    return run_jobs(some, example_data(), executor=executor or InlineExecutor(), cache=cache, log=tell)
 
 
 def trainings_n(some: list[TrainingJob], cache: Path) -> int:
-    """How many stacks are trained."""
-    executor = Here()
+    """The number of stacks that are trained."""
+    executor = InlineExecutor()
     run(some, cache, executor)
     return executor.calls_n
 
@@ -70,22 +70,24 @@ def alike(one: TrainingResult, other: TrainingResult) -> bool:
     return weights and (one.predicted == other.predicted).all() and one.curve == other.curve
 
 
-def test_a_training_says_whether_an_earlier_run_finished_it(tmp_path):
+def test_result_reports_whether_it_was_cached(tmp_path):
     first = run(jobs(2), tmp_path)
     both = run([*jobs(2), *jobs(2, steps_n=3)], tmp_path)
     assert [one.reused for one in first] == [False, False]
     assert [one.reused for one in both] == [True, True, False, False]
-    assert [one.seconds for one in both[:2]] == pytest.approx([one.seconds for one in first])  # when it was computed
+    assert [one.seconds for one in both[:2]] == pytest.approx(
+        [one.seconds for one in first]
+    )  # seconds of the training, not of the cache
 
 
-def test_results_come_in_the_order_of_jobs_with_a_prediction_a_test_row(tmp_path):
+def test_results_are_in_the_order_of_jobs(tmp_path):
     some = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adaptation(), fine_tuning()]
     done = run(some, tmp_path)
     assert len({one.key for one in done}) == len(some)
     assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in some]
 
 
-def test_a_result_is_that_of_its_own_cell_whatever_it_was_stacked_with(tmp_path):
+def test_result_does_not_depend_on_the_stack(tmp_path):
     some = [*jobs(2), pooled(), adaptation(), jobs(3)[2]]
     for job, one in zip(some, run(some, tmp_path), strict=True):
         (alone,) = train_stack([job], example_data())
@@ -93,29 +95,31 @@ def test_a_result_is_that_of_its_own_cell_whatever_it_was_stacked_with(tmp_path)
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
 
 
-def test_a_call_carries_no_row_numbers_and_the_file_of_rows_each_set_once(tmp_path, monkeypatch):
+def test_call_sends_each_set_of_rows_once(tmp_path, monkeypatch):
     sent, written = [], []
-    here, write = Here(), io.write_tensors
-    monkeypatch.setattr(here, "submit", lambda fn, *args: (sent.append(args), Here.submit(here, fn, *args))[1])
+    here, write = InlineExecutor(), io.write_tensors
+    monkeypatch.setattr(
+        here, "submit", lambda fn, *args: (sent.append(args), InlineExecutor.submit(here, fn, *args))[1]
+    )
     monkeypatch.setattr(
         io, "write_tensors", lambda file, tensors, of: (written.append(tensors), write(file, tensors, of))
     )
     run([replace(job, seed_i=seed_i) for job in jobs(2) for seed_i in (0, 1)], tmp_path, here)
     assert {job.train.size + job.test.size for _, stack, _ in sent for job, *_ in stack} == {0}
-    assert len(written[0]) == 3 + 4  # fields, targets and skins; the rows of two folds, trained and tested on
+    assert len(written[0]) == 3 + 4  # fields, targets and skins; training and test rows of two folds
 
 
-def test_a_killed_grid_loses_no_finished_cell(tmp_path):
+def test_killed_run_keeps_finished_jobs(tmp_path):
     some = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
-        run(some, tmp_path / "killed", Here(die_after=1))
+        run(some, tmp_path / "killed", InlineExecutor(die_after=1))
     assert trainings_n(some, tmp_path / "killed") == 2  # of three stacks
     done, fresh = run(some, tmp_path / "killed"), run(some, tmp_path / "fresh")
     assert all(alike(a, b) for a, b in zip(done, fresh, strict=True))
 
 
-def test_a_stack_killed_while_it_was_written_gives_what_it_would_have_given(tmp_path):
-    # Batches of 1 and many steps: here the place in a stack shows in the last bits, and those grow.
+def test_stack_killed_while_written(tmp_path):
+    # Batches of 1 and many steps amplify differences in the last bits between places in a stack.
     some = jobs(SIZE_N, steps_n=60, batch_n=1)
     done = run(some, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
@@ -123,18 +127,18 @@ def test_a_stack_killed_while_it_was_written_gives_what_it_would_have_given(tmp_
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "bit"])
-def test_a_damaged_result_is_said_and_trained_again(tmp_path, damage):
-    first, said = run(jobs(), tmp_path), []
+def test_damaged_result_is_reported_and_retrained(tmp_path, damage):
+    first, log = run(jobs(), tmp_path), []
     file = tmp_path / f"{first[1].key}.safetensors"
     content = bytearray(file.read_bytes())
-    content[-5] ^= 1  # of a weight: what no reader of the format can notice
+    content[-5] ^= 1  # one bit of a weight, which the file format does not detect
     file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
-    again = run(jobs(), tmp_path, said=said)
-    assert [line.startswith("warning: a finished training is damaged") for line in said[:2]] == [True, False]
+    again = run(jobs(), tmp_path, log=log)
+    assert [line.startswith("warning: a finished training is damaged") for line in log[:2]] == [True, False]
     assert all(alike(a, b) for a, b in zip(first, again, strict=True))
 
 
-def test_a_network_that_does_not_fit_into_memory_is_said_so(tmp_path, monkeypatch):
+def test_memory_error_is_explained(tmp_path, monkeypatch):
     def allocate(*_: object) -> None:
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000 bytes.")
 
@@ -143,17 +147,17 @@ def test_a_network_that_does_not_fit_into_memory_is_said_so(tmp_path, monkeypatc
         run(jobs(), tmp_path, make_executor(1, imports="reskin.models.train"))
 
 
-def test_an_error_of_a_training_names_its_job(tmp_path):
+def test_error_names_its_job(tmp_path):
     with pytest.raises(TrainingError, match=r"^lobo.paper.b0.seed0, triplets of group 0: the places of its points"):
         run([replace(job, train=np.array([0, 0, 12])) for job in jobs(1)], tmp_path)
 
 
-def test_what_is_finished_is_not_trained_again(tmp_path):
-    said: list[str] = []
+def test_finished_jobs_are_not_trained_again(tmp_path):
+    log: list[str] = []
     first = run(jobs(), tmp_path)
-    again = run(jobs(), tmp_path, Here(die_after=0), said)
+    again = run(jobs(), tmp_path, InlineExecutor(die_after=0), log)
     assert all(alike(a, b) for a, b in zip(first, again, strict=True))
-    assert said == ["3 of 3 trainings were finished before"]
+    assert log == ["3 of 3 trainings were finished before"]
 
 
 @pytest.mark.parametrize(
@@ -162,23 +166,23 @@ def test_what_is_finished_is_not_trained_again(tmp_path):
         (replace(jobs(1)[0], seed_i=1), 1),
         (jobs(1, steps_n=5)[0], 1),
         (replace(jobs(1)[0], recipe=without_triplets().recipe), 1),
-        (jobs(3)[2], 3),  # a fold more joins the stack of the others
+        (jobs(3)[2], 3),  # another fold joins the stack
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
-def test_one_more_costs_one_stack(tmp_path, more, trained_n):
+def test_one_more_job_costs_one_stack(tmp_path, more, trained_n):
     run(jobs(2), tmp_path)
     assert trainings_n([*jobs(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
 
 
-def test_the_same_training_under_another_name_costs_none(tmp_path):
+def test_renamed_training_is_cached(tmp_path):
     run(jobs(1), tmp_path)
     renamed = replace(jobs(1)[0], experiment="sensors", recipe_name="twin", what="multi")
     assert trainings_n([renamed], tmp_path) == 0
 
 
-def test_equal_trainings_of_one_run_are_trained_once(tmp_path):
+def test_equal_trainings_run_once(tmp_path):
     one = jobs(1)[0]
     some = [one, replace(one, recipe_name="twin"), one]
     done = run(some, tmp_path)
@@ -186,7 +190,7 @@ def test_equal_trainings_of_one_run_are_trained_once(tmp_path):
     assert all(alike(done[0], other) for other in done[1:])
 
 
-def test_different_trainings_of_one_name_are_not_mixed_up(tmp_path):
+def test_different_trainings_of_one_name_are_distinct(tmp_path):
     one, other = jobs(1)[0], jobs(1, steps_n=3)[0]
     assert one.name == other.name
     done = run([one, other], tmp_path)
@@ -194,12 +198,12 @@ def test_different_trainings_of_one_name_are_not_mixed_up(tmp_path):
     assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
 
 
-def test_rows_are_left_in_no_cache(tmp_path):
+def test_cache_holds_no_rows(tmp_path):
     run(jobs(), tmp_path)
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 
 
-def test_what_is_left_in_the_cache_opens_without_pickle(tmp_path):
+def test_cache_opens_without_pickle(tmp_path):
     run(jobs(1), tmp_path)
     (file,) = tmp_path.glob("*.safetensors")
     tensors, metadata = io.read_tensors(file)
@@ -209,14 +213,14 @@ def test_what_is_left_in_the_cache_opens_without_pickle(tmp_path):
 
 
 @pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
-def test_a_result_survives_the_cache_whole(tmp_path, job):
+def test_result_round_trip_through_the_cache(tmp_path, job):
     (direct,), (read,) = train_stack([job], example_data()), run([job], tmp_path)
     assert alike(direct, read)
     assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
     assert read.stopped_step is direct.stopped_step is None
 
 
-def test_a_cell_that_explodes_stands_with_its_last_finite_weights_and_says_so(tmp_path):
+def test_diverged_network_keeps_its_last_finite_weights(tmp_path):
     wild = jobs(2, rate_max=1e30, batch_n=4)
     for done in (run(wild, tmp_path), run(wild, tmp_path)):
         assert [one.stopped_step for one in done] == [4, 4]
@@ -224,11 +228,11 @@ def test_a_cell_that_explodes_stands_with_its_last_finite_weights_and_says_so(tm
         assert all(np.isfinite(one.predicted).all() for one in done)
 
 
-DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # answers the same to any input, and a ReLU of 0 hands no gradient on
+DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # constant output, and no gradient through a ReLU of 0
 
 
 def dies(attempts: set[int]) -> object:
-    """Start some attempts of fold b0 dead; what is dead stays dead."""
+    """Make some attempts of fold b0 start with dead weights."""
 
     def make(job: TrainingJob, rows: object) -> object:
         prepared, scaler = prepare(job, rows)
@@ -242,24 +246,24 @@ def dies(attempts: set[int]) -> object:
 
 
 @pytest.mark.parametrize(("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1, 2}, 2, 1)])
-def test_what_collapses_is_trained_again_at_most_twice_and_counted(tmp_path, monkeypatch, dead, before_n, collapsed):
+def test_collapsed_training_is_repeated_at_most_twice(tmp_path, monkeypatch, dead, before_n, collapsed):
     monkeypatch.setattr(train, "prepare", dies(dead))
-    some, said = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
-    for _ in range(2):  # the second time, from the cache
-        first, second = run(some, tmp_path, said=said)
+    some, log = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
+    for _ in range(2):  # the second time from the cache
+        first, second = run(some, tmp_path, log=log)
         assert (first.collapsed_before_n, first.collapsed) == (before_n, bool(collapsed))
         assert (second.collapsed_before_n, second.collapsed) == (0, False)
         assert second.explained_min > 0.5
-    assert any("collapsed" in line for line in said) == bool(dead)
+    assert any("collapsed" in line for line in log) == bool(dead)
 
 
-def test_a_training_too_short_to_have_left_its_start_is_not_judged(tmp_path, monkeypatch):
+def test_short_training_is_not_checked_for_collapse(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "prepare", dies({0, 1, 2}))
     first, _ = run(jobs(2, steps_n=CHECKED_STEPS_N - 1), tmp_path)
     assert (first.explained_min, first.collapsed) == (None, False)
 
 
-def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
+def test_constant_or_unknown_target_is_no_collapse(tmp_path):
     rows = example_data()
     flat, unknown = rows.target.copy(), rows.target.copy()
     flat[:, 2], unknown[:, 2] = 1.5, np.nan
@@ -271,7 +275,7 @@ def test_a_target_that_is_unknown_or_never_changes_judges_nobody(tmp_path):
         assert trained.explained_min == pytest.approx(truth.min(), rel=1e-5)
 
 
-def test_trainings_in_a_process_of_their_own_are_the_same(tmp_path, monkeypatch):
+def test_worker_process_gives_the_same_result(tmp_path, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     some = [adaptation(), fine_tuning()]
     with make_executor(imports="reskin.models.train") as executor:
@@ -283,7 +287,7 @@ def keyed(some: list[TrainingJob]) -> dict[str, TrainingJob]:
     return {f"key{i}": job for i, job in enumerate(some)}
 
 
-def test_recipes_of_equal_settings_are_stacked_and_others_are_not():
+def test_equal_recipes_share_a_stack():
     twin = [replace(job, recipe_name="twin") for job in jobs(1)]
     assert [len(stack) for stack in make_stacks(keyed([*jobs(2), *twin]), 3)] == [3]
     released = replace(adaptation(), recipe=pooled(architecture="released").recipe)
@@ -293,7 +297,7 @@ def test_recipes_of_equal_settings_are_stacked_and_others_are_not():
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
-def test_stacks_cover_every_cell_once_and_are_no_larger_than_asked(kinds, size_n):
+def test_stacks_cover_every_job_once(kinds, size_n):
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
     some = keyed([pooled(**settings[kind]) for kind in kinds])
     found = make_stacks(some, size_n)
@@ -302,16 +306,16 @@ def test_stacks_cover_every_cell_once_and_are_no_larger_than_asked(kinds, size_n
         assert 1 <= len(one) <= size_n
         assert len({kinds[int(key.removeprefix("key"))] for key in one}) == 1
     counts = [kinds.count(kind) for kind in set(kinds)]
-    assert len(found) == sum(-(-count // size_n) for count in counts)  # no stack is split without need
+    assert len(found) == sum(-(-count // size_n) for count in counts)  # the fewest possible stacks
 
 
-def test_a_network_learns_five_targets_as_it_learns_three():
+def test_five_targets_are_learned():
     own = example_data()
     shear_N = own.target[:, 2:] * np.array([0.5, -0.25], np.float32)
     five = replace(own, target=np.hstack([own.target, shear_N]))
     many = replace(without_triplets(), recipe=recipe(steps_n=400))
     (one,) = train_stack([replace(many, test=many.train)], five)
     assert one.predicted.shape == (len(many.train), 5)
-    # what it was trained on, learnt by heart: shear is a fixed share of the third target
+    # training data, overfitted: shear is a fixed share of the third target
     rms_N = np.sqrt(((one.predicted - five.target[many.train]) ** 2).mean(axis=0))
     assert (rms_N < 0.5 * five.target.std(axis=0)).all()

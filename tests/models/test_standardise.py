@@ -11,7 +11,7 @@ def rows(n: int = 50, ch: int = 6) -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(3, 40, (n, ch)).astype(np.float32), rng.uniform(0, 16, (n, 3)).astype(np.float32)
 
 
-def test_standard_inputs_have_zero_mean_and_unit_deviation():
+def test_inputs_have_zero_mean_and_unit_deviation():
     db_uT, target = rows()
     scaled = fit_standard(db_uT, target).encode(db_uT).astype(float)
     # float32 rounding of numbers around 3 sd
@@ -19,17 +19,17 @@ def test_standard_inputs_have_zero_mean_and_unit_deviation():
     np.testing.assert_allclose(scaled.std(axis=0), 1, atol=1e-5)
 
 
-def test_a_scaler_knows_training_rows_only():
+def test_scaler_uses_training_rows_only():
     db_uT, target = rows()
     train = np.arange(30)
     fitted = fit_standard(db_uT[train], target[train])
-    db_uT[30:] += 1e6  # whatever the test rows hold
+    db_uT[30:] += 1e6  # test rows
     target[30:] -= 1e6
     again = fit_standard(db_uT[train], target[train])
     assert all((a == b).all() for a, b in zip(fitted.arrays().values(), again.arrays().values(), strict=True))
 
 
-def test_a_channel_that_never_moves_gets_the_floor_and_stays_finite():
+def test_constant_channel_gets_the_floor():
     db_uT, target = rows()
     db_uT[:, 2] = 5.0
     for fit in (fit_standard, fit_released):
@@ -38,14 +38,14 @@ def test_a_channel_that_never_moves_gets_the_floor_and_stays_finite():
         assert np.isfinite(scaler.encode(db_uT)).all()
 
 
-def test_a_force_that_is_never_known_leaves_places_as_they_are():
+def test_unknown_force_leaves_places_unchanged():
     db_uT, target = rows()
     target[:, 2] = np.nan
     scaler = fit_standard(db_uT, target)
     assert np.isfinite(scaler.decode(np.zeros((1, 3), np.float32))).all()
 
 
-def test_the_released_scaling_is_five_deviations_and_fixed_targets():
+def test_released_scaling():
     db_uT, target = rows()
     scaler = fit_released(db_uT, target)
     # float32 against float64
@@ -55,7 +55,7 @@ def test_the_released_scaling_is_five_deviations_and_fixed_targets():
 
 
 @given(st.integers(0, 10_000))
-def test_decode_undoes_encode(seed):
+def test_decode_inverts_encode(seed):
     rng = rng_for(seed, "round trip")
     db_uT, target = rows()
     scaler = fit_standard(db_uT, target)
@@ -64,7 +64,7 @@ def test_decode_undoes_encode(seed):
     np.testing.assert_allclose(scaler.decode(scaler.encode_target(wanted)), wanted, atol=1e-4)
 
 
-def test_a_scaler_survives_being_saved():
+def test_scaler_round_trip():
     scaler = fit_standard(*rows())
     again = Scaler.of_arrays(scaler.arrays() | {"other": np.zeros(1)})
     assert all((a == b).all() for a, b in zip(scaler.arrays().values(), again.arrays().values(), strict=True))

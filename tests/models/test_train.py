@@ -17,9 +17,9 @@ from tests.models.plain import plain_net, plain_train
 
 ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = LossWeights(0.0)
-# Sums in another order, on another processor or at another place in memory, round otherwise: 6e-8 of a term. AdamW
-# divides a gradient by its own size, so a ReLU that rounding opens for one row moves all weights of its unit by a
-# whole step: one unit of 200 is at most 7 % of the way there, a term left out more than that.
+# Sums in another order, on another processor or memory alignment round differently: 6e-8 of a term. AdamW divides a
+# gradient by its own size, so a ReLU that rounding opens for one row moves all weights of its unit by a whole
+# step: one unit of 200 is at most 7 % of the way from the start, a missing loss term is more.
 WAY = 2e-2
 
 
@@ -36,7 +36,7 @@ def block_sizes(steps_n: int) -> list[int]:
     return [BLOCK_STEPS_N] * (steps_n // BLOCK_STEPS_N) + [steps_n % BLOCK_STEPS_N] * (steps_n % BLOCK_STEPS_N > 0)
 
 
-def test_a_gradient_is_cut_to_its_longest_network_by_network():
+def test_gradients_are_clipped_per_network():
     net = Stack(paper_layers(15), [some_weights(i) for i in range(3)])
     lengths = torch.tensor([0.0, 0.5, 70.0])
     for parameter in net.parameters():
@@ -52,8 +52,8 @@ def test_a_gradient_is_cut_to_its_longest_network_by_network():
     torch.testing.assert_close(after[2] * 70, torch.cat([one.flatten(1) for one in before], dim=1)[2])
 
 
-def test_a_rate_at_which_networks_die_without_it_trains_with_short_gradients():
-    """Found on simulated skins: at four times the rate in use all ReLUs of a layer die in most networks."""
+def test_clipping_prevents_dead_networks():
+    """On simulated skins, at four times the rate in use, all ReLUs of a layer die in most networks."""
     jobs = [some_job(i, n=400) for i in range(3)]
     schedule = recipe(steps_n=400, batch_n=64, rate_max=2.4e-2)
     free, cut = (run(jobs_of(jobs), schedule.model_copy(update={"gradient_norm_max": one})) for one in (1e9, 1.0))
@@ -64,17 +64,17 @@ def jobs_of(jobs: list[PreparedJob]) -> list[PreparedJob]:
     return [replace(job, rng=some_job(i).rng) for i, job in enumerate(jobs)]
 
 
-def test_thirty_two_rows_are_learned_by_heart():
+def test_thirty_two_rows_are_overfitted():
     job = some_job()
     (outcome,) = run([job], recipe(steps_n=600))
-    answer = plain_net("paper", outcome.weights)(torch.from_numpy(job.labelled.inputs)).detach().numpy()
-    assert ((answer - job.labelled.targets) ** 2).mean() < 1e-3 < job.labelled.targets.var()
+    output = plain_net("paper", outcome.weights)(torch.from_numpy(job.labelled.inputs)).detach().numpy()
+    assert ((output - job.labelled.targets) ** 2).mean() < 1e-3 < job.labelled.targets.var()
     assert outcome.curve[-1] < 1e-3 < outcome.curve[0]
     assert outcome.stopped_step is None
 
 
 @pytest.mark.parametrize("terms", [NO_TERMS, ALL_TERMS])
-def test_same_seed_same_weights_and_another_seed_others(terms):
+def test_weights_depend_on_the_seed(terms):
     one, again, other = (
         run([replace(some_job(terms=True), rng=some_job(draws=draws).rng)], recipe(steps_n=60), terms)[0]
         for draws in ("a", "a", "b")
@@ -84,16 +84,16 @@ def test_same_seed_same_weights_and_another_seed_others(terms):
 
 
 @pytest.mark.parametrize(("terms", "batch_n"), [(NO_TERMS, 1), (ALL_TERMS, 16), (NO_TERMS, 128)])
-def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
+def test_stack_equals_single_training(terms, batch_n):
     schedule = recipe(steps_n=60, rate_max=5e-4, batch_n=batch_n)
     together = run([some_job(i, terms=True) for i in range(3)], schedule, terms)
     for i in range(3):
         (alone,) = run([some_job(i, terms=True)], schedule, terms)
-        assert off_the_way(together[i].weights, alone.weights, some_job(i, terms=True).initial_weights) < WAY
+        assert relative_distance(together[i].weights, alone.weights, some_job(i, terms=True).initial_weights) < WAY
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
-@pytest.mark.parametrize(  # decay is of weights, whatever pulls at them
+@pytest.mark.parametrize(  # weight decay does not depend on the loss terms
     ("terms", "decay"),
     [
         (NO_TERMS, 0.0),
@@ -104,23 +104,23 @@ def test_a_network_becomes_the_same_in_a_stack_and_alone(terms, batch_n):
     ],
     ids=str,
 )
-def test_the_stack_descends_as_the_plainest_pytorch_loop_does(terms, decay):
+def test_stack_equals_plain_pytorch_loop(terms, decay):
     schedule, steps_n = recipe(steps_n=70, rate_max=5e-4, weight_decay=decay), 70
     (outcome,) = run([some_job(terms=True)], schedule, terms)
     feed = BatchSampler([some_job(terms=True)], schedule.batch_n, "cpu")
     batches = chain.from_iterable(feed.sample(n) for n in block_sizes(steps_n))
     truth = plain_train(some_job().initial_weights, batches, schedule, terms)
-    assert off_the_way(outcome.weights, truth, some_job(terms=True).initial_weights) < WAY
+    assert relative_distance(outcome.weights, truth, some_job(terms=True).initial_weights) < WAY
 
 
-def off_the_way(weights: Weights, truth: Weights, start: Weights) -> float:
-    """How far all weights together end from the truth, as a part of the way there."""
+def relative_distance(weights: Weights, truth: Weights, start: Weights) -> float:
+    """Distance of all weights from the truth, relative to the distance of the start."""
     off, way = (np.concatenate([(truth[name] - other[name]).ravel() for name in truth]) for other in (weights, start))
     return float(np.linalg.norm(off) / np.linalg.norm(way))
 
 
 @pytest.mark.parametrize("name", ["triplet", "unlabelled", "few_labels"])
-def test_each_term_pulls_and_a_weight_of_none_makes_what_it_stands_on_irrelevant(name):
+def test_each_term_changes_the_weights(name):
     schedule = recipe(steps_n=10)
     job = some_job(terms=True)
     (with_it,) = run([job], schedule, replace(NO_TERMS, **{name: 0.5}))
@@ -133,15 +133,15 @@ def test_each_term_pulls_and_a_weight_of_none_makes_what_it_stands_on_irrelevant
 
 
 @pytest.mark.parametrize("name", ["unlabelled", "few_labels"])
-def test_what_a_term_stands_on_decides_the_weights(name):
+def test_data_of_each_term_decides_the_weights(name):
     schedule, terms = recipe(steps_n=10), replace(NO_TERMS, **{name: 0.5})
     one, other = some_job(terms=True), some_job(terms=True)
     swapped = replace(other, **{name: replace(getattr(other, name), inputs=getattr(other, name).inputs[::-1].copy())})
     assert not same(run([one], schedule, terms)[0], run([swapped], schedule, terms)[0])
 
 
-def test_unlabelled_pokes_move_the_feature_layers_only():
-    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # a cut gradient is shorter in all layers
+def test_unlabelled_pokes_train_the_feature_layers_only():
+    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # clipping would scale all layers
     (outcome,) = run([some_job(terms=True)], far, LossWeights(0.0, unlabelled=1e6))
     (plain,) = run([some_job(terms=True)], far)
     for i in range(1, 7):
@@ -150,8 +150,8 @@ def test_unlabelled_pokes_move_the_feature_layers_only():
 
 
 @pytest.mark.parametrize("steps_n", [1, 2, 49, 50, 51, 120])
-def test_the_curve_has_the_mean_loss_of_every_block_of_steps(steps_n):
-    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # hardly moves: the losses are those of the first weights
+def test_curve_is_the_mean_loss_of_each_block(steps_n):
+    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # the weights hardly move
     job = some_job()
     (outcome,) = run([job], schedule)
     feed, net, blocks = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []
@@ -169,7 +169,7 @@ def test_any_number_of_rows_trains_in_any_batch(n, batch_n):
 
 
 @pytest.mark.parametrize(("times", "rate_max"), [(1e30, 3e-3), (1.0, 1e6), (1e20, 1e6)])
-def test_a_training_that_explodes_stops_with_its_last_finite_weights(times, rate_max):
+def test_diverging_training_keeps_its_last_finite_weights(times, rate_max):
     job = scaled(some_job(), times)
     (outcome,) = run([job], recipe(steps_n=500, rate_max=rate_max))
     assert outcome.stopped_step is not None
@@ -185,8 +185,8 @@ def scaled(job: PreparedJob, times: float) -> PreparedJob:
     return replace(job, labelled=replace(job.labelled, inputs=(job.labelled.inputs * times).astype(np.float32)))
 
 
-def test_weights_that_break_at_the_last_step_are_found_though_its_loss_was_finite():
-    """Pokes of 1e30 break the triplet term: the L2 loss of the same step knows nothing of it yet."""
+def test_nan_weights_of_the_last_step_are_detected():
+    """Pokes of 1e30 break the triplet term after the L2 loss of the same step was finite."""
     job = some_job(terms=True)
     job.unlabelled.inputs[:] *= 1e30
     (outcome,) = run([job], recipe(steps_n=1), LossWeights(0.0, unlabelled=1.0))
@@ -194,30 +194,30 @@ def test_weights_that_break_at_the_last_step_are_found_though_its_loss_was_finit
     assert all((outcome.weights[name] == job.initial_weights[name]).all() for name in job.initial_weights)
 
 
-def test_a_loss_that_overflows_is_found_though_the_weights_are_finite():
+def test_infinite_loss_with_finite_weights_is_detected():
     job = some_job()
-    job.labelled.targets[:] *= 1e20  # squares are beyond float32, gradients are not
+    job.labelled.targets[:] *= 1e20  # squares overflow float32, gradients do not
     (outcome,) = run([job], recipe(steps_n=1))
     assert (outcome.stopped_step, outcome.curve) == (1, [])
 
 
-def test_a_network_that_stops_late_is_as_it_was_a_block_before(monkeypatch):
-    """Row 0 breaks the network, and is first drawn in the second block: until then nobody can tell."""
+def test_late_stop_restores_the_previous_block(monkeypatch):
+    """Row 0 breaks the network and is first drawn in the second block."""
     n, schedule = 60, recipe(steps_n=170, batch_n=1)
     seed = next(seed for seed in range(1000) if first_step_of_row_0(n, seed) // BLOCK_STEPS_N == 1)
     broken, sound = some_job(n=n, draws=seed), some_job(n=n, draws=seed)
     broken.labelled.inputs[0] = 1e30
-    looks, look = [], Monitor.check
+    checks, look = [], Monitor.check
     monkeypatch.setattr(
-        Monitor, "check", lambda self, *found: looks.append(self.net.weights_of(0)) or look(self, *found)
+        Monitor, "check", lambda self, *found: checks.append(self.net.weights_of(0)) or look(self, *found)
     )
     (whole,) = run([sound], schedule)
     (outcome,) = run([broken], schedule)
-    assert len(looks) == len(block_sizes(170)) + 2  # nothing is left to train after the second look
+    assert len(checks) == len(block_sizes(170)) + 2  # nothing is left to train after the second check
     assert outcome.stopped_step == 2 * BLOCK_STEPS_N
     assert outcome.curve == whole.curve[:1]
-    assert all((outcome.weights[name] == looks[0][name]).all() for name in looks[0])
-    assert any((outcome.weights[name] != broken.initial_weights[name]).any() for name in looks[0])
+    assert all((outcome.weights[name] == checks[0][name]).all() for name in checks[0])
+    assert any((outcome.weights[name] != broken.initial_weights[name]).any() for name in checks[0])
 
 
 def first_step_of_row_0(n: int, seed: int) -> int:
@@ -228,7 +228,7 @@ def first_step_of_row_0(n: int, seed: int) -> int:
     return drawn[0] if drawn else -1
 
 
-def test_neighbours_of_a_network_that_explodes_go_on_as_if_it_were_well():
+def test_neighbours_of_a_diverging_network_are_unaffected():
     schedule = recipe(steps_n=120)
     well = run([some_job(i, terms=True) for i in range(3)], schedule, ALL_TERMS)
     jobs = [some_job(i, terms=True) for i in range(3)]
@@ -240,7 +240,7 @@ def test_neighbours_of_a_network_that_explodes_go_on_as_if_it_were_well():
     assert len(first.curve) == 3
 
 
-def test_starts_and_rows_are_left_as_they_are():
+def test_starts_and_rows_are_not_modified():
     job, untouched = some_job(terms=True), some_job(terms=True)
     run([job], recipe(), ALL_TERMS)
     assert all((job.initial_weights[name] == untouched.initial_weights[name]).all() for name in job.initial_weights)

@@ -8,7 +8,7 @@ from reskin.models.losses import TripletPoints, draw_triplets, triplet_points
 from reskin.seeds import rng_for
 
 DRAWN_N = 400
-ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, placed by index
+ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, at their indices
 
 
 def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -16,13 +16,13 @@ def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.n
 
 
 def distances(place: np.ndarray, anchor: int) -> list[float]:
-    """The true squared distances of all points from one, plainly."""
+    """The squared distances of all points from one, by a loop."""
     return [sum((float(a) - float(b)) ** 2 for a, b in zip(one, place[anchor], strict=True)) for one in place]
 
 
 @st.composite
 def placed(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
-    """TripletPoints in up to four groups, on few integer places: ties abound. Every place is visited twice at least."""
+    """TripletPoints in up to four groups, on few integer places (many ties); each place has at least two visits."""
     axes_n = draw_one(st.sampled_from([1, 2]))
     place, group = [], []
     for name in draw_one(st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True)):
@@ -37,7 +37,7 @@ def placed(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 @given(placed())
-def test_pairs_lie_in_the_anchors_group_and_the_positive_is_strictly_nearer(case):
+def test_positive_is_strictly_nearer_in_the_same_group(case):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=64)
     positive, negative = draw(triplet_points(place, group), anchor, seed)
@@ -49,7 +49,7 @@ def test_pairs_lie_in_the_anchors_group_and_the_positive_is_strictly_nearer(case
 
 
 @given(placed(), st.floats(-100, 100), st.sampled_from([0.25, 2.0, 8.0]))
-def test_moving_and_stretching_a_skin_changes_no_triplet(case, shift, times):
+def test_shift_and_scale_do_not_matter(case, shift, times):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=32)
     one = draw(triplet_points(place, group), anchor, seed)
@@ -58,7 +58,7 @@ def test_moving_and_stretching_a_skin_changes_no_triplet(case, shift, times):
 
 
 @given(placed())
-def test_what_groups_are_called_changes_no_triplet(case):
+def test_names_of_groups_do_not_matter(case):
     place, group, seed = case
     anchor = np.arange(len(group))
     one = draw(triplet_points(place, group), anchor, seed)
@@ -66,7 +66,7 @@ def test_what_groups_are_called_changes_no_triplet(case):
     assert all((a == b).all() for a, b in zip(one, other, strict=True))
 
 
-def test_places_on_skins_in_mm_are_compared_over_both_axes():
+def test_places_in_mm_use_both_axes():
     # from the corner: 3 mm along x is nearer than 2 mm and 3 mm along both
     place = np.array([[0, 0], [3, 0], [2, 3]], np.float32)
     positive, negative = draw(triplet_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
@@ -74,38 +74,38 @@ def test_places_on_skins_in_mm_are_compared_over_both_axes():
     assert set(negative) == {2}
 
 
-def test_two_places_suffice_where_each_has_two_visits():
+def test_two_places_suffice_with_two_visits_each():
     points = triplet_points(np.array([[0.0], [0.0], [1.0], [1.0]]), np.zeros(4, int))
     positive, negative = draw(points, np.tile(np.arange(4), 50))
-    assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # the other visit of the anchor's own place
+    assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # the other visit to the anchor's place
     assert all(set(negative[i::4]) == ({2, 3} if i < 2 else {0, 1}) for i in range(4))
 
 
-def test_a_group_on_one_place_is_named():
+def test_group_with_one_place_is_named():
     place = np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0], [3.0, 0.0], [1.0, 2.0]])
     skins = np.array(["b3_s2", "b1_s1", "b3_s2", "b1_s1", "b3_s2"])
     with pytest.raises(TrainingError, match=r"group b3_s2: the places of its points must be two or more; got 3 points"):
         triplet_points(place, skins)
 
 
-def test_places_that_differ_along_one_axis_only_are_two():
+def test_places_that_differ_along_one_axis():
     assert len(triplet_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
 
 
-def test_a_point_from_which_all_others_are_equally_far_is_no_anchor_and_pulls_nowhere():
+def test_point_with_equal_distances_is_no_anchor():
     three_pokes = triplet_points(np.arange(3.0)[:, None], np.zeros(3, int))
     assert three_pokes.anchors.tolist() == [0, 2]
     near, far = draw(three_pokes, np.array([0, 1, 2]))
     assert (near.tolist(), far.tolist()) == ([1, 1, 1], [2, 1, 0])
 
 
-def test_points_that_are_all_equally_far_are_one_sentence_and_no_endless_loop():
+def test_points_with_equal_distances_are_refused():
     with pytest.raises(TrainingError, match="some nearer to one than others are; got 2 that are equally far"):
         triplet_points(np.array([[0.0], [1.0]]), np.zeros(2, int))
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=3, max_size=12))
-def test_anchors_are_the_points_with_two_distances_to_others_as_a_double_loop_finds(places):
+def test_anchors_equal_double_loop(places):
     expected = [
         len({(x - u) ** 2 + (y - v) ** 2 for j, (u, v) in enumerate(places) if j != i}) > 1
         for i, (x, y) in enumerate(places)
@@ -115,15 +115,15 @@ def test_anchors_are_the_points_with_two_distances_to_others_as_a_double_loop_fi
     assert triplet_points(np.array(places, float), np.zeros(len(places), int)).is_anchor.tolist() == expected
 
 
-def test_the_same_state_of_the_generator_draws_the_same():
+def test_draws_follow_the_generator():
     points, anchor = triplet_points(ROW, np.zeros(5, int)), np.tile(np.arange(5), 20)
     one, again, other = draw(points, anchor, 1), draw(points, anchor, 1), draw(points, anchor, 2)
     assert all((a == b).all() for a, b in zip(one, again, strict=True))
     assert any((a != b).any() for a, b in zip(one, other, strict=True))
 
 
-def test_every_ordered_pair_of_other_points_is_drawn_equally_often():
-    # from index 0 of a line of five, all distances differ: six pairs of the four others
+def test_every_ordered_pair_is_equally_likely():
+    # from index 0 of five, all distances differ: six pairs of the four others
     n = 6000
     positive, negative = draw(triplet_points(ROW, np.zeros(5, int)), np.zeros(n, int))
     pairs, times = np.unique(np.stack([positive, negative]), axis=1, return_counts=True)
@@ -132,19 +132,19 @@ def test_every_ordered_pair_of_other_points_is_drawn_equally_often():
 
 
 @given(placed())
-def test_every_other_point_of_the_group_takes_part(case):
+def test_every_other_point_takes_part(case):
     place, group, seed = case
     mates = np.flatnonzero(group == group[0])
     assume(len(mates) <= 12)
     others = mates[mates != 0]
     away = np.array(distances(place, 0))[others]
     positive, negative = draw(triplet_points(place, group), np.zeros(3000, int), seed)
-    # at the worst, one point in eleven ordered against one other only: (1 - 2 / 121)^3000 = 1e-22
+    # worst case, one point in eleven ordered against one other only: (1 - 2 / 121)^3000 = 1e-22
     assert set(positive) == set(others[away < away.max()])
     assert set(negative) == set(others[away > away.min()])
 
 
-def test_the_anchors_passed_in_are_left_as_they_are():
+def test_anchors_are_not_modified():
     anchor = np.arange(5)
     draw(triplet_points(ROW, np.zeros(5, int)), anchor)
     assert (anchor == np.arange(5)).all()
