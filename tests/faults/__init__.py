@@ -1,1 +1,1 @@
-"""Faults injected for real, and what becomes of them: `make faults` writes docs/faults.md."""
+"""Fault injection into a finished checkout: `make faults` writes docs/faults.md."""

@@ -1,4 +1,4 @@
-"""Inject every fault for real, and write the table: python -m tests.faults [--only WORD] [--work FOLDER] [--out FILE].
+"""Inject every fault and write the table: python -m tests.faults [--only WORD] [--work FOLDER] [--out FILE].
 
 Clones the last commit, runs a small scene of a few experiments there once, and injects each fault into a copy of it.
 Needs Linux; faults that mount file systems need root.
@@ -26,10 +26,8 @@ OUT = ROOT / "docs/faults.md"
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", default=[], help="faults whose name holds one of these")
-    parser.add_argument(
-        "--work", type=Path, help="a folder that is kept, with the finished checkout and the rows in it"
-    )
+    parser.add_argument("--only", nargs="*", default=[], help="faults whose name contains one of these")
+    parser.add_argument("--work", type=Path, help="a folder to keep the finished checkout and the rows in")
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     work = (arguments.work or Path(tempfile.mkdtemp())).resolve()
@@ -41,8 +39,8 @@ def main() -> None:
     rows_file, code = work / "rows.json", git(template.folder, "rev-parse", "--short=12", "HEAD~1:pipeline")
     rows = io.read_json(rows_file) if rows_file.exists() else {}
     for name, (how, case) in CASES.items():
-        if any(word in name for word in arguments.only) if arguments.only else rows.get(name, {}).get("code") != code:
-            row, seconds = hit(case, template, work / "case")
+        if any(part in name for part in arguments.only) if arguments.only else rows.get(name, {}).get("code") != code:
+            row, seconds = inject(case, template, work / "case")
             rows[name] = {"line": line(name, how, row, seconds), "red": bool(row.faults), "code": code, "s": seconds}
             print(rows[name]["line"], flush=True)
             io.write_json(rows_file, rows)
@@ -51,7 +49,7 @@ def main() -> None:
     arguments.out.write_text(page(rows))
 
 
-def hit(case, template: Checkout, folder: Path) -> tuple[Row, float]:
+def inject(case, template: Checkout, folder: Path) -> tuple[Row, float]:
     """Inject a fault into a fresh copy; return its row and the seconds that it took."""
     shutil.rmtree(folder, ignore_errors=True)
     at, start_s = copy(template, folder), time.monotonic()
@@ -66,7 +64,7 @@ def hit(case, template: Checkout, folder: Path) -> tuple[Row, float]:
 
 
 def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Write the page; it marks faults that have not been injected yet."""
+    """Format the page, with marked rows for faults that have not been injected yet."""
     ran = [rows[name] for name in CASES if name in rows]
     lines = [rows[name]["line"] if name in rows else not_run(name, how) for name, (how, _) in CASES.items()]
     return INTRODUCTION.format(

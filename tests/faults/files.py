@@ -10,7 +10,7 @@ from tests.faults.harness import NOT_RUN, SCENE, Checkout, Row, fault, judge
 from tests.faults.kills import address
 
 TRIPLET = address("train_triplet")
-IN_NAMESPACE = ("unshare", "--mount", "--propagation", "private", "sh", "-c")  # what is mounted there, ends there
+IN_NAMESPACE = ("unshare", "--mount", "--propagation", "private", "sh", "-c")  # mounts end with the process
 
 
 @fault(
@@ -79,7 +79,7 @@ def _read_only(at: Checkout, *, keep: bool) -> Row:
 def _cut(file: Path) -> None:
     content = file.read_bytes()
     file.chmod(0o644)
-    file.unlink()  # the cache's copy, if it is one file with it, stays whole
+    file.unlink()  # keeps the cache's copy, which may be a hard link
     file.write_bytes(content[: len(content) * 2 // 3])
 
 
@@ -134,7 +134,7 @@ def _damage(file: Path) -> None:
 
 
 CHECK = ("python", "-m", "pipeline", "check-cache")
-CACHED = {  # what is changed: an output, the file of it, the stage that wrote it, and one that reads it
+CACHED = {  # changed output, its file, the stage that wrote it and one that reads it
     "weights": (f"data/models/{SCENE}/train_triplet", "*.safetensors", TRIPLET, address("adapt")),
     "dataset (Parquet)": (f"data/indentations/{SCENE}", "*.parquet", address("ingest_simulated"), address("split")),
 }
@@ -169,7 +169,7 @@ def cached(what: str, folder: str, pattern: str, writer: str, reader: str) -> No
         first, cells = at.run("dvc", "repro"), at.trainings()
         checked = at.run(*CHECK)
         row = judge(at, first, at.run("dvc", "repro"), may_run=[writer, reader], finished=cells)
-        row.faults += [] if "check-cache" in row.message else ["the remedy is not told"]
+        row.faults += [] if "check-cache" in row.message else ["the remedy is missing"]
         row.faults += (
             [] if (checked.status, str(file.relative_to(at.folder)) in checked.output) == (1, True) else ["not found"]
         )
@@ -184,7 +184,7 @@ for what, where in CACHED.items():
 @fault(
     "corrupted DVC cache entry, read by no stage",
     "a bit changed in the cached copy of the folds (JSON); those in the checkout deleted; `dvc repro` restores them "
-    "and runs no stage; `reskin check-cache`, whose words are shown, then the next run",
+    "and runs no stage; `reskin check-cache`, whose message is shown, then the next run",
 )
 def cached_folds(at: Checkout) -> Row:
     file, content = _restored(at, f"data/models/{SCENE}/folds.json")
@@ -199,7 +199,7 @@ def cached_folds(at: Checkout) -> Row:
 @fault(
     "cut DVC cache entry of a folder",
     "the list of files of `train_triplet` cut in DVC's cache, the folder deleted; `dvc repro`; `reskin check-cache`, "
-    "whose words are shown; `dvc repro`, then the next run",
+    "whose message is shown; `dvc repro`, then the next run",
 )
 def cache_folder(at: Checkout) -> Row:
     digest = at.lock()[TRIPLET][f"data/models/{SCENE}/train_triplet"]
@@ -207,7 +207,7 @@ def cache_folder(at: Checkout) -> Row:
     _cut(entry)
     entry.chmod(0o444)
     shutil.rmtree(at.folder / f"data/models/{SCENE}/train_triplet")
-    before, checked, after = (at.run(*words) for words in (("dvc", "repro"), CHECK, ("dvc", "repro")))
+    before, checked, after = (at.run(*command) for command in (("dvc", "repro"), CHECK, ("dvc", "repro")))
     row = judge(at, checked, at.run("dvc", "repro"), may_run=[], finished=at.trainings())
     row.faults += [] if before.ran == after.ran == [TRIPLET] else [f"ran {before.ran}, {after.ran}"]
     row.known = (

@@ -20,7 +20,7 @@ from tests.stages.checkout import ROOT, variables
 
 SCENE = "faults"
 EXPERIMENTS = ("single_random", "transfer", "lobo", "triplet", "adapt", "baselines", "sensitivity", "audit")
-PROTOCOLS = ("grid", "glass")  # those that these experiments need
+PROTOCOLS = ("grid", "glass")  # needed by these experiments
 SECTIONS = (
     "source",
     "seed",
@@ -56,16 +56,16 @@ class Checkout:
 
     def __init__(self, folder: Path, output: Path | None = None, template: "Checkout | None" = None) -> None:
         self.folder = folder
-        self.template = template or self  # the finished one that this is a copy of
+        self.template = template or self  # the finished checkout this is a copy of
         self._output = output or folder.with_suffix(".output")
 
-    def start(self, *words: str, **environment: str) -> subprocess.Popen[bytes]:
+    def start(self, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
         """Start a command in a process group of its own; its output goes into a file."""
         env = variables(self.folder, **environment)
         env["PATH"] = f"{self.folder / '.venv/bin'}{os.pathsep}{env['PATH']}"
         with self._output.open("wb") as output:
             return subprocess.Popen(
-                words, cwd=self.folder, env=env, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+                arguments, cwd=self.folder, env=env, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
             )
 
     def end(self, process: subprocess.Popen[bytes], start_s: float, limit_s: float = LIMIT_S) -> Result:
@@ -78,10 +78,10 @@ class Checkout:
             process.wait()
         return Result(status, self.output(), time.monotonic() - start_s)
 
-    def run(self, *words: str, limit_s: float = LIMIT_S, **environment: str) -> Result:
+    def run(self, *arguments: str, limit_s: float = LIMIT_S, **environment: str) -> Result:
         """Run a command to its end."""
         start_s = time.monotonic()
-        return self.end(self.start(*words, **environment), start_s, limit_s)
+        return self.end(self.start(*arguments, **environment), start_s, limit_s)
 
     def output(self) -> str:
         """Return the output of the last command so far, without the name of the folder."""
@@ -126,20 +126,20 @@ class Checkout:
     def reset(self, *names: str, trainings: bool = True) -> None:
         """Remove the entries and outputs of stages, and finished trainings, so that the stages run again."""
         file = self.folder / "dvc.lock"
-        words = YAML().load(file.read_text())
+        lock = YAML().load(file.read_text())
         for name in names:
-            for out in words["stages"].pop(name).get("outs", []):
+            for out in lock["stages"].pop(name).get("outs", []):
                 path = self.folder / out["path"]
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         with file.open("w") as stream:
-            YAML().dump(words, stream)
-        shutil.rmtree(self.folder / ".dvc/cache/runs", ignore_errors=True)  # of runs since the template was made
+            YAML().dump(lock, stream)
+        shutil.rmtree(self.folder / ".dvc/cache/runs", ignore_errors=True)  # runs since the template was made
         for name in self.trainings() if trainings else ():
             (self.folder / ".reskin/cells" / name).unlink()
 
 
 def alive(process: psutil.Process) -> bool:
-    """Tell whether a process runs; a zombie does not."""
+    """Whether a process runs and is no zombie."""
     try:
         return process.status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
@@ -162,10 +162,10 @@ def make_template(folder: Path) -> tuple[Checkout, Result]:
         YAML().dump(small(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)
     (folder / "dvc.lock").unlink()
     at = Checkout(folder)
-    for words in (["python", "-m", "pipeline", "scenes", "use", SCENE], ["dvc", "repro"]):
-        done = at.run(*words, limit_s=6 * LIMIT_S)
+    for command in (["python", "-m", "pipeline", "scenes", "use", SCENE], ["dvc", "repro"]):
+        done = at.run(*command, limit_s=6 * LIMIT_S)
         if done.status:
-            raise AssertionError(f"{' '.join(words)} failed:\n{done.output[-3000:]}")
+            raise AssertionError(f"{' '.join(command)} failed:\n{done.output[-3000:]}")
     git(folder, "add", "--all")
     git(folder, "commit", "--quiet", "--message", "finished")
     shutil.rmtree(folder / ".dvc/cache/runs")  # else DVC restores the files that a fault damages
@@ -190,7 +190,7 @@ def copy(template: Checkout, folder: Path) -> Checkout:
 
 
 def message_of(output: Sequence[str] | str) -> str:
-    """Return the line of an output that tells a user what went wrong: the stage's own, else DVC's."""
+    """Return the error message of an output: the stage's own, else DVC's."""
     lines = output.splitlines() if isinstance(output, str) else list(output)
     for start in (
         "error:",
@@ -205,7 +205,7 @@ def message_of(output: Sequence[str] | str) -> str:
     return ""
 
 
-ROOTS = (tempfile.gettempdir(), str(ROOT.parent), "/var")  # paths of this machine, which the table leaves out
+ROOTS = (tempfile.gettempdir(), str(ROOT.parent), "/var")  # paths of this machine, shortened in the table
 TITLES = ("fault", "how injected", "what the user sees", "exit status", "lost", "the next run", "s", "verdict")
 
 
@@ -223,17 +223,17 @@ class Row:
 
 Case = Callable[[Checkout], Row]
 NOT_RUN = Result(0, "", 0.0)
-CASES: dict[str, tuple[str, Case]] = {}  # by name: how it is injected, in words and as a function
+CASES: dict[str, tuple[str, Case]] = {}  # by name: description and function that injects it
 
 
 def fault(name: str, how: str) -> Callable[[Case], Case]:
     """Add a fault to the table."""
 
-    def enter(case: Case) -> Case:
+    def add(case: Case) -> Case:
         CASES[name] = (how, case)
         return case
 
-    return enter
+    return add
 
 
 def judge(
@@ -270,14 +270,14 @@ def judge(
 
 
 def _whole(trainings: dict[str, int], later: dict[str, int]) -> dict[str, int]:
-    """Keep the trainings of complete stacks: those of a stack are trained together and finished as one."""
+    """Keep the trainings of complete stacks, whose trainings finish together."""
     members = [Counter(name.rpartition("-")[0] for name in each) for each in (trainings, later)]
     whole = {stack for stack, files_n in members[0].items() if members[1][stack] == files_n}
     return {name: written for name, written in trainings.items() if name.rpartition("-")[0] in whole}
 
 
 def line(name: str, how: str, row: Row, seconds: float) -> str:
-    """Write a row of the table."""
+    """Format a row of the table."""
     status = "hang" if row.status is None else str(row.status)
     verdict = "green" if not row.faults else f"red: {'; '.join(row.faults)}"
     if row.known:
@@ -288,7 +288,7 @@ def line(name: str, how: str, row: Row, seconds: float) -> str:
 
 
 def not_run(name: str, how: str) -> str:
-    """Write the row of a fault that has not been injected yet."""
+    """Format the row of a fault that has not been injected yet."""
     return f"| {_plain(name)} | {_plain(how)} |{' – |' * 5} not run yet |"
 
 

@@ -18,16 +18,16 @@ AS_MAX = 100 * 2**20  # bytes
 
 
 def address(stage: str) -> str:
-    """Name a stage as DVC does."""
+    """The name of a stage in DVC."""
     return stage if stage == "code" else f"{stage}@{SCENE}"
 
 
 def killed(at: Checkout, stage: str, part: float) -> Result | None:
-    """Run a stage through DVC, and kill its process after a part of what it took before; None if it ended first."""
+    """Run a stage through DVC, and kill its process after a part of its earlier duration; None if it ended first."""
     cost = at.folder / ".reskin/costs" / SCENE / f"{stage}.json"
     wait_s = part * (io.read_json(cost)["seconds"] if cost.exists() else 2.0)
     if stage == "publish":
-        (at.folder / "mlflow.db").unlink()  # else there is nothing to write
+        (at.folder / "mlflow.db").unlink()  # otherwise there is nothing to write
     start_s = time.monotonic()
     repro = at.start("dvc", "repro", address(stage))
     process = at.stage(stage)
@@ -79,7 +79,7 @@ def kill_dvc(at: Checkout) -> Row:
     repro.send_signal(signal.SIGKILL)
     result, finished = at.end(repro, start_s), at.trainings()
     again = at.run("dvc", "repro")
-    at.until(lambda: False, process, 60.0)  # what is left alone ends
+    at.until(lambda: False, process, 60.0)  # orphaned processes end
     return judge(at, result, again, may_run=[stage], finished=finished)
 
 
@@ -114,7 +114,7 @@ def kill_worker(at: Checkout) -> Row:
 
 
 @fault(
-    "worker out of memory, told by the allocator",
+    "worker out of memory, reported by the allocator",
     "RLIMIT_AS of a worker of `train_triplet` set to 100 MB, less than it has, after a finished training",
 )
 def starve_worker(at: Checkout) -> Row:

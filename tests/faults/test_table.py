@@ -1,22 +1,22 @@
-"""The committed table of faults has a row for every fault, and a row states what was found."""
+"""The committed table has a row for every fault; rows show outcome and message."""
 
-from tests.faults import files, kills, together, tracking  # noqa: F401 (each enters its faults)
+from tests.faults import files, kills, together, tracking  # noqa: F401 (each adds its faults)
 from tests.faults.__main__ import OUT
 from tests.faults.harness import CASES, Row, line, message_of
 
 
-def test_the_committed_table_has_a_row_for_every_fault():
+def test_table_has_a_row_for_every_fault():
     rows = [row.split(" | ")[0].removeprefix("| ") for row in OUT.read_text().splitlines() if row.startswith("| ")]
     assert rows == ["fault", *CASES]
 
 
-def test_a_failed_check_makes_a_row_red_with_its_reason():
+def test_failed_check_makes_a_row_red():
     row = Row("error: no room", None, "nothing", "ran adapt", ["a hang"], "Known: DVC waits.")
     cells = "| “error: no room” | hang | nothing | ran adapt | 3 | red: a hang. Known: DVC waits. |"
     assert line("f", "h", row, 3.2).endswith(cells)
 
 
-def test_the_message_of_a_stage_comes_before_that_of_dvc():
+def test_stage_message_precedes_that_of_dvc():
     lines = ["x: stage 2 of 3", "error: split: a must b; got c.", "ERROR: failed to reproduce 'split@a'"]
     assert message_of(lines) == lines[1]
     assert message_of(lines[2:]) == lines[2]
@@ -24,6 +24,6 @@ def test_the_message_of_a_stage_comes_before_that_of_dvc():
     assert message_of([lock, "", "Mapping values are not allowed"]) == lock
 
 
-def test_only_paths_of_this_machine_are_shortened():
+def test_paths_of_this_machine_are_shortened():
     row = Row("error: /tmp/x1/case/data must be; delete .dvc/tmp/rwlock", 2, "nothing", "ran adapt")
     assert "“error: …/data must be; delete .dvc/tmp/rwlock”" in line("f", "h", row, 1.0)

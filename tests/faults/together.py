@@ -1,4 +1,4 @@
-"""Others at the same time, clocks, recordings that are added, and what git left half done."""
+"""Concurrent commands, clocks, added recordings, and unfinished git operations."""
 
 import shutil
 import signal
@@ -37,7 +37,7 @@ def two(at: Checkout) -> Row:
 
 @fault(
     "two `dvc repro` at once, of different stages",
-    "the second is asked for `sensitivity` while `train_triplet` of the first trains",
+    "the second runs `sensitivity` while `train_triplet` of the first trains",
 )
 def two_stages(at: Checkout) -> Row:
     at.reset(TRIPLET, address("sensitivity"))
@@ -46,7 +46,7 @@ def two_stages(at: Checkout) -> Row:
     at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
     second = other.run("dvc", "repro", address("sensitivity"))
     one, finished = at.end(first, start_s), at.trainings()
-    yet_to_run = [address("sensitivity")] if second.status else []  # one that was refused has run nothing
+    yet_to_run = [address("sensitivity")] if second.status else []  # a refused one has run nothing
     row = judge(at, second, at.run("dvc", "repro"), may_run=yet_to_run, finished=finished, fails=False)
     row.faults += [] if one.status == 0 else ["the first fails"]
     row.faults += ["refused, and it ran"] if second.status and second.ran else []
@@ -55,7 +55,7 @@ def two_stages(at: Checkout) -> Row:
 
 
 def _add(at: Checkout) -> list[str]:
-    """Write a recorded scene and a recording; give the command that adds it."""
+    """Write a recorded scene and a recording; return the command that adds it."""
     with (at.folder / "pipeline/scenes/rig.yaml").open("w") as stream:
         YAML().dump(recorded(), stream)
     recording = at.folder.with_name("recording")
@@ -75,12 +75,12 @@ def _ingest(at: Checkout) -> Result:
 )
 def add_beside(at: Checkout) -> Row:
     at.reset(TRIPLET)
-    words, start_s = _add(at), time.monotonic()
+    command, start_s = _add(at), time.monotonic()
     first, other = at.start("dvc", "repro"), Checkout(at.folder, at.folder.with_suffix(".other"))
     at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
-    added = other.run(*words)
+    added = other.run(*command)
     one = at.end(first, start_s)
-    later = at.run(*words)
+    later = at.run(*command)
     row = judge(at, added, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += [] if (one.status, later.status) == (0, 0) else ["the run, or the later add, fails"]
     row.next_run = f"added after its end; {row.next_run}"
@@ -92,16 +92,16 @@ def add_beside(at: Checkout) -> Row:
     "as soon as its folder is there; then `dvc repro`, `reskin add` again, and once more after what it says is done",
 )
 def kill_add(at: Checkout) -> Row:
-    words, start_s = _add(at), time.monotonic()
-    adding = at.start(*words)
+    command, start_s = _add(at), time.monotonic()
+    adding = at.start(*command)
     while adding.poll() is None and not (at.folder / RAW).exists():
         time.sleep(0.002)
     adding.send_signal(signal.SIGKILL)
     at.end(adding, start_s)
     still = at.run("dvc", "repro")
-    again = at.run(*words)
+    again = at.run(*command)
     shutil.rmtree(at.folder / RAW)
-    later = at.run(*words)
+    later = at.run(*command)
     row = judge(at, again, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += (
         [] if (still.status, still.ran, later.status) == (0, [], 0) else [f"{still.ran}, {later.output[-200:]}"]
@@ -207,8 +207,8 @@ def conflict_lock(at: Checkout) -> Row:
 )
 def conflict_captures(at: Checkout) -> Row:
     command = ("python", "-m", "pipeline", "scenes", "check")
-    words = MARKS.format("captures: {a: {}}\n", "captures: {b: {}}\n")
-    return _damaged_then_restored(at, "data/captures.yaml", words, command)
+    text = MARKS.format("captures: {a: {}}\n", "captures: {b: {}}\n")
+    return _damaged_then_restored(at, "data/captures.yaml", text, command)
 
 
 @fault("dvc.lock cut", "its last twentieth; `dvc repro`; `git restore dvc.lock` for the next run")

@@ -40,7 +40,7 @@ def _took_s(at: Checkout) -> float:
 
 
 def _away(at: Checkout, uri: str) -> Row:
-    direct = {"no_proxy": "*", "NO_PROXY": "*"}  # else a proxy may answer in its place
+    direct = {"no_proxy": "*", "NO_PROXY": "*"}  # otherwise a proxy may respond instead
     return _report(at, at.run(*at.command("publish"), MLFLOW_TRACKING_URI=uri, **direct), None)
 
 
@@ -57,7 +57,7 @@ def refused(at: Checkout) -> Row:
 
 
 HOLE = "10.255.255.1"
-IN_HOLE = (  # a network of its own: what is sent to its only neighbour goes to a device that nobody reads
+IN_HOLE = (  # own network namespace; packets to its only neighbour are discarded
     "ip link set lo up && ip link add hole0 type veth peer name hole1 && ip address add 10.255.255.2/24 dev hole0 && "
     "ip link set hole1 up && ip link set hole0 up && "
     f"ip neighbour add {HOLE} lladdr 02:00:00:00:00:01 dev hole0 && exec "
@@ -69,18 +69,18 @@ IN_HOLE = (  # a network of its own: what is sent to its only neighbour goes to 
     f"a network in which nothing comes back from {HOLE}, as behind a firewall that drops",
 )
 def no_route(at: Checkout) -> Row:
-    words = ("unshare", "--net", "sh", "-c", IN_HOLE + shlex.join(at.command("publish")))
-    return _report(at, at.run(*words, MLFLOW_TRACKING_URI=f"http://{HOLE}:5000", no_proxy="*", NO_PROXY="*"), None)
+    command = ("unshare", "--net", "sh", "-c", IN_HOLE + shlex.join(at.command("publish")))
+    return _report(at, at.run(*command, MLFLOW_TRACKING_URI=f"http://{HOLE}:5000", no_proxy="*", NO_PROXY="*"), None)
 
 
-@fault("tracking server black-holed, silent", "a socket that accepts and never answers")
+@fault("tracking server black-holed, silent", "a socket that accepts and never responds")
 def silent(at: Checkout) -> Row:
     with socket.create_server(("127.0.0.1", 0)) as server:
         return _away(at, f"http://127.0.0.1:{server.getsockname()[1]}")
 
 
 class OnlyHealth(http.server.BaseHTTPRequestHandler):
-    """Answers /health and nothing else."""
+    """Respond to /health only."""
 
     def do_GET(self) -> None:
         if self.path == "/health":
@@ -96,8 +96,8 @@ class OnlyHealth(http.server.BaseHTTPRequestHandler):
 
 
 @fault(
-    "tracking server hangs after its sign of life",
-    "a server that answers /health and nothing else",
+    "tracking server hangs after its health check",
+    "a server that responds to /health only",
 )
 def hangs(at: Checkout) -> Row:
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), OnlyHealth)

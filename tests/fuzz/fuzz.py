@@ -1,8 +1,8 @@
-"""python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP]: look for bytes that a door does not survive.
+"""Fuzz the input of one target or of all: python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP].
 
-With `pip install atheris` new bytes follow what code they reach (libFuzzer); without it they are drawn at random from
-the corpus and KEEP, which finds less, and memory is told as it goes. What reached new code is kept in the folder KEEP,
-if one is named. What breaks is left in the folder as `crash-...`; put it into `corpus/TARGET/`.
+With `pip install atheris`, new inputs are guided by code coverage (libFuzzer); without it they are random changes of
+the corpus and of KEEP, which finds less. Inputs that reach new code are kept in the folder KEEP, if given. A failing
+input is left in the working directory as `crash-...`; move it to `corpus/TARGET/`.
 """
 
 import operator
@@ -18,21 +18,28 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 CORPUS = Path(__file__).parent / "corpus"
 BYTES_MAX_N, MEMORY_MAX_MB, HANG_S = 4096, 2048, 20
-TOLD_INPUTS_N = 10_000
-COMPARISONS = (operator.lt, operator.le, operator.eq, operator.ne, operator.gt, operator.ge)  # as Python numbers them
+PRINT_EVERY_N = 10_000
+COMPARISONS = (
+    operator.lt,
+    operator.le,
+    operator.eq,
+    operator.ne,
+    operator.gt,
+    operator.ge,
+)  # in the order of Python's opcodes
 
 
-def follow(name: str, seconds: int, keep: Path | None) -> None:
-    """Let libFuzzer look; new bytes go to a folder of their own, which is thrown away unless it was named."""
+def fuzz_guided(name: str, seconds: int, keep: Path | None) -> None:
+    """Fuzz with libFuzzer; new inputs go to the folder `keep`, or to a temporary one."""
     import tempfile
 
     import atheris
 
-    compare_arrays_ourselves(atheris)
-    with atheris.instrument_imports(include=["pipeline"]):
+    exclude_arrays(atheris)
+    with atheris.instrument_imports(include=["reskin"]):
         from tests.fuzz.targets import feed
     for file in (CORPUS / name).iterdir():
-        feed(name, file.read_bytes())  # what is imported at first use is no hang
+        feed(name, file.read_bytes())  # late imports are not a hang
     with tempfile.TemporaryDirectory() as found:
         limits = [f"-max_total_time={seconds}", f"-max_len={BYTES_MAX_N}", f"-rss_limit_mb={MEMORY_MAX_MB}"]
         if keep is not None:
@@ -45,8 +52,8 @@ def follow(name: str, seconds: int, keep: Path | None) -> None:
         atheris.Fuzz()
 
 
-def compare_arrays_ourselves(atheris: ModuleType) -> None:
-    """Keep arrays from atheris 3.0: it never frees what a comparison gave, and follows none of arrays."""
+def exclude_arrays(atheris: ModuleType) -> None:
+    """Compare arrays without atheris 3.0, which leaks the results and learns nothing from them."""
 
     def compare(left: object, right: object, comparison_i: int, *where: object) -> object:
         if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
@@ -58,13 +65,13 @@ def compare_arrays_ourselves(atheris: ModuleType) -> None:
 
 
 def resident_MB() -> float:
-    """Tell the memory of this process; NaN where the system has no /proc."""
+    """Memory of this process; NaN if the system has no /proc."""
     statm = Path("/proc/self/statm")
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6 if statm.exists() else float("nan")
 
 
-def draw(name: str, seconds: int, keep: Path | None) -> None:
-    """Change, cut and repeat what the corpus has, and what was kept."""
+def fuzz_randomly(name: str, seconds: int, keep: Path | None) -> None:
+    """Feed random changes of the corpus and of kept inputs."""
     from reskin.seeds import rng_for
     from tests.fuzz.targets import feed
 
@@ -78,7 +85,7 @@ def draw(name: str, seconds: int, keep: Path | None) -> None:
             data[at : at + int(rng.integers(3))] = rng.bytes(int(rng.integers(4)))
         Path("crash-last").write_bytes(data)
         feed(name, bytes(data))
-        if tried_n % TOLD_INPUTS_N == 0:
+        if tried_n % PRINT_EVERY_N == 0:
             print(f"{name}: {tried_n} inputs, {resident_MB():.1f} MB", flush=True)
         tried_n += 1
     Path("crash-last").unlink()
@@ -94,9 +101,9 @@ def main(name: str, seconds: int, *keep: str) -> None:
     try:
         import atheris  # noqa: F401
     except ImportError:
-        draw(name, seconds, Path(*keep) if keep else None)
+        fuzz_randomly(name, seconds, Path(*keep) if keep else None)
     else:
-        follow(name, seconds, Path(*keep) if keep else None)
+        fuzz_guided(name, seconds, Path(*keep) if keep else None)
 
 
 if __name__ == "__main__":

@@ -32,11 +32,11 @@ from tests.recordings.headers import AS_USUAL, make_header
 
 FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
 WIRES = get_args(Wire)
-LIVE = Session("none", [], "a board that is not there")
+LIVE = Session("none", [], "no board")
 
 
 def stream(data: bytes) -> None:
-    """A stream of any format: every byte is accounted for, and portions change nothing."""
+    """A stream of any format: every byte is accounted for, and chunks do not matter."""
     wire, chips_n, cut_n = WIRES[data[0] % len(WIRES)], 1 + data[1] % 8, 1 + data[2]
     whole, parts = FrameStream(wire, chips_n), FrameStream(wire, chips_n)
     found = [whole.feed(data[3:]), whole.close()]
@@ -52,18 +52,18 @@ def stream(data: bytes) -> None:
 
 
 def page(data: bytes) -> None:
-    """What a page says on its websocket: buttons are three words, and nothing else is done."""
+    """Messages of a page: three commands, everything else is ignored."""
     receive(LIVE, data.decode(errors="replace"))
 
 
 def request(data: bytes) -> None:
-    """A request's host, origin and token: it is let in only if it names this machine and itself."""
+    """A request's host, origin and token: only requests from this machine to this machine are accepted."""
     host, origin, token = ([*data.decode("latin-1").split("\n"), "", "", ""])[:3]
-    words = {"Host": host} | ({"Origin": origin} if origin else {})
-    asked = make_mocked_request("GET", "/?" + token.replace(" ", "+"), headers=words)
+    headers = {"Host": host} | ({"Origin": origin} if origin else {})
+    mocked = make_mocked_request("GET", "/?" + token.replace(" ", "+"), headers=headers)
 
     try:
-        Server([LIVE], "").check(asked)
+        Server([LIVE], "").check(mocked)
     except web.HTTPForbidden:
         return
     name, _, port = host.lower().rpartition(":") if host[-1] != "]" and ":" in host else (host.lower(), "", "")
@@ -73,7 +73,7 @@ def request(data: bytes) -> None:
 
 
 def card(data: bytes) -> None:
-    """A model's card, beside no weights to speak of."""
+    """A model's card, with an empty weights file."""
     (FOLDER / "m.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0{}      ")
     (FOLDER / "m.json").write_bytes(data)
     read_network(FOLDER / "m.safetensors")
@@ -97,7 +97,7 @@ def _log(data: bytes) -> None:
 
 
 def labels(data: bytes) -> None:
-    """What a robot's program appends to its table, in portions: any of it makes a log that ingest takes, or none."""
+    """Rows of a robot's table, in chunks: they make a valid probe log or none."""
     table, dwells, cut_n = SampleTable("labels"), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
@@ -107,7 +107,7 @@ def labels(data: bytes) -> None:
 
 
 def gauge(data: bytes) -> None:
-    """What a force gauge says, a few bytes every 10 ms."""
+    """Output of a force gauge, a few bytes every 10 ms."""
     lines, dwells, cut_n = GaugeLines(), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
@@ -130,17 +130,17 @@ def _write_log(dwells: Iterator[Dwell]) -> None:
 
 
 def typed(data: bytes) -> None:
-    """What a person types at a prompt: a place that is there and a force, or it is asked again."""
-    first, *words = data.decode(errors="replace").split("\n")
+    """Keyboard input at a prompt: an existing place and a force, or the prompt is repeated."""
+    first, *lines = data.decode(errors="replace").split("\n")
     if (places := parse_places(first)) is None:
         return
     prompts = Prompts(places, 0.0, lambda _: None, list, None, rng_for(0, "fuzz"))
-    label = prompts._read_label(iter(words), 0)
+    label = prompts._read_label(iter(lines), 0)
     assert label is None or not label.contact or (label.x_mm, label.y_mm) in places.xy_mm
 
 
 def _files(layout: str, names: tuple[str, ...], **options: str) -> Callable[[bytes], None]:
-    """A recording of several files, which a line of dashes parts."""
+    """A recording of several files, separated by a line of dashes."""
     settings = make_header(layout=layout, chips_n=1, capture="fuzz", options=options)
 
     def read(data: bytes) -> None:
@@ -173,10 +173,10 @@ TARGETS: Mapping[str, Callable[[bytes], None]] = {
 }  # fmt: skip
 
 
-HEADS_N = {"stream": 3, "labels": 1, "gauge": 1}  # first bytes that say how to portion the rest
+HEADS_N = {"stream": 3, "labels": 1, "gauge": 1}  # number of first bytes that configure the target
 
 
 def feed(name: str, data: bytes) -> None:
-    """Hand bytes to a target; what a user did wrong is an answer like any other."""
+    """Pass bytes to a target; a `ReskinError` is a valid result."""
     with suppress(ReskinError):
         TARGETS[name](data.ljust(HEADS_N[name], b"\0") if name in HEADS_N else data)

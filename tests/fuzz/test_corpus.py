@@ -1,4 +1,4 @@
-"""Every door survives what fuzzing found worth keeping."""
+"""Every fuzz target accepts its corpus or raises a `ReskinError`."""
 
 import pytest
 
@@ -7,6 +7,6 @@ from tests.fuzz.targets import TARGETS, feed
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_what_arrives_is_answered_or_refused_in_one_sentence(name):
+def test_corpus(name):
     for file in sorted((CORPUS / name).iterdir()):
         feed(name, file.read_bytes())

@@ -1,4 +1,4 @@
-"""The rig's timeline laid out by hand; clocks, chunks and dwells as laws."""
+"""The rig's timeline, clocks, chunks and dwells, and the noise and range of its force sensor."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,16 @@ from hypothesis import strategies as st
 
 from reskin.seeds import rng_for
 from reskin.simulation.protocols import SKIN_MM, Drag, Grid
-from reskin.simulation.rig import Rig, actual_positions, draw_arrivals, draw_clock, probe_log, timeline
+from reskin.simulation.rig import (
+    FORCE_RANGE_N,
+    Rig,
+    actual_positions,
+    draw_arrivals,
+    draw_clock,
+    probe_log,
+    read_force,
+    timeline,
+)
 from tests.simulation.scene import SECTIONS
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
@@ -25,7 +34,7 @@ def plan(protocol=None):
 DRAG = Drag(kind="drag", passes_n=1, depths_mm=(1.0,), step_mm=4.0, **SHARED)
 
 
-def test_an_indentation_settles_rests_goes_down_settles_reads_and_goes_up():
+def test_timeline_of_an_indentation():
     frames = timeline(rig(), 1)
     np.testing.assert_allclose(frames.share, [0] * 5 + [1 / 3, 2 / 3] + [1] * 4 + [2 / 3, 1 / 3])
     assert frames.noload_i == 1
@@ -33,14 +42,14 @@ def test_an_indentation_settles_rests_goes_down_settles_reads_and_goes_up():
     assert not frames.stop_i.any()
 
 
-def test_a_dragged_line_settles_and_reads_at_every_stop():
+def test_timeline_of_a_dragged_line():
     frames = timeline(rig(), 3)
     assert frames.stop_i.tolist() == [0] * 7 + [0] * 4 + [1] * 4 + [2] * 4 + [2] * 2
     assert frames.contact_i.tolist() == [8, 12, 16]
 
 
 @given(st.integers(1, 7), st.floats(0, 0.01), st.integers(0, 1000))
-def test_chunks_bring_every_frame_once_in_order_and_never_early(chunk_frames_max_n, jitter_s, seed):
+def test_chunks_contain_every_frame_once_and_never_early(chunk_frames_max_n, jitter_s, seed):
     frame_s = (1 + np.arange(500)) / 400.0
     how = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
     arrived_n, arrived_s = draw_arrivals(frame_s, how, rng_for(seed, "chunks"))
@@ -53,7 +62,7 @@ def test_chunks_bring_every_frame_once_in_order_and_never_early(chunk_frames_max
 
 
 @pytest.mark.parametrize("protocol", [None, DRAG])
-def test_each_dwell_holds_its_frames_and_no_other_once_the_clocks_are_joined(protocol):
+def test_dwells_contain_their_frames(protocol):
     how, one = rig(), plan(protocol)
     stops_n = one.x_mm.shape[1]
     frames = timeline(how, stops_n)
@@ -69,7 +78,7 @@ def test_each_dwell_holds_its_frames_and_no_other_once_the_clocks_are_joined(pro
     np.testing.assert_array_equal(log.contact, np.tile([False] + [True] * stops_n, len(one)))
 
 
-def test_the_log_names_every_stop_of_a_line_and_the_force_there():
+def test_log_has_every_stop_of_a_line():
     one = plan(DRAG)
     force_N = rng_for(0, "force").standard_normal((len(one), 6, 3))
     log = probe_log(one, force_N, rig(), (0.0, 1.0))
@@ -79,7 +88,7 @@ def test_the_log_names_every_stop_of_a_line_and_the_force_there():
     np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
 
 
-def test_a_robot_misses_by_its_spread_alike_along_a_line_and_a_perfect_one_not_at_all():
+def test_robot_spread():
     grid, line = plan(), plan(DRAG)
     exact_mm = actual_positions(grid, rig(), rng_for(0, "robot"))
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))
@@ -89,3 +98,36 @@ def test_a_robot_misses_by_its_spread_alike_along_a_line_and_a_perfect_one_not_a
     planned_mm = np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
     along_mm = actual_positions(line, loose, rng_for(0, "robot")) - planned_mm
     np.testing.assert_allclose(along_mm, np.repeat(along_mm[:, :1], 5, axis=1))
+
+
+inside_N = st.tuples(st.floats(-25, 25), st.floats(-25, 25), st.floats(-35, 35))
+
+
+def read_clipped(force_N, noise_N=0.0):
+    return read_force(np.atleast_2d(np.asarray(force_N, float)), noise_N=noise_N, rng=rng_for(0, "force"))
+
+
+@given(inside_N)
+def test_noiseless_force_within_range(force_N):
+    read_N, clipped_n = read_clipped(force_N)
+    np.testing.assert_array_equal(read_N[0], np.float32(force_N))
+    assert clipped_n == 0
+
+
+def test_force_beyond_range_is_clipped_and_counted():
+    read_N, clipped_n = read_clipped([[25.1, 0, 0], [0, -1e4, 1e4], [0, 0, -36], [0, 0, 34.9]])
+    np.testing.assert_array_equal(read_N, np.float32([[25, 0, 0], [0, -25, 35], [0, 0, -35], [0, 0, 34.9]]))
+    assert clipped_n == 4
+
+
+def test_noise_has_the_given_deviation():
+    read_N, clipped_n = read_clipped(np.zeros((40_000, 3)), noise_N=1 / 160)
+    np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)  # four times 1 / sqrt(2 n)
+    assert clipped_n == 0
+    read_N, clipped_n = read_clipped(np.tile(FORCE_RANGE_N, (1000, 1)), noise_N=1 / 160)
+    assert (read_N <= np.float32(FORCE_RANGE_N)).all()
+    assert 1400 < clipped_n < 1600  # half of 3000 within 3.7 sd
+
+
+def test_readings_follow_the_generator():
+    assert read_clipped([1.0, 2.0, 3.0], 0.1)[0].tobytes() == read_clipped([1.0, 2.0, 3.0], 0.1)[0].tobytes()
