@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int
 
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.training.choice import settings_of, trimmed
+from pipeline.training.choice import fingerprint, settings_of, trimmed
 from pipeline.training.jobs import SceneData, read_data
 from reskin import io
 from reskin.config import Strict, parse
@@ -22,7 +22,6 @@ from reskin.errors import LeakError, ParamsError, SchemaError
 from reskin.models.inputs import FIT, VIEW
 from reskin.models.recipe import HEADLINE
 from reskin.seeds import rng_for
-from reskin.simulation.fingerprint import fingerprint
 
 NOT_CHOSEN = "not chosen by the study"  # first words of what is found of such a setting
 COLLAPSE = "collapse"

@@ -46,14 +46,13 @@ from pipeline.stage import say
 from pipeline.statistics import tidy, to_csv
 from pipeline.tracking import Curves, TrackingAway, metrics_of
 from pipeline.tracking import publish as write_runs
-from pipeline.training.choice import choose, to_record
+from pipeline.training import BEFORE_CONTACT_FILE
+from pipeline.training.choice import choose, fingerprint, to_record
 from reskin import io
 from reskin.config import read_yaml
-from reskin.data.rows import SCORED
 from reskin.errors import ParamsError
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device as trained_on
-from reskin.simulation.fingerprint import fingerprint
 
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
@@ -131,7 +130,9 @@ def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, res
         studies=read(scene.studies),
         audit=read(["audit"] if "audit" in scene.experiments else []),
         described={scene.described: io.read_json(results / "described.json")},
-        before_touch=[io.read_table(models / one / SCORED) for one in scene.model_stages if one == "train_single"],
+        before_touch=[
+            io.read_table(models / one / BEFORE_CONTACT_FILE) for one in scene.model_stages if one == "train_single"
+        ],
         accounts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
         dropped=split_of_scene["dropped"],
     )

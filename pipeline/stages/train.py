@@ -9,6 +9,7 @@ from pydantic import Field
 from pipeline.executors import make_executor
 from pipeline.settings import Adaptations, Row, SectionWithRows, Settings, Training, take
 from pipeline.stage import say
+from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.before_contact import BY_TIME, score_before_contact
 from pipeline.training.jobs import (
     adaptation_jobs,
@@ -23,7 +24,6 @@ from pipeline.training.jobs import (
     write_timings,
 )
 from reskin import io
-from reskin.data.rows import SCORED
 from reskin.data.splits import ONE_SKIN
 from reskin.models.classical import Classical, ClassicalJob, run_classical_jobs
 from reskin.models.recipe import Name
@@ -43,7 +43,7 @@ def train_single(settings: Settings, section: Training, indentations: Path, fold
     jobs = make_jobs(data, section, folds_of_one_skin)
     write_models(models, data, jobs, train_jobs(data, jobs, "train_single"), "train_single")
     captures, networks = io.read_json(folds)["captures"], networks_by_fold(models, BY_TIME)
-    io.write_table(models / SCORED, score_before_contact(data, indentations, captures, networks))
+    io.write_table(models / BEFORE_CONTACT_FILE, score_before_contact(data, indentations, captures, networks))
 
 
 def train_multi(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:

@@ -6,20 +6,22 @@ of contacts: chance for a tip that the skin does not sense, better for a magnet 
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from pipeline.training.jobs import SceneData
 from reskin import io
-from reskin.data.rows import Hover, Selection, gather_hover, gather_scan
+from reskin.data.rows import Selection, contacts
 from reskin.data.splits import SAME_SKIN, Fold
 from reskin.metrics import score
 from reskin.models.classical import Neighbours, fit
 from reskin.models.trained import Network
+from reskin.schema import Readings
 from reskin.seeds import rng_for
 
 NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
@@ -27,6 +29,69 @@ PLACE = ("accuracy_pct", "mse_xy_mm2")
 LENGTHS = ("hover_uT", "touch_uT")  # median |dB| of rows that hover, and of contacts of about 1 N
 TOUCH_N = (0.8, 1.2)
 BY_TIME = "single_temporal"  # whose tested passes are not in training
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The no-load field of the rows that `gather` stacks, and the number of the indentation in its pass."""
+
+    noload_uT: Float32[np.ndarray, "f ch"]
+    scan_i: Int64[np.ndarray, " f"]
+
+
+def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
+    """Stack what is known before each contact, in the order of `gather`."""
+    captures = sorted(captures, key=lambda readings: readings.capture)
+    kept = [contacts(readings, selection) for readings in captures]
+    noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
+    scan = [number_in_pass(readings)[keep] for readings, keep in zip(captures, kept, strict=True)]
+    return Scan(np.concatenate(noload), np.concatenate(scan))
+
+
+def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
+    """Number the indentations of each pass from 0, including those without a contact."""
+    passes, of_pass = np.unique(readings.pass_i, return_inverse=True)
+    indentation = readings.indentation.astype(np.int64)
+    first = np.full(len(passes), indentation.max())
+    np.minimum.at(first, of_pass, indentation)
+    return indentation - first[of_pass]
+
+
+@dataclass(frozen=True)
+class Hover:
+    """Rows of a tip that hovers over a known place without contact; `pass_i` as in `Rows`."""
+
+    db_uT: Float32[np.ndarray, "f ch"]
+    place_mm: Float32[np.ndarray, "f 2"]
+    skin: np.ndarray
+    pass_i: Int64[np.ndarray, " f"]
+
+    def __len__(self) -> int:
+        return len(self.skin)
+
+
+def gather_hover(captures: Sequence[Readings]) -> Hover:
+    """Stack the rows without force between the contacts of a pass, each at the place of the contact that comes next.
+
+    A tip that descends on a place in steps hovers over it first. Rows before the first contact of a pass are its
+    no-load reading, and rows after the last have no place.
+    """
+    parts: list[tuple[np.ndarray, ...]] = []
+    passes_n: dict[str, int] = {}
+    for one in sorted(captures, key=lambda readings: readings.capture):
+        before_n = passes_n.get(one.skin, 0)
+        passes_n[one.skin] = before_n + int(one.pass_i.max()) + 1
+        touches = np.flatnonzero(np.isfinite(one.x_mm) & (one.Fz_N > 0))
+        empty = np.flatnonzero(np.isnan(one.x_mm) & (one.Fz_N == 0))
+        after = np.searchsorted(touches, empty)
+        inside = (after > 0) & (after < len(touches))
+        empty, last, coming = empty[inside], touches[after[inside] - 1], touches[after[inside]]
+        same = (one.pass_i[last] == one.pass_i[empty]) & (one.pass_i[coming] == one.pass_i[empty])
+        empty, coming = empty[same], coming[same]
+        place_mm = np.column_stack([one.x_mm[coming], one.y_mm[coming]])
+        skins, pass_i = np.full(len(empty), one.skin), one.pass_i[empty].astype(np.int64) + before_n
+        parts.append((one.b_uT[empty] - one.noload_uT[empty], place_mm, skins, pass_i))
+    return Hover(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def score_before_contact(

@@ -5,14 +5,16 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.settings import Settings
-from pipeline.training.before_contact import score_before_contact
+from pipeline.training.before_contact import gather_hover, gather_scan, number_in_pass, score_before_contact
 from pipeline.training.jobs import SceneData
 from reskin import io
-from reskin.data.rows import Selection, gather, gather_hover
+from reskin.data.rows import Selection, gather
 from reskin.data.splits import Split, draw_folds
+from reskin.schema import Readings
 from reskin.seeds import rng_for
 from tests.data.tables import readings
 
+ALL = Selection(force_min_N=0.0)
 PASSES_N, PLACES_N = 4, 64
 WORDS = {"seed": 0, "selection": {"force_min_N": 0.0}}
 BY_CHANCE_PCT = 15.0  # one of 64 places is right by chance, neighbours' means a little more often
@@ -90,3 +92,26 @@ def test_a_hovering_tip_is_located_only_if_it_is_a_magnet(tmp_path):
 
 def test_a_random_order_tells_nothing_even_with_memory(tmp_path):
     assert max(scored(tmp_path, snake=False, memory=0.1).values()) < BY_CHANCE_PCT
+
+
+def test_indentations_count_from_0_in_each_pass():
+    press = np.array([7, 7, 8, 20, 21, 21], np.int32)
+    one = readings(indentation=press, pass_i=np.array([0, 0, 0, 1, 1, 1], np.int32))
+    assert number_in_pass(one).tolist() == [0, 0, 1, 0, 1, 1]
+
+
+def test_excluded_rows_keep_their_numbers():
+    lost = np.array([0, np.nan, 2, 3, np.nan, 5], np.float32)
+    one = readings(x_mm=lost, noload_uT=np.arange(18, dtype=np.float32).reshape(6, 3))
+    scan = gather_scan([one], ALL)
+    assert scan.scan_i.tolist() == [0, 2, 0, 2]
+    assert scan.noload_uT[:, 0].tolist() == [0, 6, 9, 15]
+
+
+def test_rows_are_aligned_with_gather():
+    def made(name: str, first: float) -> Readings:
+        x_mm = first + np.arange(6, dtype=np.float32)
+        return readings(name, x_mm=x_mm, noload_uT=np.tile(x_mm[:, None], 3))
+
+    captures = [made("c1", 10.0), made("c0", 0.0)]
+    assert gather_scan(captures, ALL).noload_uT[:, 0].tolist() == gather(captures, ALL).target[:, 0].tolist()

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.training.choice import fingerprint
 from reskin.config import read_yaml
 from reskin.physics import slide
 from reskin.simulation.defaults import NOMINAL
-from reskin.simulation.fingerprint import fingerprint
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = read_yaml(NOMINAL)
