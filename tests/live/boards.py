@@ -1,4 +1,4 @@
-"""Helpers: scripts of boards, a model that is right for their two presses, and readers that play scripts."""
+"""Helpers: emulated boards, a linear model that is exact for their two pokes, and readers that play scripts."""
 
 import threading
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from tests.recordings.headers import make_header
 RATE_HZ = 400.0
 QUIET_S, POKED_S = 1.5, 1.0
 PAUSE_S = 2.0
-PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x and y in mm, force in N: of pokes, in turn
+PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x and y in mm, force in N, of alternating pokes
 INPUT_SCALE_uT = 300.0
 
 
@@ -42,15 +42,15 @@ def make_script(
 
 
 def changes_uT(chips_n: int) -> np.ndarray:
-    """Give the changes of field of the two pokes [2 ch], which no magnet far away makes."""
+    """Changes of field of the two pokes [2 ch], unlike those of a distant magnet."""
     return 200.0 * rng_for(1, "pokes").standard_normal((2, 3 * chips_n))
 
 
 def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips_n: int = 5) -> Path:
-    """Write a network that is linear, and right for the two pokes; `off_mm` off along x."""
+    """Write a linear network that is exact for the two pokes, shifted by `off_mm` along x."""
     linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T  # [3 ch]
     weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}
-    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # a ReLU passes one of the two
+    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # a ReLU passes one of each pair
     for layer_i in range(2, 6):
         weights[f"layer{layer_i}.weight"][:6, :6] = np.eye(6)
     weights["layer6.weight"][:, :6] = np.hstack([np.eye(3), -np.eye(3)])
@@ -68,7 +68,7 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
 
 
 def write_script(script: Script, folder: Path) -> Path:
-    """Write a script as a capture that was recorded."""
+    """Write a script as a recorded capture."""
     ends = np.cumsum([len(piece) for piece in script.pieces])
     files = {
         STREAM_FILE: b"".join(script.pieces),
@@ -82,7 +82,7 @@ def write_script(script: Script, folder: Path) -> Path:
 
 
 class PlayedReader:
-    """Gives a script's bytes at the script's own times, without port and thread, so that no load disturbs them."""
+    """Return a script's bytes at the script's own times, without port and thread, so that no load disturbs them."""
 
     plugged_in, was_plugged_in, problem, missed_bytes_n, taken_s = True, True, "", 0, 0.0
 
@@ -109,7 +109,7 @@ class PlayedReader:
 
 
 def played(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Estimates]]:
-    """Play a script to a skin as fast as it goes; return the skin and all its estimates."""
+    """Play a script to a skin as fast as possible; return the skin and all its estimates."""
     skin, estimates = LiveSkin("played", models), []
     skin.reader = reader = PlayedReader(script)
     while not reader.at_end:
@@ -118,15 +118,15 @@ def played(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Estimate
     return skin, estimates
 
 
-def zeros_asked(monkeypatch) -> list[LiveSkin]:
-    """List the skins as they are asked for a no-load reading: on a busy machine it is over before a page is told."""
-    asked, zero = [], LiveSkin.zero
-    monkeypatch.setattr(LiveSkin, "zero", lambda skin: (zero(skin), asked.append(skin)))
-    return asked
+def zero_requests(monkeypatch) -> list[LiveSkin]:
+    """Collect the skins on which `zero` is called (on a busy machine, zeroing ends before the page shows it)."""
+    zeroed, zero = [], LiveSkin.zero
+    monkeypatch.setattr(LiveSkin, "zero", lambda skin: (zero(skin), zeroed.append(skin)))
+    return zeroed
 
 
-class Dying:
-    """A model that raises at the first contact, by a fault that is none of ours to name."""
+class FailingModel:
+    """A model that raises an unexpected error at the first contact."""
 
     channels_n, name = 15, "a model that raises"
 
@@ -138,10 +138,10 @@ class Dying:
 
 
 @contextmanager
-def plugged_in(script: Script, port: str = "pty", **how: object) -> Iterator[str]:
-    """Play a script beside the test; give the name of its port."""
+def plugged_in(script: Script, port: str = "pty", **options: object) -> Iterator[str]:
+    """Play a script on a pseudo-terminal; yield the name of its port."""
     end, stop = make_port(port), threading.Event()
-    player = threading.Thread(target=play, args=[script, end, stop], kwargs=how)
+    player = threading.Thread(target=play, args=[script, end, stop], kwargs=options)
     player.start()
     try:
         yield end.name

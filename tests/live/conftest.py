@@ -8,4 +8,5 @@ LONG_S = 120.0
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     monkeypatch.setattr("reskin.live.tracker.OPENING_S", LONG_S)
-    monkeypatch.setattr("reskin.live.server.HEARTBEAT_S", LONG_S)  # a test answers a ping when it has read all before
+    # A test responds to a ping only after it has read all earlier messages.
+    monkeypatch.setattr("reskin.live.server.HEARTBEAT_S", LONG_S)

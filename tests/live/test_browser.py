@@ -1,4 +1,4 @@
-"""The page in a real Chromium: a poke appears at its place, and zero, record and adapt work, by button and by key.
+"""The page in a real Chromium: contacts are drawn at their place; zero, record and adapt work by button and by key.
 
 Skipped where there is none: RESKIN_BROWSER names one, else it is looked for on the path. It is driven through its own
 debugging protocol, so that no package is needed. RESKIN_SCREENSHOTS names a folder for what is to be looked at.
@@ -23,7 +23,7 @@ from reskin.live.session import PRESSES_N
 from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE
 from reskin.universal.model import load_universal
-from tests.live.boards import PLACES, make_script, plugged_in, write_model, zeros_asked
+from tests.live.boards import PLACES, make_script, plugged_in, write_model, zero_requests
 from tests.live.test_estimators import poked, pressed, simulated  # noqa: F401 - fixtures
 from tests.live.test_server import LONG_S, serve
 from tests.live.test_several import GOES, RATES_HZ, plug_in_all
@@ -32,13 +32,13 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-port=0")
 WIDTHS_PX = (400, 1400)
-# The colour of the dot where a place in mm is drawn, from the page's own numbers.
+# The colour of the dot at a place in mm, from the page's own scale.
 DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = devicePixelRatio, margin = MARGIN_PX,
   [wide, high] = state.skin_mm, [left, bottom] = state.corner_mm,
   scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
   return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
     ratio * (margin + (bottom + high - y) * scale), 1, 1).data].slice(0, 3) : []; })"""
-# How many of a trace's pixels are more or less inked than of one that is drawn at once; how many are inked.
+# Number of pixels of a trace that differ from a trace drawn at once, and number of inked pixels.
 ANEW = """((board, i) => {
   const count = i ? board.last.chips : 1, shown = board.traces[i];
   const anew = new Trace(shown.canvas, shown.first, shown.least);
@@ -62,36 +62,36 @@ class Tab:
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket, self._numbers, self.errors = socket, count(1), []
 
-    async def call(self, method: str, **words: object) -> dict:
+    async def call(self, method: str, **params: object) -> dict:
         number = next(self._numbers)
-        await self._socket.send_json({"id": number, "method": method, "params": words})
+        await self._socket.send_json({"id": number, "method": method, "params": params})
         while True:
-            said = await self._socket.receive_json(timeout=LONG_S)
-            if said.get("method") == "Runtime.exceptionThrown":
-                self.errors.append(said["params"]["exceptionDetails"])
-            if said.get("id") == number:
-                assert "error" not in said, said
-                return said["result"]
+            message = await self._socket.receive_json(timeout=LONG_S)
+            if message.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(message["params"]["exceptionDetails"])
+            if message.get("id") == number:
+                assert "error" not in message, message
+                return message["result"]
 
-    async def value(self, words: str) -> object:
-        return (await self.call("Runtime.evaluate", expression=words, returnByValue=True))["result"].get("value")
+    async def value(self, expression: str) -> object:
+        return (await self.call("Runtime.evaluate", expression=expression, returnByValue=True))["result"].get("value")
 
     async def text(self, name: str) -> str:
         return str(await self.value(f"boards[0].parts.{name}.innerText"))
 
-    async def until(self, words: str, is_so: Callable[[object], bool] = bool) -> object:
+    async def until(self, expression: str, is_so: Callable[[object], bool] = bool) -> object:
         for _ in range(round(LONG_S / 0.02)):
-            if is_so(found := await self.value(words)):
+            if is_so(found := await self.value(expression)):
                 return found
             await asyncio.sleep(0.02)
-        raise AssertionError(f"never: {words}; last {found}")
+        raise AssertionError(f"never: {expression}; last {found}")
 
     async def press_key(self, key: str) -> None:
         for kind in ("keyDown", "keyUp"):
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
 
     async def look(self, name: str, when: str = "boards[0].last.contact && !isNaN(boards[0].last.x)") -> None:
-        """Nothing is cut off at the width of a phone and of a screen; keep pictures, if somebody wants to look."""
+        """Check that nothing is cut off on a phone and on a screen; save pictures if RESKIN_SCREENSHOTS is set."""
         for wide in WIDTHS_PX:
             await self.call(
                 "Emulation.setDeviceMetricsOverride", width=wide, height=900, deviceScaleFactor=1, mobile=False
@@ -105,7 +105,7 @@ class Tab:
 
 
 def in_browser(folder: Path, act: Callable) -> Callable:
-    """Make an action on a server's address into one on a tab that shows it."""
+    """Turn an action on a tab into an action on a server's address."""
 
     async def shown(address: str, client: aiohttp.ClientSession) -> None:
         profile = folder / "profile"
@@ -113,10 +113,10 @@ def in_browser(folder: Path, act: Callable) -> Callable:
             BROWSER, *FLAGS, f"--user-data-dir={profile}", stderr=asyncio.subprocess.DEVNULL
         )
         try:
-            said = profile / "DevToolsActivePort"
-            while not (said.exists() and "\n" in said.read_text()):
+            port_file = profile / "DevToolsActivePort"
+            while not (port_file.exists() and "\n" in port_file.read_text()):
                 await asyncio.sleep(0.05)
-            debugging = f"http://127.0.0.1:{said.read_text().split()[0]}"
+            debugging = f"http://127.0.0.1:{port_file.read_text().split()[0]}"
             async with client.put(f"{debugging}/json/new?about:blank") as answer:
                 where = (await answer.json())["webSocketDebuggerUrl"]
             async with client.ws_connect(where, max_msg_size=0) as socket:
@@ -135,7 +135,7 @@ def in_browser(folder: Path, act: Callable) -> Callable:
 
 def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    asked = zeros_asked(monkeypatch)
+    zeroed = zero_requests(monkeypatch)
 
     async def act(tab: Tab) -> None:
         for x_mm, y_mm, force_N in PLACES:
@@ -151,19 +151,19 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
             "(({rate}) => rate.innerText.endsWith('Hz') && parseFloat(rate.innerText) < 520)(boards[0].parts)"
         )
         await tab.look("network")
-        for trace_i in range(2):  # what was moved, stretched and added to looks as what is drawn at once
+        for trace_i in range(2):  # a scrolled and scaled trace looks like one drawn at once
             differ_n, inked_n = await tab.value(f"{ANEW}(boards[0], {trace_i})")
-            assert differ_n < 0.01 * inked_n  # Chromium smooths short and long paths in two ways
+            assert differ_n < 0.01 * inked_n  # Chromium smooths short and long paths differently
             assert inked_n > 1000
         await tab.value("boards[0].parts.record.click()")
         await tab.until("boards[0].state.recording")
         await tab.press_key("r")
         await tab.until("boards[0].state.recorded.startsWith('recorded')")
         await tab.press_key("z")
-        while not asked:
+        while not zeroed:
             await asyncio.sleep(0.02)
         await tab.until("boards[0].state.zeroed")
-        assert await tab.value("boards[0].parts.adapt.disabled")  # a network does not learn
+        assert await tab.value("boards[0].parts.adapt.disabled")  # a network cannot adapt
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
         serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
@@ -188,11 +188,11 @@ def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, simulated):  # n
 
 def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, pressed):  # noqa: F811
     quiet = poked(pressed)
-    late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)  # in which the button is pressed, before the first place
+    late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)  # time to press the button before the first place
     script = replace(quiet, t_s=quiet.t_s + late_s)
 
     async def act(tab: Tab) -> None:
-        none = "rows.slice(-30).every(({high}) => high[0] === 0)"  # longer than between two places
+        none = "rows.slice(-30).every(({high}) => high[0] === 0)"  # longer than the pause between two places
         await tab.until(f"(({{rows}}) => rows.length > 30 && rows.at(-1).n - rows.at(-30).n < 35 && {none})(boards[0])")
         await tab.press_key("p")
         await tab.until("boards[0].state.next_mm && !boards[0].dirty")
@@ -210,13 +210,13 @@ def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, pressed):  # n
 def test_page_draws_several_boards(tmp_path):
     async def act(tab: Tab) -> None:
         await tab.until("boards.length === 8 && boards.every(({state}) => state.zeroed)")
-        for i in range(1, 8):  # the map is of five chips; the sleeve is drawn without a dot
+        for i in range(1, 8):  # the model has five chips; the sleeve is drawn without a dot
             await tab.until(f"(({{last}}) => last && last.contact && !isNaN(last.x))(boards[{i}])")
         for i, rate_hz in enumerate(RATES_HZ[:GOES]):
             await tab.until(f"((hz) => 0 < hz && hz < 1.4 * {rate_hz})(parseFloat(boards[{i}].parts.rate.innerText))")
         await asyncio.to_thread(goes.close)
         await tab.until("boards[7].state.silent && boards[7].parts.rate.innerText === '–'")
-        lost = ",".join(["0"] * GOES + ["NaN"])  # of a board that is silent nothing is shown; what is lost stays so
+        lost = ",".join(["0"] * GOES + ["NaN"])  # a silent board shows no rate and no further loss
         await tab.until("boards.map(({parts}) => parseFloat(parts.lost.innerText)).join()", lost.__eq__)
         assert "unplugged" in str(await tab.value("boards[7].state.alarms.join()"))
         assert await tab.value("boards.slice(0, 7).every(({state}) => !state.alarms.join().includes('unplugged'))")

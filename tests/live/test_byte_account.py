@@ -11,7 +11,7 @@ from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encod
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames
 
-SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0  # a fault has a slot of its own; the last slot has none
+SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0  # one fault per slot; the last slot has none
 NOT_FINITE_SHARE = 0.02
 SEEDS_N = 200
 REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n", "skipped_resync_bytes_n",
@@ -19,20 +19,20 @@ REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_fini
 
 
 def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generator]:
-    """Draw a stream with faults in most of its slots; also its frames on a sound wire, and which of them are finite."""
+    """Draw a stream with faults in most slots; also its undamaged frames and which of them are finite."""
     rng = rng_for(seed, "byte account")
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
     faults = [str(name) for name in rng.choice([*VALUE_FAULTS, *BYTE_FAULTS, "none"], SLOTS_N - 1)]
-    # Behind damage, a frame that makes no sense passes for the rest of one: it is lost to the search for the next.
+    # After damage, an implausible frame is taken for the rest of one and lost in the resynchronisation.
     finite = rng.random(len(frames)) >= NOT_FINITE_SHARE
     finite |= np.repeat([name in BYTE_FAULTS for name in [*faults, "none"]], SLOT_FRAMES_N)
     script = Script("recorded", wire, frames, encode_pieces(frames, wire), np.arange(len(frames)) / RATE_HZ)
-    for slot_i, name in enumerate(faults):  # first what the chips give, then what the wire makes of it
+    for slot_i, name in enumerate(faults):  # first faults of chips, then faults of the wire
         if name in VALUE_FAULTS and (name != "clock-jump" or wire == "binary-clock"):
             script = inject(script, in_slot(name, slot_i, rng))
     pieces = list(script.pieces)
-    finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])  # of two readings of such bytes, sense decides
+    finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])  # a terminator in the payload: plausibility decides
     for i in np.flatnonzero(~finite):
         pieces[i] = not_finite(pieces[i], wire)
     script, clean = replace(script, pieces=pieces), pieces
@@ -48,14 +48,14 @@ def in_slot(name: str, slot_i: int, rng: np.random.Generator) -> Fault:
 
 
 def not_finite(piece: bytes, wire: str) -> bytes:
-    """Let the last number of a frame be none."""
+    """Replace the last number of a frame by NaN."""
     if wire in TEXT_WIRES:
         return piece[: piece.rstrip().rindex(b"\t") + 1] + b"nan\r\n"
     return piece[:-6] + np.float32(np.nan).tobytes() + piece[-2:]
 
 
 def expected(script: Script, clean: list[bytes], finite: list[bool]) -> Counter[str]:
-    """Count as the account's names mean, from what was done to each frame and not from its bytes.
+    """Expected account, from the faults applied to each frame and not from its bytes.
 
     What is damaged takes the next frame with it, as nothing says where that begins; but for a line feed by chance.
     """
@@ -76,12 +76,12 @@ def expected(script: Script, clean: list[bytes], finite: list[bool]) -> Counter[
     return count
 
 
-def in_portions(data: bytes, rng: np.random.Generator) -> list[bytes]:
+def split_randomly(data: bytes, rng: np.random.Generator) -> list[bytes]:
     cuts = np.sort(rng.integers(0, len(data), rng.integers(0, 9))).tolist()
     return [data[first:last] for first, last in pairwise([0, *cuts, len(data)])]
 
 
-def test_every_byte_is_in_a_frame_or_counted_under_the_right_reason():
+def test_every_byte_is_in_a_frame_or_counted_by_reason():
     total: Counter[str] = Counter()
     for seed in range(SEEDS_N):
         script, clean, finite, rng = draw(seed)
@@ -90,7 +90,7 @@ def test_every_byte_is_in_a_frame_or_counted_under_the_right_reason():
             left_n = len(clean[-1]) - int(rng.integers(3, len(clean[-1])))
             data = data[: len(data) - len(clean[-1]) + left_n]
             count.update(frames_n=-1, frame_bytes_n=-len(clean[-1]), skipped_truncated_bytes_n=left_n)
-        _, account = deliver(in_portions(data, rng), script.wire, script.frames.temperature_degC.shape[1])
+        _, account = deliver(split_randomly(data, rng), script.wire, script.frames.temperature_degC.shape[1])
         assert account == {"bytes_n": len(data)} | {name: count[name] for name in REASONS}, f"seed {seed}"
         total += count
-    assert all(total[name] > 100 for name in REASONS)  # every reason was put to the test
+    assert all(total[name] > 100 for name in REASONS)  # every reason occurred

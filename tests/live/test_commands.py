@@ -17,7 +17,7 @@ RATE_BYTES_S = 82 * 400
 
 @pytest.fixture(autouse=True)
 def clock(tmp_path, monkeypatch):
-    """Let the recorder's clock go on as bytes come, so that a machine that is late records as much."""
+    """Advance the recorder's clock as bytes arrive, so that a busy machine records as much."""
 
     def monotonic() -> float:
         return sum(stream.stat().st_size for stream in tmp_path.rglob(STREAM_FILE)) / RATE_BYTES_S
@@ -30,8 +30,8 @@ def test_record_without_options_finds_the_only_board(tmp_path, monkeypatch, caps
     with plugged_in(make_script(chips_n=4, wire="text-txyz"), loop=True) as name:
         monkeypatch.setattr(find, "port_names", lambda: [name])
         commands.record(None, seconds=0.5, out=None, **UNTOLD)
-    said = capsys.readouterr().out
-    assert f"{name}: text-txyz, 4 chips" in said
+    output = capsys.readouterr().out
+    assert f"{name}: text-txyz, 4 chips" in output
     (folder,) = (tmp_path / "captures").iterdir()
     header = parse((folder / HEADER_FILE).read_text(), "header")
     assert (header.wire, header.chips_n, header.capture) == ("text-txyz", 4, folder.name)
@@ -46,7 +46,9 @@ def test_record_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
 
 def test_live_without_options_shows_all_boards(monkeypatch):
     shown = {}
-    monkeypatch.setattr("reskin.live.server.serve", lambda sessions, **words: shown.update(words, sessions=sessions))
+    monkeypatch.setattr(
+        "reskin.live.server.serve", lambda sessions, **options: shown.update(options, sessions=sessions)
+    )
     monkeypatch.setattr(
         "reskin.board.find.find_boards", lambda: [find.DetectedBoard(f"/dev/ttyACM{i}", None) for i in (0, 1)]
     )

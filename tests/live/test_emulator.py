@@ -1,4 +1,4 @@
-"""Scripts of the emulator hold what was recorded, and every byte of them arrives, in time; injected faults."""
+"""Scripts of the emulator contain the recorded bytes, which all arrive in time; injected faults."""
 
 import math
 import threading
@@ -23,8 +23,8 @@ LONG_S = 120.0
 SCRIPT, POKED = make_script(pokes_n=0), make_script(pokes_n=1)
 
 
-class Times:
-    """A clock that waiting moves, and nothing else; also when to stop: never."""
+class SimulatedClock:
+    """A clock that only advances by waiting, and a stop event that is never set."""
 
     def __init__(self):
         self.s = 0.0
@@ -36,11 +36,11 @@ class Times:
         return False
 
     def wait(self, seconds):
-        self.s += max(seconds, 1e-9)  # what is less than a digit of the sum would not move it
+        self.s += max(seconds, 1e-9)  # a smaller step would be lost to rounding
 
 
-class Taker:
-    """A reader's end that notes when each frame came, and is `late_s` once, at the frame `late_i`."""
+class FakeReader:
+    """A reader that notes when each frame arrives and is `late_s` late once, at frame `late_i`."""
 
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.came_s = times, late_i, late_s, []
@@ -57,7 +57,7 @@ class Taker:
 
 @pytest.fixture
 def times(monkeypatch):
-    times = Times()
+    times = SimulatedClock()
     monkeypatch.setattr("reskin.live.emulator.time", times)
     return times
 
@@ -65,9 +65,9 @@ def times(monkeypatch):
 @pytest.mark.parametrize("port", ["pty", "tcp"])
 def test_no_byte_is_lost_while_nobody_reads(port):
     sent = b"".join(SCRIPT.pieces)
-    end, stop, told = make_port(port), threading.Event(), []
-    player = threading.Thread(target=lambda: told.append(play(SCRIPT, end, stop, speed=math.inf)))
-    with open_port(end.name, 115200) as device:  # a reader that opens a port throws away what waited before
+    end, stop, sent_bytes_n = make_port(port), threading.Event(), []
+    player = threading.Thread(target=lambda: sent_bytes_n.append(play(SCRIPT, end, stop, speed=math.inf)))
+    with open_port(end.name, 115200) as device:  # opening a port discards waiting bytes
         player.start()
         time.sleep(0.5)  # nobody reads
         data = b""
@@ -76,12 +76,12 @@ def test_no_byte_is_lost_while_nobody_reads(port):
     player.join(LONG_S)
     end.unplug()
     assert data == sent
-    assert told == [len(sent)]
+    assert sent_bytes_n == [len(sent)]
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
 def test_loop_starts_again_when_the_port_is_opened_again(port):
-    # Who opens a port throws away what waits there, so that of the first frames some may not come.
+    # Opening a port discards waiting bytes, so some of the first frames may be missing.
     script = make_script(pokes_n=2)
     end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
     player = threading.Thread(target=play, args=[script, end, stop], kwargs={"loop": True})
@@ -90,7 +90,7 @@ def test_loop_starts_again_when_the_port_is_opened_again(port):
     for _ in range(2):
         with open_port(end.name, 115200) as device:
             data = b""
-            while len(data) < 8 * len(early):  # the second time they would be others
+            while len(data) < 8 * len(early):  # a stream that is not restarted would differ
                 data += read_waiting(device)
         began.append(early in data)
     stop.set()
@@ -102,13 +102,13 @@ def test_loop_starts_again_when_the_port_is_opened_again(port):
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
 def test_speed_multiplies_the_rate_of_the_script(times, speed):
-    taker = Taker(times)
+    taker = FakeReader(times)
     assert play(SCRIPT, taker, times, speed=speed) == len(b"".join(SCRIPT.pieces))
     np.testing.assert_allclose(taker.came_s, SCRIPT.t_s / speed, atol=1e-8)
 
 
 def test_a_late_reader_gets_at_most_a_tenth_of_a_second_at_once(times):
-    taker = Taker(times, late_i=100, late_s=2.0)
+    taker = FakeReader(times, late_i=100, late_s=2.0)
     play(SCRIPT, taker, times)
     late_s = np.array(taker.came_s) - SCRIPT.t_s
     np.testing.assert_allclose(late_s[:101], 0, atol=1e-8)
@@ -126,7 +126,7 @@ def test_link_keeps_its_name_over_unplugging(tmp_path):
             read_waiting(device)
     assert not link.is_symlink()
     assert not link.exists()
-    stop.set()  # which ends the time that it is away
+    stop.set()  # ends the unplugged period
     player.join()
     assert link.is_symlink()
     end.unplug()
@@ -160,7 +160,7 @@ class TestFaults:
 
         assert frames_n("dropped") == len(SCRIPT) - 50
         assert frames_n("repeated") == len(SCRIPT) + 100
-        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # with its end goes the start of the next
+        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # a torn frame also loses the start of the next
 
     def test_clock_jump_needs_frames_with_a_clock(self):
         with pytest.raises(ParamsError, match="Take binary-clock"):
@@ -206,6 +206,6 @@ def test_script_of_a_simulation_has_contacts(source):
 
 def test_invalid_sources_raise(tmp_path):
     for source in (str(tmp_path), "nowhere", str(ROOT / "pipeline/scenes/lab.yaml"), "../scenes/quick"):
-        with pytest.raises(ReskinError, match="not the folder of a capture|not a simulated scene") as told:
+        with pytest.raises(ReskinError, match="not the folder of a capture|not a simulated scene") as error:
             read_script(source)
-        assert "Traceback" not in str(told.value)
+        assert "Traceback" not in str(error.value)

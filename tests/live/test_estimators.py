@@ -1,4 +1,4 @@
-"""The estimators of a live board, their calibration on the page, and unknown skins."""
+"""Estimators of a live board, their calibration on the page, and unknown skins."""
 
 import re
 
@@ -27,7 +27,7 @@ def simulated():
 
 
 def poked(simulated, chips_on_n: int = 0):
-    """A script of a quiet start and of all pokes, with a pause after each; chips may come so many places later."""
+    """A script with a quiet start and all pokes with pauses; the last chips start `chips_on_n` places later."""
     noload_uT, b_uT, _, _ = simulated
     script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * len(b_uT)) / 400)
     poke_i, since_n = np.divmod(np.arange(len(script)) - QUIET_N, 2 * POKED_N)
@@ -39,11 +39,11 @@ def poked(simulated, chips_on_n: int = 0):
 
 def test_universal_model_estimates_places_and_their_standard_deviation(simulated):
     skin, readings = played(poked(simulated), load_universal())
-    answers = np.concatenate([each.target[each.contact] for each in readings])
+    estimates = np.concatenate([each.target[each.contact] for each in readings])
     sd_mm = np.concatenate([each.sd_mm[each.contact] for each in readings])
     true = np.repeat(simulated[2], POKED_N, axis=0)
-    assert len(answers) == pytest.approx(len(true), abs=20)
-    error_mm = np.abs(answers[: len(true), :2] - true[: len(answers)])
+    assert len(estimates) == pytest.approx(len(true), abs=20)
+    error_mm = np.abs(estimates[: len(true), :2] - true[: len(estimates)])
     assert np.median(error_mm) < 1.0
     assert 0.2 < np.median(error_mm) / np.median(sd_mm) < 2.0
     assert skin.health.alarms == {}
@@ -62,23 +62,23 @@ def test_presses_are_collected_and_adapted_to(simulated):
     assert pokes.complete
     change_uT = simulated[1] - simulated[0].mean(axis=0)
     np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # the strongest of 200 readings with noise of 3 uT
-    answers = UniversalEstimator(load_universal())
-    answers.set_noload(simulated[0])
-    assert "adapted to 12 presses: standard deviation of a place" in answers.adapt(pokes.db_uT)
-    before = answers(pokes.db_uT.astype(np.float32))
-    answers.set_noload(simulated[0])  # what it has seen is kept
-    np.testing.assert_allclose(answers(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
+    estimator = UniversalEstimator(load_universal())
+    estimator.set_noload(simulated[0])
+    assert "adapted to 12 presses: standard deviation of a place" in estimator.adapt(pokes.db_uT)
+    before = estimator(pokes.db_uT.astype(np.float32))
+    estimator.set_noload(simulated[0])  # the adaptation is kept
+    np.testing.assert_allclose(estimator(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
 
 
 def test_new_presses_replace_wrong_ones(simulated):
     db_uT = simulated[1] - simulated[0].mean(axis=0)
     mended, once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
-    for answers in (mended, once):
-        answers.set_noload(simulated[0])
+    for estimator in (mended, once):
+        estimator.set_noload(simulated[0])
     mended.adapt(rng_for(0, "a hand").normal(0, 300, db_uT.shape))
     wrong = mended(db_uT.astype(np.float32)).target
-    for answers in (mended, once):
-        answers.adapt(db_uT)
+    for estimator in (mended, once):
+        estimator.adapt(db_uT)
     right = once(db_uT.astype(np.float32)).target
     np.testing.assert_allclose(mended(db_uT.astype(np.float32)).target, right, rtol=1e-6)
     assert np.abs(wrong - right).max() > 1.0
@@ -86,7 +86,7 @@ def test_new_presses_replace_wrong_ones(simulated):
 
 @pytest.fixture(scope="module")
 def pressed():
-    """A simulated skin that is pressed where the page shows it, in that order."""
+    """A simulated skin that is pressed at the places shown by the page, in that order."""
     places = np.column_stack([GuidedPresses().place_mm, np.full(GuidedPresses().presses_n, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=5), places, seed=5)
     return noload_uT, b_uT, places[:, :2], force_N
@@ -101,68 +101,73 @@ def test_guided_presses_calibrate_and_test_the_model(pressed):
     np.testing.assert_allclose(crosses, pressed[2])
     assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.held_out.sum()
     assert pokes.next_mm is None
-    answers = UniversalEstimator(load_universal())
-    answers.set_noload(pressed[0])
-    told = answers.label(pokes.place_mm, pokes.db_uT, pokes.held_out)
-    before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", told))
-    found = answers(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2]
+    estimator = UniversalEstimator(load_universal())
+    estimator.set_noload(pressed[0])
+    message = estimator.label(pokes.place_mm, pokes.db_uT, pokes.held_out)
+    before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", message))
+    found = estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2]
     assert after_mm == pytest.approx(
         np.median(np.linalg.norm(found - pressed[2][pokes.held_out], axis=1)), abs=0.006
-    )  # of the places that were pressed
+    )  # held-out presses
     assert after_mm < before_mm
-    answers.set_noload(pressed[0])  # what it has learnt is kept
-    np.testing.assert_allclose(answers(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6)
+    estimator.set_noload(pressed[0])  # the calibration is kept
+    np.testing.assert_allclose(
+        estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6
+    )
 
 
 def test_guided_presses_add_to_the_labels_of_a_calibration(pressed):
     noload_uT, b_uT, place_mm, force_N = pressed
     kept, rest_uT = GuidedPresses().held_out, noload_uT.mean(axis=0)
-    learnt = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
-    all_force_N = np.where(kept, force_N, learnt.estimate(b_uT).force_N)  # nobody measured that of the shown ones
-    at_once = load_universal().zero(noload_uT).label(place_mm, all_force_N, b_uT).predict(b_uT)
-    answers = UniversalEstimator(learnt)
-    answers.set_noload(noload_uT)
-    answers.label(place_mm, b_uT - rest_uT, kept)
-    np.testing.assert_allclose(answers((b_uT - rest_uT).astype(np.float32)).target, at_once, rtol=1e-3)
-    assert learnt.presses_n == kept.sum()
+    calibrated = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
+    # The guided presses have no measured force.
+    all_force_N = np.where(kept, force_N, calibrated.estimate(b_uT).force_N)
+    expected = load_universal().zero(noload_uT).label(place_mm, all_force_N, b_uT).predict(b_uT)
+    estimator = UniversalEstimator(calibrated)
+    estimator.set_noload(noload_uT)
+    estimator.label(place_mm, b_uT - rest_uT, kept)
+    np.testing.assert_allclose(estimator((b_uT - rest_uT).astype(np.float32)).target, expected, rtol=1e-3)
+    assert calibrated.presses_n == kept.sum()
 
 
-def test_a_knock_is_no_press():
+def test_short_contact_is_no_press():
     pokes, db_uT = Presses(), np.full((6, 15), 100.0, np.float32)
     contact = np.array([True, True, False, True, False, False])
     pokes.add(Estimates(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), contact))
     assert len(pokes) == 0
 
 
-def test_universal_model_is_not_used_for_boards_of_other_chips():
+def test_universal_model_is_refused_for_other_chips():
     skin, readings = played(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
     assert "no place and force: the universal model is for five chips. Give a model of this board." in skin.alarms()
     assert all(np.isnan(each.target).all() for each in readings)
 
 
-def test_a_calibrated_model_keeps_its_calibration_when_the_board_is_opened(simulated, tmp_path):
+def test_opening_a_board_keeps_the_calibration(simulated, tmp_path):
     noload_uT, b_uT, place_mm, force_N = simulated
-    learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
-    learnt.save(tmp_path / "s3.safetensors")
-    before, number = learnt.predict(b_uT), learnt.skin.mean
-    (tmp_path / "s3.json").write_text("{}")  # a user's own file of that name is no network's card
-    for models in (learnt, read_models([tmp_path / "s3.safetensors"])):
+    calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
+    calibrated.save(tmp_path / "s3.safetensors")
+    before, number = calibrated.predict(b_uT), calibrated.skin.mean
+    (tmp_path / "s3.json").write_text("{}")  # a user's file of that name is no network card
+    for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
         _, readings = played(poked(simulated), models)
-        answers = np.concatenate([each.target[each.contact] for each in readings])
-        true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(answers)]
-        untaught = np.concatenate([each.target[each.contact] for each in played(poked(simulated), load_universal())[1]])
-        assert np.abs(answers[:, :2] - true_mm).mean() < 0.6 * np.abs(untaught[:, :2] - true_mm).mean()
-    np.testing.assert_array_equal(learnt.predict(b_uT), before)  # the user's own stays as it is
-    np.testing.assert_array_equal(learnt.skin.mean, number)
+        estimates = np.concatenate([each.target[each.contact] for each in readings])
+        true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(estimates)]
+        uncalibrated = np.concatenate(
+            [each.target[each.contact] for each in played(poked(simulated), load_universal())[1]]
+        )
+        assert np.abs(estimates[:, :2] - true_mm).mean() < 0.6 * np.abs(uncalibrated[:, :2] - true_mm).mean()
+    np.testing.assert_array_equal(calibrated.predict(b_uT), before)  # the user's model is unchanged
+    np.testing.assert_array_equal(calibrated.skin.mean, number)
 
 
-def test_a_calibration_is_refused_for_several_boards(simulated, tmp_path):
+def test_calibration_is_refused_for_several_boards(simulated, tmp_path):
     noload_uT, b_uT, place_mm, force_N = simulated
-    learnt = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
+    calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):
-        reskin.open(["/dev/a", "/dev/b"], model=learnt)
-    learnt.save(tmp_path / "s3.safetensors")
+        reskin.open(["/dev/a", "/dev/b"], model=calibrated)
+    calibrated.save(tmp_path / "s3.safetensors")
     with pytest.raises(ParamsError, match="is a calibration of the universal model, load it with reskin.load_univ"):
         reskin.load_model(tmp_path / "s3.safetensors")
     with pytest.raises(ParamsError, match="a calibration cannot be combined with other models"):

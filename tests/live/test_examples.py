@@ -1,4 +1,4 @@
-"""The examples of docs/live.md and docs/add-a-skin.md run, with stand-ins for foreign packages."""
+"""The examples of docs/live.md and docs/add-a-skin.md run, with fakes for third-party packages."""
 
 import re
 import sys
@@ -45,20 +45,20 @@ def test_ros_2_example(run):
     published = []
     node = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=published.append))
 
-    def message(**words: object) -> SimpleNamespace:
-        return SimpleNamespace(**words, header=SimpleNamespace(stamp=SimpleNamespace()))
+    def message(**fields: object) -> SimpleNamespace:
+        return SimpleNamespace(**fields, header=SimpleNamespace(stamp=SimpleNamespace()))
 
     ros = {"init": lambda: None, "create_node": lambda _: node}
     run("ros2", rclpy=ros, skin_msgs={}, skin_msgs__msg={"Contact": message})
-    (told,) = published
-    assert (told.x_mm, told.y_mm, told.force_n, told.sd_mm, told.alarms) == (
+    (sent,) = published
+    assert (sent.x_mm, sent.y_mm, sent.force_n, sent.sd_mm, sent.alarms) == (
         4.0,
         6.0,
         0.5,
         [0.1, 0.2],
         ["no data"],
     )
-    assert (told.header.stamp.sec, told.header.stamp.nanosec) == (12, 500_000_000)
+    assert (sent.header.stamp.sec, sent.header.stamp.nanosec) == (12, 500_000_000)
 
 
 def test_lerobot_example(run):
@@ -77,13 +77,13 @@ def test_lerobot_example(run):
 
 
 def test_robot_example(monkeypatch):
-    did, said = [], []
+    moved, recorded = [], []
     robot = SimpleNamespace(
-        places_in_random_order=lambda: [(4.0, 8.0), (0.0, 2.0)], lift_and_go_to=lambda *place: did.append(place),
-        press=lambda: did.append("press"), force_N=lambda: 0.5,
+        places_in_random_order=lambda: [(4.0, 8.0), (0.0, 2.0)], lift_and_go_to=lambda *place: moved.append(place),
+        press=lambda: moved.append("press"), force_N=lambda: 0.5,
     )  # fmt: skip
-    monkeypatch.setattr(reskin, "record", lambda labels, **told: said.extend([*labels, told]))
+    monkeypatch.setattr(reskin, "record", lambda labels, **options: recorded.extend([*labels, options]))
     exec(EXAMPLES["robot"], {"robot": robot})
-    assert did == [(4.0, 8.0), "press", (0.0, 2.0), "press"]
-    assert (said[1].x_mm, said[1].Fz_N, said[0].contact) == (4.0, 0.5, False)
-    assert said[-1]["scan"] == "random"
+    assert moved == [(4.0, 8.0), "press", (0.0, 2.0), "press"]
+    assert (recorded[1].x_mm, recorded[1].Fz_N, recorded[0].contact) == (4.0, 0.5, False)
+    assert recorded[-1]["scan"] == "random"

@@ -1,15 +1,15 @@
-"""A one-line controller holds half a newton by the estimated force, while the object stiffens."""
+"""A proportional controller holds half a newton by the estimated force while the object stiffens."""
 
 import numpy as np
 
 from reskin.seeds import rng_for
 from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
 
-SEEDS = range(3)  # each a skin and its network
+SEEDS = range(3)  # one skin and network each
 
 
-def test_a_controller_holds_half_a_newton():
-    """Over 12 seeds (mean and standard deviation) the estimate is held at 0.512 +- 0.002 N.
+def test_controller_holds_half_a_newton():
+    """Over 12 seeds (mean and standard deviation), the estimate is held at 0.512 +- 0.002 N.
 
     The true force is off by 15 +- 9 % of the aim, so the mean of three seeds by 15 +- 5 %, and is 0.7 N at most.
     """
@@ -18,6 +18,6 @@ def test_a_controller_holds_half_a_newton():
         held = grip(Finger(seed), [fit(seed, pokes_n=300)], rng_for(seed, "grip"), seconds=PERIOD_S / 2)
         true_N, estimate_N = held[round(SETTLED_S * RATE_HZ) :].T
         assert abs(estimate_N.mean() / AIM_N - 1) < 0.05
-        assert held[:, 0].max() < 2 * AIM_N  # it is not crushed at the first touch
+        assert held[:, 0].max() < 2 * AIM_N  # no overshoot at the first touch
         errors.append(abs(true_N.mean() / AIM_N - 1))
     assert np.mean(errors) < 0.35

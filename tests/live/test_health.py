@@ -1,4 +1,4 @@
-"""Every fault is named, with the chip that has it, and a healthy board raises no alarm."""
+"""Every fault raises an alarm with its chip; a healthy board raises none."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from reskin.recordings.fault_policy import override
 from tests.live.boards import make_script
 
 SCRIPT = make_script(pokes_n=2)
-TOLD = {
+ALARMS = {
     "failed-read": "chip 1: failed I2C reads",
     "chip-reset": "chip 1: another step than the others: reset",
     "stuck": "chip 1: stuck",
@@ -21,7 +21,7 @@ TOLD = {
 
 
 def feed(script, frames_n=7):
-    """Feed a script's frames as they would come, a few at a time."""
+    """Feed a script's frames in small batches, as they arrive."""
     health, frames = Health(script.frames.temperature_degC.shape[1]), script.frames
     for first in range(0, len(frames), frames_n):
         rows = (np.arange(len(frames)) >= first) & (np.arange(len(frames)) < first + frames_n)
@@ -29,50 +29,50 @@ def feed(script, frames_n=7):
     return health
 
 
-def changed(name, wire="binary"):
+def inject_fault(name, wire="binary"):
     """The frames of a script with a fault, decoded again."""
     from reskin.board.stream import decode_all
     from reskin.live.emulator import Script
 
-    lasts_s = 4.0 if name == "chip-reset" else 1.5  # lost settings do not come back
-    script = inject(make_script(pokes_n=2, wire=wire), parse_fault(f"{name}@1.5+{lasts_s}"))
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset chip stays reset
+    script = inject(make_script(pokes_n=2, wire=wire), parse_fault(f"{name}@1.5+{duration_s}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     t_s = script.t_s if len(frames) == len(script) else np.linspace(0, script.duration_s, len(frames))
     return Script("recorded", wire, frames, [b""] * len(frames), t_s)
 
 
-def test_a_healthy_board_raises_no_alarm_pressed_or_not():
+def test_healthy_board_raises_no_alarm():
     health = feed(SCRIPT)
     assert health.alarms == {}
     assert health.rate_hz == pytest.approx(400, rel=0.02)
 
 
-@pytest.mark.parametrize("name", TOLD)
-def test_a_fault_is_named_with_its_chip_and_counted_where_it_was(name):
-    health = feed(changed(name))
-    assert set(health.alarms) == {TOLD[name]}
-    alarm = health.alarms[TOLD[name]]
-    lasted_s = 4.0 if name == "chip-reset" else 1.5  # a step shows in 400 frames
-    assert 1.4 <= alarm.first_s <= 1.5 + lasted_s
-    assert alarm.last_s <= 1.6 + lasted_s
+@pytest.mark.parametrize("name", ALARMS)
+def test_fault_is_named_and_counted(name):
+    health = feed(inject_fault(name))
+    assert set(health.alarms) == {ALARMS[name]}
+    alarm = health.alarms[ALARMS[name]]
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # finding the LSB takes 400 frames
+    assert 1.4 <= alarm.first_s <= 1.5 + duration_s
+    assert alarm.last_s <= 1.6 + duration_s
     assert alarm.count_n >= 100
     assert health.active(alarm.last_s + 1.0) == [alarm]
     assert health.active(alarm.last_s + 3.0) == []
 
 
 def test_zeros_are_named_on_every_chip():
-    health = feed(changed("zeros"))
+    health = feed(inject_fault("zeros"))
     assert {name: alarm.count_n for name, alarm in health.alarms.items()} == {
         f"chip {chip_i}: zeros in place of a reading": 600 for chip_i in range(5)
     }
 
 
-def test_frames_that_repeat_and_a_clock_that_jumps_are_named():
-    assert "frames repeat" in feed(changed("repeated")).alarms
-    assert "the board's clock jumps" in feed(changed("clock-jump", "binary-clock")).alarms
+def test_repeated_frames_and_clock_jump():
+    assert "frames repeat" in feed(inject_fault("repeated")).alarms
+    assert "the board's clock jumps" in feed(inject_fault("clock-jump", "binary-clock")).alarms
 
 
-def test_a_board_of_which_half_the_frames_are_missing_is_slower_than_it_was():
+def test_missing_frames_make_a_board_slower():
     half = (np.arange(len(SCRIPT)) < 1000) | (np.arange(len(SCRIPT)) % 2 == 0)
     health = Health(5)
     for i in np.flatnonzero(half):
@@ -81,7 +81,7 @@ def test_a_board_of_which_half_the_frames_are_missing_is_slower_than_it_was():
     assert health.rate_hz == pytest.approx(200, rel=0.1)
 
 
-def test_frames_that_a_fault_has_hit_are_not_believed():
+def test_faulty_frames_are_invalid():
     frames = SCRIPT.frames.where(np.arange(len(SCRIPT)) < BATCH_FRAMES_N)
     for name in ("failed-read", "zeros", "saturated", "too-hot"):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
@@ -101,17 +101,17 @@ def feed_once(frames: Frames):
     return Health(5).feed(frames, 1.0)
 
 
-def test_a_change_of_field_that_all_chips_share_comes_from_outside():
+def test_common_field_is_an_outside_field():
     turn = np.tile(np.eye(3), (5, 1, 1))
     health = Health(5)
-    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # too weak to say
+    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # too weak to decide
     health.feed_change(np.array([200.0, 0, 0, -100, 50, 0, 0, 0, 100, 0, -50, 0, 30, 0, 0]), turn, 0.0)
     assert health.alarms == {}
     health.feed_change(np.tile([0.0, 0.0, 400.0], 5), turn, 0.0)
     assert [name.split(":")[0] for name in health.alarms] == ["field from outside"]
 
 
-def test_what_becomes_of_readings_that_a_fault_has_hit_is_decided_by_setting():
+def test_fault_policy_setting():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         frames = changed_frames(script, BATCH_FRAMES_N)
@@ -122,10 +122,34 @@ def test_what_becomes_of_readings_that_a_fault_has_hit_is_decided_by_setting():
             assert (alarm.action, alarm.count_n) == (action, 20)
 
 
-def test_a_chip_that_is_stuck_is_not_believed_while_it_is_unless_flagged():
+def test_stuck_chip_is_invalid_unless_flagged():
     for action, unbelieved_n in (("drop", 500), ("flag", 0)):
-        health, script, lost_n = Health(5, override(LIVE_POLICY, [f"stuck={action}"], "test")), changed("stuck"), 0
+        health, script, lost_n = Health(5, override(LIVE_POLICY, [f"stuck={action}"], "test")), inject_fault("stuck"), 0
         for first in range(0, len(script.frames), 10):
             rows = (np.arange(len(script.frames)) >= first) & (np.arange(len(script.frames)) < first + 10)
             lost_n += int((~health.feed(script.frames.where(rows), float(script.t_s[rows][-1]))).sum())
         assert lost_n == pytest.approx(unbelieved_n, abs=100)
+
+
+RESET, FAILED = "another step than the others: reset", "failed I2C reads"
+
+
+@pytest.mark.parametrize(
+    ("name", "alarms"),
+    [
+        ("b20_artillery_AFG_board2_50_screw.txt", []),
+        ("norm_b20_artillery_AFG_board2_50_screw.txt", []),
+        ("faults/b20_artillery_AFG_flex_50.head400.txt", [f"chip {i}: {FAILED}" for i in range(5)]),
+        ("faults/b20_artillery_AFG_test_new_board15.head400.txt", [f"chip 3: {RESET}"]),
+        ("faults/b20_artillery_piezo.head400.txt", [f"chip {i}: {RESET}" for i in range(5)]),
+    ],
+)
+def test_alarms_of_real_recordings(shared_data, name, alarms):
+    chips = np.loadtxt(shared_data / "ini" / name, dtype=np.float32).reshape(-1, 5, 4)
+    b_uT, temperature_degC = chips[..., :3].reshape(len(chips), -1), chips[..., 3]
+    health = Health(5)
+    for first in range(0, len(chips), 5):
+        rows = slice(first, first + 5)
+        unknown = np.full(len(b_uT[rows]), np.nan), np.zeros(len(b_uT[rows]), np.int64)
+        health.feed(Frames(b_uT[rows], temperature_degC[rows], *unknown), first / 100.0)
+    assert sorted(health.alarms) == alarms

@@ -1,4 +1,4 @@
-"""A board is recognised from its bytes alone, whatever it sends; what is no board is said to be none."""
+"""A board is recognised from its bytes; other ports are not."""
 
 from dataclasses import replace
 
@@ -13,11 +13,11 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
 
-CHUNK_N = 3  # frames, of which the cuts lie anywhere
+CHUNK_N = 3  # frames per chunk, cut anywhere
 
 
 def chunks_of(script, cut_n=31):
-    """The script's bytes as a port that is opened in the middle of a frame hands them over."""
+    """The script's bytes, as read from a port opened in the middle of a frame."""
     data = b"".join(script.pieces)[cut_n:]
     size = CHUNK_N * len(script.pieces[0])
     every_s = CHUNK_N * script.duration_s / len(script)
@@ -26,7 +26,7 @@ def chunks_of(script, cut_n=31):
 
 @pytest.mark.parametrize("wire", ["binary", "binary-clock", "text-xyzt", "text-txyz"])
 @pytest.mark.parametrize(("chips_n", "rate_hz"), [(1, 400.0), (5, 400.0), (40, 133.0)])
-def test_format_chips_rate_and_scale_are_told_from_the_bytes(wire, chips_n, rate_hz):
+def test_wire_chips_rate_and_lsb_are_detected(wire, chips_n, rate_hz):
     script = make_script(pokes_n=0, chips_n=chips_n, wire=wire, rate_hz=rate_hz)
     found = find.recognise("port", chunks_of(script))
     assert (found.problem, found.wire, found.chips_n) == (None, wire, chips_n)
@@ -36,7 +36,7 @@ def test_format_chips_rate_and_scale_are_told_from_the_bytes(wire, chips_n, rate
     assert f"{chips_n} chips" in str(found)
 
 
-def test_what_is_no_board_is_told_as_such():
+def test_other_devices_are_no_board():
     script = make_script(pokes_n=0)
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
     assert "another baud rate" in str(find.recognise("port", wrong_baud))
@@ -45,13 +45,13 @@ def test_what_is_no_board_is_told_as_such():
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
-def test_any_bytes_are_a_board_or_none_and_never_an_error(data, size):
+def test_any_bytes_are_a_board_or_none(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
     assert str(find.recognise("port", chunks)).startswith("port: ")
 
 
 @given(st.integers(0, 2**32), st.integers(1, 4))
-def test_frames_of_any_numbers_are_a_board(seed, chips_n):
+def test_random_frames_are_a_board(seed, chips_n):
     rng = rng_for(seed, "numbers")
     values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
     values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)
@@ -59,13 +59,13 @@ def test_frames_of_any_numbers_are_a_board(seed, chips_n):
     assert str(find.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
 
 
-def test_chips_at_rest_without_noise_show_no_scale():
+def test_noiseless_chips_show_no_lsb():
     script = make_script(pokes_n=0)
     still = replace(script, pieces=[script.pieces[0]] * len(script))
     assert "steps not seen yet" in str(find.recognise("port", chunks_of(still)))
 
 
-def test_the_one_board_is_found_among_ports_and_two_are_one_too_many(tmp_path):
+def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
         assert find.find_board([name, "/dev/none"]).port == name
@@ -76,23 +76,23 @@ def test_the_one_board_is_found_among_ports_and_two_are_one_too_many(tmp_path):
         find.find_board([])
 
 
-class TestHunt:
-    def hunt(self, *seen):
-        """Hunt over lists of ports as they are seen, one a look; the last stays."""
-        looks, said = iter(seen), []
-        last = [set(seen[-1])]
+class TestReplugging:
+    def find(self, *port_lists):
+        """Look for the replugged port, with one list of ports per poll; the last list stays."""
+        polls, printed = iter(port_lists), []
+        last = [set(port_lists[-1])]
 
         def names():
-            last[0] = set(next(looks, last[0]))
+            last[0] = set(next(polls, last[0]))
             return last[0]
 
-        return find.find_replugged_port(said.append, names=names, pause=lambda _: None, hunting_s=1.0), said
+        return find.find_replugged_port(printed.append, names=names, pause=lambda _: None, hunting_s=1.0), printed
 
-    def test_the_port_that_goes_and_comes_is_the_board(self):
-        found, said = self.hunt("ab", "ab", "ab", "b", "b", "b", "bc")
+    def test_replugged_port_is_found(self):
+        found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
         assert found == "c"  # it may come back under another name
-        assert said == ["Unplug the board.", "a went. Plug it in again."]
+        assert printed == ["Unplug the board.", "a went. Plug it in again."]
 
-    def test_a_board_that_is_never_unplugged_is_waited_for_so_long(self):
+    def test_waiting_for_replugging_ends(self):
         with pytest.raises(CaptureError, match="a port that goes must be seen within 1 s"):
-            self.hunt("ab")
+            self.find("ab")

@@ -30,32 +30,32 @@ LONG_S = 120.0  # a process that imports torch on a busy machine
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 
-def hear_ctrl_c() -> None:
-    """Undo what a shell does to what it runs in the background, tests included: there Ctrl-C is ignored."""
+def restore_ctrl_c() -> None:
+    """Undo the shell's setting that processes in the background ignore Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class Shell:
-    """Runs `reskin` in a folder, and ends what it left running."""
+    """Run `reskin` in a folder, and stop what is left running."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running = folder, []
 
-    def start(self, *words: object) -> subprocess.Popen:
-        command = [sys.executable, "-m", "pipeline", *map(str, words)]
+    def start(self, *arguments: object) -> subprocess.Popen:
+        command = [sys.executable, "-m", "pipeline", *map(str, arguments)]
         environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
         process = subprocess.Popen(
             command, cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            preexec_fn=hear_ctrl_c,
+            preexec_fn=restore_ctrl_c,
         )  # fmt: skip
         self.running.append(process)
         return process
 
-    def run(self, *words: object) -> str:
-        process = self.start(*words)
-        said, complained = process.communicate(timeout=LONG_S)
-        assert process.returncode == 0, complained
-        return said
+    def run(self, *arguments: object) -> str:
+        process = self.start(*arguments)
+        output, errors = process.communicate(timeout=LONG_S)
+        assert process.returncode == 0, errors
+        return output
 
     def close(self) -> None:
         for process in self.running:
@@ -83,8 +83,8 @@ def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
 
     assert "binary, 5 chips, " in shell.run("ports", link)
 
-    said = shell.run("record", "--port", link, "--seconds", 2.0, "--out", "run1")
-    assert float(re.search(r"duration after ([0-9.]+) s", said)[1]) >= 2.0
+    output = shell.run("record", "--port", link, "--seconds", 2.0, "--out", "run1")
+    assert float(re.search(r"duration after ([0-9.]+) s", output)[1]) >= 2.0
     stream = tmp_path / "run1/stream.bin"
     assert parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header").chips_n == 5
     shell.run("decode", stream, "--out", "run1.parquet")
@@ -97,7 +97,7 @@ def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as free:
         http_port = free.getsockname()[1]
     page = shell.start("live", "--port", link, "--model", write_model(tmp_path), "--http-port", http_port)
-    assert "open http://localhost" in page.stdout.readline()  # it waits for the board
+    assert "open http://localhost" in page.stdout.readline()  # the page waits for the board
     board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@3+2", "--fault", "unplug@6.5+1")
     asyncio.run(look(f"http://localhost:{http_port}/live"))
     page.send_signal(signal.SIGINT)
@@ -105,19 +105,19 @@ def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
 
 
 async def look(address: str) -> None:
-    """See a poke at its place, and what is wrong with the board."""
+    """Wait for contacts at their places and for the alarms of the board."""
     async with aiohttp.ClientSession() as client, connect(client, address) as page:
-        await until(page, lambda told: told.get("zeroed") is True)
-        words, near_n = "", 0
+        await until(page, lambda message: message.get("zeroed") is True)
+        alarms, near_n = "", 0
         for _ in range(6000):
-            told = await until(page, lambda told: True)
-            words += " ".join(told.get("alarms", []))
-            if told.get("contact") == 1:
-                found = np.array([told["x_mm"], told["y_mm"], told["F_N"]])
+            message = await until(page, lambda message: True)
+            alarms += " ".join(message.get("alarms", []))
+            if message.get("contact") == 1:
+                found = np.array([message["x_mm"], message["y_mm"], message["F_N"]])
                 near_n += int(np.abs(found - PLACES).max(axis=1).min() < 1.0)
-            if near_n >= 10 and "no data" in words and "unplugged" in words:
+            if near_n >= 10 and "no data" in alarms and "unplugged" in alarms:
                 return
-        raise AssertionError(f"{near_n} messages of pokes near their place; told: {words[:500]}")
+        raise AssertionError(f"{near_n} messages of pokes near their place; alarms: {alarms[:500]}")
 
 
 class connect:
@@ -140,7 +140,7 @@ class connect:
         await self._socket.close()
 
 
-def test_a_killed_recording_can_be_added(shell, tmp_path):
+def test_killed_recording_can_be_added(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
     shell.start("emulate", capture, "--port", link, "--loop")
     wait_until(link.is_symlink)
@@ -155,7 +155,7 @@ def test_a_killed_recording_can_be_added(shell, tmp_path):
     assert files["stream.bin"].stat().st_size > 8200
 
 
-def test_unplugging_ends_a_recording_that_is_complete(shell, tmp_path):
+def test_unplugging_ends_a_complete_recording(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=1), tmp_path / "c0"), tmp_path / "board"
     shell.start("emulate", capture, "--port", link, "--loop", "--fault", "unplug@3+99")
     wait_until(link.is_symlink)
@@ -163,15 +163,15 @@ def test_unplugging_ends_a_recording_that_is_complete(shell, tmp_path):
     assert (tmp_path / "run1" / HEADER_FILE).is_file()
 
 
-def test_wrong_options_print_one_sentence(shell):
+def test_invalid_options_print_one_sentence(shell):
     process = shell.start("live", "--port", "x", "--replay", "y")
-    _, complained = process.communicate(timeout=LONG_S)
+    _, errors = process.communicate(timeout=LONG_S)
     assert process.returncode == 2
-    assert "give only one of --port, --replay" in complained
-    assert "Traceback" not in complained
-    for words, told in (
+    assert "give only one of --port, --replay" in errors
+    assert "Traceback" not in errors
+    for arguments, message in (
         (["nothing"], "not the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
         (["nothing", "--fault", "melted"], r"is not NAME\[@START_S\[\+DURATION_S\]\] with one of failed-read"),
     ):
-        with pytest.raises(ReskinError, match=told):
-            CliRunner().invoke(app, ["emulate", *words], catch_exceptions=False)
+        with pytest.raises(ReskinError, match=message):
+            CliRunner().invoke(app, ["emulate", *arguments], catch_exceptions=False)

@@ -1,4 +1,4 @@
-"""Recordings with labels can be added, however they end."""
+"""Labelled recordings can be added, however they end."""
 
 import os
 import signal
@@ -29,14 +29,14 @@ FRAME_BYTES_N, DWELL_FRAMES_N, LONG_S = 82, 40, 120.0
 
 
 def read_n(part):
-    """Count the frames that a recorder has written."""
+    """Number of frames that a recorder has written."""
     stream = part / STREAM_FILE
     return stream.stat().st_size // FRAME_BYTES_N if stream.exists() else 0
 
 
 @pytest.fixture
 def held(monkeypatch, tmp_path):
-    """Let a label hold until some frames came, however late the machine is."""
+    """Hold each label until some frames have arrived, so that a busy machine changes nothing."""
 
     def hold(self, label, dwell_s):
         start_s, before_n = self.unix_s(), read_n(tmp_path / "run1.part")
@@ -55,7 +55,7 @@ def pokes():
 
 
 def read(folder):
-    """Read a capture as `reskin add` does: its own files, under its own header."""
+    """Read a capture as `reskin add` does, with its own files and header."""
     from reskin.recordings.header import write_capture
 
     header, files = native(folder, CaptureNames("b0", "s0", None), None, ())
@@ -68,7 +68,7 @@ def places_of(blocks):
     return {(float(x), float(y)) for block in blocks for x, y in zip(block.x_mm, block.y_mm, strict=True)}
 
 
-def test_a_program_labels_a_recording(tmp_path, held, capsys):
+def test_program_labels_a_recording(tmp_path, held, capsys):
     with plugged_in(make_script(pokes_n=2), loop=True) as port:
         folder = reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.3, board="b0", scan="random")
     assert "2 touches labelled" in capsys.readouterr().err
@@ -87,8 +87,8 @@ def test_a_program_labels_a_recording(tmp_path, held, capsys):
     assert account["frames_contact_n"] == pytest.approx(came_n, abs=2)
 
 
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # Python 3.12: there are threads
-def test_a_killed_recording_keeps_its_labels(tmp_path):
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # Python 3.12 warns because of threads
+def test_killed_recording_keeps_its_labels(tmp_path):
     """The recorder is a child of this process, so that no interpreter has to start."""
     robot = tmp_path / "robot.csv"
     with plugged_in(make_script(pokes_n=1), loop=True) as port:
@@ -106,13 +106,13 @@ def test_a_killed_recording_keeps_its_labels(tmp_path):
 
 
 def write_robots_log(robot, part):
-    """Touch at (4, 8) again and again until the recorder has written two touches; each holds until frames came."""
+    """Touch (4, 8) repeatedly until the recorder has written two touches; hold each until frames have arrived."""
     end_s = time.monotonic() + LONG_S
     with robot.open("w", buffering=1) as stream:
         stream.write("unix_s,phase,x_mm,y_mm,Fz_N\n")
         for phase in cycle(["noload", "contact"]):
             before_n, holds = read_n(part), True
-            while holds:  # the last row is written after the frames came
+            while holds:  # the last row is written after the frames have arrived
                 holds = read_n(part) < before_n + DWELL_FRAMES_N
                 stream.write(f"{time.time():.4f},{phase},4,8,0.5\n")
                 time.sleep(0.02)
@@ -121,7 +121,7 @@ def write_robots_log(robot, part):
                 return
 
 
-def test_a_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
+def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
     from errno import ENOSPC
 
     from reskin.recordings import labels
@@ -130,7 +130,7 @@ def test_a_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
 
     def append(file, data):
         taken.append(data)
-        if len(taken) > 2:  # the log's first line, and a touch
+        if len(taken) > 2:  # the log's header and one touch
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 
@@ -144,12 +144,12 @@ def test_a_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
 
 
 @pytest.mark.parametrize(
-    ("labels", "gauge", "scan", "told"),
+    ("labels", "gauge", "scan", "message"),
     [("robot.txt", None, None, "--labels: robot.txt is none of"), ("grid:2x2:4", None, "spiral", "--scan: prompts"),
      (None, "/dev/x@fast", None, "--gauge: /dev/x@fast is not PORT"), ("robot.csv", "/dev/x", None, "--labels")],
 )  # fmt: skip
-def test_invalid_label_sources_raise(labels, gauge, scan, told):
-    with pytest.raises(ParamsError, match=told):
+def test_invalid_label_sources_raise(labels, gauge, scan, message):
+    with pytest.raises(ParamsError, match=message):
         label_source(labels, gauge, scan, dwell_s=1.0, say=print)
 
 

@@ -17,16 +17,16 @@ from reskin.live.session import BINS_N, HEAD, NUMBERS_N, open_sessions
 from reskin.live.tracker import Models
 from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE, parse
-from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zeros_asked
+from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zero_requests
 
 LONG_S = 120.0
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # of sockets that a refused client leaves
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # sockets of refused clients
 
 
 def serve(
     ports: str | list[str], models: Models, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token=""
 ):
-    """Serve the page of a board or several, let a client act, and stop."""
+    """Serve a page of one or several boards, let a client act, and stop."""
 
     async def run() -> None:
         boards = open_sessions([ports] if isinstance(ports, str) else ports, models, "a board")
@@ -55,50 +55,52 @@ def unpack(data: bytes) -> dict:
     first = NUMBERS_N + 3 * chips_n
     assert len(values) == first + bins_n * (1 + 2 * (1 + chips_n))
     names = ("x_mm", "y_mm", "F_N", "sd_x", "sd_y", "contact", "rate_hz", "lost")
-    told = dict(zip(names, values[:8].tolist(), strict=True))
-    return told | {"number": number, "t_s": t_s, "bins_n": bins_n, "change_uT": values[NUMBERS_N:first]}
+    message = dict(zip(names, values[:8].tolist(), strict=True))
+    return message | {"number": number, "t_s": t_s, "bins_n": bins_n, "change_uT": values[NUMBERS_N:first]}
 
 
 async def until(socket, wanted: Callable[[dict], bool]) -> dict:
-    """Take messages until one is wanted."""
+    """Receive messages until one is wanted."""
     end_s = time.monotonic() + LONG_S
     while time.monotonic() < end_s:
-        said = await asyncio.wait_for(socket.receive(), LONG_S)  # its own time-out begins again with every ping
-        told = unpack(said.data) if said.type == aiohttp.WSMsgType.BINARY else json.loads(said.data)
-        if wanted(told):
-            return told
-    raise AssertionError("it was never told")
+        received = await asyncio.wait_for(socket.receive(), LONG_S)  # aiohttp's timeout restarts with every ping
+        message = unpack(received.data) if received.type == aiohttp.WSMsgType.BINARY else json.loads(received.data)
+        if wanted(message):
+            return message
+    raise AssertionError("the message was never received")
 
 
 def test_page_gets_estimates_and_buttons_zero_and_record(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    asked = zeros_asked(monkeypatch)
+    zeroed = zero_requests(monkeypatch)
     models = [read_network(write_model(tmp_path))]
 
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         async with client.ws_connect(f"{address}/live") as socket:
-            state = await until(socket, lambda told: told.get("zeroed") is True)
+            state = await until(socket, lambda message: message.get("zeroed") is True)
             assert len(state["chips_mm"]) == 5
-            poke = await until(socket, lambda told: told.get("contact") == 1 and 0 < told["rate_hz"] < 1.3 * RATE_HZ)
+            poke = await until(
+                socket, lambda message: message.get("contact") == 1 and 0 < message["rate_hz"] < 1.3 * RATE_HZ
+            )
             assert np.abs(np.array([poke["x_mm"], poke["y_mm"], poke["F_N"]]) - PLACES).max(axis=1).min() < 0.5
             assert poke["bins_n"] <= BINS_N
             await socket.send_json({"seen": poke["number"]})
             await socket.send_json({"press": "record"})
-            recording = await until(socket, lambda told: bool(told.get("recording")))
+            recording = await until(socket, lambda message: bool(message.get("recording")))
             part = Path(recording["recording"].strip() + ".part")
             assert (part / HEADER_FILE).is_file()
             while (part / "stream.bin").stat().st_size <= 82 * 50:
                 await asyncio.sleep(0.02)
             await socket.send_json({"press": "record"})
-            done = await until(socket, lambda told: str(told.get("recorded", "")).startswith("recorded"))
+            done = await until(socket, lambda message: str(message.get("recorded", "")).startswith("recorded"))
             folder = Path(done["recorded"].removeprefix("recorded "))
             header = parse((folder / HEADER_FILE).read_text(), "header")
             assert set(header.files) == {"stream.bin", "arrivals.csv"}
             assert (folder / "stream.bin").stat().st_size > 82 * 50
             await socket.send_json({"press": "zero"})
-            while not asked:
+            while not zeroed:
                 await asyncio.sleep(0.02)
-            while not asked[0].zeroed:
+            while not zeroed[0].zeroed:
                 await asyncio.sleep(0.02)
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
@@ -108,7 +110,7 @@ def test_page_gets_estimates_and_buttons_zero_and_record(tmp_path, monkeypatch):
 def test_page_waits_for_a_missing_board(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         async with client.ws_connect(f"{address}/live") as socket:
-            state = await until(socket, lambda told: "not open" in " ".join(told.get("alarms", [])))
+            state = await until(socket, lambda message: "not open" in " ".join(message.get("alarms", [])))
             assert state["waiting"]
         for path, kind in (
             ("/", "text/html"),
@@ -120,7 +122,7 @@ def test_page_waits_for_a_missing_board(tmp_path):
                 assert page.status == 200
                 assert kind in page.headers["Content-Type"]
                 assert "default-src 'self'" in page.headers["Content-Security-Policy"]
-                assert "://" not in (await page.text()).replace("http://www.w3.org", "")  # nothing from elsewhere
+                assert "://" not in (await page.text()).replace("http://www.w3.org", "")  # no external resource
 
     serve(str(tmp_path / "none"), [], act)
 
@@ -131,7 +133,7 @@ def test_requests_of_other_hosts_and_sites_are_forbidden(tmp_path):
         for headers, status in (
             ({"Host": "evil.example"}, 403), ({"Host": "127.0.0.1.evil.example"}, 403), ({"Host": "[::1"}, 403),
             ({"Host": "lohost[::1]::8786"}, 403),
-            ({"Host": "localhost:9000"}, 200),  # the other end of an SSH tunnel
+            ({"Host": "localhost:9000"}, 200),  # through an SSH tunnel
             ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{own}"}, 200),
         ):  # fmt: skip
             async with client.get(f"{address}/", headers=headers) as page:
@@ -158,7 +160,7 @@ def test_other_machines_need_the_token(tmp_path):
     serve(str(tmp_path / "none"), [], act, token="secret")
 
 
-def test_junk_is_ignored_and_long_messages_and_crowds_refused(tmp_path, monkeypatch):
+def test_junk_is_ignored_and_floods_are_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     async def act(address: str, client: aiohttp.ClientSession) -> None:
@@ -166,7 +168,7 @@ def test_junk_is_ignored_and_long_messages_and_crowds_refused(tmp_path, monkeypa
             for junk in ("", "{", "[]", "null", '{"press": ["record"]}', '{"press": {}}', '{"seen": 1e999}', "[" * 900):
                 await socket.send_str(junk)
             await socket.send_bytes(struct.pack("<4d", 1, 2, 3, 4))
-            await until(socket, lambda told: "alarms" in told)
+            await until(socket, lambda message: "alarms" in message)
             await socket.send_str("x" * (REQUEST_BYTES_MAX_N + 1))
             while not socket.closed:
                 await socket.receive(timeout=LONG_S)

@@ -1,4 +1,4 @@
-"""Eight boards on eight ports, one of them a sleeve of forty chips: independent, also when one is unplugged."""
+"""Eight boards on eight ports, one of them a sleeve of forty chips; one is unplugged."""
 
 import asyncio
 import math
@@ -17,7 +17,7 @@ from reskin.live.server import PAGES_MAX_N
 from reskin.live.session import BINS_N, LATENCIES_N, Session, open_sessions
 from reskin.live.tracker import LiveSkin, LiveSkins
 from reskin.universal.model import load_universal
-from tests.live.boards import PLACES, Dying, PlayedReader, make_script, plugged_in, write_model
+from tests.live.boards import PLACES, FailingModel, PlayedReader, make_script, plugged_in, write_model
 from tests.live.test_server import serve, until
 
 RATES_HZ = [133.0, 400.0, *(50.0,) * 6]
@@ -42,12 +42,16 @@ def plug_in_all(stack: ExitStack, goes: ExitStack, folder, boards) -> list[str]:
 def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
     async def look(address: str, client: aiohttp.ClientSession, i: int) -> None:
         async with client.ws_connect(f"{address}/live?board={i}") as page:
-            state = await until(page, lambda told: told.get("zeroed") is True)
+            state = await until(page, lambda message: message.get("zeroed") is True)
             assert state["boards_n"] == len(CHIPS_N)
             assert len(state["chips_mm"]) == CHIPS_N[i]
             assert f"board{i}" in state["what"]
-            poke = await until(page, lambda told: told.get("contact") == 1 and 0 < told["rate_hz"] < 1.3 * RATES_HZ[i])
-            assert math.isfinite(poke["x_mm"]) == (CHIPS_N[i] == 5)  # the map is of five chips; all others are drawn
+            poke = await until(
+                page, lambda message: message.get("contact") == 1 and 0 < message["rate_hz"] < 1.3 * RATES_HZ[i]
+            )
+            assert math.isfinite(poke["x_mm"]) == (
+                CHIPS_N[i] == 5
+            )  # the model has five chips; other boards have no estimate
             assert len(poke["change_uT"]) == 3 * CHIPS_N[i]
             assert np.abs(poke["change_uT"]).max() > 100
 
@@ -57,35 +61,35 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
         await asyncio.gather(*(look(address, client, i) for i in range(len(CHIPS_N))))
         pages = [await client.ws_connect(f"{address}/live?board={i}") for i in range(len(CHIPS_N))]
         await asyncio.to_thread(goes.close)
-        await until(pages[GOES], lambda told: "unplugged" in " ".join(told.get("alarms", [])))
+        await until(pages[GOES], lambda message: "unplugged" in " ".join(message.get("alarms", [])))
         for page in pages[:GOES]:
-            after = await until(page, lambda told: "lost" in told)
+            after = await until(page, lambda message: "lost" in message)
             assert after["lost"] == 0
             assert after["bins_n"] <= BINS_N
-            later = await until(page, lambda told, t_s=after["t_s"]: told.get("t_s", 0) > t_s + 0.5)
+            later = await until(page, lambda message, t_s=after["t_s"]: message.get("t_s", 0) > t_s + 0.5)
             assert later["lost"] == 0
         for page in pages:
             await page.close()
 
-    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # bins at most: what is remembered has an end
+    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # maximum number of bins: memory is bounded
     assert LATENCIES_N < 1e4
     with ExitStack() as stack, ExitStack() as goes:
         serve(plug_in_all(stack, goes, tmp_path, range(len(CHIPS_N))), load_universal(), act)
 
 
-def test_an_unplugged_board_does_not_hold_up_the_others(tmp_path):
+def test_unplugged_board_does_not_delay_the_others(tmp_path):
     with ExitStack() as stack, ExitStack() as goes:
         names = plug_in_all(stack, goes, tmp_path, (1, 2, GOES))
         with reskin.open(names, model=write_model(tmp_path)) as skins:
-            told, found = Counter(), []  # how often the others gave something new while the last board had nothing new
+            updates, found = Counter(), []  # updates of the other boards per update of the last board
             for *well, last in skins:
                 found += [each[1:4] for each in well if each.F_N > 0]
                 if len(found) > 20:
                     goes.close()
                 if math.isnan(last.F_N) and any("unplugged" in alarm for alarm in last.alarms):
                     assert not any("unplugged" in alarm for each in well for alarm in each.alarms)
-                    told[last.t_s] += 1
-                if len(told) >= 5 and max(told.values()) >= 5:
+                    updates[last.t_s] += 1
+                if len(updates) >= 5 and max(updates.values()) >= 5:
                     break
         nearest = np.abs(np.array(found)[:, None] - PLACES).sum(axis=2).min(axis=1)
         assert np.median(nearest) < 0.5
@@ -97,19 +101,19 @@ def played_at(port: str) -> LiveSkin:
     return skin
 
 
-def test_an_error_of_a_model_is_raised_to_the_caller():
+def test_model_error_is_raised_to_the_caller():
     dying, well = played_at("dying"), played_at("well")
-    dying.estimator = Dying()
+    dying.estimator = FailingModel()
     with LiveSkins([dying, well]) as skins:
         skins._threads[0].join(60.0)
         with pytest.raises(RuntimeError, match="out of memory"):
             next(iter(skins))
 
 
-def test_an_error_of_a_model_is_an_alarm_on_the_page():
+def test_model_error_is_an_alarm_on_the_page():
     live = Session("played", [], "a board")
     live.skin = played_at("played")
-    live.skin.estimator = Dying()
+    live.skin.estimator = FailingModel()
     live.run()
     assert "estimates ended: RuntimeError('out of memory')" in live.state()["alarms"]
 

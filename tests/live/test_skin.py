@@ -31,12 +31,12 @@ from tests.live.boards import (
 )
 
 SCRIPT = make_script(pokes_n=2)
-LATE = {"no data", "slower than it was: frames are missing"}  # what a busy machine makes of a healthy board
+LATE = {"no data", "slower than it was: frames are missing"}  # possible alarms of a healthy board on a busy machine
 
 
 def test_every_reading_has_time_place_and_force(tmp_path):
     script = make_script(pokes_n=3, quiet_s=QUIET_S + 2.5)
-    unread_n = 1000  # frames at most that a pseudo-terminal keeps, and throws away when a late reader opens it
+    unread_n = 1000  # upper limit of frames that opening a pseudo-terminal late discards
     with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         wanted_n = len(script) - unread_n
         contacts = list(itertools.takewhile(lambda _: skin.account["frames_n"] < wanted_n, skin.every()))
@@ -57,12 +57,12 @@ def test_several_models_give_mean_and_standard_deviation(tmp_path):
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)  # on a busy machine the first poke may have passed
+    off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)  # on a busy machine the first poke may be missed
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
 
 
-def test_a_slow_caller_gets_the_latest_reading_and_no_byte_is_lost(tmp_path):
+def test_slow_caller_gets_the_latest_reading(tmp_path):
     def frame_i(contact) -> int:
         return int(np.flatnonzero((SCRIPT.frames.b_uT == contact.b_uT).all(axis=1))[0])
 
@@ -70,28 +70,28 @@ def test_a_slow_caller_gets_the_latest_reading_and_no_byte_is_lost(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        came = (contact for contact in skin if np.isfinite(contact.b_uT).all())  # not that no data on a busy machine
+        came = (contact for contact in skin if np.isfinite(contact.b_uT).all())  # skips "no data" on a busy machine
         before, before_n = next(came), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # a slow controller
             time.sleep(0.01)
         late = next(came)
         came_n = skin.account["frames_n"] - before_n
         assert came_n >= 300
-        assert (frame_i(late) - frame_i(before) - came_n) % len(SCRIPT) == 0  # the last of those that came, and no hole
+        assert (frame_i(late) - frame_i(before) - came_n) % len(SCRIPT) == 0  # the latest frame, and none is missing
         assert skin.reader.missed_bytes_n == skin.lost_bytes_n == 0
 
 
 def test_stalls_and_unplugging_are_alarms_and_it_continues(tmp_path):
     script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
-    link, told = str(tmp_path / "board"), []
+    link, seen = str(tmp_path / "board"), []
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         for contact in skin:
-            told += [] if told and told[-1] == contact.alarms else [contact.alarms]
-            if any("unplugged" in alarm for alarms in told for alarm in alarms) and contact.F_N > 0:
+            seen += [] if seen and seen[-1] == contact.alarms else [contact.alarms]
+            if any("unplugged" in alarm for alarms in seen for alarm in alarms) and contact.F_N > 0:
                 break
-    words = " ".join(alarm for alarms in told for alarm in alarms)
-    assert "no data" in words
-    assert "unplugged" in words
+    alarms_text = " ".join(alarm for alarms in seen for alarm in alarms)
+    assert "no data" in alarms_text
+    assert "unplugged" in alarms_text
 
 
 def test_failed_reads_have_no_estimate(tmp_path):
@@ -102,9 +102,9 @@ def test_failed_reads_have_no_estimate(tmp_path):
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
 
 
-def test_opening_a_port_within_a_frame_is_no_loss():
+def test_opening_a_port_mid_frame_is_no_loss():
     whole = make_script(pokes_n=0)
-    for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):  # a line feed alone begins no frame
+    for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):  # a line feed alone starts no frame
         pieces = [piece[-left_n:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
         skin, _ = played(replace(whole, pieces=pieces))
         assert skin.account["skipped_resync_bytes_n"] == skipped_n
@@ -123,23 +123,23 @@ def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
     assert {"bytes lost between frames", "no frames in what comes: wrong baud rate?"} <= set(skin.health.alarms)
 
 
-def test_a_magnet_raises_only_the_alarm_of_an_outside_field(tmp_path):
+def test_magnet_raises_only_the_outside_field_alarm(tmp_path):
     skin, _ = played(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"field from outside"}
 
 
-def test_no_load_reading_waits_until_nothing_moves():
+def test_no_load_reading_waits_for_a_still_skin():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = played(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
-    np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # of noise of 3 uT
+    np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # noise of 3 uT
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
     assert not played(moving)[0].zeroed
 
 
 def test_zero_from_another_thread_restarts_the_no_load_reading():
     class Pressed(list):
-        def append(self, frames):  # between what two statements of the thread that polls do
+        def append(self, frames):  # interrupts the polling thread between two statements
             super().append(frames)
             skin.zero()
 
@@ -177,7 +177,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
         - sum(count for name, count in account.items() if name.startswith("skipped_"))
     )
     assert account["bytes_n"] + account["missed_bytes_n"] == sum(sent)
-    assert 0 <= waiting_n < 3 * 82  # of what comes last, more bytes would tell
+    assert 0 <= waiting_n < 3 * 82  # the end of the stream is undecided
     assert account["frames_n"] * 82 == account["frame_bytes_n"]
     assert account["skipped_resync_bytes_n"] > 1000
     print(f"\n{sum(sent)} bytes sent: {dict(account)}, {waiting_n} bytes wait for more")
@@ -210,7 +210,7 @@ def test_eight_boards_at_once():
         assert list(pool.map(look, names)) == list(chips_n)
 
 
-def test_a_model_of_other_boards_and_a_missing_port_raise(tmp_path):
+def test_other_chip_count_and_missing_port_raise(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
         with pytest.raises(ReskinError, match="the board has 12 channels, but the model 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
@@ -218,12 +218,12 @@ def test_a_model_of_other_boards_and_a_missing_port_raise(tmp_path):
         pass
 
 
-def test_a_port_held_by_another_program_is_not_open():
+def test_port_held_by_another_program_is_not_open():
     with plugged_in(SCRIPT, loop=True) as name, open_port(name, 115200):
         skin = LiveSkin(name)
         skin.reader.start(there=False)
         try:
-            while not skin.reader.problem:  # the suite's time limit ends it
+            while not skin.reader.problem:  # ended by the suite's time limit
                 time.sleep(0.01)
             assert skin.alarms()[0].startswith(f"not open: {name}: the port must be one that opens")
         finally:

@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseud
 
 
 def make_poked() -> tuple[Script, ProbeLog]:
-    """Make pokes at places of a grid with pauses that differ, and the robot's log, whose clock began 100 s earlier."""
+    """Poke places of a grid with varying pauses; return the script and the log of a robot 100 s behind."""
     rng = rng_for(0, "poked")
     starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.1, 0.25, POKES_N))
     place_mm, force_N = 4.0 * rng.integers(1, 4, (POKES_N, 2)), rng.uniform(0.5, 2.0, POKES_N)
@@ -61,10 +61,10 @@ def make_poked() -> tuple[Script, ProbeLog]:
 
 
 def let_arrive_in_time(folder: Path, sent: Script) -> None:
-    """Write when the bytes of a recording would have come to a machine that is never late."""
+    """Write arrival times as on a machine that is never late."""
     data, header = (folder / STREAM_FILE).read_bytes(), parse((folder / HEADER_FILE).read_text(), "header")
     first = b"".join(sent.pieces).find(data)
-    assert first >= 0  # it is all of what was sent from when the port was opened
+    assert first >= 0  # the recording is a suffix of the sent bytes
     ends = np.cumsum([len(piece) for piece in sent.pieces]) - first
     came = (ends > 0) & (ends <= len(data))
     times = clocks.Arrivals(ends[came], 1e9 + sent.t_s[came])
@@ -82,7 +82,7 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     with closing(Shell(root)) as shell:
         shell.start("emulate", write_script(script, tmp_path / "c0"), "--port", link, "--fault", CRLF)
         wait_until(link.is_symlink)
-        assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # where the script ends
+        assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # at the end of the script
         let_arrive_in_time(root / "run1", inject(script, parse_fault(CRLF)))
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
     run(root, "dvc", "repro", "report@pressed")
@@ -91,7 +91,7 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     assert numbers["provenance"]["source"] == "recorded"
     assert numbers["capture"]["logged_indentations_n"] == POKES_N
     assert numbers["capture"]["frames_n"] * 82 == numbers["capture"]["frame_bytes_n"]
-    assert numbers["capture"]["frames_n"] > 0.7 * len(script)  # what waits in a terminal is lost when it opens or goes
+    assert numbers["capture"]["frames_n"] > 0.7 * len(script)  # opening and closing a terminal discard waiting bytes
     model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
     _, readings = played(script, [read_network(model)])
     t_s = np.concatenate([each.t_s[each.contact] for each in readings])
@@ -99,4 +99,4 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
     pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
     true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]
-    assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()  # mm and N, of most that it was trained on
+    assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()  # mm and N; mostly training data

@@ -13,7 +13,7 @@ def readings(t_s, force_N):
 
 
 def forces(data):
-    """The bins of a message: start, least and greatest force."""
+    """The bins of a message: start, minimum and maximum of the force."""
     _, chips_n, bins_n, t_s = HEAD.unpack_from(data)
     rest = np.frombuffer(data, "<f4", offset=HEAD.size)[NUMBERS_N + 3 * chips_n :]
     start_s, traces = t_s + rest[:bins_n].astype(float), rest[bins_n:].reshape(2, bins_n, 1 + chips_n)
@@ -51,11 +51,11 @@ def test_bin_times_stay_precise_after_two_weeks():
     np.testing.assert_allclose(np.diff(start_s), BIN_S, atol=1e-5)
 
 
-def test_time_to_screen_is_that_of_the_confirmed_message():
+def test_display_latency_of_the_confirmed_message():
     traces = Traces(layout_of(5), 0.0)
     traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
     number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
-    for seen in (number, number + 1, -1):  # those that were never sent tell nothing
+    for seen in (number, number + 1, -1):  # unknown numbers have no latency
         traces.confirm(seen, 1.03)
     np.testing.assert_allclose(traces.to_screen_s, [0.03])
     np.testing.assert_allclose(traces.to_estimate_s, [0.002])
