@@ -191,9 +191,12 @@ def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
     """Check a scene's experiments, and that its sections are there; their stages check the content of sections."""
     for name, value in content.items():
         if name not in {*Scene.model_fields, *SECTIONS}:
-            raise ParamsError(where, name, "a known parameter", repr(value)[:80], "Mend it there.")
+            found = repr(value)[:80]
+            raise ParamsError(
+                f"{where}: {name} is not a known parameter (its value: {found}). Correct or remove it there."
+            )
         if name in SECTIONS and not isinstance(value, dict):
-            raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Mend it there.")
+            raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Correct it there.")
     return parse(Scene, content, where)
 
 

@@ -32,7 +32,7 @@ def read_yaml(path: Path) -> Any:
         raise ParamsError(f"{path}: file not found. Check the name.") from None
     except (YAMLError, UnicodeDecodeError) as error:
         problem = " ".join(str(error).split())
-        raise ParamsError(path, "the file", "YAML", problem, "Mend the line it names.") from None
+        raise ParamsError(f"{path}: the file is not YAML: {problem}. Correct the line it names.") from None
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
@@ -47,13 +47,18 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         beside = [found for found in faults if found["type"] == "missing" and found["loc"][:-1] == first["loc"][:-1]]
         names = [".".join(_path_in_file(found["loc"], value)) for found in (beside if first in beside else [first])]
         name = ", ".join(names) or "the file"
-        got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
-        rule = {"missing": "given", "extra_forbidden": "a known parameter"}.get(first["type"])
-        rule = rule or first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+        got = repr(first.get("input"))[:80]
+        if first["type"] == "missing":
+            raise ParamsError(f"{where}: {name} {'are' if ', ' in name else 'is'} missing. Add it there.") from None
+        if first["type"] == "extra_forbidden":
+            raise ParamsError(
+                f"{where}: {name} is not a known parameter (its value: {got}). Correct or remove it there."
+            ) from None
+        rule = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
         if first["type"] == "value_error":  # parameters contradict each other: the rule names them and their values
             place = f"{where}: {name}" if first["loc"] else where
-            raise ParamsError(f"{place}: {rule}. Mend it there.") from None
-        raise ParamsError(where, name, rule, got, "Mend it there.") from None
+            raise ParamsError(f"{place}: {rule}. Correct it there.") from None
+        raise ParamsError(where, name, rule, got, "Correct it there.") from None
 
 
 def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:

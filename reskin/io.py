@@ -27,7 +27,9 @@ from reskin.schema import Readings, arrow_schema, from_table, to_table
 COUNTS_KEY = b"reskin.account"
 DIGEST = "digest"  # in the metadata of a safetensors file
 HEADER_AT = 8  # bytes of a safetensors file before its header: the header's length
-MEND = "It was cut or changed. In a checkout: delete it, then `reskin check-cache` and `dvc repro`; else copy it again."
+REMEDY = (
+    "It was cut or changed. In a checkout: delete it, then `reskin check-cache` and `dvc repro`; else copy it again."
+)
 OF_MACHINE = {
     errno.EACCES,
     errno.EIO,
@@ -48,7 +50,7 @@ def replacing(path: Path) -> Iterator[Path]:
         if temporary.is_dir():
             remove(path)
         elif path.is_dir():
-            raise SchemaError(path, "a file to write", "no folder", "a folder", "Choose another name.")
+            raise SchemaError(f"{path}: a folder of this name exists. Choose another name for the file.")
         temporary.replace(path)
     except BaseException as error:
         if isinstance(error, OSError) and error.errno in DISK_REMEDIES and _is_written(error, temporary):
@@ -99,7 +101,7 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise SchemaError(path, "the file", "readable", error.strerror, "Check the path.") from None
+        raise SchemaError(f"{path}: cannot read the file: {error.strerror}. Check the path.") from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -137,7 +139,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SchemaError(path, "the file", "JSON", error, "Run its stage again.") from None
+        raise SchemaError(f"{path}: the file is not JSON: {error}. Run its stage again.") from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
@@ -164,11 +166,11 @@ def read_tensors(
             metadata: dict[str, str] = file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
         _raise_if_of_machine(error)
-        raise SchemaError(path, "the file", "safetensors", error, f"Is it a trained model? {MEND}") from None
+        raise SchemaError(f"{path}: the file is not safetensors: {error}. Is it a trained model? {REMEDY}") from None
     written = metadata.pop(DIGEST, None)
     is_checked = not names and (digest_needed or written is not None)
     if is_checked and written != _digest(tensors, metadata):
-        raise SchemaError(path, "the file", "as it was written", "other content", MEND)
+        raise SchemaError(f"{path}: the file's content does not match its digest. {REMEDY}")
     return tensors, metadata
 
 
@@ -207,7 +209,7 @@ def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, 
                 writer = pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True)
             writer.write_table(to_table(block))
         if writer is None:
-            raise SchemaError(path, "a capture", "at least one reading", "none", "See what was dropped, and why.")
+            raise SchemaError(f"{path}: the capture has no reading left. See what was dropped, and why.")
         writer.add_key_value_metadata({COUNTS_KEY.decode(): json.dumps(dict(counts), sort_keys=True)})
         writer.close()
 
@@ -221,7 +223,7 @@ def read_ingest_counts(path: Path) -> dict[str, int]:
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
     if COUNTS_KEY not in metadata:
-        raise SchemaError(path, "the file's metadata", "an account of losses", "none", "Ingest it again.")
+        raise SchemaError(f"{path}: the file's metadata has no counts of losses. Ingest it again.")
     counts: dict[str, int] = json.loads(metadata[COUNTS_KEY])
     return counts
 
@@ -244,8 +246,8 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
         yield pq.ParquetFile(path, page_checksum_verification=True)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, OSError) as error:
         _raise_if_of_machine(error)
-        got = " ".join(str(error).split()).rstrip(".")
-        raise SchemaError(path, "the file", "readable Parquet", got, MEND) from None
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise SchemaError(f"{path}: the file is not readable as Parquet: {reason}. {REMEDY}") from None
 
 
 # --- Cache of computed arrays, beside the compiled code of a package ---

@@ -106,8 +106,9 @@ def from_table(table: pa.Table, where: str) -> Readings:
     for name in LABELS:
         distinct = table.column(name).unique().to_pylist()
         if len(distinct) != 1:
-            remedy = "Write one capture a file."
-            raise SchemaError(where, f"column {name}", "one value in the file", distinct[:3], remedy)
+            raise SchemaError(
+                f"{where}: column {name} has several values, {distinct[:3]}. Write one capture to a file."
+            )
         values[name] = distinct[0]
     for name in UNITS:
         column = table.column(name).combine_chunks()
@@ -122,8 +123,7 @@ def check_schema(schema: pa.Schema, where: str) -> int:
     """Check names, types and units against `arrow_schema`; return the number of chips."""
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
-        rule, got = "those of reskin/schema.py", f"none named {missing}"
-        raise SchemaError(where, "columns", rule, got, "Ingest it again.")
+        raise SchemaError(f"{where}: no column {', '.join(missing)}. Ingest it again.")
     b_type = schema.field("b_uT").type
     if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
         raise SchemaError(where, "b_uT", "a fixed list of 3 values a chip", b_type, "Ingest it again.")

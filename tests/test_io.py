@@ -48,7 +48,7 @@ def test_same_readings_same_bytes(tmp_path):
 
 
 def test_a_capture_without_readings_writes_nothing(tmp_path):
-    with pytest.raises(SchemaError, match="at least one reading"):
+    with pytest.raises(SchemaError, match="no reading left"):
         io.write_readings(tmp_path / "c0.parquet", [], {})
     assert list(tmp_path.iterdir()) == []
 
@@ -124,7 +124,7 @@ def test_a_text_that_cannot_be_written_leaves_the_whole_old_folder(tmp_path):
 @pytest.mark.parametrize("content", [b"", b"x", bytes(range(256)) * 9])
 def test_what_is_no_parquet_is_one_sentence(tmp_path, content):
     (tmp_path / "c0.parquet").write_bytes(content)
-    with pytest.raises(SchemaError, match=r"c0.parquet: the file must be readable Parquet"):
+    with pytest.raises(SchemaError, match=r"c0.parquet: the file is not readable as Parquet"):
         io.read_readings(tmp_path / "c0.parquet")
 
 
@@ -141,7 +141,7 @@ def test_a_column_in_another_unit_is_refused(tmp_path):
 def test_a_missing_column_is_named(tmp_path):
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     io.write_table(tmp_path / "c1.parquet", pq.read_table(tmp_path / "c0.parquet").drop_columns(["noload_uT"]))
-    with pytest.raises(SchemaError, match="none named \\['noload_uT'\\]"):
+    with pytest.raises(SchemaError, match="no column noload_uT"):
         io.read_readings(tmp_path / "c1.parquet")
 
 
@@ -153,7 +153,7 @@ def test_json_refuses_what_json_cannot_say(tmp_path):
 
 def test_broken_safetensors_are_one_sentence(tmp_path):
     (tmp_path / "m.safetensors").write_bytes(b"junk")
-    with pytest.raises(SchemaError, match="must be safetensors"):
+    with pytest.raises(SchemaError, match="is not safetensors"):
         io.read_tensors(tmp_path / "m.safetensors")
 
 
@@ -176,7 +176,7 @@ def test_whichever_bit_of_arrays_changes_it_is_told_or_changes_nothing(tmp_path)
         try:
             found, words = io.read_tensors(file)
         except SchemaError as error:
-            told_n += "m.safetensors: the file must be" in str(error)
+            told_n += "m.safetensors: the file" in str(error)
             continue
         assert all(np.array_equal(found[name], tensors[name]) for name in tensors)
         assert {name: words[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
@@ -192,7 +192,7 @@ def test_a_changed_bit_among_the_readings_of_a_table_is_told(tmp_path):
         try:
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
-            told_n += i <= end and "c0.parquet: the file must be readable Parquet" in str(error)
+            told_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
     assert told_n > end // 2  # the other bits are of the pages' headers, which say nothing of what is read
 
 

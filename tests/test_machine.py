@@ -59,7 +59,7 @@ def test_a_damaged_table_raises_one_sentence(tmp_path):
     content = (tmp_path / "t.parquet").read_bytes()
     for damaged in (content[:-20], bytes(500) + content[500:], b""):
         (tmp_path / "t.parquet").write_bytes(damaged)
-        with pytest.raises(SchemaError, match="must be readable Parquet; got .* `reskin check-cache` and `dvc repro`"):
+        with pytest.raises(SchemaError, match="not readable as Parquet: .* `reskin check-cache` and `dvc repro`"):
             io.read_table(tmp_path / "t.parquet")
 
 

@@ -86,7 +86,7 @@ def test_fields_in_mT_are_refused(tmp_path, model):
 
 def test_other_tables_and_labelled_recordings_raise(tmp_path, model):
     io.write_table(tmp_path / "x.parquet", pa.table({"x": [1.0]}))
-    with pytest.raises(CaptureError, match="columns must be those of reskin decode; got x"):
+    with pytest.raises(CaptureError, match="not the columns of reskin decode: x"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
     write_capture(tmp_path / "c0", make_header(capture="c0"), {})
     with pytest.raises(CaptureError, match="layout .* cannot be predicted"):
@@ -141,7 +141,7 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
         ({"format": 2}, "format 2 is not supported"),
         ({"output": {"x_mm": "mm", "y_mm": "mm"}}, "the model predicts x_mm, y_mm, not x_mm, y_mm, Fz_N"),
         ({"input": None}, r"model\.json: input must be"),
-        ({"input": {}}, "input.quantity, input.unit, .* must be given; got nothing"),
+        ({"input": {}}, "input.quantity, input.unit, .* are missing"),
         ({"input": CARD["input"] | {"unit": "T"}}, "input.unit must be 'uT'; got 'T'"),
         ({"input": CARD["input"] | {"channels_n": "15"}}, "input.channels_n must be a valid integer; got '15'"),
         ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),
@@ -154,7 +154,7 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
             "inputs shape give 16 inputs, but the weights take 15",
         ),
         ({"recipe": {"inputs": "spectrum", "architecture": "paper"}}, "recipe.inputs must be 'raw' or 'shape'"),
-        ({"recipe": {"inputs": "raw"}}, "recipe.architecture must be given; got nothing"),
+        ({"recipe": {"inputs": "raw"}}, "recipe.architecture is missing"),
     ],
 )
 def test_a_wrong_card_raises(tmp_path, model, change, message):
@@ -167,7 +167,7 @@ def test_a_wrong_card_raises(tmp_path, model, change, message):
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
 def test_an_incomplete_card_raises(tmp_path, model, lacking):
     model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
-    with pytest.raises(ReskinError, match=f"{lacking} (must be given|None is not supported)"):
+    with pytest.raises(ReskinError, match=f"{lacking} (is missing|None is not supported)"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 

@@ -69,8 +69,9 @@ def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
     """Return the board of this machine; raise `CaptureError` if there is none, or more than one."""
     boards = find_boards(names)
     if len(boards) != 1:
-        got, remedy = "; ".join(map(str, boards)), "Give --port."
-        raise CaptureError("ports", "the board", "one, to go without --port", got, remedy)
+        raise CaptureError(
+            f"{len(boards)} boards are connected: {'; '.join(map(str, boards))}. Choose one with --port."
+        )
     return boards[0]
 
 
@@ -80,7 +81,7 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     boards = [each for each in found if each.problem is None]
     if not boards:
         got = "; ".join(map(str, found)) or "no serial port at all"
-        raise CaptureError("ports", "boards", "one or more, to go without --port", got, "Plug one in, or give --port.")
+        raise CaptureError(f"no board found: {got}. Plug one in, or give --port.")
     return boards
 
 
@@ -142,10 +143,10 @@ def find_replugged_port(
     """
     say("Unplug the board.")
     before = set(names())
-    gone = _wait(lambda: before - set(names()), pause, hunting_s, "a port that goes")
-    say(f"{', '.join(sorted(gone))} went. Plug it in again.")
+    gone = _wait(lambda: before - set(names()), pause, hunting_s, "disappeared")
+    say(f"{', '.join(sorted(gone))} disappeared. Plug it in again.")
     left = before - gone
-    return min(_wait(lambda: set(names()) - left, pause, hunting_s, "a port that comes"))
+    return min(_wait(lambda: set(names()) - left, pause, hunting_s, "appeared"))
 
 
 def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], hunting_s: float, what: str) -> set[str]:
@@ -153,7 +154,7 @@ def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], huntin
         if found := change():
             return found
         pause(POLL_S)
-    raise CaptureError("ports", what, f"seen within {hunting_s:g} s", "none", "Is it a board with a serial port?")
+    raise CaptureError(f"no port {what} within {hunting_s:g} s. Is it a board with a serial port?")
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:

@@ -26,10 +26,10 @@ def open_port(port: str, baud: int) -> Device:
     """
     try:
         if "://" in port and not port.startswith(SOCKET):  # pyserial has more schemes, some of which load code
-            raise ValueError(f"of these, only {SOCKET}host:port is known")
+            raise ValueError(f"of all URLs, only {SOCKET}host:port is supported")
         device = serial.serial_for_url(port, baud, timeout=READ_TIMEOUT_s, exclusive=None if "://" in port else True)
     except (OSError, ValueError) as error:
-        raise CaptureError(port, "the port", "one that opens", error, found_ports()) from None
+        raise CaptureError(f"{port}: cannot open the port: {error}. {found_ports()}") from None
     if not isinstance(device, serial.Serial):
         device.timeout = 0
     return device

@@ -75,8 +75,8 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
     lines: dict[str, Lines] = {}
     for readings in captures:
         if readings.skin in lines:
-            rule = "poked by hand in one capture"
-            raise ParamsError(f"capture {readings.capture}", "its skin", rule, readings.skin, "Drop one.")
+            what = f"skin {readings.skin} is poked by hand in another capture too"
+            raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two.")
         lines[readings.skin] = shifted(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
         f = len(readings)
         parts.append(
@@ -148,9 +148,10 @@ def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], orde
 def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) -> None:
     skins, pool_n = np.unique(rows.skin[pool]), len(np.unique(rows.indentation[pool]))
     if len(skins) > 1:
-        remedy = "Choose on each skin by itself."
-        raise ParamsError("a choice of pokes", "its pool", "of one skin", ", ".join(skins), remedy)
+        raise ParamsError(
+            f"the pool of pokes is of several skins: {', '.join(skins)}. Choose pokes of one skin at a time."
+        )
     if indentations_n > pool_n:
         rule = f"at most the {pool_n} indentations of its pool"
-        remedy = "Ask for fewer, or let section split keep a larger pool."
+        remedy = "Choose fewer, or let section split keep a larger pool."
         raise ParamsError(f"skin {', '.join(skins)}", "pokes to choose", rule, indentations_n, remedy)

@@ -62,16 +62,15 @@ def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
 def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
     """Stack the contacts of a scene's captures, and count dropped rows; `targets` name columns of `Readings`."""
     if not captures:
-        raise ParamsError("the scene", "captures", "one or more", "none", "Add one with `reskin add`.")
+        raise ParamsError("the scene has no captures. Add one with `reskin add`.")
     _check_one_kind(captures)
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     pairs = list(zip(captures, kept, strict=True))
     for readings, keep in pairs:
         if not keep.any():
-            what = f"readings with a known place and at least {selection.force_min_N} N"
-            remedy = "Look at its places and at the sign of its force."
-            raise ParamsError(f"capture {readings.capture}", what, "one or more", f"none of {len(readings)}", remedy)
+            what = f"none of {len(readings)} readings has a known place and at least {selection.force_min_N} N"
+            raise ParamsError(f"capture {readings.capture}: {what}. Check its places and the sign of its force.")
     passes_n: dict[str, int] = {}
     pass_i = []
     for readings, keep in pairs:
@@ -97,9 +96,10 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
 def stack(above: Rows, below: Rows) -> Rows:
     """Stack rows below others, which keep their numbers; indentations below are numbered after those above."""
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
-        rule = f"the {above.db_uT.shape[1]} of {above.capture[0]}"
+        above_n, below_n = above.db_uT.shape[1], below.db_uT.shape[1]
         raise ParamsError(
-            f"capture {below.capture[0]}", "channels", rule, below.db_uT.shape[1], "Use boards of one kind."
+            f"capture {below.capture[0]}: {below_n} channels, but {above.capture[0]} has {above_n}. Use boards of one "
+            "kind."
         )
     stacked = {name: np.concatenate([getattr(above, name), getattr(below, name)]) for name in AS_THEY_ARE}
     indentation = np.concatenate([above.indentation, below.indentation + above.indentation.max() + 1])
@@ -129,8 +129,8 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
     for readings in captures:
         where, skin = f"capture {readings.capture}", readings.skin
         if readings.chips_n != first.chips_n:
-            what, rule = "chips of a scene's captures", f"the {first.chips_n} of {first.capture}"
-            raise ParamsError(where, what, rule, readings.chips_n, "Add it to a scene of its own.")
+            what = f"{readings.chips_n} chips, but {first.capture} in the same scene has {first.chips_n}"
+            raise ParamsError(f"{where}: {what}. Add it to a scene of its own.")
         if readings.source != first.source:
             rule = f"{first.source}, as {first.capture} is"
             remedy = "Simulated and recorded captures belong to different scenes."

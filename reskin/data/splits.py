@@ -113,7 +113,7 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """One fold a board: train on all other boards, test on its skins (paper section 5.1)."""
     boards = np.unique(rows.board)
     if len(boards) < 2:
-        remedy = "Add another board's recording, or take lobo out of the scene's experiments."
+        remedy = "Add another board's recording, or remove lobo from the scene's experiments."
         raise ParamsError("experiment lobo", "boards", "two or more", f"{len(boards)} ({', '.join(boards)})", remedy)
     folds = []
     for board in boards:
@@ -135,7 +135,7 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
         held, skins = np.flatnonzero(rows.board == board), np.unique(rows.skin[rows.board != board])
         if max(split.sensors_skins_n) > len(skins):
             rule = f"at most the {len(skins)} skins beside held-out board {board}"
-            remedy = "Ask for fewer, or add another board's recording."
+            remedy = "Reduce it, or add another board's recording."
             raise ParamsError("experiment sensors", "split.sensors_skins_n", rule, max(split.sensors_skins_n), remedy)
         draws = range(split.sensors_draws_n)
         orders = [rng_for(seed, "sensors", str(board), draw_i).permutation(skins) for draw_i in draws]
@@ -167,7 +167,7 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
             test = np.setdiff1d(whole.test, pool)
             if not len(test):
                 what, rule = "split.labels_pool_n", "less than its indentations"
-                remedy = "Ask for fewer, or record more."
+                remedy = "Reduce it, or record more."
                 raise ParamsError(f"fold labels/{whole.name}", what, rule, split.labels_pool_n, remedy)
             folds.append(Fold("labels", f"{whole.name}{DRAW}{draw_i}", whole.train, test, pool))
     return folds
@@ -244,9 +244,9 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
         skin_rows = np.flatnonzero(rows.skin == skin)
         captures = np.unique(rows.capture[skin_rows])
         if len(captures) > 1:
-            what, rule = f"the captures of skin {skin}", "one, as no clock orders several"
-            remedy = "Record the passes in one capture, or ask single_random."
-            raise ParamsError("experiment single_temporal", what, rule, ", ".join(captures), remedy)
+            what = f"no clock orders the {len(captures)} captures of skin {skin}: {', '.join(captures)}"
+            remedy = "Record the passes in one capture, or run single_random instead."
+            raise ParamsError(f"experiment single_temporal: {what}. {remedy}")
         pass_i = rows.pass_i[skin_rows]
         passes, what = np.unique(pass_i), f"passes of skin {skin}"
         test_n = _test_n(len(passes), split.temporal_test_fraction, what, "experiment single_temporal")
@@ -274,9 +274,10 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
     """Round the number held out to the nearest; both sides need one at least."""
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
-        got = f"{all_n}, of which {fraction:g} are {test_n}"
-        remedy = "Record more, change the fraction, or take the experiment out of the scene's."
-        raise ParamsError(where, what, "enough for both sides", got, remedy)
+        remedy = "Record more, change the fraction, or remove the experiment from the scene's."
+        raise ParamsError(
+            f"{where}: {all_n} {what} are too few for both sides: a fraction of {fraction:g} is {test_n}. {remedy}"
+        )
     return test_n
 
 
@@ -285,9 +286,9 @@ def _check_disjoint(rows: Rows, fold: Fold) -> None:
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
         if len(both):
-            where, got = f"fold {fold.experiment}/{fold.name}", f"{', '.join(both)} on both"
+            where = f"fold {fold.experiment}/{fold.name}"
             remedy = "Give every skin its own name, and each skin one board."
-            raise ParamsError(where, f"a {what}", "on one side only", got, remedy)
+            raise ParamsError(f"{where}: {what} {', '.join(both)} is both trained on and held out. {remedy}")
 
 
 _DRAW: dict[str, Callable[[Rows, Split, int], list[Fold]]] = {
@@ -322,7 +323,9 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
 def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
     """Read folds from JSON values; raise `SchemaError` if they were drawn from other rows."""
     if content["rows_n"] != len(rows):
-        raise SchemaError(where, "rows_n", f"the {len(rows)} rows of its captures", content["rows_n"], "Split again.")
+        raise SchemaError(
+            f"{where}: drawn from {content['rows_n']} rows, but its captures have {len(rows)}. Split again."
+        )
     return [
         Fold(fold["experiment"], fold["name"], *(from_ranges(fold[side]) for side in SIDES))
         for fold in content["folds"]

@@ -75,9 +75,9 @@ def check_one_each(captures: Sequence[Readings]) -> None:
         names.setdefault(readings.skin, []).append(readings.capture)
     for skin, of_skin in names.items():
         if len(of_skin) > 1:
-            what, rule = f"the captures of skin {skin}", "one, as no clock orders several"
+            what = f"no clock orders the {len(of_skin)} captures of skin {skin}: {', '.join(of_skin)}"
             remedy = "Record its contacts in one capture, or give each skin its own name."
-            raise ParamsError("experiment drift", what, rule, ", ".join(of_skin), remedy)
+            raise ParamsError(f"experiment drift: {what}. {remedy}")
 
 
 def make_parts(

@@ -173,7 +173,7 @@ def _thin(
     left_n = most_n - int(heavy.sum())
     if left_n < 1:
         raise TrainingError(
-            "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} rows of greater weight", most_n, "Raise it."
+            "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} rows of greater weight", most_n, "Increase it."
         )
     kept = np.sort(np.concatenate([np.flatnonzero(heavy), rng.choice(light, left_n, replace=False)]))
     return kept, np.where(heavy, weight * left_n / len(light), weight)[kept]
@@ -188,7 +188,7 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
         raise TrainingError(settings.method, "training rows", rule, fewest_n, "Record more.")
     if not np.isfinite(inputs).all():
         broken_n = int((~np.isfinite(inputs)).any(axis=1).sum())
-        raise TrainingError(settings.method, "inputs", "finite", f"{broken_n} rows that are not", "Drop them.")
+        raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")
 
 
 BLOCK_ROWS_N = 4096  # computed at once, to bound memory: their kernel with 6000 rows is 200 MB

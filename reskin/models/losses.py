@@ -81,15 +81,13 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
     highest = np.maximum.reduceat(place[order], start, axis=0)
     flat = np.flatnonzero((lowest == highest).all(axis=1))
     if len(flat):
-        where, got = f"triplets of group {names[flat[0]]}", f"{count[flat[0]]} points on one place"
-        remedy = "Poke at several places, or leave the group out."
-        raise TrainingError(where, "the places of its points", "two or more", got, remedy)
+        where, found = f"triplets of group {names[flat[0]]}", f"all {count[flat[0]]} points are at one place"
+        raise TrainingError(f"{where}: {found}. Poke at several places, or leave the group out.")
     is_anchor = np.zeros(len(place), bool)
     for first, n in zip(start, count, strict=True):
         is_anchor[order[first : first + n]] = _find_anchors(place[order[first : first + n]])
     if not is_anchor.any():
-        rule, got = "some nearer to one than others are", f"{len(place)} that are equally far"
-        raise TrainingError("triplets", "points", rule, got, "Poke at more places.")
+        raise TrainingError(f"triplets: all {len(place)} points are equally far from each other. Poke at more places.")
     return TripletPoints(place.astype(np.float64), codes.astype(np.int64), order, start, count, is_anchor)
 
 

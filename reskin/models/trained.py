@@ -131,8 +131,8 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
         if (card["question"], card["fold"], card["recipe_name"]) == ("lobo", board, recipe):
             found.append(Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0]))
     if not found:
-        rule = f"some of recipe {recipe} with board {board} held out"
-        raise SchemaError(str(models), "networks", rule, "none", "Train them: ask lobo of this scene.")
+        what = f"no networks of recipe {recipe} with board {board} held out"
+        raise SchemaError(f"{models}: {what}. Train them: add lobo to the scene's experiments.")
     return found
 
 

@@ -186,7 +186,7 @@ def baseline_walk(
     _check_counts(contacts_n)
     new_n = np.diff(contacts_n, prepend=0)
     if (new_n < 0).any():
-        raise ParamsError("wear", "contact count", "never falling", f"{new_n.min()}", "Sort the contacts.")
+        raise ParamsError(f"wear: the contact count falls by {-new_n.min()}. Sort the contacts.")
     steps_T = step_T * np.sqrt(new_n)[:, None] * rng.standard_normal((len(contacts_n), channels_n))
     return np.cumsum(steps_T, axis=0)
 

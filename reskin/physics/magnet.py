@@ -138,7 +138,7 @@ def place_nodes(
     """Place nodes: midpoints of cells that end at seams and edges, times Gauss nodes in z."""
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
-        raise ParamsError("quadrature", "thickness, cell and layers", "above 0", got, "Mend the design.")
+        raise ParamsError("quadrature", "thickness, cell and layers", "above 0", got, "Correct the design.")
     (along_x_m, widths_x_m), (along_y_m, widths_y_m) = (_cells(side_m, rule) for side_m in sides_m)
     gauss, weights = np.polynomial.legendre.leggauss(rule.layers_n)
     x_m, y_m, z_m = np.meshgrid(along_x_m, along_y_m, (1 + gauss) / 2 * thickness_m, indexing="ij")

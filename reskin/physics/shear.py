@@ -76,7 +76,7 @@ def _check_drag(
     friction: float,
 ) -> None:
     if not np.isfinite(path_m).all():
-        raise ParamsError("drag", "every place", "finite", "NaN or infinity", "Mend the path.")
+        raise ParamsError("drag", "every place", "finite", "NaN or infinity", "Correct the path.")
     along = np.diagonal(stiffness, axis1=1, axis2=2)
     for what, unit, values in (("normal force", "N", normal_N), ("stiffness", "N/m", along)):
         if not (np.isfinite(values) & (values >= 0)).all():
@@ -179,7 +179,7 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
     """
     layer.check_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
-        raise ParamsError("drag", "depth", "above 0 m", f"{depth_m}", "Touch the skin.")
+        raise ParamsError("drag", "depth", "above 0 m", f"{depth_m}", "Press deeper.")
     contact = layer.contact_of_depth(depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     reach_m = thickness_m * deformation.reach(tip_radius_m / thickness_m, base)
     return tabulate(slip_traction(contact), thickness_m, reach_m)

@@ -32,8 +32,10 @@ def read_frames(
     """
     chips_n = sum(name.startswith("temperature") for name in table.column_names)
     if table.column_names != list(_columns(chips_n)):
-        remedy = "Decode the dump again: reskin decode."
-        raise CaptureError(where, "columns", "those of reskin decode", ", ".join(table.column_names)[:80], remedy)
+        names = ", ".join(table.column_names)[:80]
+        raise CaptureError(
+            f"{where}: these are not the columns of reskin decode: {names}. Decode the dump again: reskin decode."
+        )
     values = [np.asarray(column) for column in table.columns]
     device_s, end_byte = values[-2:]
     if np.isfinite(device_s).all():

@@ -146,8 +146,8 @@ class _Recorder:
         account = self._frames.account()
         duration_s = time.monotonic() - self._start_s
         if not self._head:
-            got, remedy = f"none in {duration_s:.1f} s", f"Is the board running, and this its port? {found_ports()}"
-            raise CaptureError(self._port, "bytes", "coming in", got, remedy)
+            remedy = f"Is the board running, and this its port? {found_ports()}"
+            raise CaptureError(f"{self._port}: no bytes arrived in {duration_s:.1f} s. {remedy}")
         if not account["frames_n"]:
             raise no_frame(self._port, self._head, self._settings.wire, self._settings.chips_n)
         return Recording(ended, duration_s, self._writer.partial_line_bytes_n, account)

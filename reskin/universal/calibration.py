@@ -23,17 +23,19 @@ def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
     """Return one reading or several as rows; raise SchemaError on those of another board."""
     rows_uT = np.atleast_2d(np.asarray(b_uT, float))
     if rows_uT.ndim != 2 or rows_uT.shape[1] != CHANNELS_N:
-        rule, remedy = f"the {CHANNELS_N} of five chips", "Load a model of such boards."
-        raise SchemaError("fields", "channels", rule, f"shape {np.shape(b_uT)}", remedy)
+        shape = np.shape(b_uT)
+        raise SchemaError(
+            f"fields of shape {shape} do not have the {CHANNELS_N} channels of five chips. Load a model of such boards."
+        )
     return rows_uT
 
 
 def check_readings(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
     """Return calibration readings as rows; raise SchemaError on values that are not finite or out of range."""
     rows_uT = check_shape(b_uT)
-    _need("fields", "readings to learn from", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
+    _need("fields", "calibration readings", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
     rule = f"at most {FIELD_MAX_uT:,.0f} uT in size"
-    _need("fields", "readings to learn from", rule, rows_uT, np.abs(rows_uT) <= FIELD_MAX_uT)
+    _need("fields", "calibration readings", rule, rows_uT, np.abs(rows_uT) <= FIELD_MAX_uT)
     return rows_uT
 
 
@@ -50,10 +52,12 @@ def check_labels(
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n}, {CHANNELS_N})"
     if places_mm.shape != (rows_n, 2) or forces_N.shape != (rows_n,):
-        rule, remedy = "x and y, a force and a reading of each press", "Give arrays [m, 2], [m] and [m, 15]."
-        raise SchemaError("labels", "shapes", rule, got, remedy)
+        raise SchemaError(
+            f"labels: each press needs x and y, a force and a reading; got {got}. Give arrays [m, 2], [m] and [m, "
+            f"{CHANNELS_N}]."
+        )
     if rows_n > LABELS_MAX_N:
-        raise SchemaError("labels", "their number", f"at most {LABELS_MAX_N}", rows_n, "Take some of them.")
+        raise SchemaError(f"labels: {rows_n} are too many, at most {LABELS_MAX_N} can be used. Take some of them.")
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
     _need("labels", "places", f"on the skin, {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
@@ -133,7 +137,9 @@ def is_calibration(file: Path) -> bool:
 def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
     """Read calibration data; raise SchemaError on places that are not within `reach_mm` of the middle."""
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
-        raise SchemaError(file, "a saved skin", f"at most {FILE_BYTES_MAX_N:,} bytes", f"{bytes_n:,}", REMEDY)
+        raise SchemaError(
+            f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
+        )
     found, metadata = io.read_tensors(file, digest_needed=True)
     if metadata.get("format") != FORMAT:
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)

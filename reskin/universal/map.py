@@ -303,9 +303,8 @@ class MapEvaluator:
         self._gaussians = whiten(skin.hypotheses.linear, parameters, *self._errors(skin), error_cov, NOISE_uT**2)
         unknown = ~np.isfinite(self._gaussians.log_det)
         if unknown.any():
-            rule, got = "positive definite", f"{int(unknown.sum())} that are not"
-            remedy = "Take the no-load reading again."
-            raise SchemaError("a map of a skin", "covariances of its hypotheses", rule, got, remedy)
+            what = f"{int(unknown.sum())} covariances of its hypotheses are not positive definite"
+            raise SchemaError(f"a map of a skin: {what}. Take the no-load reading again.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
         """Return the law's expected errors, and the share of their variance that remains after the labels."""

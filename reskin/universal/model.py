@@ -281,7 +281,7 @@ class Universal:
         """
         noload_uT = check_readings(b_uT)
         if not len(noload_uT):
-            raise SchemaError("zero", "readings without contact", "one or more", 0, "Read the board before a touch.")
+            raise SchemaError("zero: no readings without contact. Read the board before a touch.")
         self._noload_uT = noload_uT.mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
         data = replace(self._data, rest_uT=rest_uT) if keep else CalibrationData(rest_uT)
@@ -365,7 +365,7 @@ class Universal:
     def save(self, file: Path | str) -> None:
         """Write the calibration data of this skin, for `load_universal(file)`; raise SchemaError before `zero`."""
         if self._noload_uT is None:
-            raise SchemaError("save", "the model", "zeroed", "no no-load reading", "First call zero.")
+            raise SchemaError("save: the model has no no-load reading. First call zero.")
         write_calibration(self._data, Path(file))
 
     def remember(self, file: Path | str) -> "Universal":

@@ -46,8 +46,8 @@ def pool(captures: Sequence[Readings]) -> RecordedPresses:
     )
     known = np.isfinite(place_mm).all(axis=1) & (force_N > 0)
     if not known.any():
-        where, remedy = f"board {captures[0].board}", "Record both, or do not run this experiment."
-        raise SchemaError(where, "experiment compare", "run on presses with place and force", "none", remedy)
+        what = f"board {captures[0].board} has no press with place and force"
+        raise SchemaError(f"experiment compare: {what}. Record both, or remove the experiment from the scene's.")
     return RecordedPresses(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
         capture_i=capture_i[known],

@@ -231,7 +231,7 @@ def test_too_many_pokes_are_refused():
 
 
 def test_pokes_are_chosen_on_one_skin():
-    with pytest.raises(ParamsError, match="its pool must be of one skin; got s0, s1"):
+    with pytest.raises(ParamsError, match="of several skins: s0, s1"):
         take_pokes(at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
 
 
@@ -281,7 +281,7 @@ def test_lines_of_each_skin_name_its_own_rows():
 def test_other_channels_and_repeated_skin_are_refused():
     wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], EVERY)
-    with pytest.raises(ParamsError, match="channels must be the 3 of c0; got 6"):
+    with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):
         stack(gather([readings("c0")], EVERY), other)
-    with pytest.raises(ParamsError, match="its skin must be poked by hand in one capture; got s0"):
+    with pytest.raises(ParamsError, match="skin s0 is poked by hand in another capture too"):
         hand_rows([by_hand("s0"), by_hand("s0")])

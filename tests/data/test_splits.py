@@ -292,8 +292,8 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
     [
         (ONE_BOARD, "lobo", Split(), "experiment lobo: boards must be two or more; got 1"),
         (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
-        (ONE_BOARD, "single_temporal", TEMPORAL, "passes of skin s0 must be .*; got 1, of which 0.2 are 0"),
-        (ONE_BOARD, "single_random", ALMOST_ALL, "got 3, of which 0.95 are 3"),
+        (ONE_BOARD, "single_temporal", TEMPORAL, "1 passes of skin s0 are too few .* of 0.2 is 0"),
+        (ONE_BOARD, "single_random", ALMOST_ALL, "3 readings of skin s0 are too few .* of 0.95 is 3"),
         (six_by_three_in_passes(2), "lobo", POOL_OF_2, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
         (six_by_three_in_passes(2), "sensors", SENSORS, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
         (six_by_three_in_passes(1), "sensors", MANY_SENSORS, "at most the 15 skins beside held-out board b0; got 16"),
@@ -307,7 +307,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
             poked(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
             "skin b0_s0: pokes to choose must be at most the 10 indentations of its pool; got 11",
         ),
-        (TWO_CAPTURES, "single_temporal", TEMPORAL, "the captures of skin s0 must be one, .*; got run10, run2"),
+        (TWO_CAPTURES, "single_temporal", TEMPORAL, "no clock orders the 2 captures of skin s0: run10, run2"),
     ],
 )  # fmt: skip
 def test_impossible_folds_are_refused(table, experiment, split, message):
@@ -319,7 +319,7 @@ def test_impossible_folds_are_refused(table, experiment, split, message):
     ("experiment", "split"), [("lobo", Split()), ("sensors", Split(sensors_skins_n=(1,), sensors_draws_n=1))]
 )
 def test_skin_on_two_boards_is_refused(experiment, split):
-    with pytest.raises(ParamsError, match="must be on one side only; got .* on both"):
+    with pytest.raises(ParamsError, match="is both trained on and held out"):
         draw_folds(rows(["b0", "b1"], ["s0", "s0"]), [experiment], split, 0)
 
 
@@ -359,7 +359,7 @@ def test_folds_list_boards_and_skins():
 
 def test_folds_of_other_rows_are_refused():
     document = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
-    with pytest.raises(SchemaError, match="rows_n must be the 2 rows"):
+    with pytest.raises(SchemaError, match="but its captures have 2"):
         parse_folds(document, rows(["b0", "b1"], ["s0", "s1"]), "folds.json")
 
 

@@ -91,8 +91,8 @@ class TestReplugging:
     def test_replugged_port_is_found(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
         assert found == "c"  # it may come back under another name
-        assert printed == ["Unplug the board.", "a went. Plug it in again."]
+        assert printed == ["Unplug the board.", "a disappeared. Plug it in again."]
 
     def test_waiting_for_replugging_ends(self):
-        with pytest.raises(CaptureError, match="a port that goes must be seen within 1 s"):
+        with pytest.raises(CaptureError, match="no port disappeared within 1 s"):
             self.find("ab")

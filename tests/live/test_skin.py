@@ -214,7 +214,7 @@ def test_other_chip_count_and_missing_port_raise(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
         with pytest.raises(ReskinError, match="the board has 12 channels, but the model 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
-    with pytest.raises(ReskinError, match="the port must be one that opens"), reskin.open("/dev/none"):
+    with pytest.raises(ReskinError, match="cannot open the port"), reskin.open("/dev/none"):
         pass
 
 
@@ -225,6 +225,6 @@ def test_port_held_by_another_program_is_not_open():
         try:
             while not skin.reader.problem:  # ended by the suite's time limit
                 time.sleep(0.01)
-            assert skin.alarms()[0].startswith(f"not open: {name}: the port must be one that opens")
+            assert skin.alarms()[0].startswith(f"not open: {name}: cannot open the port")
         finally:
             skin.reader.stop()

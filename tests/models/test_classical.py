@@ -279,7 +279,7 @@ def test_too_few_rows_are_refused(method, n):
 def test_nan_readings_are_refused():
     db_uT, target = rows()
     db_uT[3, 1] = np.nan
-    with pytest.raises(TrainingError, match="inputs must be finite; got 1 rows that are not"):
+    with pytest.raises(TrainingError, match="inputs of 1 rows are not finite"):
         fit_to("boosting", db_uT, target)
 
 

@@ -429,5 +429,5 @@ def test_an_unknown_parameter_is_one_sentence(story, run_stages):
     scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))
     output = run_stages("split@ci", end=False)
     scene.write_text(before)
-    assert "split: random_repeets_n must be a known parameter; got 2" in output
+    assert "split: random_repeets_n is not a known parameter (its value: 2)" in output
     assert "Traceback" not in output

@@ -77,7 +77,7 @@ def test_the_card_says_what_the_model_is_and_what_it_is_not_for(skin):
 
 
 def test_other_boards_are_refused(skin):
-    with pytest.raises(SchemaError, match="channels must be the 15 of five chips"):
+    with pytest.raises(SchemaError, match="do not have the 15 channels of five chips"):
         skin.predict(np.zeros((2, 12)))
     assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
 
@@ -124,7 +124,7 @@ def test_what_is_told_counts_and_neither_its_order_nor_what_was_asked_between(sk
     [
         ((8.0, np.nan), 1.0, "places must be on the skin"), ((40.0, 8.0), 1.0, "mm; got 40.0"),
         ((8.0, 8.0), 0.0, "forces must be above 0 N; got 0.0"), ((8.0, 8.0), np.nan, "forces must be above 0 N"),
-        ((8.0, 8.0), np.inf, "forces must be finite"), ((8.0, 8.0, 1.0), 1.0, "shapes must be x and y"),
+        ((8.0, 8.0), np.inf, "forces must be finite"), ((8.0, 8.0, 1.0), 1.0, "each press needs x and y"),
     ],
 )  # fmt: skip
 def test_labels_that_no_poke_has_are_refused_and_nothing_is_learnt(skin, place_mm, force_N, rule):
@@ -146,7 +146,7 @@ def test_a_changed_model_is_refused(skin, tmp_path):
     content[-1] ^= 1
     for changed in (bytes(content), FILE.read_bytes().replace(b"__metadata__", b"__metad4ta__")):
         file.write_bytes(changed)
-        with pytest.raises(SchemaError, match="must be"):
+        with pytest.raises(SchemaError, match="(does not match its digest|not safetensors)"):
             load_universal(file=file)
 
 
@@ -183,7 +183,7 @@ def test_labels_are_kept_where_that_is_asked_for_and_else_forgotten(skin):
     in_turn = skin.label(shifted_mm[2:], force_N[2:], read_uT[2:], keep=True).predict(read_uT)
     np.testing.assert_allclose(in_turn, at_once, rtol=1e-6)
     assert skin.presses_n == 4
-    with pytest.raises(SchemaError, match="their number must be at most 2000; got 2003"):
+    with pytest.raises(SchemaError, match="2003 are too many, at most 2000"):
         skin.label(np.full((1999, 2), 8.0), np.ones(1999), np.ones((1999, CHANNELS_N)), keep=True)
     assert skin.presses_n == 4
     assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).presses_n == 2
@@ -207,7 +207,7 @@ def many(labels_n):
 
 def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
     file = tmp_path / "s0.safetensors"
-    with pytest.raises(SchemaError, match="save: the model must be zeroed"):
+    with pytest.raises(SchemaError, match="save: the model has no no-load reading"):
         skin.save(file)
     assert not file.exists()
     skin.zero(to_chips(skin.tables.rest_uT[None])).save(file)
@@ -221,9 +221,9 @@ def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
         ({"even_uT": np.ones((66, CHANNELS_N))}, "arrays must be"),
         ({"even_uT": one_uT[:, :12]}, "arrays must be"),
         ({"labelled_mm": np.full((1, 2), 40.0), "labelled_N": np.ones(1), "labelled_uT": one_uT}, "places must be on"),
-        ({"labelled_mm": np.full((1, 2), 8.0)}, "shapes must be x and y"),
-        ({"labelled_uT": np.ones((2001, CHANNELS_N))} | many(2001), "their number must be at most 2000; got 2001"),
-        ({"pokes_uT": np.ones((9000, CHANNELS_N))}, "a saved skin must be at most 1,048,576 bytes; got 1,08"),
+        ({"labelled_mm": np.full((1, 2), 8.0)}, "each press needs x and y"),
+        ({"labelled_uT": np.ones((2001, CHANNELS_N))} | many(2001), "2001 are too many, at most 2000"),
+        ({"pokes_uT": np.ones((9000, CHANNELS_N))}, "1,08.* bytes are too many for a saved skin .at most 1,048,576"),
     ]:
         io.write_tensors(file, sound | changed, words)
         with pytest.raises(SchemaError, match=rule):
@@ -232,12 +232,12 @@ def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
     with pytest.raises(SchemaError, match="arrays must be rest_uT"):
         load_universal(file)
     file.write_bytes(b"no such thing")
-    with pytest.raises(SchemaError, match="the file must be safetensors"):
+    with pytest.raises(SchemaError, match="the file is not safetensors"):
         load_universal(file)
     io.write_tensors(file, sound, {"format": "reskin-skin-0"})
     with pytest.raises(SchemaError, match="format must be reskin-skin-1; got reskin-skin-0"):
         load_universal(file)
-    with pytest.raises(SchemaError, match="a saved skin must be at most 1,048,576 bytes"):
+    with pytest.raises(SchemaError, match="too many for a saved skin .at most 1,048,576"):
         load_universal(FILE)
 
 
@@ -245,7 +245,7 @@ def test_no_rows_give_no_answers_and_cannot_zero():
     model = load_universal()
     assert model.predict(np.empty((0, 15))).shape == (0, 3)
     assert len(model.estimate(np.empty((0, 15))).place_mm) == 0
-    with pytest.raises(SchemaError, match="readings without contact must be one or more; got 0"):
+    with pytest.raises(SchemaError, match="no readings without contact"):
         model.zero(np.empty((0, 15)))
 
 

@@ -105,5 +105,5 @@ def test_even_presses_tell_the_labels_middle(skin):
 
 def test_a_covariance_that_is_not_positive_definite_is_an_error(skin):
     broken = replace(skin, hypotheses=replace(skin.hypotheses, error_cov=-1e6 * skin.hypotheses.error_cov))
-    with pytest.raises(SchemaError, match="covariances of its hypotheses must be positive definite"):
+    with pytest.raises(SchemaError, match="covariances of its hypotheses are not positive definite"):
         _ = broken.evaluator

@@ -373,5 +373,5 @@ def test_a_variant_without_a_choice_is_stated_and_a_broken_record_is_an_error():
     checks = choice_checks(recipes={"adapt": RECIPE})
     assert passes(checks)
     assert checks[-1].found == "not chosen by the study: it chose none for this"
-    with pytest.raises(ParamsError, match="skins must be given; got nothing"):
+    with pytest.raises(ParamsError, match="skins is missing"):
         choice_checks({key: value for key, value in CHOICE.items() if key != "skins"})
