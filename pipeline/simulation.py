@@ -1,17 +1,47 @@
-"""Simulation settings of a scene."""
+"""Simulation settings of a scene, checked against what its experiments read."""
 
 from pipeline.settings import Settings
-from reskin.simulation.protocols import Load
-from reskin.simulation.settings import SimulationSettings, parse_simulation
+from reskin.errors import ParamsError
+from reskin.simulation.protocols import SKIN_MM, Load
+from reskin.simulation.settings import MAIN, SimulationSettings, parse_simulation
+
+# Protocols that experiments read, and the kind that each can read.
+KINDS = {
+    "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter", "glass": "load",
+    "press": "press", "log": "walk",
+}  # fmt: skip
+ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "press", "log")  # compared with, or read by networks of, these
+ON_OTHER_BOARDS = ("flexible",)
+OF_ONE_SKIN = ("wear", "glass", "press", "log")  # their experiments read one capture
 
 
 def simulation_settings(settings: Settings) -> SimulationSettings:
     """Parse section `simulate` of a scene, with the nominal skin, rig, chip, spreads and terms."""
-    return parse_simulation(settings["simulate"], settings.shared, f"{settings.where}: simulate")
+    where = f"{settings.where}: simulate"
+    simulation = parse_simulation(settings["simulate"], settings.shared, where)
+    check_protocols(simulation, where)
+    return simulation
+
+
+def check_protocols(simulation: SimulationSettings, where: str) -> None:
+    """Raise ParamsError, which names `where`, if an experiment cannot read one of the protocols."""
+    main = simulation.main.boards
+    if simulation.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
+        raise ParamsError(f"{where}: skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}. Mend it there.")
+    for name, protocol in simulation.protocols.items():
+        kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
+        faults = {
+            f"kind is {kind}, which its experiment reads, not {protocol.kind}": protocol.kind != kind,
+            f"boards is {main}, as of {MAIN}, not {boards}": name in ON_MAIN_BOARDS and boards != main,
+            f"boards is another kind than that of {MAIN}, not {boards} too": name in ON_OTHER_BOARDS and boards == main,
+            f"skins_n is 1, as its experiment reads one skin, not {skins_n}": name in OF_ONE_SKIN and skins_n != 1,
+        }
+        for fault in (rule for rule, is_broken in faults.items() if is_broken):
+            raise ParamsError(f"{where}: protocol {name}: {fault}. Mend it there.")
 
 
 def load_protocol(settings: Settings, protocol: str) -> Load:
     """Return the settings of a protocol that loads the skin step by step."""
     load = simulation_settings(settings).protocols[protocol]
-    assert isinstance(load, Load), "checked by SimulationSettings"
+    assert isinstance(load, Load), "checked by check_protocols"
     return load

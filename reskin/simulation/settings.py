@@ -12,26 +12,11 @@ from reskin.physics.chip import ChipDesign
 from reskin.physics.magnet import QuadratureSettings
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.contact import Terms
-from reskin.simulation.protocols import SKIN_MM, Drag, Grid, Hand, Protocol
+from reskin.simulation.defaults import SHARED
+from reskin.simulation.protocols import Drag, Grid, Hand, Protocol
 from reskin.simulation.rig import Rig
 
 MAIN = "grid"  # its captures are named as their skins
-# Protocols that experiments read, and the kind that each can read.
-KINDS: dict[str, str] = {
-    MAIN: "grid", "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter",
-    "glass": "load", "press": "press", "log": "walk",
-}  # fmt: skip
-ON_MAIN_BOARDS = (
-    "wear",
-    "drag",
-    "hand",
-    "glass",
-    "press",
-    "log",
-)  # compared with, or read by networks of, these
-ON_OTHER_BOARDS = ("flexible",)
-OF_ONE_SKIN = ("wear", "glass", "press", "log")  # their experiments read one capture
-SHARED: dict[str, type[Strict]] = {"skin": SkinDesign, "rig": Rig, "chip": ChipDesign, "spreads": Spreads}
 Count = Annotated[int, Field(ge=1, le=1000)]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 
@@ -74,6 +59,8 @@ class SimulationSettings(Strict):
                 raise ValueError(f"protocol {name}: boards is one of {sorted(self.boards)}, not {protocol.boards!r}")
             if isinstance(protocol, Hand) and protocol.tilt_sd_deg > 0 and "friction" not in protocol.terms:
                 raise ValueError(f"protocol {name}: a stylus that leans (tilt_sd_deg) needs the term friction")
+            if isinstance(protocol, Drag) and "friction" not in protocol.terms:
+                raise ValueError(f"protocol {name}: terms of a drag hold friction, without which there is no shear")
             kind, skins_n = self.boards[protocol.boards], protocol.skins_n
             if skins_n > (have_n := kind.boards_n * kind.skins_per_board_n):
                 raise ValueError(
@@ -87,24 +74,6 @@ class SimulationSettings(Strict):
     def _check_main_protocol(self) -> "SimulationSettings":
         if MAIN not in self.protocols or not isinstance(self.protocols[MAIN], Grid):
             raise ValueError(f"protocols holds a grid named {MAIN}")
-        if self.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
-            raise ValueError(f"skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}")
-        return self
-
-    @model_validator(mode="after")
-    def _check_protocols_of_experiments(self) -> "SimulationSettings":
-        for name, protocol in self.protocols.items():
-            kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
-            if protocol.kind != kind:
-                raise ValueError(f"protocol {name}: kind is {kind}, which its experiment reads, not {protocol.kind}")
-            if isinstance(protocol, Drag) and "friction" not in protocol.terms:
-                raise ValueError(f"protocol {name}: terms of a drag hold friction, without which there is no shear")
-            if name in ON_MAIN_BOARDS and boards != self.main.boards:
-                raise ValueError(f"protocol {name}: boards is {self.main.boards}, as of {MAIN}, not {boards}")
-            if name in ON_OTHER_BOARDS and boards == self.main.boards:
-                raise ValueError(f"protocol {name}: boards is another kind than that of {MAIN}, not {boards} too")
-            if name in OF_ONE_SKIN and skins_n != 1:
-                raise ValueError(f"protocol {name}: skins_n is 1, as its experiment reads one skin, not {skins_n}")
         return self
 
     @property

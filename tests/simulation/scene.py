@@ -5,6 +5,15 @@ from reskin.simulation.settings import SimulationSettings
 from tests.physics.test_board import SPREADS
 
 GRID = {"kind": "grid", "boards": "rigid", "skins_n": 4, "passes_n": 2, "depths_mm": (0.6, 1.2), "terms": []}
+HAND = {
+    "kind": "hand", "boards": "rigid", "skins_n": 1, "lines_n": 3, "pokes_per_line_n": 4, "depth_mm": (0.4, 1.2),
+    "place_sd_mm": 0.3, "tilt_sd_deg": 0.0, "terms": [],
+}  # fmt: skip
+DRAG = {
+    "kind": "drag", "boards": "rigid", "skins_n": 1, "passes_n": 1, "depths_mm": (0.6,), "step_mm": 2.0,
+    "terms": ["friction"],
+}  # fmt: skip
+LOAD = {"kind": "load", "boards": "rigid", "skins_n": 1, "passes_n": 2, "force_max_N": 1.0, "step_N": 0.5, "terms": []}
 CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
 RIGID = {"chips_xy_mm": CHIPS_MM, "chips_turn_deg": (0.0, 180.0, 270.0, 90.0, 0.0), "gap_mm": 1.1}
 RULE = {"cell_mm": 1.0, "layers_n": 4}

@@ -10,15 +10,23 @@ from reskin.errors import ParamsError
 from reskin.physics.board import draw_board
 from reskin.physics.skin import changes_of_field, draw_skin, forces
 from reskin.simulation.capture import list_captures, simulate_capture, to_files
-from tests.simulation.scene import AGEING, GRID, RELAXATION, RIGID, SECTIONS, TEMPERATURE, synthesis, with_protocol
+from tests.simulation.scene import (
+    AGEING,
+    DRAG,
+    GRID,
+    HAND,
+    LOAD,
+    RELAXATION,
+    RIGID,
+    SECTIONS,
+    TEMPERATURE,
+    synthesis,
+    with_protocol,
+)
 
 LIFTED_N, MOVING_N, DWELL_N = 1 + 4, 2, 1 + 3
 FRAMES_N = LIFTED_N + MOVING_N + DWELL_N + MOVING_N
 READ = slice(LIFTED_N + MOVING_N + 1, LIFTED_N + MOVING_N + DWELL_N)
-HAND = {
-    "kind": "hand", "boards": "rigid", "skins_n": 1, "lines_n": 3, "pokes_per_line_n": 4, "depth_mm": (0.4, 1.2),
-    "place_sd_mm": 0.3, "tilt_sd_deg": 0.0, "terms": [],
-}  # fmt: skip
 
 
 def capture_of(of=None, protocol="grid", *, board="b0", skin="b0_s0", seed=1):
@@ -150,11 +158,6 @@ def test_the_frames_of_forty_chips_come_through_the_wire_as_they_went_in():
     np.testing.assert_array_equal(frames.temperature_degC, one.temperature_degC)
 
 
-def test_the_papers_protocol_is_refused_on_a_skin_that_is_not_the_papers():
-    with pytest.raises(ParamsError, match="skin_mm of the boards of protocol grid is .20.0, 20.0."):
-        synthesis("boards", rigid=SECTIONS["boards"]["rigid"] | {"skin_mm": (50.8, 101.6)})
-
-
 def test_a_hand_leaves_no_label_but_a_field_that_changes():
     one = capture_of(with_protocol("hand", HAND), "hand")
     for name in ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N"):
@@ -243,6 +246,8 @@ def test_an_unknown_parameter_is_refused_by_name(section, name):
         (GRID, {"terms": {"ageing": AGEING}}, "terms holds exactly what a protocol needs"),
         (HAND | {"depth_mm": (1.2, 0.4)}, {}, "from the shallower to the deeper"),
         (HAND | {"tilt_sd_deg": 5.0}, {}, "a stylus that leans .tilt_sd_deg. needs the term friction"),
+        (DRAG | {"terms": []}, {}, "protocol other: terms of a drag hold friction"),
+        (LOAD | {"passes_n": 1}, {}, "protocols.other.passes_n must be greater than or equal to 2; got 1"),
     ],
 )
 def test_a_scene_that_contradicts_itself_is_refused(protocol, changes, sentence):
@@ -253,51 +258,3 @@ def test_a_scene_that_contradicts_itself_is_refused(protocol, changes, sentence)
 def test_a_depth_that_the_skin_cannot_take_is_refused():
     with pytest.raises(ParamsError, match="depth must be"):
         capture_of(with_protocol("deep", GRID | {"depths_mm": (2.5,)}), "deep")
-
-
-FLEXIBLE = SECTIONS["boards"] | {"flexible": SECTIONS["boards"]["rigid"] | {"letter": "f"}}
-DRAG = {
-    "kind": "drag", "boards": "rigid", "skins_n": 1, "passes_n": 1, "depths_mm": (0.6,), "step_mm": 2.0,
-    "terms": ["friction"],
-}  # fmt: skip
-FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
-LOAD = {"kind": "load", "boards": "rigid", "skins_n": 1, "passes_n": 2, "force_max_N": 1.0, "step_N": 0.5, "terms": []}
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("wear", "grid"), ("flexible", "grid"), ("drag", "drag"), ("hand", "hand"), ("sleeve", "scatter"),
-        ("glass", "load"), ("press", "press"), ("log", "walk"),
-    ],
-)  # fmt: skip
-def test_a_protocol_of_a_kind_that_its_experiment_cannot_read_is_refused(name, kind):
-    other = HAND if kind == "grid" else GRID | {"skins_n": 1}
-    sentence = f"test: protocol {name}: kind is {kind}, which its experiment reads, not {other['kind']}. "
-    with pytest.raises(ParamsError, match=sentence) as refused:
-        with_protocol(name, other)
-    assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "protocol", "changes", "sentence"),
-    [
-        ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n is 1, .*, not 2"),
-        ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n is 1, .*, not 2"),
-        ("glass", LOAD | {"passes_n": 1}, {}, "protocols.glass.passes_n must be greater than or equal to 2; got 1"),
-        ("glass", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol glass: boards is rigid, .* flexible"),
-        ("hand", HAND | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol hand: boards is rigid, .* flexible"),
-        ("drag", DRAG | {"boards": "flexible"}, FRICTION, "protocol drag: boards is rigid, as of grid, not flexible"),
-        ("drag", DRAG | {"terms": []}, {}, "protocol drag: terms of a drag hold friction"),
-        ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards is another kind .*, not rigid too"),
-    ],
-)
-def test_a_protocol_that_its_experiment_cannot_be_asked_of_is_refused(name, protocol, changes, sentence):
-    with pytest.raises(ParamsError, match=sentence):
-        with_protocol(name, protocol, **changes)
-
-
-def test_protocols_that_suit_their_experiments_are_taken():
-    assert with_protocol("drag", DRAG, **FRICTION).protocols["drag"].skins_n == 1
-    assert with_protocol("glass", LOAD).protocols["glass"].kind == "load"
-    assert with_protocol("flexible", GRID | {"boards": "flexible"}, boards=FLEXIBLE).protocols["flexible"].skins_n == 4

@@ -1,0 +1,58 @@
+"""Protocols of a scene, checked against what its experiments read."""
+
+import pytest
+
+from pipeline.simulation import check_protocols
+from reskin.errors import ParamsError
+from tests.simulation.scene import DRAG, GRID, HAND, LOAD, SECTIONS, synthesis, with_protocol
+
+FLEXIBLE = SECTIONS["boards"] | {"flexible": SECTIONS["boards"]["rigid"] | {"letter": "f"}}
+FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("wear", "grid"), ("flexible", "grid"), ("drag", "drag"), ("hand", "hand"), ("sleeve", "scatter"),
+        ("glass", "load"), ("press", "press"), ("log", "walk"),
+    ],
+)  # fmt: skip
+def test_wrong_kind_of_protocol(name, kind):
+    other = HAND if kind == "grid" else GRID | {"skins_n": 1}
+    sentence = f"test: protocol {name}: kind is {kind}, which its experiment reads, not {other['kind']}. "
+    with pytest.raises(ParamsError, match=sentence) as refused:
+        check_protocols(with_protocol(name, other), "test")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "protocol", "changes", "sentence"),
+    [
+        ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n is 1, .*, not 2"),
+        ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n is 1, .*, not 2"),
+        ("glass", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol glass: boards is rigid, .* flexible"),
+        ("hand", HAND | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol hand: boards is rigid, .* flexible"),
+        ("drag", DRAG | {"boards": "flexible"}, FRICTION, "protocol drag: boards is rigid, as of grid, not flexible"),
+        ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards is another kind .*, not rigid too"),
+    ],
+)
+def test_wrong_boards_or_skins(name, protocol, changes, sentence):
+    with pytest.raises(ParamsError, match=sentence):
+        check_protocols(with_protocol(name, protocol, **changes), "test")
+
+
+@pytest.mark.parametrize(
+    ("name", "protocol", "changes"),
+    [
+        ("drag", DRAG, FRICTION), ("glass", LOAD, {}),
+        ("flexible", GRID | {"boards": "flexible"}, {"boards": FLEXIBLE}),
+    ],
+)  # fmt: skip
+def test_suitable_protocols(name, protocol, changes):
+    check_protocols(with_protocol(name, protocol, **changes), "test")
+
+
+def test_main_boards_have_the_skin_of_the_paper():
+    changed = synthesis("boards", rigid=SECTIONS["boards"]["rigid"] | {"skin_mm": (50.8, 101.6)})
+    with pytest.raises(ParamsError, match="skin_mm of the boards of protocol grid is .20.0, 20.0."):
+        check_protocols(changed, "test")
