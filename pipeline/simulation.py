@@ -1,8 +1,9 @@
 """Simulation settings of a scene, checked against what its experiments read."""
 
 from pipeline.settings import Settings
+from reskin.data.grid import SKIN_MM
 from reskin.errors import ParamsError
-from reskin.simulation.protocols import SKIN_MM, Load
+from reskin.simulation.protocols import Load
 from reskin.simulation.settings import MAIN, SimulationSettings, parse_simulation
 
 # Protocols that experiments read, and the kind that each can read.

@@ -24,13 +24,13 @@ from pipeline.training.universal import (
     split_presses,
 )
 from reskin.config import parse, read_yaml
-from reskin.data.grid import CENTRE_MM
+from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.physics.skin import SkinDesign
 from reskin.simulation import defaults
 from reskin.universal.calibration import LikelihoodPowers, lower_by_misfit, lower_by_residuals
 from reskin.universal.law import CHIPS_MM, Setup, to_chips
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, tabulate
-from reskin.universal.model import SKIN_MM, Universal, write
+from reskin.universal.model import Universal, write
 from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
 from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks

@@ -14,6 +14,7 @@ SIDE_POINTS_N = 9
 PITCH_MM = 2.0
 BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # rows, and columns
 CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
+SKIN_MM = (20.0, 20.0)  # sides of the paper's skin, from the authors' CAD
 
 
 @dataclass(frozen=True)

@@ -27,16 +27,15 @@ from reskin.board.reader import PLUGGED_IN, Reader
 from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate
 from reskin.config import parse
-from reskin.data.grid import CENTRE_MM
+from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.live.health import LIVE_POLICY, Health
 from reskin.logs import CONTACT_SDS, quiet_start
 from reskin.models.inputs import VIEW, Scaler
 from reskin.models.trained import Network
+from reskin.physics.board import BoardDesign
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
-from reskin.simulation.protocols import SKIN_MM
-from reskin.simulation.settings import BoardKind
 from reskin.universal.calibration import CHANNELS_N
 from reskin.universal.map import Estimate
 from reskin.universal.model import Universal
@@ -188,14 +187,16 @@ def layout_of(chips_n: int) -> Layout:
     The bytes do not say which board it is: five chips are taken for the paper's board, forty for its sleeve.
     """
     for name, settings in nominal("boards").items():
-        kind = parse(BoardKind, settings, f"nominal board {name}")
-        if len(kind.design.places_mm) == chips_n:
-            half_mm = np.array(kind.skin_mm) / 2
-            centre_mm = np.full(2, CENTRE_MM) if kind.skin_mm == SKIN_MM else half_mm
-            turn = Rotation.from_euler("z", np.array(kind.design.turns_deg)[:, None], degrees=True).as_matrix()
+        design = parse(BoardDesign, settings["design"], f"nominal board {name}")
+        if len(design.places_mm) == chips_n:
+            along_x_mm, along_y_mm = settings["skin_mm"]
+            skin_mm = (float(along_x_mm), float(along_y_mm))
+            half_mm = np.array(skin_mm) / 2
+            centre_mm = np.full(2, CENTRE_MM) if skin_mm == SKIN_MM else half_mm
+            turn = Rotation.from_euler("z", np.array(design.turns_deg)[:, None], degrees=True).as_matrix()
             corner_mm = centre_mm - half_mm
-            chips_mm = centre_mm + np.array(kind.design.places_mm)
-            return Layout(True, chips_mm, turn, (float(corner_mm[0]), float(corner_mm[1])), kind.skin_mm)
+            chips_mm = centre_mm + np.array(design.places_mm)
+            return Layout(True, chips_mm, turn, (float(corner_mm[0]), float(corner_mm[1])), skin_mm)
     chips_mm = np.column_stack([SPACING_MM * (0.5 + np.arange(chips_n)), np.full(chips_n, SPACING_MM)])
     skin_mm = (SPACING_MM * chips_n, 2 * SPACING_MM)
     return Layout(False, chips_mm, np.tile(np.eye(3), (chips_n, 1, 1)), (0.0, 0.0), skin_mm)

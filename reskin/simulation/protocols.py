@@ -27,7 +27,6 @@ class Stops:
     depth_mm: Float64[np.ndarray, "n p"]
 
 
-SKIN_MM = (20.0, 20.0)  # authors' CAD
 Count = Annotated[int, Field(ge=1, le=100_000)]
 Depth_mm = Annotated[float, Field(gt=0, le=10)]
 Depths_mm = Annotated[tuple[Depth_mm, ...], Field(min_length=1)]

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from reskin import io
-from reskin.data.grid import CENTRE_MM
+from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.errors import SchemaError
 from reskin.universal import network
 from reskin.universal.calibration import (
@@ -62,7 +62,6 @@ BLOCK_N = 200  # readings at a time, to bound memory
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card beside it, .json
 FORMAT = "reskin-universal-3"
-SKIN_MM = (20.0, 20.0)
 REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # of places, about the middle
 CHOICE_EVERY_N = 3  # of the lattice's places, one is a candidate for the next press
 

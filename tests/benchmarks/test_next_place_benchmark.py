@@ -10,14 +10,14 @@ from collections.abc import Callable
 import numpy as np
 
 from reskin.config import parse
-from reskin.data.grid import CENTRE_MM
+from reskin.data.grid import CENTRE_MM, SKIN_MM
 from reskin.live.session import GUIDED_MM
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 from reskin.simulation.defaults import nominal
 from reskin.universal.law import CHIPS_MM, Setup, to_board
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, expected_gain
-from reskin.universal.model import SKIN_MM, Universal, load_universal
+from reskin.universal.model import Universal, load_universal
 from reskin.universal.population import PLACES_N, draw_population
 from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, add_error
 from tests.benchmarks import size

@@ -16,12 +16,13 @@ import numpy as np
 from pipeline.training.shipping import NO_POWERS, calibrate
 from pipeline.training.universal import AS_TRAINED, LAW_ERRORS, draw_prior_skins, split_presses
 from reskin.config import parse
+from reskin.data.grid import SKIN_MM
 from reskin.physics.skin import SkinDesign
 from reskin.simulation.defaults import nominal
 from reskin.universal import map
 from reskin.universal.law import CHIPS_MM, Setup
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, Tables, tabulate
-from reskin.universal.model import SKIN_MM, Universal
+from reskin.universal.model import Universal
 from reskin.universal.network import FULL_SET_N, Weights
 from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
 from tests.benchmarks import FULL, size

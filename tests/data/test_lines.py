@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reskin.data.grid import points_mm, protocol
+from reskin.data.grid import SKIN_MM, points_mm, protocol
 from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, shifted, take_pokes
 from reskin.data.rows import Rows, Selection, gather, stack
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from reskin.simulation.protocols import SKIN_MM, Hand
+from reskin.simulation.protocols import Hand
 from tests.data.tables import readings
 from tests.data.tables import rows as labelled
 

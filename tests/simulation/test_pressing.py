@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reskin.data.grid import SKIN_MM
 from reskin.errors import CaptureError, ParamsError
 from reskin.physics.skin import draw_skin, forces
 from reskin.recordings.header import write_capture
@@ -14,7 +15,6 @@ from reskin.seeds import rng_for
 from reskin.simulation.capture import simulate_capture, to_files
 from reskin.simulation.protocols import (
     LIFTED_MM,
-    SKIN_MM,
     Press,
     Walk,
     depths_under_load,

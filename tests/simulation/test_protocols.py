@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from reskin.config import parse
-from reskin.data.grid import points_mm
+from reskin.data.grid import SKIN_MM, points_mm
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
-from reskin.simulation.protocols import SKIN_MM, Drag, Grid, Hand, Scatter
+from reskin.simulation.protocols import Drag, Grid, Hand, Scatter
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": ()}
 GRID = Grid(kind="grid", passes_n=2, depths_mm=(0.2, 0.4, 0.6, 0.8, 1.0, 1.2), **SHARED)

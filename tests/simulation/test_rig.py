@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reskin.data.grid import SKIN_MM
 from reskin.seeds import rng_for
-from reskin.simulation.protocols import SKIN_MM, Drag, Grid
+from reskin.simulation.protocols import Drag, Grid
 from reskin.simulation.rig import (
     FORCE_RANGE_N,
     Rig,
