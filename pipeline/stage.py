@@ -5,13 +5,12 @@ import inspect
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from pipeline.executors import end_workers
 from pipeline.progress import announce
 from pipeline.provenance import COSTS, clear_cost, record_cost
-from pipeline.settings import Settings, read_settings, section_of
+from pipeline.settings import read_settings, section_of
 from reskin.errors import ReskinError, explaining
 
 
@@ -22,7 +21,7 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
     parser.add_argument("--scene", required=True)
     kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
     for name, kind in kinds.items():
-        if kind is Path:
+        if name not in ("settings", "section"):
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
     options = vars(parser.parse_args(arguments))
     scene = options.pop("scene")
@@ -32,7 +31,7 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
     try:
         with explaining(stage):
             clear_cost(costs, unit)
-            if Settings in kinds.values():
+            if "settings" in kinds:
                 options["settings"] = read_settings(scene)
             if model := section_of(work):
                 options["section"] = options["settings"].section(model, stage)
