@@ -8,15 +8,15 @@ from typing import Any, Literal
 from reskin.config import Strict, parse, read_yaml
 
 FOLDER = Path(__file__).parent / "experiments"
-Kind = Literal["models", "curve", "other", "analysis", "study", "report"]
+Kind = Literal["models", "curve", "analysis", "study", "report"]
 
 
 class Experiment(Strict):
     """What a scene can run, and what it needs.
 
-    kind: what its stage writes: `models` with cards, points of a `curve`, an `other` file about learning; the results
-    of an `analysis`, a module of `pipeline.experiments`; those of a `study` of the physics, the same for all simulated
-    scenes; or nothing, as it is part of the `report`.
+    kind: what its stage writes: `models` with cards; points of a `curve`; the results of an `analysis` (numbers, data
+    of its figures, losses of its captures); those of a `study` (numbers alone); or nothing, as it is part of the
+    `report`. Analyses and studies are modules of `pipeline.experiments`.
     stage: the stage that runs it. key: the name of its results in numbers.json; an experiment that is renamed keeps it.
     needs: experiments that the scene runs besides.
     protocol: the simulated protocol whose captures it reads; None: those of the main protocol.
@@ -87,6 +87,5 @@ LEARNING = (
     _learning("baselines", "curve", "train_classical", needs=("lobo",)),
     _learning("labels", "curve", "few_labels", needs=("lobo",), folds=("labels_pool_n", "labels_draws_n")),
     _learning("universal", "curve", "universal", needs=("labels", "compare")),
-    _learning("audit", "other", "audit", needs=("lobo",)),
     _learning("choice", "report", "report", needs=("lobo", "triplet", "adapt"), settings=False),
 )  # fmt: skip

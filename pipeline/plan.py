@@ -57,7 +57,7 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
         "simulate": simulate, "ingest_simulated": ingest_simulated, "ingest": ingest, "ingest_many": many,
         "describe": list(scenes), "split": list(scenes),
     }  # fmt: skip
-    for stage in (*stages(EXPERIMENTS, "models", "curve", "other", "study"), *ANALYSES):
+    for stage in (*stages(EXPERIMENTS, "models", "curve", "study"), *ANALYSES):
         items[stage] = [name for name, scene in scenes.items() if scene.runs(stage)]
     for one in EXPERIMENTS.values():
         if one.protocol is not None and one.recorded:

@@ -10,7 +10,7 @@ from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, check, rec
 
 ROOT = Path(__file__).resolve().parents[1]
 ADAPTED = ("lobo", "triplet", "adapt")  # the experiments that those of adaptation need
-LEARNING = ("models", "curve", "other")
+LEARNING = ("models", "curve", "study")
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)

@@ -16,21 +16,16 @@ REPORT = "pipeline.report"
 SHOWING = f"{REPORT}.experiments"  # imports the modules of experiments by name
 
 
-def experiment_stages() -> list[str]:
-    """List the stages that run a module of `pipeline.experiments`."""
-    return [*experiment_files(), "audit"]
-
-
 def all_stages() -> list[str]:
     """List all stages but this one."""
-    return list(dict.fromkeys([*MODULES, *experiment_stages()]))
+    return list(dict.fromkeys([*MODULES, *experiment_files()]))
 
 
 def digests_of(stage: str) -> dict[str, str]:
     """Return the digest of each module that decides what a stage writes, by the module's name."""
     names = imported(module_name(stage))
     if SHOWING in names:
-        return {name: digest(name) for name in imported(module_name(stage), *map(module_name, experiment_stages()))}
+        return {name: digest(name) for name in imported(module_name(stage), *map(module_name, experiment_files()))}
     computing = [name for name in names if not name.startswith(REPORT)]
     return {name: digest(name, data=not name.startswith(EXPERIMENTS)) for name in computing}
 

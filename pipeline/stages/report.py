@@ -109,7 +109,6 @@ class Inputs:
     points: dict[str, Any]
     analyses: dict[str, Any]
     studies: dict[str, Any]
-    audit: dict[str, Any]
     described: dict[str, Any]
     before_touch: list[pa.Table]
     accounts: list[dict[str, Any]]
@@ -128,7 +127,6 @@ def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, res
         points={experiment: read([stage])[stage] for experiment, stage in scene.curves.items()},
         analyses=read(scene.analyses),
         studies=read(scene.studies),
-        audit=read(["audit"] if "audit" in scene.experiments else []),
         described={scene.described: io.read_json(results / "described.json")},
         before_touch=[
             io.read_table(models / one / BEFORE_CONTACT_FILE) for one in scene.model_stages if one == "train_single"
@@ -145,6 +143,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
     costs = {unit: cost for unit, cost in read_costs(COSTS / settings.scene).items() if scene.runs(unit)}
     seconds = {file.stem: io.read_json(file) for file in sorted((SECONDS / settings.scene).glob("*.json"))}
     runtime = runtime_numbers(len(inputs.cards), costs, studies.pop("runtime", None), seconds.get("runtime", []))
+    experiments = {key: result["numbers"] for key, result in analyses.items()} | studies
     numbers = {
         "provenance": {
             "scene": settings.scene, "source": scene.source, "git": code_version(), "seed": settings.seed,
@@ -156,9 +155,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
         **before_touch_numbers(inputs.before_touch),
         "trainings": count_trainings(inputs.cards, inputs.points, analyses),
         "described": inputs.described,
-        **inputs.audit,
-        **{key: result["numbers"] for key, result in analyses.items()},
-        **studies,
+        **{one.key: experiments[one.key] for one in scene.rows if one.key in experiments},
         "runtime": runtime,
     }  # fmt: skip
     if scene.source == "simulated":
