@@ -1,4 +1,4 @@
-"""A small scene to simulate, as plain words, and small changes of it."""
+"""A small scene to simulate, and variations of it."""
 
 from reskin.config import parse
 from reskin.simulation.settings import SimulationSettings
@@ -65,10 +65,10 @@ SECTIONS = {
 
 
 def synthesis(section: str = "rig", **changes: object) -> SimulationSettings:
-    """The scene, one of its sections changed."""
+    """The scene with changes in one of its sections."""
     return parse(SimulationSettings, SECTIONS | {section: {**SECTIONS[section], **changes}}, "test")  # type: ignore[dict-item]
 
 
 def with_protocol(name: str, protocol: dict[str, object], **changes: object) -> SimulationSettings:
-    """The scene with one protocol more, and other sections instead of its own."""
+    """The scene with one more protocol and with other sections."""
     return parse(SimulationSettings, SECTIONS | {"protocols": {"grid": GRID, name: protocol}} | changes, "test")

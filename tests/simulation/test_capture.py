@@ -1,4 +1,4 @@
-"""A synthetic capture against the protocol it follows and the field it is made of; names, seeds and terms as laws."""
+"""A synthetic capture compared with its protocol and with the simulated field; names, seeds and physics terms."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def same(one, other):
 
 
 def shaped(capture, frames_n=FRAMES_N):
-    """Frames as indentation, frame within it, chip, axis."""
+    """Frames as [indentation, frame, chip, axis]."""
     return capture.b_uT.astype(np.float64).reshape(-1, frames_n, 5, 3)
 
 
@@ -59,7 +59,7 @@ def touched(capture, name):
     return getattr(capture.probe, name)[capture.probe.contact]
 
 
-def test_there_is_a_frame_for_every_reading_and_two_dwells_an_indentation(capture):
+def test_frames_and_dwells_of_each_indentation(capture):
     indentations_n = 2 * 2 * 65
     assert capture.b_uT.shape == (indentations_n * FRAMES_N, 15)
     assert capture.temperature_degC.shape == (indentations_n * FRAMES_N, 5)
@@ -67,7 +67,7 @@ def test_there_is_a_frame_for_every_reading_and_two_dwells_an_indentation(captur
     assert set(capture.overruns.values()) == {0}
 
 
-def test_a_quiet_capture_holds_the_field_of_its_board_and_skin():
+def test_noiseless_capture_equals_the_field():
     of = quiet()
     b_uT = shaped(capture_of(of))
     board = draw_board(of.boards["rigid"].design, of.spreads, seed=1, name="b0")
@@ -77,17 +77,17 @@ def test_a_quiet_capture_holds_the_field_of_its_board_and_skin():
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
     found_uT = (b_uT[:, READ] - b_uT[:, 1:2])[:130]
-    assert np.abs(found_uT - truth_uT[:, None]).max() < 0.75  # a step of z, lost twice by half
+    assert np.abs(found_uT - truth_uT[:, None]).max() < 0.75  # one LSB of z: two roundings
 
 
-def test_a_robot_that_repeats_badly_changes_the_field_but_not_the_label():
+def test_robot_spread_changes_fields_but_not_labels():
     exact, loose = capture_of(quiet()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
     assert np.array_equal(exact.probe.x_mm, loose.probe.x_mm)
     moved_uT = (shaped(exact) - shaped(loose))[:, READ].std()
     assert moved_uT > 2 * 5.0  # twice the noise of one reading
 
 
-def test_labels_are_what_was_commanded_and_the_force_is_the_skins(capture):
+def test_labels_are_commanded_and_forces_measured(capture):
     log = capture.probe
     np.testing.assert_array_equal(
         np.column_stack([touched(capture, "x_mm"), touched(capture, "y_mm")]), np.tile(points_mm(), (4, 1))
@@ -100,20 +100,20 @@ def test_labels_are_what_was_commanded_and_the_force_is_the_skins(capture):
     assert np.abs(np.concatenate([noise_N, log.Fz_N[~log.contact], log.Fx_N, log.Fy_N])).max() < 6 * 0.006
 
 
-def test_with_a_perfect_robot_passes_repeat_the_field_and_differ_by_noise(capture):
-    still = [1, 2, 3, 4, 8, 9, 10]  # on the way, a chip that converts earlier sees less
+def test_passes_of_a_perfect_robot_differ_by_noise(capture):
+    still = [1, 2, 3, 4, 8, 9, 10]  # while the tip moves, chips that convert earlier see less
     b_uT = shaped(capture)[:, still]
     differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)
     np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)  # 7000 draws: 0.8 %
 
 
-def test_a_protocol_with_a_rate_of_its_own_is_recorded_at_it_and_another_at_the_rigs():
+def test_protocol_may_have_its_own_rate():
     slow, usual = (
         capture_of(with_protocol("other", GRID | {"passes_n": 1} | own), "other") for own in ({"rate_hz": 133.0}, {})
     )
     for capture, rate_hz in ((slow, 133.0), (usual, 400.0)):
         frames_n, log = 130 * FRAMES_N, capture.probe
-        # A chunk comes a few tenths of a millisecond late, of 3 s and more.
+        # A chunk arrives a few tenths of a millisecond late; the capture lasts 3 s and more.
         assert capture.arrived_s[-1] == pytest.approx(frames_n / rate_hz, rel=1e-3)
         np.testing.assert_allclose((log.t_end_s - log.t_start_s)[log.contact], 3 / rate_hz, rtol=1e-3)
 
@@ -133,7 +133,7 @@ def sleeve(**changes):
     return with_protocol("sleeve", SCATTER, boards=SECTIONS["boards"] | {"sleeve": SLEEVE}, **changes)
 
 
-def test_scattered_pokes_lie_where_their_labels_say_from_the_skins_corner():
+def test_scattered_pokes_are_at_their_labels():
     of = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
     one = capture_of(of, "sleeve", board="v0", skin="v0_s0")
     place_mm = np.column_stack([touched(one, "x_mm"), touched(one, "y_mm")]).astype(float)
@@ -144,11 +144,11 @@ def test_scattered_pokes_lie_where_their_labels_say_from_the_skins_corner():
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
     b_uT = one.b_uT.astype(np.float64).reshape(-1, FRAMES_N, 40, 3)
-    # a step of z, lost twice by half; a label is written as float32, 4 nm, which moves no field
+    # one LSB of z: two roundings; rounding of float32 labels (4 nm) is negligible
     assert np.abs(b_uT[:, READ] - b_uT[:, 1:2] - truth_uT[:, None]).max() < 0.75
 
 
-def test_the_frames_of_forty_chips_come_through_the_wire_as_they_went_in():
+def test_frames_of_forty_chips_survive_the_wire():
     one = capture_of(sleeve(), "sleeve", board="v0", skin="v0_s0")
     header, files = to_files(one, sleeve())
     assert (header.chips_n, len(files["stream.bin"])) == (40, 6 * FRAMES_N * (16 * 40 + 2))
@@ -158,14 +158,14 @@ def test_the_frames_of_forty_chips_come_through_the_wire_as_they_went_in():
     np.testing.assert_array_equal(frames.temperature_degC, one.temperature_degC)
 
 
-def test_a_hand_leaves_no_label_but_a_field_that_changes():
+def test_hand_pokes_have_fields_but_no_labels():
     one = capture_of(with_protocol("hand", HAND), "hand")
     for name in ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N"):
         assert np.isnan(touched(one, name)).all()
     np.testing.assert_array_equal(touched(one, "pass_i"), np.repeat([0, 1, 2], 4))
     assert one.name == "b0_s0-hand"
     change_uT = np.linalg.norm((shaped(one)[:, READ] - shaped(one)[:, 1:2]).mean(axis=1).reshape(12, 15), axis=1)
-    assert change_uT.min() > 30  # 15 channels of noise, a reading less another, averaged over 3: 13
+    assert change_uT.min() > 30  # noise alone: difference of two readings in 15 channels, averaged over 3: 13
 
 
 def aged(**changes):
@@ -173,7 +173,7 @@ def aged(**changes):
     return with_protocol("grid", grid, terms=changes)
 
 
-def test_a_skin_that_ages_gets_softer_and_its_baseline_drifts(capture):
+def test_aging_softens_and_drifts(capture):
     old = capture_of(aged(ageing=AGEING))
     ratio = touched(old, "Fz_N")[-65:] / touched(capture, "Fz_N")[-65:]
     # by hand: 1 - 0.1 (1 - exp(-227/300)) - 0.01 log10(1.227) = 0.946 at contact 227, half way through the last 65
@@ -181,39 +181,39 @@ def test_a_skin_that_ages_gets_softer_and_its_baseline_drifts(capture):
     drift_uT = (shaped(old)[:, 1:5].mean(axis=1) - shaped(capture)[:, 1:5].mean(axis=1))[-1]
     assert np.abs(drift_uT).max() > 5
     early_uT = (shaped(old)[:, 1:5].mean(axis=1) - shaped(capture)[:, 1:5].mean(axis=1))[0]
-    assert np.abs(early_uT).max() < 12  # noise only: 5 / sqrt(2) less 5 / sqrt(2), three sd
+    assert np.abs(early_uT).max() < 12  # noise only: difference of two means with 5 / sqrt(2), three sd
 
 
-def test_a_skin_that_relaxes_pushes_less_and_shows_the_same_field(capture):
+def test_relaxation_lowers_the_force_only(capture):
     slack = capture_of(aged(relaxation=RELAXATION))
     ratio = np.median(touched(slack, "Fz_N")[65:130] / touched(capture, "Fz_N")[65:130])
-    # after 1 s the two fastest terms, 0.05 each, are gone, of the third at most a tenth
+    # after 1 s the two fastest terms, 0.05 each, are gone, and at most a tenth of the third
     assert 0.88 < ratio < 0.91
     assert np.array_equal(slack.b_uT, capture.b_uT)
 
 
-def test_warmth_is_read_by_the_chips_and_takes_the_field_along(capture):
+def test_temperature_is_read_and_weakens_the_field(capture):
     warm = capture_of(aged(temperature=TEMPERATURE))
     assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
     before_uT, after_uT = (shaped(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
     change_uT = np.abs(after_uT).sum() - np.abs(before_uT).sum()
-    offset = 5 * 3 * 200 * 0.8  # the chips' own offset does not follow: mean |normal| of 15 channels
+    offset = 5 * 3 * 200 * 0.8  # the chips' offset is constant: mean |normal| of 15 channels
     assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_skin(capture):
+def test_capture_is_reproducible(capture):
     assert same(capture, capture_of())
     assert not same(capture, capture_of(seed=2))
 
 
-def test_more_boards_skins_and_protocols_leave_the_others_as_they_are(capture):
+def test_more_boards_skins_and_protocols_change_nothing(capture):
     boards = {"rigid": SECTIONS["boards"]["rigid"] | {"boards_n": 3, "skins_per_board_n": 5}}
     more = with_protocol("hand", HAND, boards=boards)
     assert set(list_captures(synthesis(), "grid")) < {(f"b{b}", f"b{b}_s{s}") for b in range(3) for s in range(5)}
     assert same(capture, capture_of(more))
 
 
-def test_the_first_skin_of_every_board_comes_before_the_second_of_any():
+def test_order_of_captures():
     assert list_captures(with_protocol("few", GRID | {"skins_n": 3}), "few") == [
         ("b0", "b0_s0"),
         ("b0", "b0_s1"),
@@ -221,24 +221,24 @@ def test_the_first_skin_of_every_board_comes_before_the_second_of_any():
     ]
 
 
-def test_two_skins_on_one_board_share_its_chips_but_not_their_response(capture):
+def test_skins_of_a_board_share_chips_only(capture):
     other = capture_of(skin="b0_s1")
     assert not np.allclose(shaped(capture)[0, 1], shaped(other)[0, 1], atol=20)  # six times the noise
 
 
-def test_a_skin_without_magnetisation_reads_offset_and_noise_only():
+def test_skin_without_magnetisation_has_no_signal():
     b_uT = shaped(capture_of(synthesis("skin", saturation_T=0.0)))
     np.testing.assert_allclose(b_uT.std(axis=(0, 1)), np.tile([3.3, 3.3, 5.0], (5, 1)), rtol=0.1)
 
 
 @pytest.mark.parametrize(("section", "name"), [("rig", "rate"), ("skin", "stickiness"), ("spreads", "chip_gian")])
-def test_an_unknown_parameter_is_refused_by_name(section, name):
+def test_unknown_parameter_is_named(section, name):
     with pytest.raises(ParamsError, match=name):
         synthesis(section, **{name: 1.0})
 
 
 @pytest.mark.parametrize(
-    ("protocol", "changes", "sentence"),
+    ("protocol", "changes", "message"),
     [
         (GRID | {"skins_n": 5}, {}, "skins_n 5 is more than rigid boards have, 4"),
         (GRID | {"boards": "soft"}, {}, "boards is one of .'rigid'., not 'soft'"),
@@ -250,11 +250,11 @@ def test_an_unknown_parameter_is_refused_by_name(section, name):
         (LOAD | {"passes_n": 1}, {}, "protocols.other.passes_n must be greater than or equal to 2; got 1"),
     ],
 )
-def test_a_scene_that_contradicts_itself_is_refused(protocol, changes, sentence):
-    with pytest.raises(ParamsError, match=sentence):
+def test_contradictory_scene_is_refused(protocol, changes, message):
+    with pytest.raises(ParamsError, match=message):
         with_protocol("other", protocol, **changes)
 
 
-def test_a_depth_that_the_skin_cannot_take_is_refused():
+def test_depth_beyond_the_skin_is_refused():
     with pytest.raises(ParamsError, match="depth must be"):
         capture_of(with_protocol("deep", GRID | {"depths_mm": (2.5,)}), "deep")

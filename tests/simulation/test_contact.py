@@ -1,4 +1,4 @@
-"""The contact response: the terms' own formulas as truth; no term, no effect, as law."""
+"""The contact response compared with the formulas of its terms; without terms, nothing changes."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ TIP_M = np.tile([[[1e-3, 2e-3, 0.8e-3]]], (200, 1, 1))
 
 @pytest.fixture(scope="module")
 def first() -> tuple[np.ndarray, np.ndarray]:
-    """The field at rest and the change of the first contact, in T, at the chips."""
+    """The field at rest and its change at the first contact, in T, at the chips."""
     rest_T, change_T = changes_of_field(BOARD, SKIN, TIP_M[0])
     return rest_T, change_T[0]
 
@@ -29,7 +29,7 @@ def response(tilt=0.0, **terms):
     return simulate_response(BOARD, SKIN, TIP_M, tilt=lean, terms=Terms(**terms), rng=rng_for(0, "felt"))
 
 
-def test_without_terms_every_contact_is_the_first(first):
+def test_without_terms_all_contacts_are_equal(first):
     one, (rest_T, change_T) = response(), first
     np.testing.assert_array_equal(one.rest_T, np.tile(rest_T, (200, 1, 1)))
     np.testing.assert_array_equal(one.change_T[:, 0], np.tile(change_T, (200, 1, 1)))
@@ -37,7 +37,7 @@ def test_without_terms_every_contact_is_the_first(first):
     assert not one.force_N[:, :, :2].any()
 
 
-def test_the_field_at_rest_fades_with_every_decade_of_contacts(first):
+def test_field_fades_per_decade_of_contacts(first):
     one = response(ageing=Ageing(settling=0.0, ageing=0.0, fading_per_decade=0.02, wandering_uT=0.0))
     np.testing.assert_allclose(one.rest_T[99], (1 - 0.02 * 2) * first[0], rtol=1e-12)  # log10(1 + 99) = 2
 
@@ -51,14 +51,14 @@ def test_force_softens_and_relaxes_in_every_direction():
     np.testing.assert_allclose(worn.force_N[199], left * plain.force_N[199], rtol=1e-12)
 
 
-def test_a_tip_that_leans_pushes_sideways_by_its_lean(first):
+def test_leaning_tip_pushes_sideways(first):
     one = response(tilt=0.1, friction=Friction(coefficient=0.8))
     np.testing.assert_allclose(one.force_N[:, 0, 0], 0.1 * one.force_N[:, 0, 2])
     assert np.linalg.norm(one.change_T[0, 0] - first[1]) > 0.01 * np.linalg.norm(first[1])
 
 
 @pytest.mark.parametrize(("depth_mm", "deep"), [(0.5, False), (1.4, True)])
-def test_stops_past_what_is_verified_are_counted(depth_mm, deep):
+def test_unverified_depths_are_counted(depth_mm, deep):
     tip_m = np.array([[[0.0, 0.0, depth_mm * 1e-3]]])
     one = simulate_response(BOARD, SKIN, tip_m, tilt=np.zeros((1, 2)), terms=Terms(), rng=rng_for(0, "felt"))
     assert one.beyond_verified_n == deep

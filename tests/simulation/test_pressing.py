@@ -1,4 +1,4 @@
-"""Weights against the skin's own force curve; half sines, footfalls and draws of presses as laws."""
+"""Weights compared with the skin's force curve; half sines, footfalls and random presses."""
 
 import numpy as np
 import pytest
@@ -44,33 +44,33 @@ def drawn(presses_n, name="presses"):
 
 
 @given(st.floats(1e-3, 2.0))
-def test_the_skin_bears_at_the_depth_found_just_the_weight_on_it(weight_N):
+def test_depth_of_a_weight_balances_it(weight_N):
     depth_m = depths_under_load(SKIN, np.array([[weight_N]]))
     # 1e-12 m on at most 20 N/mm is 2e-8 N
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
 
 
-def test_no_weight_just_touches_the_skin_and_more_weight_sinks_deeper():
+def test_more_weight_sinks_deeper():
     depth_m = depths_under_load(SKIN, load_steps_N(1.0, 0.02)[None])[0]
     assert depth_m[0] == -SKIN.depth_zero_m
     assert (np.diff(depth_m) > 0).all()
 
 
-def test_a_weight_that_no_skin_bears_is_refused():
+def test_too_heavy_weight_is_refused():
     with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, which the skin bears"):
         depths_under_load(SKIN, np.array([[1e4]]))
 
 
-def test_a_glass_is_filled_from_nothing_to_the_most_in_even_steps():
+def test_glass_is_filled_in_even_steps():
     np.testing.assert_allclose(load_steps_N(1.0, 0.25), [0, 0.25, 0.5, 0.75, 1.0])
 
 
-def test_a_filling_reads_its_weights_and_knows_no_depth():
+def test_filling_has_weights_and_no_depth():
     capture = capture_of("glass", GLASS)
     log = capture.probe
     assert np.isnan(log.depth_mm[log.contact]).all()
     read_N = log.Fz_N[log.contact].reshape(3, 5)
-    np.testing.assert_allclose(read_N, np.tile([0, 0.25, 0.5, 0.75, 1.0], (3, 1)), atol=6 * 0.006)  # sd of the sensor
+    np.testing.assert_allclose(read_N, np.tile([0, 0.25, 0.5, 0.75, 1.0], (3, 1)), atol=6 * 0.006)  # six sd
     assert set(log.x_mm[log.contact]) == {8.0}
 
 
@@ -80,11 +80,11 @@ def test_more_weight_changes_the_field_more():
     lifted_n, dwell_n = 1 + 4 + 2, 1 + 3
     stops_uT = b_uT[:, lifted_n : lifted_n + 5 * dwell_n].reshape(3, 5, dwell_n, 15)[:, :, -1]
     change_uT = np.linalg.norm(stops_uT - b_uT[:, 1:2], axis=2)
-    assert (change_uT[:, 0] <= 0.7 * 4).all()  # no more than a step of each channel: sqrt(15) / 2 steps
+    assert (change_uT[:, 0] <= 0.7 * 4).all()  # rounding of each channel: sqrt(15) / 2 LSB
     assert (np.diff(change_uT, axis=1) > 10).all()
 
 
-def test_a_half_sine_is_deepest_in_its_middle_and_the_same_backwards():
+def test_half_sine_is_symmetric():
     depth_mm = half_sine(101, 0.8)
     assert depth_mm.argmax() == 50
     assert depth_mm[50] == pytest.approx(0.8)
@@ -92,7 +92,7 @@ def test_a_half_sine_is_deepest_in_its_middle_and_the_same_backwards():
     assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)  # midpoint rule: (pi / 2 n)^2 / 6
 
 
-def test_durations_lie_evenly_in_their_logarithm_and_the_tip_is_lifted_after_a_press():
+def test_durations_are_log_uniform():
     stops = drawn(2000)
     frames_n = (stops.depth_mm > 0).sum(axis=1)
     position = np.log(frames_n / 20) / np.log(20)
@@ -104,7 +104,7 @@ def test_durations_lie_evenly_in_their_logarithm_and_the_tip_is_lifted_after_a_p
     assert stops.depth_mm.max() <= 1.2
 
 
-def test_a_walk_has_a_footfall_and_a_swing_for_each_step():
+def test_walk_has_footfalls_and_swings():
     plan = Walk(**WALK | {"steps_n": 40, "terms": ()}).plan(rng_for(0, "walk"), SKIN_MM)
     down = plan.depth_mm[0] > 0
     edges = np.diff(np.concatenate([[False], down, [False]]).astype(int))
@@ -115,7 +115,7 @@ def test_a_walk_has_a_footfall_and_a_swing_for_each_step():
     assert not down[-50:].any()
 
 
-def test_every_frame_of_a_press_is_a_dwell_and_the_frames_above_the_skin_are_none():
+def test_frames_in_contact_are_dwells():
     log = capture_of("press", PRESS).probe
     plan = Press(**PRESS | {"terms": ()}).plan(rng_for(1, "recording", "press", "b0", "b0_s0", "plan"), SKIN_MM)
     assert log.contact.sum() == (plan.depth_mm > 0).sum()
@@ -125,7 +125,7 @@ def test_every_frame_of_a_press_is_a_dwell_and_the_frames_above_the_skin_are_non
     np.testing.assert_allclose(depths_mm, plan.depth_mm[plan.depth_mm > 0], rtol=1e-6)
 
 
-def test_chips_read_a_rising_press_a_little_late_and_not_all_at_the_same_moment():
+def test_chips_read_a_rising_press_late():
     quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
     fast, slow = (
         capture_of("press", PRESS | {"rate_hz": rate_hz, "presses_n": 1, "duration_s": (duration_s,) * 2}, chip=quiet)
@@ -133,19 +133,19 @@ def test_chips_read_a_rising_press_a_little_late_and_not_all_at_the_same_moment(
     )
     still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
     late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
-    assert (late_uT > 1.0).all()  # three steps of z
-    # the same press, read up to 1.84 of 2.5 ms late: each reading lies between two of the slow one's
+    assert (late_uT > 1.0).all()  # three LSB of z
+    # the same press, read up to 1.84 of 2.5 ms late: each reading is between two of the slow press
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
-    assert (moving_uT[1:] >= low_uT - 1).all()  # uT: a step of x and y, and of z
+    assert (moving_uT[1:] >= low_uT - 1).all()  # uT: one LSB of x and y, and of z
     assert (moving_uT[1:] <= high_uT + 1).all()
 
 
-def test_a_walk_keeps_the_truth_on_the_logs_own_clock():
+def test_walk_truth_uses_the_logs_clock():
     capture = capture_of("log", WALK)
     assert capture.card_rate_hz == 250.0
     log = capture.probe
     assert log.t_start_s[0] == pytest.approx(0.5 / 250)
-    assert log.t_end_s[0] == pytest.approx(100.5 / 250)  # 0.4 s of quiet
+    assert log.t_end_s[0] == pytest.approx(100.5 / 250)  # after 0.4 s at rest
     touched = log.depth_mm[log.contact].astype(float)
     skin = draw_skin(
         synthesis().skin,
@@ -158,7 +158,7 @@ def test_a_walk_keeps_the_truth_on_the_logs_own_clock():
     assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2  # three footfalls
 
 
-def test_what_is_pressed_refuses_physics_that_would_change_its_force():
+def test_force_controlled_presses_refuse_relaxation_and_wear():
     with pytest.raises(ParamsError, match="terms"):
         with_protocol("press", PRESS | {"terms": ["relaxation"]})
     with pytest.raises(ParamsError, match="duration_s goes from the lower to the higher"):
@@ -167,7 +167,7 @@ def test_what_is_pressed_refuses_physics_that_would_change_its_force():
         with_protocol("glass", GLASS | {"step_N": 0.3})
 
 
-def test_a_walk_leaves_the_log_of_an_sd_card_and_its_truth_and_is_no_capture_to_learn_from(tmp_path):
+def test_walk_is_an_sd_card_log_and_no_capture(tmp_path):
     capture = capture_of("log", WALK)
     header = write_capture(tmp_path / capture.name, *to_files(capture, with_protocol("log", WALK)))
     assert sorted(header.files) == ["log.csv", "probe.csv"]
@@ -181,7 +181,7 @@ def test_a_walk_leaves_the_log_of_an_sd_card_and_its_truth_and_is_no_capture_to_
         open_capture(tmp_path / capture.name, AS_USUAL)
 
 
-def test_presses_and_fillings_come_through_the_same_door_as_everything(tmp_path):
+def test_presses_and_fillings_are_valid_captures(tmp_path):
     for name, protocol in (("press", PRESS), ("glass", GLASS)):
         capture = capture_of(name, protocol)
         write_capture(tmp_path / capture.name, *to_files(capture, with_protocol(name, protocol)))

@@ -1,4 +1,4 @@
-"""The paper's counts as truth; order, spacing and randomness of each protocol as laws."""
+"""The paper's counts; order, spacing and randomness of each protocol."""
 
 import numpy as np
 import pytest
@@ -24,14 +24,14 @@ def plan_of(protocol, name="plan"):
     return protocol.plan(rng_for(0, name), SKIN_MM)
 
 
-def test_a_pass_over_the_grid_is_390_indentations_at_one_stop_each():
+def test_grid_pass_has_390_indentations():
     plan = plan_of(GRID)
     assert plan.x_mm.shape == (2 * 390, 1)
     np.testing.assert_array_equal(np.hstack([plan.x_mm, plan.y_mm])[:65], points_mm())
     np.testing.assert_array_equal(plan.pass_i, np.repeat([0, 1], 390))
 
 
-def test_drag_lines_lie_2_mm_apart_along_x_and_then_along_y():
+def test_drag_lines_are_2_mm_apart():
     plan = plan_of(DRAG)
     assert plan.x_mm.shape == (2 * 18, 17)  # 9 rows and 9 columns, at two depths
     rows, columns = slice(0, 9), slice(9, 18)
@@ -41,12 +41,12 @@ def test_drag_lines_lie_2_mm_apart_along_x_and_then_along_y():
     np.testing.assert_allclose(np.abs(np.diff(plan.y_mm[columns], axis=1)), 1.0)
 
 
-def test_each_next_line_is_dragged_the_other_way():
+def test_drag_lines_alternate_in_direction():
     steps_mm = np.diff(plan_of(DRAG).x_mm, axis=1)[:9, 0]
     np.testing.assert_array_equal(np.sign(steps_mm), np.where(np.arange(9) % 2 == 0, 1, -1))
 
 
-def test_every_second_pass_drags_the_same_lines_backwards():
+def test_every_second_pass_drags_backwards():
     one, two = plan_of(DRAG), plan_of(DRAG.model_copy(update={"passes_n": 3}))
     n = len(one)
     for name in ("x_mm", "y_mm"):
@@ -58,7 +58,7 @@ def test_every_second_pass_drags_the_same_lines_backwards():
     np.testing.assert_array_equal(two.pass_i, np.repeat([0, 1, 2], n))
 
 
-def test_a_hand_pokes_325_times_in_order_along_lines_and_nobody_knows_where():
+def test_hand_pokes_325_times_without_labels():
     plan = plan_of(HAND)
     assert len(plan) == 325  # paper section 5.2
     assert not plan.labelled
@@ -90,16 +90,16 @@ def scattered(name="plan", skin_mm=SLEEVE_MM, **changes):
     return parse(Scatter, SCATTER | changes, "test").plan(rng_for(0, name), skin_mm)
 
 
-def test_places_and_depths_are_uniform_within_the_margin():
+def test_scattered_places_and_depths_are_uniform():
     plan = scattered()
     for drawn, low, high in ((plan.x_mm, 4.0, 46.8), (plan.y_mm, 4.0, 97.6), (plan.depth_mm, 0.4, 1.2)):
-        # One honest draw in a thousand is further off than this.
+        # A correct draw is further off once in a thousand times.
         assert kstest(drawn.ravel(), "uniform", args=(low, high - low)).pvalue > 1e-3
     assert abs(np.corrcoef(plan.x_mm.ravel(), plan.y_mm.ravel())[0, 1]) < 4 / np.sqrt(3000)
 
 
 @given(st.tuples(st.floats(5, 200), st.floats(5, 200)), st.floats(0, 2.4))
-def test_no_poke_is_nearer_to_an_edge_than_the_margin_and_the_middle_is_half_of_the_sides(skin_mm, margin_mm):
+def test_margin_to_the_edges(skin_mm, margin_mm):
     plan = scattered(skin_mm=skin_mm, margin_mm=margin_mm, pokes_n=50)
     place_mm = np.hstack([plan.x_mm, plan.y_mm])
     to_edge_mm = np.minimum(place_mm, np.array(skin_mm) - place_mm)
@@ -109,16 +109,16 @@ def test_no_poke_is_nearer_to_an_edge_than_the_margin_and_the_middle_is_half_of_
     assert not plan.tilt.any()
 
 
-def test_other_draws_give_other_places():
+def test_draws_differ():
     assert not np.array_equal(scattered("one").x_mm, scattered("other").x_mm)
     assert np.array_equal(scattered("one").x_mm, scattered("one").x_mm)
 
 
-def test_a_margin_that_leaves_nothing_is_refused():
+def test_too_large_margin_is_refused():
     with pytest.raises(ParamsError, match="less than half of the skin's shorter side, 25.4 mm; got 25.4"):
         scattered(margin_mm=25.4)
 
 
-def test_depths_that_fall_are_refused():
+def test_decreasing_depths_are_refused():
     with pytest.raises(ParamsError, match="from the shallower to the deeper"):
         scattered(depth_mm=[1.2, 0.4])

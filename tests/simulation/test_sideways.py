@@ -1,4 +1,4 @@
-"""A tip that pushes sideways: Coulomb and the spring by hand as truth; no friction, mirror images as laws."""
+"""Tangential forces: Coulomb and spring by hand; no friction, mirror images."""
 
 from dataclasses import replace
 
@@ -36,23 +36,23 @@ def pressed(tip_m):
     return changes_of_field(BOARD, SKIN, tip_m.reshape(-1, 3))[1].reshape(*tip_m.shape[:2], 5, 3)
 
 
-def test_a_short_drag_sticks_and_a_long_one_slides():
+def test_short_drag_sticks_and_long_drag_slides():
     found = pushed(line(0.0, 0.1, 4.0)).force_N[0]
     sizes = {"thickness_m": SKIN.thickness_m, "tip_radius_m": SKIN.tip_radius_m, "base": SKIN.base}
     stiffness = SKIN.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
     limit_N = 0.8 * forces(SKIN, np.array([DEPTH_M]))[0]
     np.testing.assert_allclose(found, [[0, 0], [stiffness * 0.1e-3, 0], [limit_N, 0]], rtol=1e-6)
-    assert found[1, 0] < limit_N  # or nothing would have stuck
+    assert found[1, 0] < limit_N  # the first stop sticks
 
 
-def test_without_friction_the_field_is_that_of_pressing_alone():
+def test_without_friction_the_drag_is_a_press():
     tip_m = line(-2.0, 0.0, 3.0)
     found = pushed(tip_m, coefficient=0.0)
     assert not found.force_N.any()
     np.testing.assert_array_equal(found.change_T, pressed(tip_m))
 
 
-def test_a_push_sideways_changes_the_field_and_the_other_way_differently():
+def test_push_direction_changes_the_field():
     there, back = pushed(line(-2.0, 1.0)), pushed(line(4.0, 1.0))
     np.testing.assert_allclose(there.force_N[0, 1], -back.force_N[0, 1])
     alone_T = pressed(line(1.0))[0, 0]
@@ -62,42 +62,42 @@ def test_a_push_sideways_changes_the_field_and_the_other_way_differently():
     assert np.linalg.norm(there.change_T[0, 1] - back.change_T[0, 1]) > 0.2 * size_T
 
 
-def test_the_mirror_image_of_a_drag_has_the_mirrored_field():
-    # Chips 1 and 3 swap; B is axial, and so does the checkerboard: Jx of it flips instead (as for a poke).
+def test_mirror_symmetry_of_a_drag():
+    # Chips 1 and 3 swap; B is axial, and so is the checkerboard: its Jx flips instead (as for a poke).
     one = pushed(line(-1.0, 2.0))
     mirrored = pushed(line(1.0, -2.0)).change_T[0][:, [0, 3, 2, 1, 4]]
     np.testing.assert_allclose(mirrored, one.change_T[0] * (1, -1, -1), atol=1e-9 * np.abs(one.change_T).max())
 
 
-def test_a_tip_that_leans_pushes_by_its_lean_but_no_more_than_friction_holds():
+def test_lean_of_the_tip_is_limited_by_friction():
     normal_N = forces(SKIN, np.array([DEPTH_M]))[0]
     for lean, share in ((0.1, 0.1), (2.0, 0.8)):
         found = pushed(line(1.0), tilt=np.array([[0.0, lean]])).force_N[0, 0]
         np.testing.assert_allclose(found, [0.0, share * normal_N], rtol=1e-12)
 
 
-def test_a_tip_above_the_skin_neither_pushes_nor_changes_anything():
+def test_tip_above_the_skin_has_no_effect():
     tip_m = line(0.0, 2.0) * (1, 1, -1)
     found = pushed(tip_m)
     assert not found.force_N.any()
     assert not found.change_T.any()
 
 
-def test_each_line_begins_anew():
+def test_lines_are_independent():
     lines_m = np.concatenate([line(0.0, 3.0), line(-3.0, -2.9)])
     both, second = pushed(lines_m, tilt=np.zeros((2, 2))), pushed(lines_m[1:])
     np.testing.assert_allclose(both.force_N[1], second.force_N[0])
 
 
 @pytest.mark.parametrize("coefficient", [0.3, 0.8])
-def test_the_force_sideways_never_passes_coulombs(coefficient):
+def test_force_is_limited_by_coulomb(coefficient):
     tip_m = line(-5.0, -4.9, -4.5, 0.0, 0.05, -3.0)
     found = np.hypot(*pushed(tip_m, coefficient).force_N[0].T)
     assert (found <= coefficient * forces(SKIN, tip_m[0, :, 2]) * (1 + 1e-12)).all()
 
 
-def test_a_drag_is_the_press_and_many_small_shears_at_where_the_material_under_the_tip_rested():
-    # The truth: material pressed where it rested, behind the tip, then sheared a fiftieth of the force at a time.
+def test_drag_equals_press_and_many_small_shears():
+    # Reference: material pressed at its rest position behind the tip, then sheared in fiftieths of the force.
     tip_m, modulus_Pa = line(-2.0, 1.0), SKIN.modulus_Pa
     found = pushed(tip_m, coefficient=0.4)
     sizes = {"thickness_m": SKIN.thickness_m, "tip_radius_m": SKIN.tip_radius_m, "base": SKIN.base}
@@ -111,11 +111,11 @@ def test_a_drag_is_the_press_and_many_small_shears_at_where_the_material_under_t
         )
         nodes_m, moments = nodes_m + step.displacement_m, Rotation.from_rotvec(step.half_curl).apply(moments)
     truth_T = change_of_field(before, (nodes_m, moments), BOARD.chips_m)
-    # 20 %: the product takes one or two midpoint steps, and the traction along; a sign turned is off by 50 % and more
+    # 20 %: the code takes one or two midpoint steps and carries the traction; a wrong sign costs 50 % and more
     assert np.linalg.norm(found.change_T[0, 1] - truth_T) < 0.2 * np.linalg.norm(truth_T)
 
 
-def test_a_skin_that_begins_higher_is_pushed_as_one_that_is_pressed_deeper():
+def test_higher_skin_equals_deeper_press():
     high = type(SKIN)(**{**SKIN.__dict__, "depth_zero_m": 0.1e-3})
     there = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, how=Friction(coefficient=0.5))
     deeper = drag_tip(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, how=Friction(coefficient=0.5))
@@ -128,15 +128,15 @@ HELD = EVEN.skin.model_copy(
 )
 
 
-def test_a_drag_slides_a_held_skin_as_one_and_what_gives_is_layer_and_springs_in_series():
+def test_held_skin_is_in_series_with_its_springs():
     one = draw_skin(HELD, EVEN.spreads, seed=0, name="b0_s0")
-    tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3  # through the middle, so that nothing turns
+    tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3  # through the middle: no rotation
     force_N = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, how=Friction(coefficient=0.8)).force_N[0, 1]
     sizes = {"thickness_m": one.thickness_m, "tip_radius_m": one.tip_radius_m, "base": one.base}
     thinned = (1 - DEPTH_M / one.thickness_m) ** -1.5
     layer_N_per_m = thinned * one.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
     np.testing.assert_allclose(force_N, [so_far_m / (1 / layer_N_per_m + 1 / 7e3), 0.0], rtol=1e-9, atol=1e-12)
-    # Far from the tip, where the layer is not sheared, a chip sees nodes that have moved by force over springs.
+    # Far from the tip, where the layer is not sheared, nodes have moved by force over springs.
     slid = one.nodes_m + (force_N[0] / 7e3, 0.0, 0.0)
     as_one_T = change_of_field((one.nodes_m, one.moments_A_m2), (slid, one.moments_A_m2), BOARD.chips_m)
     pressed_T = changes_of_field(BOARD, one, tip_m[0, 1:])[1][0]
@@ -145,7 +145,7 @@ def test_a_drag_slides_a_held_skin_as_one_and_what_gives_is_layer_and_springs_in
     np.testing.assert_allclose((dragged_T - pressed_T)[far], as_one_T[far], atol=0.5 * np.abs(as_one_T[far]).max())
 
 
-def test_stiff_springs_leave_the_drag_of_a_fixed_base():
+def test_stiff_springs_equal_a_fixed_base():
     tip_m, hold = line(0.0, 0.02), HELD.hold.model_copy(update={"springs_N_mm": 1e6})
     stiff = draw_skin(HELD.model_copy(update={"hold": hold}), EVEN.spreads, seed=0, name="b0_s0")
     free = replace(stiff, hold=None, modulus_Pa=stiff.modulus_Pa * (1 - DEPTH_M / stiff.thickness_m) ** -1.5)

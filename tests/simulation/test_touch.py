@@ -1,4 +1,4 @@
-"""A touch from its first millinewton to lift-off: nothing jumps. Skins of the product's settings, drawn at random."""
+"""A touch from the first millinewton to lift-off changes the field continuously, for random skins."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,10 +26,10 @@ RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boar
 TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
-STOPS_N = 48  # of a path, and twice as many
-HALVED = 0.75  # of the largest step of dB: half as large where dB is smooth, as large where it jumps
+STOPS_N = 48  # stops of a path; also with twice as many
+HALVED = 0.75  # ratio of the largest steps of dB: 0.5 if dB is smooth, 1 if it jumps
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
-ways = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # of a drag, short beside what sticks gives way by
+ways = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # drags much shorter than sticking
 some = settings(max_examples=8, deadline=None)
 
 
@@ -39,7 +39,7 @@ def drawn(name: str) -> tuple[Board, Skin]:
 
 
 def pressed_by(skin: Skin, force_N) -> np.ndarray:
-    """Give the commanded depths of forces on a skin; of none, a tip 20 um above it."""
+    """Commanded depths of forces on a skin; without force, a tip 20 um above it."""
     of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
     depth_m = slide.depth_at(np.asarray(force_N, float), **of) - skin.depth_zero_m
     return np.where(np.asarray(force_N) > 0, depth_m, -20e-6 - skin.depth_zero_m)
@@ -51,14 +51,14 @@ def sizes_uT(change_T) -> np.ndarray:
 
 @some
 @given(places, st.integers(0, 10**6))
-def test_a_touch_of_a_millinewton_changes_the_field_by_less_than_a_readings_noise(place_m, name_i):
+def test_millinewton_is_below_the_noise(place_m, name_i):
     board, skin = drawn(f"b{name_i}")
     force_N = np.array([0.0, 1e-6, 1e-5, 1e-4, LIGHT_N])
     poke_m = np.column_stack([np.tile(place_m, (5, 1)), pressed_by(skin, force_N)])
     np.testing.assert_allclose(forces(skin, poke_m[:, 2]), force_N, rtol=1e-2)
     found_uT = sizes_uT(changes_of_field(board, skin, poke_m)[1])
     assert found_uT[0] == 0
-    # The slide is proportional to a small force, the flow of the layer falls faster, as F^(4/3) under a round tip.
+    # The slide is proportional to small forces; the flow of the layer falls faster, as F^(4/3) under a round tip.
     assert (found_uT[1:] <= 1.3 * found_uT[-1] * force_N[1:] / LIGHT_N).all()
     assert found_uT[-1] <= LIGHT_MAX_uT
 
@@ -81,11 +81,11 @@ def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> floa
 @given(
     places, st.floats(0, 2 * np.pi), st.floats(0.02, 2.5), st.floats(0, 1.2), st.floats(-0.3, 0.3), st.integers(0, 99)
 )
-def test_one_friction_bounds_the_slide_of_press_and_drag_together(start_m, angle_rad, force_N, friction, lean, name_i):
+def test_press_and_drag_share_one_friction(start_m, angle_rad, force_N, friction, lean, name_i):
     board, skin = drawn(f"b{name_i}")
     assert skin.hold is not None
     way_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
-    end_m = np.subtract(start_m, way_m)  # places of a millimetre inside the skin's edge at least
+    end_m = np.subtract(start_m, way_m)  # at least a millimetre inside the skin's edge
     tip_m = path(skin, (start_m, end_m), (force_N, force_N), STOPS_N // 4)
     found = drag_tip(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), how=Friction(coefficient=friction))
     limit_N = friction * forces(skin, tip_m[0, :, 2])
@@ -95,7 +95,7 @@ def test_one_friction_bounds_the_slide_of_press_and_drag_together(start_m, angle
         assert not found.slide_m.any()
 
 
-def test_a_tip_without_friction_takes_no_skin_along_and_says_so_in_force_and_slide():
+def test_frictionless_tip_moves_no_skin():
     board, skin = drawn("b0")
     tip_m = path(skin, ((0.0, 0.0), (1e-3, 0.0)), (0.5, 0.5), STOPS_N // 4)
     slippery = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.0))
@@ -105,9 +105,9 @@ def test_a_tip_without_friction_takes_no_skin_along_and_says_so_in_force_and_sli
 
 
 @pytest.mark.parametrize("depth_m", [3e-5, 2e-4, 6e-4])
-def test_a_tip_that_sinks_while_it_sticks_sideways_moves_the_field_evenly(depth_m):
+def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
     board, skin = drawn("b0")
-    deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # across two depths of the shear's tables
+    deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # across two depths of the shear tables
     place_m = np.column_stack([np.r_[0.0, np.full(41, 4e-5)], np.zeros(42)])
     tip_m = np.column_stack([place_m, np.r_[deeper_m[0], deeper_m]])[None]
     found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.8))
@@ -117,7 +117,7 @@ def test_a_tip_that_sinks_while_it_sticks_sideways_moves_the_field_evenly(depth_
 
 @settings(max_examples=4, deadline=None)
 @given(places, ways, st.tuples(st.floats(0.05, 1.5), st.floats(0.05, 1.5)), st.integers(0, 10**6))
-def test_half_the_step_of_force_and_place_is_half_the_largest_step_of_the_field(start_m, way_m, forces_N, name_i):
+def test_half_steps_halve_the_largest_field_step(start_m, way_m, forces_N, name_i):
     board, skin = drawn(f"b{name_i}")
     end_m = tuple(np.add(start_m, way_m))
     coarse, fine = (
@@ -126,7 +126,7 @@ def test_half_the_step_of_force_and_place_is_half_the_largest_step_of_the_field(
     assert fine <= HALVED * coarse
 
 
-def test_a_slide_that_is_taken_whole_at_first_contact_is_found_out(monkeypatch):
+def test_planted_jump_at_first_contact_is_detected(monkeypatch):
     board, skin = drawn("b0")
     monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
     place_m = (6e-3, 2e-3)
@@ -137,7 +137,7 @@ def test_a_slide_that_is_taken_whole_at_first_contact_is_found_out(monkeypatch):
 
 
 @pytest.mark.parametrize("terms", [(), ("memory",)])
-def test_at_lift_off_nothing_is_left_but_what_the_skin_remembers(terms):
+def test_lift_off_leaves_only_the_memory(terms):
     board, skin = drawn("b0")
     depth_m = pressed_by(skin, np.array([0.5, 2.0, 0.5, 0.0]))
     tip_m = np.column_stack([np.full(4, 5e-3), np.full(4, -3e-3), depth_m])[None].repeat(3, axis=0)
@@ -145,14 +145,14 @@ def test_at_lift_off_nothing_is_left_but_what_the_skin_remembers(terms):
     found = simulate_response(board, skin, tip_m, tilt=np.zeros((3, 2)), terms=TERMS.only(terms), rng=rng)
     left_uT, pressed_uT = sizes_uT(found.change_T[:, -1]), sizes_uT(found.change_T[:, 1])
     assert not found.force_N[:, -1].any()
-    if terms:  # 5 to 8 % of the last contact stands in the next no-load reading (recorded)
+    if terms:  # recorded: 5 to 8 % of the last contact remain in the next no-load reading
         assert (left_uT < 0.2 * pressed_uT).all()
         assert left_uT[0] > 0
     else:
         assert not left_uT.any()
 
 
-def test_a_light_touch_is_felt_in_proportion_and_a_firm_one_as_before_friction_was_asked():
+def test_friction_matters_for_light_touches_only():
     board, skin = drawn("b0")
     assert skin.hold is not None
     firm = replace(skin, hold=replace(skin.hold, friction=1e12))

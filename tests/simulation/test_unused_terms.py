@@ -1,4 +1,4 @@
-"""Terms of physics that a protocol does not name are not computed, by the interpreter's profile of one recording."""
+"""Physics terms that a protocol does not use are not computed (by profiling one simulation)."""
 
 import sys
 from pathlib import Path
@@ -23,15 +23,15 @@ FEW = GRID | {"passes_n": 1, "depths_mm": (0.6,), "skins_n": 1}
 
 
 def functions_run(scene):
-    """Name the functions of the library that were called."""
+    """Names of the library functions that were called."""
     called = set()
 
     def note(frame, event, _):
         if event == "call":
             called.add((frame.f_code.co_filename, frame.f_code.co_name))
 
-    simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # makes the tables of deformation
-    shear.tabulate_depth.cache_clear()  # what an earlier test left there would hide a call
+    simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # computes the deformation tables
+    shear.tabulate_depth.cache_clear()  # a cached result would hide a call
     sys.setprofile(note)
     try:
         simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)
@@ -44,14 +44,14 @@ def scene_with(*terms):
     return with_protocol("few", FEW | {"terms": list(terms)}, terms={term: TERMS[term][0] for term in terms})
 
 
-def test_a_protocol_without_terms_computes_none():
+def test_protocol_without_terms_computes_none():
     run = functions_run(scene_with())
-    assert {"simulate_capture", "read_field"} <= run  # or the profile would see nothing
+    assert {"simulate_capture", "read_field"} <= run  # the profiler works
     assert not run & OF_TERMS
 
 
 @pytest.mark.parametrize("term", sorted(TERMS))
-def test_a_term_computes_itself_and_no_other(term):
+def test_term_computes_itself_only(term):
     run = functions_run(scene_with(term)) & OF_TERMS
     assert run
     assert run <= TERMS[term][1]

@@ -1,4 +1,4 @@
-"""A made-up skin whose fields are known in closed form, so that tests need no simulation; and the real one's setup."""
+"""A synthetic skin whose fields have a closed form, so that tests need no simulation; the real skin's design."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
 WIDE_MM = 5.0
-FORCES_N = np.geomspace(0.55, 9.5, 6)  # enough for a skin in closed form
+FORCES_N = np.geomspace(0.55, 9.5, 6)  # enough for the closed form
 NAMES, SPREADS = ("label_x_mm", "label_y_mm", "gap_mm"), np.array([0.25, 0.25, 0.3])
 REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300
 
@@ -29,13 +29,13 @@ def fields_uT(place_mm: np.ndarray, force_N: np.ndarray, upright: float = 1.0) -
 
 
 def poked_uT(place_mm: np.ndarray, force_N: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Fields of a skin whose numbers lie so many spreads off the centre."""
+    """Fields of a skin whose parameters are `number` prior deviations off the centre."""
     label_x_mm, label_y_mm, gap_mm = number * SPREADS
     return fields_uT(place_mm + [label_x_mm, label_y_mm], force_N, 1 + gap_mm)
 
 
 def made_tables() -> Tables:
-    """Tables of the made-up skin; slopes by small differences."""
+    """Tables of the synthetic skin; slopes by small differences."""
     axis_mm = lattice_mm()
     place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.repeat(place_mm, len(FORCES_N), axis=0), np.tile(FORCES_N, len(place_mm))
@@ -49,7 +49,7 @@ def made_tables() -> Tables:
 
 
 def made_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
-    """Draw made-up skins whose numbers differ; where a weight is given, its press comes last."""
+    """Draw synthetic skins with different parameters; if a weight is given, its press comes last."""
     place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
     force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, PRESSES_N)))
     number = rng.standard_normal((skins_n, 3))

@@ -1,4 +1,4 @@
-"""The gain of a labelled press is what conditioning a Gaussian on it takes from the variance of all fields."""
+"""The information gain of a labelled press equals the variance removed by Gaussian conditioning."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from reskin.universal.map import NOISE_uT, SkinMap, condition_on_labels, expecte
 from reskin.universal.model import load_universal
 from tests.universal.skins import fields_uT, made_tables
 
-PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])  # of the lattice
+PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])  # lattice points
 
 
 @pytest.fixture(scope="module")
@@ -15,23 +15,23 @@ def skin() -> SkinMap:
     return new_map(made_tables())
 
 
-def test_the_gain_is_what_conditioning_takes_from_the_variance(skin):
+def test_gain_equals_removed_variance(skin):
     of, some = skin.hypotheses, np.arange(3, len(skin.hypotheses.mean_uT), len(skin.hypotheses.log_N))
     i = int(np.linalg.norm(of.place_mm - PLACE_mm[1], axis=1).argmin())
     slope = (of.slope_uT / np.linalg.norm(of.mean_uT, axis=1)[:, None, None])[some].astype(float)
     at_mm, at_log_N = (part[some] for part in of.at)
     force_N = np.exp(of.log_N[3:4])
     press_uT = np.linalg.norm(of.mean_uT[some[i]])
-    # All channels at all places, beside those of the press, which is one of these places.
+    # All channels at all places, together with those of the press, which is one of these places.
     alike = kernel(at_mm, at_mm[i : i + 1], at_log_N, at_log_N[i : i + 1])[:, 0]
     beside = slope @ skin.cov @ slope[i].T + alike[:, None, None] * skin.error_cov
     read = beside[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / press_uT) ** 2 * np.eye(15)
     taken = [np.trace(one @ np.linalg.solve(read, one.T)) for one in beside]
     found = expected_gain(skin, of.place_mm[i : i + 1], force_N)
-    assert found[0] == pytest.approx(np.mean(taken), rel=1e-5)  # tables in single precision
+    assert found[0] == pytest.approx(np.mean(taken), rel=1e-5)  # single-precision tables
 
 
-def test_a_labelled_place_gains_little_more_and_a_far_one_more(skin):
+def test_labelled_place_gains_less_than_a_far_one(skin):
     before = expected_gain(skin, PLACE_mm, FORCE_N)
     labelled = condition_on_labels(skin, PLACE_mm[:1], FORCE_N[:1], fields_uT(PLACE_mm[:1], FORCE_N[:1]))
     after = expected_gain(labelled, PLACE_mm, FORCE_N)
@@ -39,7 +39,7 @@ def test_a_labelled_place_gains_little_more_and_a_far_one_more(skin):
     assert after[1] > 1.5 * after[0]
 
 
-def test_the_shipped_model_chooses_the_next_place_to_press():
+def test_model_chooses_the_next_place():
     model = load_universal()
     first_mm = model.next_place()
     press_uT = 300 * np.sin(np.arange(15.0))[None]

@@ -1,4 +1,4 @@
-"""Inversion recovers presses and parameters of the law; its slopes are differences; foreign readings have residuals."""
+"""Inversion recovers presses and parameters of the law; slopes equal differences; foreign readings have residuals."""
 
 from dataclasses import asdict, replace
 
@@ -21,14 +21,14 @@ FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(P
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])  # 2.8 mm about the middle
+    monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])  # 2.8 mm around the middle
 
 
 def fields_uT() -> np.ndarray:
     return simulate_uT(TRUE, CHEAP, PLACE_MM, FORCE_N).reshape(len(PLACE_MM), -1)
 
 
-def test_a_search_recovers_places_and_forces():
+def test_search_recovers_places_and_forces():
     found = search(chart(TRUE, CHEAP), fields_uT())
     np.testing.assert_allclose(
         found.place_mm, PLACE_MM, atol=0.2
@@ -37,7 +37,7 @@ def test_a_search_recovers_places_and_forces():
     assert found.left.max() < 0.1
 
 
-def test_points_of_the_lattice_have_no_residual_and_foreign_readings_have():
+def test_residuals_are_zero_on_the_lattice_only():
     known = chart(TRUE, CHEAP)
     found = search(known, known.field_uT)
     np.testing.assert_allclose(found.place_mm, known.place_mm, atol=1e-9)
@@ -45,7 +45,7 @@ def test_points_of_the_lattice_have_no_residual_and_foreign_readings_have():
     assert np.median(search(known, -fields_uT()).left) > 0.5
 
 
-def test_slopes_are_differences_of_residuals():
+def test_slopes_equal_differences():
     two = _JointFit(TRUE, CHEAP, fields_uT()[:2], at_rest_uT(TRUE, CHEAP).ravel())
     at = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
     values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], at.ravel()])
@@ -56,7 +56,7 @@ def test_slopes_are_differences_of_residuals():
         np.testing.assert_allclose(columns[:, i], expected, rtol=1e-6, atol=1e-9)
 
 
-def test_unlabelled_presses_and_the_no_load_field_determine_parameters(monkeypatch):
+def test_unlabelled_presses_determine_parameters(monkeypatch):
     monkeypatch.setattr(inversion, "ROUNDS_N", 1)
     rest_uT, presses_uT = at_rest_uT(TRUE, CHEAP).ravel(), fields_uT()[::2]
     found = fit_unlabelled(presses_uT, rest_uT, CHEAP)

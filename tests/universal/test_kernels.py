@@ -12,7 +12,7 @@ FIRST_mm, FIRST_SD_mm, LOG_N = np.array([1.0, -2.0]), 1.2, 0.8
 
 
 def total() -> np.ndarray:
-    """Deviances of a Gaussian about a place and a force, sharper, ruffled and flatter."""
+    """Deviances of a Gaussian around a place and a force, sharper, with noise and flatter."""
     of_place = ((AT.place_mm - FIRST_mm) ** 2).sum(axis=1) / FIRST_SD_mm**2
     of_force = (AT.log_N - LOG_N) ** 2 / 0.5
     of_all = (of_place[:, None] + of_force).ravel() + 300.0
@@ -21,7 +21,7 @@ def total() -> np.ndarray:
 
 
 def of(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The deviance and the likeliest hypothesis."""
+    """The deviance and the most likely hypothesis."""
     return total, total.argmin(axis=1)
 
 
@@ -39,13 +39,13 @@ def spread(of_place: np.ndarray, about_mm: np.ndarray) -> np.ndarray:
 def test_means_are_sums_over_all_hypotheses(power):
     place_mm, sd_mm, force_N = means(*of(total()), AT, power)
     of_place = probabilities(power).sum(axis=2)
-    np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)  # what lies e^-25 below is left out
+    np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)  # below e^-25 of the maximum: omitted
     np.testing.assert_allclose(sd_mm, spread(of_place, place_mm), atol=1e-6)
     np.testing.assert_allclose(np.log(force_N), probabilities(power).sum(axis=1) @ AT.log_N, atol=1e-6)
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
-def test_products_are_those_of_both_margins_and_normals(power):
+def test_product_equals_margins_times_normals(power):
     rng = rng_for(1, "answers")
     normals = np.column_stack(
         [rng.normal(0, 3, (4, 2)), rng.uniform(0.5, 2, (4, 2)), rng.normal(0, 1, 4), np.full(4, 0.4)]
@@ -61,7 +61,7 @@ def test_products_are_those_of_both_margins_and_normals(power):
     np.testing.assert_allclose(np.log(force_N), of_force @ AT.log_N, atol=1e-6)
 
 
-def test_a_product_on_a_lattice_is_the_closed_form_of_two_gaussians():
+def test_product_of_two_gaussians():
     second_mm, second_sd = np.array([2.5, 0.0]), np.array([1.0, 0.8])
     second = np.concatenate([second_mm, second_sd, np.ones(2)])[None]
     place_mm, sd_mm, _ = products(*of(total()[:1]), AT, second, 1.0, 1.0)
@@ -70,7 +70,7 @@ def test_a_product_on_a_lattice_is_the_closed_form_of_two_gaussians():
     np.testing.assert_allclose(sd_mm[0], np.sqrt(var), atol=1e-4)
 
 
-def test_a_place_that_the_map_excludes_keeps_the_least_probability_of_single_precision():
+def test_excluded_place_keeps_the_minimum_probability():
     far = np.full((1, total().shape[1]), 1e4, np.float32)
     far[0, 0] = 0.0
     normals = np.array([[8.0, 8.0, 0.1, 0.1, 1.0, 1.0]])
@@ -87,7 +87,7 @@ def test_nan_gives_nan():
 
 
 @pytest.mark.parametrize("h", [1, LANES_N, LANES_N + 3])
-def test_chi2_is_the_mahalanobis_distance_however_many_fill_the_last_block(h):
+def test_chi2_is_the_mahalanobis_distance(h):
     rng = rng_for(0, "gaussians", h)
     mean, slope = rng.normal(0, 300, (h, 6)), rng.normal(0, 60, (h, 6, 4))
     number, root = rng.standard_normal(4), np.linalg.cholesky(np.cov(rng.standard_normal((4, 20))))

@@ -1,4 +1,4 @@
-"""The network is conditioned on a set of presses: their order does not matter, and there may be none."""
+"""The network is conditioned on a set of presses, which may be empty and whose order does not matter."""
 
 import numpy as np
 import pytest
@@ -13,14 +13,14 @@ PRESSES_uT, READ_uT, REST_uT = (RNG.normal(0, 300, shape) for shape in ((20, 15)
 ONE, OTHER = (draw_weights(15, rng_for(0, name)) for name in ("one", "other"))
 
 
-def test_the_order_of_presses_does_not_matter():
+def test_order_of_presses_does_not_matter():
     forward, backward = predict([ONE], READ_uT, REST_uT, PRESSES_uT), predict([ONE], READ_uT, REST_uT, PRESSES_uT[::-1])
-    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)  # sums in another order
+    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)  # different order of summation
     other = predict([ONE], READ_uT, REST_uT, 2 * PRESSES_uT)
     assert np.abs(forward.place_mm - other.place_mm).max() > 1e-3
 
 
-def test_a_press_that_is_not_kept_does_not_count():
+def test_masked_press_is_ignored():
     network, rest = Network(ONE), torch.from_numpy(REST_uT[None].astype(np.float32))
     presses = torch.from_numpy(PRESSES_uT[None].astype(np.float32))
     kept = (torch.arange(20) < 5).float()[None]
@@ -38,7 +38,7 @@ def test_inputs_are_direction_and_length():
     torch.testing.assert_close(far[..., 15] - near[..., 15], torch.full((1, 7), float(np.log(5.0))), atol=1e-5, rtol=0)
 
 
-def test_the_spread_of_several_networks_adds_to_their_variance():
+def test_spread_of_networks_adds_to_the_variance():
     one, other = (predict([each], READ_uT, REST_uT, PRESSES_uT) for each in (ONE, OTHER))
     both = predict([ONE, OTHER], READ_uT, REST_uT, PRESSES_uT)
     np.testing.assert_allclose(both.place_mm, (one.place_mm + other.place_mm) / 2, rtol=1e-6)
@@ -55,7 +55,7 @@ def test_weights_fit_any_number_of_chips(chips_n):
 
 
 @pytest.mark.parametrize("presses_n", [0, 20])
-def test_numpy_and_pytorch_agree(presses_n):
+def test_numpy_equals_pytorch(presses_n):
     weights = {name: value + 0.05 * RNG.standard_normal(value.shape).astype(np.float32) for name, value in ONE.items()}
     found = predict([weights], READ_uT, REST_uT, PRESSES_uT[:presses_n])
     read, rest, presses = (torch.from_numpy(part.astype(np.float32))[None] for part in (READ_uT, REST_uT, PRESSES_uT))
@@ -65,5 +65,5 @@ def test_numpy_and_pytorch_agree(presses_n):
         mean, log_sd = (part[0].numpy() for part in network(read, rest, network.encode(presses, rest, kept)))
     found_mean = np.column_stack([found.place_mm / PLACE_MM, found.log_N / LOG_N])
     found_sd = np.column_stack([found.sd_mm / PLACE_MM, found.sd_log_N / LOG_N])
-    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)  # sums in another order
+    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)  # different order of summation
     np.testing.assert_allclose(np.log(found_sd), log_sd, rtol=1e-5, atol=1e-5)

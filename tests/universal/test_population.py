@@ -1,4 +1,4 @@
-"""Drawn skins are repeatable, and differ as their prior says."""
+"""Simulated skins are reproducible and follow their prior."""
 
 from dataclasses import fields, replace
 
@@ -25,7 +25,7 @@ from tests.universal.skins import SETUP
 COARSE = replace(SETUP, rule=population.COARSE)
 
 
-def test_the_same_seed_draws_the_same_skins_however_many_more_are_drawn(monkeypatch):
+def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     monkeypatch.setattr(population, "THICKNESSES_MM", {2.0: 1.0})  # each thickness and tip takes seconds to tabulate
     monkeypatch.setattr(population, "TIPS_MM", {2.0: 1.0})
     one, two = (draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, n, rng_for(0, "skins")) for n in (1, 2))
@@ -35,7 +35,7 @@ def test_the_same_seed_draws_the_same_skins_however_many_more_are_drawn(monkeypa
     second = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, slice(1, 2), rng_for(0, "skins"))
     np.testing.assert_array_equal(second.db_uT[0], two.db_uT[1])
     weighed = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(PLAIN, weight_N=5.0))
-    np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)  # the press of a weight moves no other
+    np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)  # a weight press does not change the others
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 
 
@@ -51,16 +51,16 @@ def test_parameters_have_the_given_spreads_and_bounds():
     assert np.polyfit(gap_mm, log, 1)[0] == pytest.approx(population.STRONGER_PER_MM, abs=0.15)
 
 
-def test_presses_begin_with_every_place_of_the_grid_and_all_lie_on_the_skin():
+def test_presses_cover_the_grid_and_stay_on_the_skin():
     place_mm = draw_places(rng_for(2, "places"))
     assert place_mm.shape == (2 * PLACES_N, 2)
     assert inside(place_mm).all()
-    assert np.abs(place_mm[:PLACES_N] - grid()).max() < 0.3  # six jitters
+    assert np.abs(place_mm[:PLACES_N] - grid()).max() < 0.3  # six standard deviations of the jitter
     assert len(np.unique(grid(), axis=0)) == PLACES_N
     assert inside(grid()).all()
 
 
-def test_fields_grow_with_an_even_filler_and_an_uneven_one_moves_them(monkeypatch):
+def test_filler_scales_and_shifts_fields(monkeypatch):
     place_mm, force_N = np.array([[1.0, 2.0]]), np.array([3.0])
     twice = replace(COARSE.rest, moments_A_m2=2 * COARSE.rest.moments_A_m2)
     plain_uT = simulate_uT(NOMINAL, COARSE, place_mm, force_N)
@@ -68,7 +68,7 @@ def test_fields_grow_with_an_even_filler_and_an_uneven_one_moves_them(monkeypatc
     np.testing.assert_allclose(at_rest_uT(NOMINAL, COARSE, twice), 2 * at_rest_uT(NOMINAL, COARSE), rtol=1e-9)
     filled = fill(COARSE.rest, rng_for(3, "filler"))
     part = np.linalg.norm(filled.moments_A_m2, axis=1) / np.linalg.norm(COARSE.rest.moments_A_m2, axis=1)
-    assert 0.05 < np.std(np.log(part)) < 0.3  # 0.15 over many skins; a skin is some six lengths wide
+    assert 0.05 < np.std(np.log(part)) < 0.3  # 0.15 over many skins; a skin is about six correlation lengths wide
 
 
 def test_chips_read_nearly_the_true_field():

@@ -1,4 +1,4 @@
-"""Likelihood powers: every label is held out once; residuals as large as estimated change nothing."""
+"""Likelihood powers and variance inflation from cross-validated labels."""
 
 import numpy as np
 import pytest
@@ -22,20 +22,20 @@ def estimate(off_mm: np.ndarray, sd_mm: float) -> Estimate:
 
 
 @pytest.mark.parametrize("labels_n", [0, 1, 3, 5, 12, 40])
-def test_every_label_is_held_out_once_and_kept_otherwise(labels_n):
+def test_every_label_is_held_out_once(labels_n):
     parts = folds_of_labels(labels_n)
     assert sorted(i for _, held_out in parts for i in held_out) == list(range(labels_n))
     assert all(sorted([*kept, *held_out]) == list(range(labels_n)) for kept, held_out in parts)
     assert all(len(held_out) for _, held_out in parts)
 
 
-def test_normal_residuals_as_large_as_estimated_inflate_nothing_and_twice_as_large_ones_fourfold():
+def test_inflation_of_normal_and_doubled_residuals():
     off = np.abs(rng_for(0, "residuals").standard_normal((200_000, 2)))
     assert variance_inflation(off) == pytest.approx(1, abs=0.01)
     assert variance_inflation(2 * off) == pytest.approx(4, rel=0.01)
 
 
-def test_few_residuals_are_weighed_against_the_prior():
+def test_few_residuals_are_shrunk_to_the_prior():
     assert variance_inflation(np.zeros((0, 2))) == 1
     none_off = variance_inflation(np.zeros((5, 2)))
     assert none_off == pytest.approx((PRIOR_N / (PRIOR_N + 10)) ** 2)
@@ -48,7 +48,7 @@ def test_few_residuals_are_weighed_against_the_prior():
     )
 
 
-def test_each_power_has_its_own_inflation_over_all_held_out_labels():
+def test_each_power_has_its_inflation():
     at_mm, off_mm = np.zeros((20, 2)), np.ones((20, 2))
     parts = [([estimate(off_mm, 1.0), estimate(off_mm, 0.25)], at_mm)] * 2
     assert variance_inflations(2, parts) == pytest.approx(
@@ -62,7 +62,7 @@ def test_powers_are_at_most_one():
     assert [lower_by_residuals(0.5, of) for of in (0.1, 1.0, 2.0)] == [1.0, 0.5, 0.25]
 
 
-def test_powers_are_interpolated_between_labels_and_taken_of_fewer_presses():
+def test_powers_are_interpolated_between_label_counts():
     powers = LikelihoodPowers({0: {0: 0.9, 10: 0.9}, 12: {0: 0.8, 10: 0.2}}, {0: 0.3})
     assert [powers.of(12, n, even=False) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
     assert [powers.of(n, 0, even=False) for n in (0, 11, 12, 65)] == pytest.approx([0.9, 0.9, 0.8, 0.8])

@@ -1,4 +1,4 @@
-"""The residual expects the part of the law's errors that boards share."""
+"""The residual predicts the part of the law's errors that boards share."""
 
 import numpy as np
 import pytest
@@ -6,26 +6,26 @@ import pytest
 from reskin.seeds import rng_for
 from reskin.universal.map import NOISE, SHARED, fit_residual, kernel, no_residual
 
-APART_MM = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])  # too far to correlate
+APART_MM = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])  # too far apart to correlate
 FORCE_N = np.ones(3)
 ERRORS = rng_for(0, "missed").standard_normal((3, 15))
 
 
 @pytest.mark.parametrize("boards_n", [1, 2, 5])
-def test_boards_with_equal_errors_predict_their_shared_part(boards_n):
+def test_equal_errors_predict_their_shared_part(boards_n):
     found = fit_residual([APART_MM] * boards_n, [FORCE_N] * boards_n, [ERRORS] * boards_n).at(APART_MM, np.zeros(3))
     # Gaussian conditioning on n equal values of variance 1 + noise, covariance SHARED with each other and the new one.
     part = boards_n * SHARED / (1 + NOISE + (boards_n - 1) * SHARED)
     np.testing.assert_allclose(found, part * ERRORS, rtol=1e-9)
 
 
-def test_no_error_is_expected_far_from_presses_nor_without_boards():
+def test_no_error_without_presses_or_boards():
     far_mm = np.array([[100.0, 100.0]])
     assert np.abs(fit_residual([APART_MM], [FORCE_N], [ERRORS]).at(far_mm, np.zeros(1))).max() < 1e-9
     assert (no_residual(15).at(far_mm, np.zeros(1)) == 0).all()
 
 
-def test_the_order_of_boards_does_not_matter():
+def test_order_of_boards_does_not_matter():
     one = fit_residual([APART_MM, APART_MM + 1], [FORCE_N, 2 * FORCE_N], [ERRORS, ERRORS**2])
     other = fit_residual([APART_MM + 1, APART_MM], [2 * FORCE_N, FORCE_N], [ERRORS**2, ERRORS])
     np.testing.assert_allclose(one.at(APART_MM, np.zeros(3)), other.at(APART_MM, np.zeros(3)), rtol=1e-9)
@@ -33,7 +33,7 @@ def test_the_order_of_boards_does_not_matter():
     assert np.trace(one.share) == pytest.approx(1)
 
 
-def test_the_kernel_is_squared_exponential():
+def test_kernel_is_squared_exponential():
     place_mm, log_N = np.array([[0.0, 0.0], [3.0, 0.0]]), np.array([0.0, 1.2])
     expected = [[1, np.exp(-0.5)], [np.exp(-0.5), 1]]
     np.testing.assert_allclose(kernel(place_mm, place_mm, np.zeros(2), np.zeros(2)), expected)

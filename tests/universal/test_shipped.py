@@ -1,4 +1,4 @@
-"""The model that comes with the project: it reads simulated pokes, tells what is none, and refuses other boards."""
+"""The model that comes with the library: accuracy on simulated pokes, misfit, labels, files and refused input."""
 
 import shutil
 from pathlib import Path
@@ -37,13 +37,13 @@ def skin() -> Universal:
 
 
 def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
-    """What a nominal skin reads at the places of the lattice next to `PLACES_MM`, in the chips' axes."""
+    """Readings of a nominal skin at the lattice points next to `PLACES_MM`, in the chips' axes."""
     tables = skin.tables
     at = np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)
     return to_chips(tables.mean_uT[at[:, 0], at[:, 1], force_i])
 
 
-def test_a_nominal_skin_is_read_within_the_lattice_and_its_force_between_the_forces(skin):
+def test_nominal_skin_is_estimated_within_the_lattice(skin):
     tables, rest_uT = skin.tables, to_chips(skin.tables.rest_uT[None])
     found = skin.zero(rest_uT).predict(pokes(skin) + rest_uT)
     lattice_mm = tables.axis_mm[np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)] + 8
@@ -51,7 +51,7 @@ def test_a_nominal_skin_is_read_within_the_lattice_and_its_force_between_the_for
     assert ((found[:, 2] > tables.force_N[1]) & (found[:, 2] < tables.force_N[5])).all()
 
 
-def test_labels_move_what_is_answered_towards_them(skin):
+def test_labels_move_estimates_towards_them(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, shifted_mm = pokes(skin) + rest_uT, PLACES_MM + (0.8, -0.5)
     before = skin.zero(rest_uT).predict(read_uT)
@@ -59,7 +59,7 @@ def test_labels_move_what_is_answered_towards_them(skin):
     assert np.abs(after[:, :2] - shifted_mm).mean() < 0.5 * np.abs(before[:, :2] - shifted_mm).mean()
 
 
-def test_what_is_no_poke_of_a_skin_has_a_misfit_far_above_one(skin):
+def test_misfit_of_other_signals_is_large(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     own = skin.zero(rest_uT).estimate(pokes(skin) + rest_uT).misfit
     alien = skin.estimate(3000 * np.random.default_rng(0).standard_normal((4, CHANNELS_N)) + rest_uT).misfit
@@ -67,7 +67,7 @@ def test_what_is_no_poke_of_a_skin_has_a_misfit_far_above_one(skin):
     assert alien.min() > 10 * own.max()
 
 
-def test_the_card_says_what_the_model_is_and_what_it_is_not_for(skin):
+def test_card_describes_the_model(skin):
     assert skin.card["source"] == "simulated"
     assert skin.card["centre"]["gap_mm"] == NOMINAL.gap_mm
     assert skin.card["not_for"]
@@ -82,7 +82,7 @@ def test_other_boards_are_refused(skin):
     assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
 
 
-def test_pokes_one_by_one_tell_nearly_what_they_tell_at_once(skin):
+def test_single_and_joint_adaptation_agree(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     stronger_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT
     at_once = skin.zero(rest_uT).see(stronger_uT).skin.mean
@@ -92,7 +92,7 @@ def test_pokes_one_by_one_tell_nearly_what_they_tell_at_once(skin):
     assert np.linalg.norm(skin.skin.mean - at_once) < 0.3 * np.linalg.norm(at_once)
 
 
-def test_labels_that_it_cannot_foresee_make_it_less_sure_and_earlier_ones_are_forgotten(skin):
+def test_surprising_labels_raise_uncertainty_and_labels_are_replaced(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N = np.tile(pokes(skin), (3, 1)) + rest_uT, np.full(12, skin.tables.force_N[3])
     place_mm = np.tile(PLACES_MM, (3, 1))
@@ -107,7 +107,7 @@ def test_labels_that_it_cannot_foresee_make_it_less_sure_and_earlier_ones_are_fo
     assert skin.power == pytest.approx(skin.powers.of(0, 0, even=False))
 
 
-def test_what_is_told_counts_and_neither_its_order_nor_what_was_asked_between(skin):
+def test_order_of_data_and_queries_does_not_matter(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3])
     off_mm = PLACES_MM + np.random.default_rng(0).standard_normal(PLACES_MM.shape)
@@ -127,10 +127,10 @@ def test_what_is_told_counts_and_neither_its_order_nor_what_was_asked_between(sk
         ((8.0, 8.0), np.inf, "forces must be finite"), ((8.0, 8.0, 1.0), 1.0, "each press needs x and y"),
     ],
 )  # fmt: skip
-def test_labels_that_no_poke_has_are_refused_and_nothing_is_learnt(skin, place_mm, force_N, rule):
+def test_invalid_labels_are_refused_and_change_nothing(skin, place_mm, force_N, rule):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT = pokes(skin)[:1] + rest_uT
-    before = skin.zero(rest_uT).label(PLACES_MM[0], 1.0, read_uT[0]).predict(read_uT)  # one poke, without brackets
+    before = skin.zero(rest_uT).label(PLACES_MM[0], 1.0, read_uT[0]).predict(read_uT)  # one poke, not in a list
     with pytest.raises(SchemaError, match=rule):
         skin.label(place_mm, force_N, read_uT)
     for learn in (skin.see, skin.zero):
@@ -139,7 +139,7 @@ def test_labels_that_no_poke_has_are_refused_and_nothing_is_learnt(skin, place_m
     np.testing.assert_array_equal(skin.predict(read_uT), before)
 
 
-def test_a_changed_model_is_refused(skin, tmp_path):
+def test_changed_model_is_refused(skin, tmp_path):
     file = tmp_path / FILE.name
     shutil.copy(FILE.with_suffix(".json"), file.with_suffix(".json"))
     content = bytearray(FILE.read_bytes())
@@ -150,7 +150,7 @@ def test_a_changed_model_is_refused(skin, tmp_path):
             load_universal(file=file)
 
 
-def test_a_model_of_an_earlier_version_is_refused(skin, tmp_path):
+def test_model_of_an_earlier_version_is_refused(skin, tmp_path):
     file = tmp_path / FILE.name
     shutil.copy(FILE, file)
     io.write_json(file.with_suffix(".json"), skin.card | {"format": "reskin-universal-2"})
@@ -158,7 +158,7 @@ def test_a_model_of_an_earlier_version_is_refused(skin, tmp_path):
         load_universal(file=file)
 
 
-def test_a_skin_that_was_saved_answers_the_next_day_as_it_did_and_follows_its_drift(skin, tmp_path):
+def test_saved_skin_estimates_alike_and_follows_drift(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
     read_uT, force_N = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3])
     further_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (1, 2, 3, 4)]) + rest_uT
@@ -175,7 +175,7 @@ def test_a_skin_that_was_saved_answers_the_next_day_as_it_did_and_follows_its_dr
     assert again.zero(drifted_uT).presses_n == 0
 
 
-def test_labels_are_kept_where_that_is_asked_for_and_else_forgotten(skin):
+def test_labels_are_kept_on_request(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N, shifted_mm = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3]), PLACES_MM + (0.8, -0.5)
     at_once = skin.zero(rest_uT).label(shifted_mm, force_N, read_uT).predict(read_uT)
@@ -189,7 +189,7 @@ def test_labels_are_kept_where_that_is_asked_for_and_else_forgotten(skin):
     assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).presses_n == 2
 
 
-def test_of_pokes_that_came_one_by_one_a_saved_skin_knows_nearly_the_same(skin, tmp_path):
+def test_saved_skin_keeps_incremental_pokes(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
     skin.zero(rest_uT)
     for one_uT in np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT:
@@ -205,13 +205,13 @@ def many(labels_n):
     return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
 
 
-def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
+def test_invalid_skin_files_are_refused(skin, tmp_path):
     file = tmp_path / "s0.safetensors"
     with pytest.raises(SchemaError, match="save: the model has no no-load reading"):
         skin.save(file)
     assert not file.exists()
     skin.zero(to_chips(skin.tables.rest_uT[None])).save(file)
-    sound, words = io.read_tensors(file)
+    sound, header = io.read_tensors(file)
     one_uT = np.ones((1, CHANNELS_N))
     for changed, rule in [
         ({"pokes_uT": one_uT * np.nan}, "must be finite numbers of uT; got nan"),
@@ -225,10 +225,10 @@ def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
         ({"labelled_uT": np.ones((2001, CHANNELS_N))} | many(2001), "2001 are too many, at most 2000"),
         ({"pokes_uT": np.ones((9000, CHANNELS_N))}, "1,08.* bytes are too many for a saved skin .at most 1,048,576"),
     ]:
-        io.write_tensors(file, sound | changed, words)
+        io.write_tensors(file, sound | changed, header)
         with pytest.raises(SchemaError, match=rule):
             load_universal(file)
-    io.write_tensors(file, {name: sound[name] for name in sound if name != "rest_uT"}, words)
+    io.write_tensors(file, {name: sound[name] for name in sound if name != "rest_uT"}, header)
     with pytest.raises(SchemaError, match="arrays must be rest_uT"):
         load_universal(file)
     file.write_bytes(b"no such thing")
@@ -241,7 +241,7 @@ def test_what_no_skin_was_told_is_not_taken_from_a_file(skin, tmp_path):
         load_universal(FILE)
 
 
-def test_no_rows_give_no_answers_and_cannot_zero():
+def test_no_rows():
     model = load_universal()
     assert model.predict(np.empty((0, 15))).shape == (0, 3)
     assert len(model.estimate(np.empty((0, 15))).place_mm) == 0
@@ -250,7 +250,7 @@ def test_no_rows_give_no_answers_and_cannot_zero():
 
 
 @pytest.mark.parametrize("force_N", [0.1, 0.5])
-def test_light_touches_of_skins_that_it_never_saw_read_as_about_what_they_are(force_N):
+def test_light_touches_on_unseen_skins(force_N):
     model, read_N, rng = load_universal(), [], rng_for(0, "light")
     for name in ("b0", "b1", "b2", "b3"):
         board = draw_board(RIGID, SPREADS, seed=5, name=name)

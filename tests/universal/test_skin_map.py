@@ -1,4 +1,4 @@
-"""A map is conditioned as a Gaussian is, and estimates labelled places as labelled."""
+"""A map is conditioned as a Gaussian process and reproduces labelled places."""
 
 from dataclasses import replace
 
@@ -33,16 +33,16 @@ def presses(number=NUMBER, seed=0):
     return grid(), force_N, poked_uT(grid(), force_N, number)
 
 
-def test_the_no_load_field_conditions_as_a_gaussian(skin):
+def test_no_load_field_conditions_as_a_gaussian(skin):
     noload_uT = rng_for(1, "rest").normal(0, 300, 15)
     found = map.condition_on_noload(skin, noload_uT)
-    # In covariance form; the map computes in information form.
+    # Covariance form; the map computes in information form.
     gain = REST_SLOPE_uT.T @ np.linalg.inv(REST_SLOPE_uT @ REST_SLOPE_uT.T + OFFSET_uT**2 * np.eye(15))
     np.testing.assert_allclose(found.mean, gain @ noload_uT, rtol=1e-9)
     np.testing.assert_allclose(found.cov, np.eye(3) - gain @ REST_SLOPE_uT, rtol=1e-9, atol=1e-12)
 
 
-def test_the_deviance_is_that_of_a_gaussian(skin):
+def test_deviance_is_that_of_a_gaussian(skin):
     skin = replace(skin, mean=np.array([0.3, -0.2, 0.5]))
     hypothesis = [300, 1100, 2000]
     mean_uT, slope_uT = skin.hypotheses.mean_uT[hypothesis], skin.hypotheses.slope_uT[hypothesis]
@@ -61,16 +61,16 @@ def test_the_deviance_is_that_of_a_gaussian(skin):
         assert found.deviance[0, i] == pytest.approx(deviance, abs=0.02)
 
 
-def test_presses_of_the_tabulated_skin_are_estimated_where_they_were(skin):
+def test_presses_of_the_tabulated_skin_are_located(skin):
     place_mm, force_N, db_uT = presses(np.zeros(3))
     found = skin.evaluator.estimate(db_uT)
     assert np.abs(found.place_mm - place_mm).max() < 1.0
     assert np.abs(np.log(found.force_N / force_N)).mean() < 0.3
 
 
-def test_a_labelled_place_is_estimated_as_labelled_even_against_the_law(skin):
+def test_labelled_place_overrides_the_law(skin):
     place_mm, force_N, db_uT = presses()
-    wrong_uT = db_uT[::-1] * 0.9  # each place reads as the one opposite
+    wrong_uT = db_uT[::-1] * 0.9  # each place reads like the opposite one
     some = [12, 32, 50]
     found = condition_on_labels(skin, place_mm[some], force_N[some], wrong_uT[some]).evaluator.estimate(wrong_uT[some])
     assert np.abs(found.place_mm - place_mm[some]).max() < 0.5
@@ -78,32 +78,32 @@ def test_a_labelled_place_is_estimated_as_labelled_even_against_the_law(skin):
     assert np.abs(before.place_mm - place_mm[[12, 50]]).max() > 3
 
 
-def test_the_order_of_labels_does_not_matter(skin):
+def test_order_of_labels_does_not_matter(skin):
     place_mm, force_N, db_uT = (part[:10] for part in presses())
     order = rng_for(2, "order").permutation(10)
     maps = [condition_on_labels(skin, place_mm[i], force_N[i], db_uT[i]) for i in (np.arange(10), order)]
     one, other = (each.evaluator.estimate(db_uT) for each in maps)
-    np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)  # mm; deviance in single precision
+    np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)  # mm; single-precision deviance
     np.testing.assert_allclose(one.sd_mm, other.sd_mm, atol=1e-3)
 
 
 @pytest.mark.parametrize("gap", [-1.5, 1.5])
-def test_unlabelled_presses_move_the_parameters_towards_the_truth(skin, gap):
+def test_unlabelled_presses_improve_the_parameters(skin, gap):
     _, _, db_uT = presses(np.array([0.0, 0.0, gap]))
     found = condition_on_presses(skin, db_uT + rng_for(3, "noise").normal(0, 3, db_uT.shape))
-    # Not nearer: each press's place and force take up part of what the parameter does.
+    # Not closer: each press's place and force absorb part of the parameter's effect.
     assert abs(found.mean[2] - gap) < 0.8 * abs(gap)
     assert found.cov[2, 2] < skin.cov[2, 2]
 
 
-def test_even_presses_tell_the_labels_middle(skin):
+def test_even_presses_determine_the_middle_of_the_labels(skin):
     shifted = np.array([2.0, -1.0, 0.0])  # spreads of 0.25 mm
     _, _, db_uT = presses(shifted)
     found = condition_on_even_presses(skin, db_uT)
     assert np.linalg.norm((found.mean - shifted)[:2]) < 0.5 * np.linalg.norm(shifted)
 
 
-def test_a_covariance_that_is_not_positive_definite_is_an_error(skin):
+def test_indefinite_covariance_is_an_error(skin):
     broken = replace(skin, hypotheses=replace(skin.hypotheses, error_cov=-1e6 * skin.hypotheses.error_cov))
     with pytest.raises(SchemaError, match="covariances of its hypotheses are not positive definite"):
         _ = broken.evaluator

@@ -1,4 +1,4 @@
-"""Tables are the fields that the law simulates, and their slopes."""
+"""Tables contain the simulated fields of the law and their slopes."""
 
 from dataclasses import asdict, replace
 
@@ -11,7 +11,7 @@ from reskin.universal.map import LOGARITHMIC, NOMINAL, NOMINAL_SPREADS, RIG_SPRE
 from tests.universal.skins import SETUP
 
 
-def test_tables_are_the_laws_fields_and_their_slopes(monkeypatch):
+def test_tables_equal_simulated_fields_and_slopes(monkeypatch):
     monkeypatch.setattr(map, "lattice_mm", lambda: np.array([-4.0, 1.0]))
     found = tabulate(NOMINAL, {"amplitude": 0.2, "label_x_mm": 0.5}, SETUP)
     at_mm = np.array([[-4.0, 1.0]])
@@ -20,12 +20,12 @@ def test_tables_are_the_laws_fields_and_their_slopes(monkeypatch):
         np.testing.assert_allclose(found.mean_uT[0, 1, i], there_uT, rtol=1e-9)
         moved_uT = simulate_uT(NOMINAL, SETUP, at_mm + [STEP * 0.5, 0], np.array([force_N])).ravel()
         np.testing.assert_allclose(found.slope_uT[0, 1, i, :, 1], (moved_uT - there_uT) / STEP, rtol=1e-9, atol=1e-9)
-    grown = (np.exp(STEP * 0.2) - 1) / STEP  # fields are linear in the amplitude, whose spread is of its logarithm
+    grown = (np.exp(STEP * 0.2) - 1) / STEP  # fields are linear in the amplitude, whose logarithm has the spread
     np.testing.assert_allclose(found.slope_uT[..., 0], grown * found.mean_uT, rtol=1e-9)
     np.testing.assert_allclose(found.rest_slope_uT, np.outer(found.rest_uT, [grown, 0]), rtol=1e-9, atol=1e-9)
 
 
-def test_the_mean_law_has_the_seat_as_designed():
+def test_mean_law_has_the_design_seat():
     weak, strong = replace(NOMINAL, amplitude=1.0, seat_x_mm=0.4), replace(NOMINAL, amplitude=4.0, gap_mm=2.0)
     found = mean_law([weak, strong])
     assert (found.amplitude, found.gap_mm) == pytest.approx((2.0, 1.8))
@@ -33,7 +33,7 @@ def test_the_mean_law_has_the_seat_as_designed():
 
 
 @pytest.mark.parametrize("spreads", [RIG_SPREADS, NOMINAL_SPREADS])
-def test_perturbing_a_parameter_and_back_restores_it(spreads):
+def test_perturbation_is_reversible(spreads):
     assert set(spreads) <= set(asdict(NOMINAL))
     assert set(LOGARITHMIC) <= set(spreads)
     for name, spread in spreads.items():

@@ -1,4 +1,4 @@
-"""A short training learns, and is repeatable."""
+"""A short training learns and is reproducible."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def weights():
     return train(SKINS, PRIOR, 80, rng_for(0, "training"))
 
 
-def test_a_short_training_beats_the_mean_on_unseen_skins(weights):
+def test_short_training_beats_the_mean_on_unseen_skins(weights):
     tested = slice(PLACES_N, None)
     fresh, off_mm2, off_log2 = made_population(5, rng_for(1, "fresh")), [], []
     for db_uT, rest_uT, place_mm, force_N in zip(
@@ -41,7 +41,7 @@ def test_a_short_training_beats_the_mean_on_unseen_skins(weights):
     assert np.mean(off_log2) < 0.5 * np.log(fresh.force_N).var()
 
 
-def test_the_same_generator_gives_the_same_weights():
+def test_weights_follow_the_generator():
     one, other = (train(SKINS, PRIOR, 3, rng_for(2, "same")) for _ in range(2))
     assert all((one[name] == other[name]).all() for name in one)
 
@@ -54,10 +54,10 @@ def test_errors_of_the_law_have_the_given_size():
     assert off_uT.std() == pytest.approx(30.0, rel=0.05)
     same_mm = np.zeros((400, 20, 2), np.float32)
     together_uT = add_error(db_uT, same_mm, np.zeros((400, 20), np.float32), (0.3, 0.3), rng)
-    assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01  # at one place under one force, one error
+    assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01  # one error per place and force
 
 
-def test_some_skins_have_no_press_to_condition_on_and_the_others_any_number():
+def test_number_of_conditioning_presses_varies():
     kept_n = draw_kept(4000, rng_for(4, "kept")).sum(axis=1)
     assert (kept_n == 0).mean() == pytest.approx(0.25, abs=0.03)
     assert kept_n[kept_n > 0].min() == 1
@@ -65,13 +65,13 @@ def test_some_skins_have_no_press_to_condition_on_and_the_others_any_number():
     assert kept_n[kept_n > 0].mean() == pytest.approx((PLACES_N + 1) / 2, abs=1.5)
 
 
-def test_batches_hold_known_boards_and_simulated_skins_with_the_residual():
+def test_batches_mix_recorded_boards_and_simulated_skins():
     place_mm = SKINS.place_mm[0, :40]
     force_N = np.repeat(SKINS.force_N[0, :40, None], 3, axis=1)
     db_uT = np.repeat(fields_uT(place_mm, force_N[:, 0])[:, None], 3, axis=1).astype(np.float32)
     board = RecordedBoard(db_uT, np.ones(15, np.float32), place_mm, force_N)
     drawn = draw_recorded(board, rng_for(5, "recorded"))
-    assert drawn[0].shape == (PRESSES_N, 15)  # of 40 presses, some repeat
+    assert drawn[0].shape == (PRESSES_N, 15)  # drawn from 40 presses with repeats
     np.testing.assert_allclose(drawn[0], fields_uT(drawn[2], np.exp(drawn[3])), rtol=1e-4, atol=1e-2)
 
     residual = fit_residual([place_mm.astype(float)], [force_N[:, 0].astype(float)], [np.full((40, 15), 0.1)])
