@@ -106,19 +106,19 @@ def _connect(address: str) -> Any:
         from distributed import Client
     except ImportError:
         remedy = "Try: pip install -c constraints.txt -e '.[dask]'"
-        raise ParamsError("RESKIN_EXECUTOR", "package distributed", "installed", "none", remedy) from None
+        raise ParamsError(f"RESKIN_EXECUTOR: package distributed is not installed. {remedy}") from None
     try:
         return Client(address, timeout=CONNECT_MAX_s, set_as_default=False)
     except (OSError, ValueError) as error:
-        rule, got = f"one that answers within {CONNECT_MAX_s:g} s", f"{address} ({str(error)[:80]})"
-        raise ParamsError("RESKIN_EXECUTOR", "the scheduler", rule, got, HOW) from None
+        what = f"the scheduler at {address} did not answer within {CONNECT_MAX_s:g} s ({str(error)[:80]})"
+        raise ParamsError(f"RESKIN_EXECUTOR: {what}. {HOW}") from None
 
 
 def _check_workers(client: Any, address: str) -> None:
     """Raise if there is no worker, or one that would give other bits than this process."""
     workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
     if not workers:
-        raise ParamsError("RESKIN_EXECUTOR", f"workers of {address}", "one or more", "none", HOW)
+        raise ParamsError(f"RESKIN_EXECUTOR: the scheduler at {address} has no workers. {HOW}")
     for name, worker in workers.items():
         if worker["nthreads"] != 1:
             raise ParamsError("RESKIN_EXECUTOR", f"threads of worker {name}", "1", worker["nthreads"], HOW)
@@ -131,7 +131,7 @@ def _compare(own: Mapping[str, str], theirs: Mapping[str, str], name: str) -> No
     for what, value in own.items():
         got = theirs.get(what, "nothing")  # of a worker that imported an older version of this module
         if got != value:
-            raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Start it anew. {HOW}")
+            raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Restart it. {HOW}")
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:

@@ -35,21 +35,20 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     for name, scene in scenes.items():
         if scene.source == "recorded" and not captures[name]:
             remedy = f"Try: reskin add RECORDING --scene {name} ..."
-            raise ParamsError(f"scene {name}", "recorded captures", "one or more", "none", remedy)
+            raise ParamsError(f"scene {name} has no recorded captures. {remedy}")
     many = [name for name in scenes if len(captures[name]) > MANY_N]
     pairs = [(name, capture) for name in scenes if name not in many for capture in captures[name]]
     ingest = {f"{name}-{capture}": {"scene": name, "capture": capture} for name, capture in pairs}
     if len(ingest) < len(pairs):
-        rule, got = "unlike any other", "two that read the same"
-        raise ParamsError("stage ingest", "scene-capture", rule, got, "Rename a scene.")
+        raise ParamsError("stage ingest: two captures have the same SCENE-CAPTURE name. Rename a scene.")
     simulate: dict[str, dict[str, str]] = {}
     ingest_simulated: dict[str, str] = {}
     for name, scene in scenes.items():
         for protocol, settings in scene.simulate.protocols.items() if scene.simulate else ():
             folder = _folder(name, protocol)
             if folder in simulate or (folder in scenes and folder != name):
-                rule = "unlike any scene and any other's protocol"
-                raise ParamsError(f"scene {name}", "a protocol's folder", rule, folder, "Rename one.")
+                what = f"the folder {folder} of a protocol is that of another scene or protocol"
+                raise ParamsError(f"scene {name}: {what}. Rename one.")
             simulate[folder] = {"scene": name, "protocol": protocol}
             if settings.kind not in NOT_INGESTED:
                 ingest_simulated[folder] = name
@@ -90,7 +89,7 @@ def scene_file(root: Path, name: str) -> Path:
     known = scene_names(root)
     if name not in known:
         remedy = f"Check the name, or copy a scene: {SCENES}/{name}.yaml, or reskin add --like SCENE."
-        raise ParamsError("scenes", "a scene", f"one of {', '.join(known)}", name, remedy)
+        raise ParamsError(f"no scene {name}. The scenes are: {', '.join(known)}. {remedy}")
     return root / SCENES / f"{name}.yaml"
 
 
@@ -109,7 +108,7 @@ def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
     target = original.with_name(f"{name}.yaml")
     if target.exists():
         remedy = "Leave out --like to add to it."
-        raise ParamsError(f"--like {like}", "the new scene", "a free name", f"{name}, which is there", remedy)
+        raise ParamsError(f"--like {like}: scene {name} exists already. {remedy}")
     lines = original.read_text(encoding="utf-8").splitlines(keepends=True)
     first_i = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     header = f"# Scene {name}: a copy of scene {like}, by `reskin add --like`.\n"

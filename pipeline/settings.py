@@ -77,7 +77,9 @@ class Adaptations(SectionWithRows):
         known = sorted(settings.section(Training, "train_triplet").recipes)
         for name, recipe in section["recipes"].items():
             if recipe["base"] not in known:
-                raise ParamsError(where, f"base of {name}", f"one of {known}", repr(recipe["base"]), "Mend it there.")
+                raise ParamsError(
+                    where, f"base of {name}", f"one of {known}", repr(recipe["base"]), "Correct it there."
+                )
         return section
 
 
@@ -103,7 +105,7 @@ class Settings:
     def __getitem__(self, section: str) -> Any:
         """Return a section of the scene's file as it is written; raise `ParamsError` if it is missing."""
         if section not in self.of_scene:
-            raise ParamsError(self.where, section, "given", "nothing", "Write it there.")
+            raise ParamsError(f"{self.where}: section {section} is missing. Add it there.")
         return self.of_scene[section]
 
     def section(self, model: type[Section], name: str) -> Section:
@@ -125,7 +127,9 @@ class Settings:
         """Return a named row of a shared section, such as a recipe; raise `ParamsError` if there is none."""
         rows = self.shared[section]
         if name not in rows:
-            raise ParamsError(self.where, f"a row of {section}", f"one of {sorted(rows)}", repr(name), "Mend it there.")
+            raise ParamsError(
+                self.where, f"a row of {section}", f"one of {sorted(rows)}", repr(name), "Correct it there."
+            )
         return dict(rows[name])
 
     @property
@@ -164,7 +168,8 @@ def read_shared_files(root: Path = Path()) -> dict[str, Any]:
 def take(section: dict[str, Any], key: str, where: str) -> Any:
     """Remove a key from a section and return its value; raise `ParamsError` if it is missing."""
     if key not in section:
-        raise ParamsError(where, key, "given", f"only {', '.join(sorted(section)) or 'nothing'}", "Mend it there.")
+        known = ", ".join(sorted(section)) or "nothing"
+        raise ParamsError(f"{where}: {key} is missing (given: {known}). Add it there.")
     return section.pop(key)
 
 

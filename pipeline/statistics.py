@@ -377,7 +377,7 @@ def _t_test(mean: float, se: float, df: float) -> dict[str, Any]:
 
 def _unpaired(skins: Sequence[Any]) -> SchemaError:
     remedy = "Train both on the same folds."
-    return SchemaError("a paired difference", "held-out skins", "the same on both sides", skins, remedy)
+    return SchemaError(f"a paired difference needs the same held-out skins on both sides; got {skins}. {remedy}")
 
 
 def negate(stat: Stat) -> dict[str, Any]:

@@ -132,7 +132,7 @@ def test_places_that_lie_otherwise_than_those_of_other_captures_are_a_warning(ro
 
 def test_the_same_recording_twice_is_refused_and_another_label_needs_a_word(root, lab_file):
     add_lab(root, lab_file)
-    refuse(root, lambda: add_lab(root, lab_file), "its name must be new to its scene")
+    refuse(root, lambda: add_lab(root, lab_file), "the name .* is taken in this scene")
     refuse(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
     refuse(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
     refuse(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the readings of")
@@ -232,9 +232,7 @@ def test_a_name_that_is_no_name_is_refused(root, lab_file, tmp_path, name):
 
 def test_an_unknown_scene_is_named_beside_the_known_ones(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
-    refuse(
-        root, lambda: add.add(root, "smal", prepared, allow_copy=False), "a scene must be one of .*small.*; got smal"
-    )
+    refuse(root, lambda: add.add(root, "smal", prepared, allow_copy=False), "no scene smal. The scenes are: .*small")
 
 
 def test_a_recording_does_not_join_a_simulated_scene(root, lab_file):
@@ -362,7 +360,7 @@ def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it
     monkeypatch.chdir(root)
     known = contents(root)
     words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
-    assert "a scene must be one of" in said([*words, "nowhere"])
+    assert "no scene nowhere. The scenes are:" in said([*words, "nowhere"])
     up = said([*words[:-2], "../up", "--like", "small"])
     assert "--scene: a name must be 1 to 64 of" in up
     assert "no truths_" in said([*words[:3], "ini", *words[4:], "ini"])
@@ -372,7 +370,7 @@ def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it
     assert YAML(typ="safe").load(text) == recorded()
     assert read_registry(root).captures.keys() == {"mine"}
     again = said([*words, "small", "--name", "again"])
-    assert "the new scene must be a free name; got mine, which is there" in again
+    assert "scene mine exists already" in again
     assert (root / SCENES / "mine.yaml").read_text() == text
 
 

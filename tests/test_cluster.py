@@ -97,7 +97,7 @@ def test_an_error_on_a_worker_comes_back_as_it_was(address, monkeypatch):
 @pytest.mark.parametrize(
     ("workers", "expected"),
     [
-        ({}, "workers of tcp://there must be one or more; got none"),
+        ({}, "the scheduler at tcp://there has no workers"),
         ({"w": {"threads": 2}}, "threads of worker w must be 1; got 2"),
         (
             {"v": {}, "w": {"variables of numerics": "COMPATIBLE"}},
@@ -146,7 +146,7 @@ def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a
         module.write("# edited\n")
     now = imported_from(source)
     cluster._compare(now.describe_process(), imported_from(source).describe_process(), "w")
-    with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Start it anew"):
+    with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Restart it"):
         cluster._compare(now.describe_process(), before.describe_process(), "w")
     with pytest.raises(ParamsError, match="sources as imported of worker process"):
         cluster.run_on_worker(str(tmp_path), before.describe_process(), os.getcwd)

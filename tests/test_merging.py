@@ -112,8 +112,8 @@ def test_contradicting_recordings_change_nothing(root):
     ("theirs", "sentence"),
     [
         ({"yours": entry("s1", "b2")}, "the board of skin s1 must be b1, as in mine; got b2"),
-        ({"yours": entry("s2", "b2", "b1-s1")}, "a recording must be new to its scene; got the readings of mine"),
-        ({"mine": entry("s2", "b2")}, "capture mine: its name must be new to its scene"),
+        ({"yours": entry("s2", "b2", "b1-s1")}, "it has the same readings as mine"),
+        ({"mine": entry("s2", "b2")}, "the name mine is taken in scene"),
     ],
 )
 def test_a_merged_registry_keeps_the_rules_of_one(theirs, sentence):

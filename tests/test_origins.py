@@ -101,7 +101,7 @@ def test_only_what_is_read_is_transferred(tmp_path, home, scratch):
 def test_a_commit_that_is_not_there_is_refused_and_no_other_is_taken(tmp_path, home, scratch):
     repositories.commit(home, FILES)
     url = repositories.bare(home, tmp_path / "mirror.git", filters=True)
-    refuse(f"the commit must be {'0' * 40}, .*; got a repository without it", url, "0" * 40, scratch)
+    refuse(f"the repository does not have commit {'0' * 40}, at which", url, "0" * 40, scratch)
 
 
 def test_a_clone_that_is_cut_off_before_the_commit_is_refused(tmp_path, home, scratch):
@@ -123,15 +123,15 @@ def test_a_clone_that_is_cut_off_at_the_commit_is_a_mirror(tmp_path, home, scrat
 def test_what_is_no_repository_is_refused_with_the_reason_that_git_gives(tmp_path, scratch):
     refuse("nowhere: no such mirror or folder", str(tmp_path / "nowhere"), None, scratch)
     nowhere = (tmp_path / "nowhere.git").as_uri()
-    refuse("nowhere.git: the repository must be there and readable; got fatal: .*--from", nowhere, None, scratch)
+    refuse("nowhere.git: cannot read the repository: fatal: .*--from", nowhere, None, scratch)
     (tmp_path / "file").write_bytes(b"no bundle")
-    refuse("file: the repository must be there and readable", str(tmp_path / "file"), None, scratch)
+    refuse("file: cannot read the repository", str(tmp_path / "file"), None, scratch)
 
 
 def test_without_git_a_repository_cannot_be_read_and_a_folder_can(tmp_path, home, scratch, monkeypatch):
     commit = repositories.commit(home, FILES)
     monkeypatch.setenv("PATH", str(tmp_path))
-    refuse("git: the program must be installed; got none.", str(home), commit, scratch)
+    refuse("git is not installed.", str(home), commit, scratch)
     assert open_origin(str(home / "data"), commit, scratch).read("lf.csv") == FILES["data/lf.csv"]
 
 

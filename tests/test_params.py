@@ -219,7 +219,7 @@ def test_a_misspelt_parameter_is_named_as_it_was_written():
     with pytest.raises(ParamsError, match=r"recipes.fast.rat_max is not a known parameter .its value: 4"):
         check(recorded(train_multi=TRAINING | {"variants": {"fast": {"rat_max": 4}}}))
     words = {name: value for name, value in TRAINING.items() if name != "steps_n"} | {"step_n": 4}
-    with pytest.raises(ParamsError, match=r"train_multi: steps_n must be given; got only .*step_n"):
+    with pytest.raises(ParamsError, match=r"train_multi: steps_n is missing .given: .*step_n"):
         check(recorded(train_multi=words))
 
 

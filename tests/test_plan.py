@@ -146,7 +146,7 @@ def test_a_plan_that_is_out_of_date_is_refused(tmp_path):
 
 
 def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path):
-    with pytest.raises(ParamsError, match="a scene must be one of one, two; got three"):
+    with pytest.raises(ParamsError, match="no scene three. The scenes are: one, two"):
         plan.use(checkout(tmp_path), ["three"])
 
 

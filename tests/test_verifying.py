@@ -74,8 +74,8 @@ def test_a_rerun_starts_from_the_commit_without_its_reports_and_is_kept(checkout
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["lab"], "reports/lab/numbers.json must be committed"),
-        (["quick", "--against", "data"], "data: the folder must be one that holds quick/numbers.json"),
+        (["lab"], "has no reports/lab/numbers.json"),
+        (["quick", "--against", "data"], "data: no quick/numbers.json there"),
     ],
 )
 def test_what_is_not_there_is_one_sentence(checkout, words, sentence):

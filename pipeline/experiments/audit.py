@@ -73,7 +73,7 @@ def audit(
         checks += settings_checks(data, choice, models)
     leak = next((check for check in checks if not (check.holds or check.known)), None)
     if leak is not None:
-        remedy = "Look at who is held out."
+        remedy = "Check what is held out."
         raise LeakError(f"audit of {settings.scene}, {leak.where}", leak.what, leak.rule, leak.found, remedy)
     io.write_json(results, [asdict(check) for check in checks])
     unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
@@ -158,7 +158,7 @@ def _check_experiment(sides: Sides) -> None:
             )  # fmt: skip
     if not (len(sides.train) and len(sides.test)):
         got = f"{len(sides.train)} to train on, {len(sides.test)} to test on"
-        raise ParamsError(f"fold {sides.where}", "rows", "on both sides", got, "Split again.")
+        raise ParamsError(f"fold {sides.where}: a side has no rows: {got}. Split again.")
 
 
 def _readings(sides: Sides) -> Check:
@@ -371,9 +371,7 @@ def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
     gaps = []
     for name, value in fitted.items():
         if name not in arrays or arrays[name].shape != value.shape:
-            raise SchemaError(
-                where, f"scaler array {name}", f"there, of shape {value.shape}", "none", "Train it again."
-            )
+            raise SchemaError(f"{where}: scaler array {name} of shape {value.shape} is missing. Train it again.")
         size = np.where(value == 0, 1.0, np.abs(value))
         gaps.append(np.max(np.abs(arrays[name].astype(np.float64) - value) / size))
     return float(np.max(gaps))

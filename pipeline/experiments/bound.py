@@ -77,8 +77,10 @@ def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarra
     """Mark commanded depths that press a skin by more than a step of the differences; raise if none does."""
     touched = depths_mm - STEP_MM + skin.depth_zero_m / milli > 0
     if not touched.any():
-        got = f"{depths_mm.max():g} mm at most, the skin {-skin.depth_zero_m / milli:.2g} mm below zero"
-        raise ParamsError(f"skin {skin.name}", "depths_mm", "deep enough to touch it", got, "Poke deeper.")
+        what = (
+            f"depths_mm of at most {depths_mm.max():g} do not reach it, {-skin.depth_zero_m / milli:.2g} mm below zero"
+        )
+        raise ParamsError(f"skin {skin.name}: {what}. Poke deeper.")
     return touched
 
 
@@ -156,7 +158,9 @@ def score_network(models: Path, skin: str) -> dict[str, Any]:
     cards = [card for card in cards if (card["question"], card["recipe_name"]) == (NETWORK, HEADLINE)]
     skins = sorted({name for card in cards for name in card["train_skins"]})
     if skins != [skin]:
-        raise SchemaError(models, f"skin of {NETWORK}", f"{skin}, as bounded", skins, "Train its networks again.")
+        raise SchemaError(
+            f"{models}: the networks of {NETWORK} are trained on {skins}, not on {skin}. Train them again."
+        )
     scores = over_folds(tidy(cards))
     return {metric: scores[metric] for metric in METRICS if metric in scores}
 

@@ -176,8 +176,8 @@ def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
     """Transform labels and fields to the board's axes."""
     turn, chips_n = chip_rotations(section), pokes.db_uT.shape[1]
     if len(turn) != chips_n:
-        rule, remedy = f"{chips_n}, as recorded", "Mend compare.design of the scene."
-        raise ParamsError(f"board {pokes.board}", "chips of compare.design", rule, len(turn), remedy)
+        what = f"{chips_n} chips were recorded, but compare.design has {len(turn)}"
+        raise ParamsError(f"board {pokes.board}: {what}. Correct compare.design of the scene.")
     place_mm = (pokes.place_mm - section.labels_middle_mm) * (1, -1 if section.labels_mirrored else 1)
     rest_uT = np.einsum("kij,kj->ki", turn, pokes.noload_uT.mean(axis=0))
     return AlignedPresses(pokes, place_mm, np.einsum("kij,nkj->nki", turn, pokes.db_uT), rest_uT)

@@ -171,8 +171,8 @@ def draw_pairs(
     found = [_places_apart(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])]
     sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in found for i, j in pairs]
     if not sides:
-        rule = f"such that two of one skin lie {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
-        raise ParamsError("contacts", "held-out places", rule, "none", "Mend contacts.separations_mm of the scene.")
+        what = f"no two held-out places of one skin lie {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
+        raise ParamsError(f"contacts: {what}. Correct contacts.separations_mm of the scene.")
     drawn = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
     one, other = (np.array([rng.choice(side) for side in both]) for both in zip(*drawn, strict=True))
     force_N, length_uT = rows.target[:, 2], np.linalg.norm(rows.db_uT, axis=1)
@@ -204,8 +204,8 @@ def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, 
         if len(kinds) > 1:
             last = labels[train] == kinds[-1]
             return train[~last], train[last], what
-    remedy = "Record more, or do not run this experiment."
-    raise ParamsError("contacts", "training rows", "of two boards, skins or passes", "one", remedy)
+    what = "the training rows are of a single board, skin and pass, and two of one of these are needed"
+    raise ParamsError(f"contacts: {what}. Record more, or remove the experiment from the scene's.")
 
 
 def where_it_falls(

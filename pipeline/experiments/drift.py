@@ -115,8 +115,8 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
     selection = settings.section(Selection, "selection")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
     if section.wander_uT and captures[0].source != "simulated":
-        rule = "none in a recorded scene: a walk would be added to what was recorded"
-        raise ParamsError(settings.where, "drift.wander_uT", rule, list(section.wander_uT), "Take it out.")
+        what = f"drift.wander_uT is {list(section.wander_uT)}, but a recorded scene has its own drift"
+        raise ParamsError(f"{settings.where}: {what}. Remove it.")
     windows, parts = cut_windows(captures, section, selection)
     jobs = list(make_jobs(parts, section, settings.seed))
     data = SceneData(settings.scene, settings, stack(parts), [])

@@ -92,8 +92,8 @@ def fold_without(data: SceneData, board: str) -> Fold:
     """Return the fold of `lobo` that holds out a board."""
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
-        remedy = "Poke skins by hand that the main captures have too."
-        raise SchemaError("experiment manual", f"board {board}", f"one of {sorted(folds)}", "none", remedy)
+        what = f"board {board} is in no fold of lobo ({', '.join(sorted(folds))})"
+        raise SchemaError(f"experiment manual: {what}. Poke skins by hand that the main captures have too.")
     return folds[board]
 
 

@@ -116,8 +116,8 @@ class DesignedSkins:
 def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> DesignedSkins:
     """Return skins about a design, on boards as designed, with the law's parameters and the slide of the design."""
     if design.hold is None:
-        remedy = "Run this experiment in a scene whose skin has hold."
-        raise ParamsError("params.yaml: skin", "hold", "that of a skin that slides, as the law's", "null", remedy)
+        what = "hold of section skin is null, but this experiment needs a skin that slides"
+        raise ParamsError(f"params.yaml: {what}. Run it in a scene whose skin has hold.")
     modulus_MPa = design.modulus_kPa * 1e-3
     law = Law(
         0.0, 0.0, 0.0, kind.design.gap_mm, 1.0, 0.0, 0.0, modulus_MPa, design.hold.away_um_mm,
@@ -246,8 +246,8 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
     off = np.full(len(ratio), np.inf)  # a gauge may read 0 N and less, which have no logarithm
     off[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
     if np.isinf(off).all():
-        rule, got = "of a press with a force above 0 N", f"{len(ratio)} without"
-        raise SchemaError(f"skin {rows.skin[own[0]]}", "the known weight", rule, got, "Check the sign of its forces.")
+        what = f"none of the {len(ratio)} presses near the middle has a force above 0 N"
+        raise SchemaError(f"skin {rows.skin[own[0]]}: {what}. Check the sign of its forces.")
     press = middle[rows.indentation[middle] == press_i[off.argmin()]]
     return known_weight(frame.field(rows.db_uT[press]).mean(axis=0), float(rows.target[press, 2].mean()), rng)
 

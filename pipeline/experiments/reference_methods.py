@@ -203,8 +203,9 @@ def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) ->
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
     kept = np.isfinite(old_uT).all(axis=1)
     if not kept.any():
-        remedy = "Record known boards at the same places, or do not run this experiment."
-        raise ParamsError(f"fold {fold.name}", "labelled pokes", f"within {SAME_MM} mm of known ones", "none", remedy)
+        what = f"no labelled poke is within {SAME_MM} mm of one on the known boards"
+        remedy = "Record known boards at the same places, or remove the experiment from the scene's."
+        raise ParamsError(f"fold {fold.name}: {what}. {remedy}")
     length_uT = np.linalg.norm(new_uT[kept], axis=1, keepdims=True)
     new, old = new_uT[kept] / length_uT, old_uT[kept] / length_uT
     moved = direct(new, old, choose_ridge(new, old))(data.rows.db_uT[fold.test].astype(float))

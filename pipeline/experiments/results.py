@@ -16,7 +16,7 @@ def read_captures(indentations: Path, names: tuple[str, ...] = ()) -> list[Readi
     """Read the named captures of a folder in order of name; without names, all captures of the folder."""
     files = [indentations / f"{name}.parquet" for name in sorted(names)] or sorted(indentations.glob("*.parquet"))
     if not files:
-        raise SchemaError(str(indentations), "captures", "one or more", "none", "Ingest them again.")
+        raise SchemaError(f"{indentations}: no captures in this folder. Ingest them again.")
     return [io.read_readings(file) for file in files]
 
 
@@ -24,7 +24,7 @@ def only(captures: Sequence[Capture], folder: Path) -> Capture:
     """Return the one capture of a folder; raise `SchemaError` if there are several."""
     if len(captures) != 1:
         remedy = "Run its protocol on one skin (skins_n), and simulate it again."
-        raise SchemaError(folder, "captures", "one, as its experiment reads no more", len(captures), remedy)
+        raise SchemaError(f"{folder}: {len(captures)} captures, but the experiment reads exactly one. {remedy}")
     return captures[0]
 
 

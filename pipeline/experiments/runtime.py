@@ -158,7 +158,7 @@ def time_calls(calls: Sequence[TimedCall], repeats_n: int) -> list[Seconds]:
     Each has run before, when its error was computed: compilation and caches are not included.
     """
     if repeats_n < 1:
-        raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Raise it.")
+        raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Increase it.")
     times_s = np.empty((repeats_n, len(calls)))
     for round_i in range(repeats_n):
         # Every other round runs backwards, so that no call always follows the same one.
@@ -214,7 +214,7 @@ def study_quadratures(
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
-        raise ParamsError(STUDY, "methods", f"among {list(METHODS)}", got, "Mend the rules.")
+        raise ParamsError(STUDY, "methods", f"among {list(METHODS)}", got, "Correct the rules.")
     truths_T = [_reference(trial, reference.finer, reference.per_cell_n).call() for trial in trials]
     coarser = [_reference(trial, reference.coarser, reference.per_cell_n) for trial in trials]
     found_T = [prepared.call() for prepared in coarser]

@@ -39,8 +39,8 @@ def group_by_level(
     lengths = {len(stop) for stop in stops}
     if len(stops) != fillings_n * levels_n or len(lengths) != 1:
         got = f"{len(stops)} stops of {sorted(lengths)} readings in {fillings_n} fillings"
-        rule = f"{levels_n} a filling, all of as many readings"
-        raise SchemaError(where, "stops", rule, got, "Simulate and ingest it again.")
+        rule = f"each filling needs {levels_n} stops, all with the same number of readings"
+        raise SchemaError(f"{where}: {rule}; got {got}. Simulate and ingest it again.")
     return db_uT[np.stack(stops)].reshape(fillings_n, levels_n, lengths.pop(), -1)
 
 

@@ -121,9 +121,8 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
         indentations = np.unique(rows.indentation[own])  # in order of time
         test_n = round(test_fraction * len(indentations))
         if not 0 < test_n < len(indentations):
-            got = f"{test_n} of the {len(indentations)} of {capture}"
-            rule = "one or more, and not all"
-            raise ParamsError("experiment sleeve", "indentations held out", rule, got, "Poke more often.")
+            what = f"{test_n} of the {len(indentations)} of {capture} would be held out: a side is empty"
+            raise ParamsError(f"experiment sleeve: {what}. Poke more often.")
         held |= own & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held), np.flatnonzero(held)
 
@@ -151,8 +150,8 @@ def rate_hz(captures: Sequence[Readings]) -> float:
         steps_n += int(same.sum())
         steps_s += float(np.diff(one.t_s)[same].sum())
     if not steps_s > 0:
-        rule, remedy = "two or more an indentation, at known times", "Record more than one reading."
-        raise ParamsError("experiment sleeve", "readings", rule, f"{steps_n} steps of time", remedy)
+        what = "two or more readings of an indentation at known times are needed"
+        raise ParamsError(f"experiment sleeve: {what}; got {steps_n} steps of time. Record more than one reading.")
     return steps_n / steps_s
 
 

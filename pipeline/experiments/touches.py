@@ -127,9 +127,9 @@ def touched_rows(readings: Readings, account: Mapping[str, int], selection: Sele
     """Take the rows with enough force; raise `ParamsError` for a recording whose places have no numbers."""
     places = tuple(sorted(int(found[1]) for name in account if (found := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):
-        rule = "one or two, by number"
-        remedy = "Only layout eflash7 has such: run this experiment in a scene of its own."
-        raise ParamsError(f"capture {readings.capture}", "its places", rule, list(places), remedy)
+        what = f"one or two numbered places are needed; got {list(places)}"
+        remedy = "Only layout eflash7 has such places: run this experiment in a scene of its own."
+        raise ParamsError(f"capture {readings.capture}: {what}. {remedy}")
     rows = readings.Fz_N >= selection.force_min_N
     db_uT = subtract(readings.b_uT[rows], readings.noload_uT[rows])
     return Touched(readings.capture, places, db_uT, readings.Fz_N[rows])

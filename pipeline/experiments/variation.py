@@ -78,10 +78,9 @@ def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: flo
     """Average the readings of each indentation at one place and depth; raise `ParamsError` if there are none."""
     at = _at(readings, place_mm, depth_mm)
     if not at.any():
-        raise ParamsError(
-                f"experiment variation, capture {readings.capture}", "variation.places_mm and depth_mm", "visited",
-                f"{place_mm[0]:g}, {place_mm[1]:g} mm at {depth_mm:g} mm, never", _visited(readings, place_mm),
-            )  # fmt: skip
+        what = f"{place_mm[0]:g}, {place_mm[1]:g} mm is never visited at a depth of {depth_mm:g} mm"
+        where = f"experiment variation, capture {readings.capture}"
+        raise ParamsError(f"{where}: {what} (variation.places_mm, depth_mm). {_visited(readings, place_mm)}")
     b_uT = readings.b_uT[at]
     visit_i, n_contacts = rank(readings.indentation[at]), readings.n_contacts[at]
     _, first_i, n = np.unique(visit_i, return_index=True, return_counts=True)
@@ -164,7 +163,7 @@ def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
         order[boards[skin]] += 1
     if skins_n > len(ranked):
         rule = f"at most the {len(ranked)} skins of the main captures"
-        raise ParamsError("experiment variation", "variation.skins_n", rule, skins_n, "Ask for fewer.")
+        raise ParamsError("experiment variation", "variation.skins_n", rule, skins_n, "Reduce it.")
     return [skin for *_, skin in sorted(ranked)[:skins_n]]
 
 

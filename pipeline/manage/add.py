@@ -69,10 +69,10 @@ def remove(root: Path, scene: str, capture: str) -> None:
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
         remedy = "Is it the same recording? It is in already. Otherwise choose another --name."
-        raise CaptureError(f"capture {target.name}", "its name", "new to its scene", "one that is taken", remedy)
+        raise CaptureError(f"the name {target.name} is taken in this scene. {remedy}")
     if target.exists():
         remedy = "It is in no scene: an add was killed there. Delete the folder, or choose another --name."
-        raise CaptureError(target, "a new capture's folder", "free", "one that is there", remedy)
+        raise CaptureError(f"{target}: the folder exists already. {remedy}")
 
 
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
@@ -84,8 +84,7 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
         readings.update(block.b_uT.tobytes())
     check_losses(account, limit, folder.name)
     if rows_n == 0:
-        counts = f"none; counted {dict(account)}"
-        raise CaptureError(folder.name, "a capture", "one reading or more", counts, "Check its files.")
+        raise CaptureError(f"{folder.name}: no reading is left; counted {dict(account)}. Check its files.")
     faults = [f"{key.removeprefix('fault_')} {n}" for key, n in account.items() if key.startswith("fault_")]
     if faults:
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
@@ -168,5 +167,5 @@ def _track(folder: Path, root: Path) -> None:
         with Repo(str(root)) as repo:
             repo.add([str(folder)])
     except (DvcException, OSError) as error:
-        rule, got = "able to track it", " ".join(str(error).split())[-300:]
-        raise CaptureError(f"dvc add {folder.relative_to(root)}", "DVC", rule, got, "See above.") from None
+        reason = " ".join(str(error).split())[-300:]
+        raise CaptureError(f"dvc add {folder.relative_to(root)} failed: {reason}. See above.") from None

@@ -199,7 +199,7 @@ def read_folder(path: Path, scene: str) -> Report:
     folder = next((one for one in candidates if (one / "numbers.json").is_file()), None)
     if folder is None:
         remedy = "Name reports/<scene> of another checkout."
-        raise SchemaError(path, "the folder", f"one that holds {scene}/numbers.json", "none", remedy)
+        raise SchemaError(f"{path}: no {scene}/numbers.json there. {remedy}")
     files = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
     return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in files})
 
@@ -211,7 +211,7 @@ def read_revision(root: Path, scene: str, revision: str) -> Report:
     names = [name for name in listed.splitlines() if name.endswith((".json", ".csv"))]
     if f"reports/{scene}/numbers.json" not in names:
         remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
-        raise SchemaError(f"git revision {revision}", f"reports/{scene}/numbers.json", "committed", "none", remedy)
+        raise SchemaError(f"git revision {revision} has no reports/{scene}/numbers.json. {remedy}")
     commit = _git(root, "log", "-1", "--format=%h", revision, "--", folder).strip()
     texts = {name.removeprefix(f"reports/{scene}/"): _git(root, "show", f"{revision}:./{name}") for name in names}
     return _parse(f"committed at {commit}", texts)

@@ -116,9 +116,9 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
             say(f"taken from: {where}")
         if source.licence is None and not agree("It has no licence. Fetch it, for use here only?"):
             remedy = "Nothing was fetched. Answer y on a terminal, or add --yes."
-            raise ParamsError(f"reskin fetch {name}", "use without a licence", "agreed to", "no yes", remedy)
+            raise ParamsError(f"reskin fetch {name}: use without a licence was not agreed to. {remedy}")
         download(source, where or source.home, folder)
-        say(f"{folder}: {source.size}, every checksum as it must be")
+        say(f"{folder}: {source.size}, every checksum is right")
     if source.scene is None:
         return say(source.note or "no layout reads it, so nothing is added")
     _add_all(root, source.scene, source, folder, say)
@@ -135,8 +135,8 @@ def download(source: Source, where: str, folder: Path) -> None:
         with io.replacing(folder) as temporary:
             needed, free = COPIES_N * sum(file.bytes_n for file in source.files), shutil.disk_usage(folder.parent).free
             if free < needed:
-                rule, got = f"free by {needed / 1e6:.0f} MB or more", f"{free / 1e6:.0f} MB"
-                raise CaptureError(folder.parent.absolute(), "its disk", rule, got, "Make room, and run it again.")
+                what = f"needs {needed / 1e6:.0f} MB of free disk space; {free / 1e6:.0f} MB are free"
+                raise CaptureError(f"{folder.parent.absolute()}: {what}. Free some disk space, and run it again.")
             with TemporaryDirectory(prefix=".git-", dir=folder.parent) as scratch:
                 origin = open_origin(where, source.commit, Path(scratch))
                 for file in source.files:
@@ -144,8 +144,10 @@ def download(source: Source, where: str, folder: Path) -> None:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     target.write_bytes(_read_checked(origin, file))
     except OSError as error:
-        got = f"{error.strerror or error} at {error.filename or folder}"
-        raise CaptureError(folder, "the folder", "writable", got, "Make room, or mend its rights.") from None
+        reason = f"{error.strerror or error} at {error.filename or folder}"
+        raise CaptureError(
+            f"{folder}: cannot write: {reason}. Free some disk space, or check its permissions."
+        ) from None
 
 
 def _read_checked(origin: "Origin", file: File) -> bytes:
@@ -153,7 +155,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     found = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
     if found is None:
         remedy = f"Is it the right place? {USE_FROM}"
-        raise CaptureError(origin.name, "a file", f"{file.at} or {file.path}", "none of that name", remedy)
+        raise CaptureError(f"{origin.name}: no file {file.at} or {file.path}. {remedy}")
     content, name = origin.read(found), f"{origin.name} {found}"
     if found.endswith(".npz"):
         content, name = to_lab_csv(content, name), f"{name} as CSV"
@@ -252,7 +254,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
         newest = _git("ls-remote", "origin", "HEAD", repository=repository).split()
     except subprocess.CalledProcessError as error:
         remedy = f"Check the network and the address; {USE_FROM}"
-        raise CaptureError(url, "the repository", "there and readable", _reason(error), remedy) from None
+        raise CaptureError(f"{url}: cannot read the repository: {_reason(error)}. {remedy}") from None
     commit = commit or (newest[0].decode() if newest else "HEAD")
     try:
         _git("fetch", "--quiet", "--filter=blob:none", "--depth=1", "origin", commit, repository=repository)
@@ -263,15 +265,15 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
             _git("cat-file", "-e", f"{commit}^{{commit}}", repository=whole)
         except subprocess.CalledProcessError as error:
             remedy = f"Was its history rewritten, or is it a clone made with --depth? {USE_FROM}"
-            rule, got = f"{commit}, at which the files are pinned", f"a repository without it ({_reason(error)})"
-            raise CaptureError(url, "the commit", rule, got, remedy) from None
+            what = f"the repository does not have commit {commit}, at which the files are pinned ({_reason(error)})"
+            raise CaptureError(f"{url}: {what}. {remedy}") from None
 
     def read(path: str) -> bytes:
         try:
             return _git("cat-file", "blob", f"{commit}:{path}", repository=repository)
         except subprocess.CalledProcessError as error:
             remedy = f"Run it again; {USE_FROM}"
-            raise CaptureError(f"{url} {path}", "the file", "readable", _reason(error), remedy) from None
+            raise CaptureError(f"{url} {path}: cannot read the file: {_reason(error)}. {remedy}") from None
 
     listed = _git("ls-tree", "-r", "-z", "--name-only", commit, repository=repository).decode(errors="replace")
     return Origin(f"{url} @{commit[:12]}", listed.split("\0")[:-1], read)
@@ -288,8 +290,7 @@ def _git(*arguments: str, repository: Path | None = None) -> bytes:
             env={**os.environ, **silent},
         ).stdout  # fmt: skip
     except FileNotFoundError:
-        remedy = "Install git, or give a folder of the files with --from."
-        raise CaptureError("git", "the program", "installed", "none", remedy) from None
+        raise CaptureError("git is not installed. Install it, or give a folder of the files with --from.") from None
 
 
 def _reason(error: subprocess.CalledProcessError) -> str:

@@ -55,15 +55,15 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
     if original is not None:
         _refuse_copy(where, original, captures[original], entry, allow_copy)
     if capture in captures:
-        raise CaptureError(where, "its name", "new to its scene", "one that is taken", "Choose another with --name.")
+        raise CaptureError(f"the name {capture} is taken in scene {scene}. Choose another with --name.")
     for name, other in captures.items():
         if other.skin == entry.skin and other.board != entry.board:
             what, rule = f"the board of skin {entry.skin}", f"{other.board}, as in {name}"
             remedy = "A skin that moves to another board gets a new name, or it would stand on both sides of a fold."
             raise CaptureError(where, what, rule, entry.board, remedy)
         if other.chips_n != entry.chips_n:
-            rule, remedy = f"the {other.chips_n} of {name}", "Add it to a scene of its own."
-            raise CaptureError(where, "chips", rule, entry.chips_n, remedy)
+            what = f"{entry.chips_n} chips, but {name} in the same scene has {other.chips_n}"
+            raise CaptureError(f"{where}: {what}. Add it to a scene of its own.")
     added = entry.model_copy(update={"copy_of": original})
     return Registry(captures={**registry.captures, scene: {**captures, capture: added}})
 
@@ -73,7 +73,7 @@ def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
     captures = registry.captures.get(scene, {})
     if capture not in captures:
         known = ", ".join(sorted(captures)) or "none"
-        raise CaptureError(f"scene {scene}", "a capture", f"one of its own ({known})", capture, "Check the name.")
+        raise CaptureError(f"scene {scene} has no capture {capture}. Its captures: {known}.")
     left = {name: entry for name, entry in captures.items() if name != capture}
     others = {name: entries for name, entries in registry.captures.items() if name != scene}
     return Registry(captures=others | ({scene: left} if left else {}))
@@ -94,4 +94,4 @@ def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_c
     remedy = "It is in the scene already."
     if relabelled:
         remedy = "Under two labels it would stand on both sides of a fold; to try that knowingly, add --allow-copy."
-    raise CaptureError(where, "a recording", "new to its scene", f"the readings of {original}", remedy)
+    raise CaptureError(f"{where}: it has the same readings as {original}. {remedy}")

@@ -323,8 +323,8 @@ def look_up(numbers: Mapping[str, Any], name: str) -> Any:
     """Find a number by its dotted name: a constant of `pipeline.report.paper` (`SHEAR.mse_fz_N2`), or one of ours."""
     found = resolve(vars(paper) if name[0].isupper() else numbers, name)
     if found is None:
-        rule = "a constant of pipeline.report.paper, or a path in numbers.json"
-        raise SchemaError(FILE.name, "a number", rule, name, "Correct the name.")
+        what = f"{name} is neither a constant of pipeline.report.paper nor a path in numbers.json"
+        raise SchemaError(f"{FILE.name}: {what}. Correct the name.")
     return found
 
 

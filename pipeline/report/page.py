@@ -236,7 +236,7 @@ def measure(file: str, svg: str) -> Drawing:
     size = SVG_SIZE_PT.search(svg)
     if size is None:
         raise SchemaError(
-            file, "size", "in points, at the head of the file", svg[:80], "Was it written by drawing.svg?"
+            f"{file}: no size in points at the head of the file: {svg[:80]}. Was it written by drawing.svg?"
         )
     width_pt, height_pt = map(float, size.groups())
     smallest_pt = min(map(float, LETTERS_PT.findall(svg)), default=np.inf)

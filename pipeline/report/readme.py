@@ -65,8 +65,10 @@ def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
         marks = re.compile(rf"(<!-- {name} -->\n)(.*?)(<!-- /{name} -->)", re.DOTALL)
         pages = [page for page, text in filled.items() if marks.search(text)]
         if len(pages) != 1:
-            got = ", ".join(pages) or "no page"
-            raise SchemaError("README.md and docs", f"the block {name}", "in one page", got, "Restore its marks.")
+            found = ", ".join(pages) or "no page"
+            raise SchemaError(
+                f"README.md and docs: block {name} must be in one page; it is in {found}. Restore its marks."
+            )
         before, opening, _, closing, after = marks.split(filled[pages[0]])
         filled[pages[0]] = f"{before}{opening}{content.strip()}\n{closing}{after}"
     return filled

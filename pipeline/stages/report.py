@@ -206,7 +206,9 @@ def planned_scene(settings: Settings) -> Scene:
     if list(scene.experiments) != list(planned):
         differing = ", ".join(sorted(set(scene.experiments) ^ set(planned))) or "another order"
         remedy = f"Try: reskin scenes use {settings.scene}, beside the others that run."
-        raise ParamsError(settings.where, "experiments", f"those of {PLAN}", f"{differing} only in one", remedy)
+        raise ParamsError(
+            f"{settings.where}: experiments differ from those of {PLAN}: {differing} only in one. {remedy}"
+        )
     return scene
 
 

@@ -19,7 +19,7 @@ def simulate(settings: Settings, protocol: str, raw: Path) -> None:
     pairs, skins_n = list_captures(simulation, protocol), simulation.protocols[protocol].skins_n
     if len(pairs) < skins_n:
         rule = f"at most the {len(pairs)} that its boards have"
-        raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Ask for fewer.")
+        raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Reduce it.")
     with io.replacing(raw) as folder, make_executor(len(pairs), imports="reskin.simulation.capture") as executor:
         folder.mkdir()
         waiting = [executor.submit(_write_capture, simulation, protocol, pair, seed, folder) for pair in pairs]

@@ -40,7 +40,7 @@ def sweep_pokes(
     held_out = data.folds_of("lobo")[-section.boards_n :]
     if section.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
-        raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, section.boards_n, "Ask for fewer.")
+        raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, section.boards_n, "Reduce it.")
     named = (HEADLINE, recipe)
     pairs = [
         (job, pokes_n)

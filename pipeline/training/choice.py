@@ -92,12 +92,12 @@ def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, 
     """Find the eligible card with the smallest error; return it, the choice, and the errors by recipe."""
     what = f"candidates of {stage}"
     if not eligible:
-        raise ParamsError(WHERE, what, "one or more", "none", "Run lobo, triplet, adapt.")
+        raise ParamsError(f"{WHERE}: no {what}. Run lobo, triplet, adapt.")
     _check_budgets(cards, stage)
     collapsed = [_key(card) for card in cards if _has_collapsed(card)]
     stable = [card for card in eligible if _key(card) not in collapsed]
     if not stable:
-        raise ParamsError(WHERE, what, "one or more without a collapsed training", "none", "Try lower rates.")
+        raise ParamsError(f"{WHERE}: all {what} have a collapsed training. Try lower rates.")
     candidates = _candidates(cards)
     errors = _errors(cards, candidates)
     best = min(stable, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
@@ -128,7 +128,7 @@ def _check_budgets(cards: Cards, stage: str) -> None:
         if budgets != every:
             what, got = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(every)}"
             remedy = "Try every candidate with every number of steps."
-            raise ParamsError(WHERE, what, "those of all candidates", got, remedy)
+            raise ParamsError(f"{WHERE}: {what} differ between candidates: {got}. {remedy}")
 
 
 def _key(card: Card) -> dict[str, Any]:

@@ -196,8 +196,7 @@ def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> 
     own = (base, fold.name)
     selected = {seed_i: one for (recipe, name, seed_i), one in pretrained.items() if (recipe, name) == own}
     if not selected:
-        where, rule = f"fold {fold.name}", f"those of recipe {base}"
-        raise SchemaError(where, "networks to adapt", rule, "none", "Train them.")
+        raise SchemaError(f"fold {fold.name}: no networks of recipe {base} to adapt. Run: dvc repro train_triplet")
     return selected
 
 

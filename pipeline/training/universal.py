@@ -142,9 +142,8 @@ def score_fold(
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
     if board not in known.presses:  # they are named by board and skin if a board has several
-        rule = "boards of one skin each"
-        names = ", ".join(known.presses)
-        raise ParamsError(f"fold {fold.name}", "the boards", rule, names, "Do not run this experiment.")
+        what = f"boards of one skin each are needed; got {', '.join(known.presses)}"
+        raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene's.")
     pool, rest_uT = pool_of(known, fold), known.presses[board].rest_uT.ravel()
     test_uT = known.frame.field(data.rows.db_uT[fold.test])
     points = []

@@ -86,7 +86,7 @@ def test_many_pairs_map_a_new_board_to_the_known_ones():
     back_uT = standardised_uT(DATA, FOLD, pool_rows(DATA, FOLD))
     np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # ridge penalty above 0
     nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
-    with pytest.raises(ParamsError, match="labelled pokes must be within"):
+    with pytest.raises(ParamsError, match="no labelled poke is within"):
         standardised_uT(DATA, nowhere, pool_rows(DATA, nowhere))
 
 

@@ -156,7 +156,7 @@ def test_readings_are_sorted_by_filling_weight():
     levels = group_by_level(db_uT, indentation, force_N, levels_n=3, where="glass")
     assert levels.shape == (2, 3, 2, 2)
     np.testing.assert_array_equal(levels.reshape(12, 2), db_uT)
-    with pytest.raises(SchemaError, match=r"glass: stops must be 4 a filling.*got 6 stops of \[2\] readings"):
+    with pytest.raises(SchemaError, match=r"glass: each filling needs 4 stops.*got 6 stops of \[2\] readings"):
         group_by_level(db_uT, indentation, force_N, levels_n=4, where="glass")
     with pytest.raises(SchemaError, match=r"got 6 stops of \[1, 2\] readings"):
         group_by_level(db_uT[1:], indentation[1:], force_N[1:], levels_n=3, where="glass")

@@ -89,7 +89,7 @@ def test_last_indentations_are_held_out(pokes_n, test_fraction):
 
 @pytest.mark.parametrize("test_fraction", [0.05, 0.99])
 def test_empty_side_is_an_error(test_fraction):
-    with pytest.raises(ParamsError, match="indentations held out must be one or more, and not all"):
+    with pytest.raises(ParamsError, match="would be held out: a side is empty"):
         hold_out_last(rows_of(9), test_fraction)
 
 
@@ -102,7 +102,7 @@ def test_rate_is_measured_within_indentations(rate, pause_s):
 
 
 def test_rate_of_single_readings_is_an_error():
-    with pytest.raises(ParamsError, match="readings must be two or more an indentation"):
+    with pytest.raises(ParamsError, match="two or more readings of an indentation"):
         rate_hz([readings_of([0.0, 1.0], [0, 1], [0, 0])])
 
 

@@ -99,7 +99,7 @@ def test_recordings_need_numbered_places():
     result = touched_rows(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
     assert result.places == (7,)
     assert result.force_N.min() >= 1
-    with pytest.raises(ParamsError, match="its places must be one or two, by number"):
+    with pytest.raises(ParamsError, match="one or two numbered places are needed"):
         touched_rows(readings, {"rows_n": 60}, Selection(force_min_N=1.0))
 
 

@@ -41,7 +41,7 @@ def test_other_devices_are_no_board():
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
     assert "another baud rate" in str(find.recognise("port", wrong_baud))
     assert "no byte came" in str(find.recognise("port", []))
-    assert "must be one that opens" in str(find.detect_board("/dev/none"))
+    assert "cannot open the port" in str(find.detect_board("/dev/none"))
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))

@@ -295,9 +295,7 @@ def test_claims_table_lists_only_judged_claims():
 
 
 def test_unknown_constant_is_an_error():
-    with pytest.raises(
-        SchemaError, match="must be a constant of pipeline.report.paper, or a path in numbers.json; got SHEARS.x"
-    ):
+    with pytest.raises(SchemaError, match="SHEARS.x.* is neither a constant of pipeline.report.paper"):
         look_up({}, "SHEARS.x")
 
 

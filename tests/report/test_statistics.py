@@ -278,7 +278,7 @@ def test_combined_verdicts():
 
 def test_paired_needs_equal_skins():
     few, many = score_table({"b0": [[1.0]]}), score_table({"b0": [[2.0], [3.0]], "b1": [[4.0]]})
-    with pytest.raises(SchemaError, match="held-out skins must be the same on both sides; got .*'b1_s0'"):
+    with pytest.raises(SchemaError, match="the same held-out skins on both sides; got .*'b1_s0'"):
         paired(few, many)
 
 
@@ -306,7 +306,7 @@ def test_paired_with_single_counts_training_skins():
     assert paired_with_single(board_scores([80.0] * 4), transfer_scores({"t0": {"b1": 79.0}}))["by_board"] == {
         "b1": {"accuracy_pct": 1.0}
     }
-    with pytest.raises(SchemaError, match="held-out skins must be the same"):
+    with pytest.raises(SchemaError, match="the same held-out skins"):
         paired_with_single(board_scores([80.0]), alike)
 
 

@@ -191,9 +191,9 @@ def test_fill_replaces_only_marked_blocks():
     pages = {"one.md": "before\n<!-- a -->\nold\n<!-- /a -->\nafter\n", "other.md": "a\n"}
     assert fill(pages, {"a": "new"}) == pages | {"one.md": "before\n<!-- a -->\nnew\n<!-- /a -->\nafter\n"}
     assert fill(fill(pages, {"a": r"\1 new"}), {"a": r"\1 new"}) == fill(pages, {"a": r"\1 new"})
-    with pytest.raises(SchemaError, match="the block b must be in one page; got no page"):
+    with pytest.raises(SchemaError, match="block b must be in one page; it is in no page"):
         fill(pages, {"b": "new"})
-    with pytest.raises(SchemaError, match="in one page; got one.md, other.md"):
+    with pytest.raises(SchemaError, match="in one page; it is in one.md, other.md"):
         fill(pages | {"other.md": pages["one.md"]}, {"a": "new"})
 
 

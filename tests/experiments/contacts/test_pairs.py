@@ -77,7 +77,7 @@ def test_readings_of_pairs_are_sums_row_by_row():
 
 
 def test_a_distance_without_places_is_an_error():
-    with pytest.raises(ParamsError, match=r"31 mm apart, within 0.5 mm; got none. Mend contacts.separations_mm"):
+    with pytest.raises(ParamsError, match=r"31 mm apart, within 0.5 mm. Correct contacts.separations_mm"):
         pairs_at(31.0)
 
 
@@ -120,7 +120,7 @@ def test_a_board_is_kept_aside_else_a_skin_else_a_pass(boards, skins, passes, as
 
 
 def test_one_pass_of_one_skin_cannot_be_split():
-    with pytest.raises(ParamsError, match="two boards, skins or passes; got one"):
+    with pytest.raises(ParamsError, match="of a single board, skin and pass"):
         keep_aside(tables.rows(["b0"] * 2, ["s0"] * 2), np.arange(2))
 
 
