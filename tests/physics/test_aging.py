@@ -1,4 +1,4 @@
-"""Relaxation, hysteresis, wear and temperature against closed forms, 50 digits and published numbers."""
+"""Relaxation, hysteresis, wear and temperature, compared with closed forms, 50 digits and published numbers."""
 
 import numpy as np
 import pytest
@@ -32,26 +32,26 @@ changes = st.floats(-10, 10)
 
 
 @given(st.floats(1e3, 1e8), st.floats(1e-16, 1e8))
-def test_one_step_is_that_of_50_digits_however_stiff(ratio, dt_over_fastest):
+def test_one_step_equals_50_digits(ratio, dt_over_fastest):
     assert signals.step_error(1e-3 * dt_over_fastest, signals.stiff(ratio)) <= signals.ROUNDING
 
 
-def test_pokes_in_a_row_and_a_held_poke_relax_as_the_relaxation_function_says():
+def test_pokes_relax_as_the_relaxation_function():
     assert not broken(signals.check_relaxation())
 
 
-def test_no_time_and_no_change_leave_the_state_bit_for_bit():
+def test_no_time_and_no_change_keep_the_state():
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     assert advance(state, 0.0, 0.0, SKIN_RELAXATION).tobytes() == state.tobytes()
 
 
 @given(changes)
-def test_a_jump_without_time_is_felt_in_full(change):
+def test_instantaneous_change_acts_in_full(change):
     np.testing.assert_array_equal(advance(np.zeros(5), change, 0.0, SKIN_RELAXATION), SKIN_RELAXATION.share * change)
 
 
 @given(times_s, times_s, changes)
-def test_a_ramp_may_be_cut_anywhere(first_s, second_s, rate):
+def test_ramp_may_be_split_anywhere(first_s, second_s, rate):
     whole = advance(np.ones(5), rate * (first_s + second_s), first_s + second_s, SKIN_RELAXATION)
     halfway = advance(np.ones(5), rate * first_s, first_s, SKIN_RELAXATION)
     size = 1 + abs(rate) * (first_s + second_s)
@@ -61,14 +61,14 @@ def test_a_ramp_may_be_cut_anywhere(first_s, second_s, rate):
 
 
 @given(times_s, changes, st.floats(-3, 3))
-def test_force_with_memory_is_linear_in_the_elastic_one(dt_s, change, factor):
+def test_force_is_linear_in_the_elastic_force(dt_s, change, factor):
     once = advance(np.zeros(5), change, dt_s, SKIN_RELAXATION)
     np.testing.assert_allclose(
         advance(np.zeros(5), factor * change, dt_s, SKIN_RELAXATION), factor * once, atol=ROUNDING * 30
     )
 
 
-def test_a_held_skin_only_loses_force_and_keeps_what_the_shares_leave():
+def test_held_skin_relaxes_to_the_remaining_share():
     relaxed = relax(np.linspace(0, 1e6, 1000), np.ones(1000), SKIN_RELAXATION)
     assert (np.diff(relaxed) <= ROUNDING).all()
     assert relaxed[0] == pytest.approx(1, abs=ROUNDING)
@@ -76,7 +76,7 @@ def test_a_held_skin_only_loses_force_and_keeps_what_the_shares_leave():
 
 
 @pytest.mark.parametrize("dt_s", [-1e-9, np.nan, np.inf])
-def test_time_that_runs_backwards_or_is_no_number_is_refused(dt_s):
+def test_negative_or_nan_time_is_refused(dt_s):
     with pytest.raises(ParamsError, match="time step"):
         advance(np.zeros(5), 1.0, dt_s, SKIN_RELAXATION)
     with pytest.raises(ParamsError, match="time step"):
@@ -84,16 +84,16 @@ def test_time_that_runs_backwards_or_is_no_number_is_refused(dt_s):
 
 
 @pytest.mark.parametrize(("tau_s", "share"), [(0.0, 0.1), (-1.0, 0.1), (np.nan, 0.1), (1.0, -0.1), (1.0, 1.1)])
-def test_impossible_relaxation_is_refused(tau_s, share):
+def test_invalid_relaxation_is_refused(tau_s, share):
     with pytest.raises(ParamsError, match="prony"):
         Prony(np.array([tau_s]), np.array([share]))
 
 
-def test_an_indentation_is_read_after_the_tip_went_down_and_held():
+def test_reading_follows_approach_and_hold():
     jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
     truth = 1 - (SKIN_RELAXATION.share * -np.expm1(-5.0 / SKIN_RELAXATION.tau_s)).sum()
     assert relaxed_share(jump) == pytest.approx(truth, rel=1e-12)
-    # While it went down, each part of the force had less time: by the mean of the decay over the approach.
+    # During the approach, each part of the force had less time to relax: mean of the decay over the approach.
     x = 5.0 / SKIN_RELAXATION.tau_s
     assert relaxed_share(slow) == pytest.approx(1 - (SKIN_RELAXATION.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)
 
@@ -101,7 +101,7 @@ def test_an_indentation_is_read_after_the_tip_went_down_and_held():
 REMEMBERED = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
 
 
-def test_a_field_remembers_as_integration_in_small_steps_says():
+def test_field_memory_equals_integration_in_small_steps():
     stops_T, how, steps_n = np.random.default_rng(0).normal(0, 1e-4, (6, 3, 2, 3)), REMEMBERED, 20_000
     change_T = stops_T.mean(axis=1)
     q_T = np.zeros((2, *change_T.shape[1:]))
@@ -117,7 +117,7 @@ def test_a_field_remembers_as_integration_in_small_steps_says():
                 np.testing.assert_allclose(added_T[i, -1], (q_T - first_T).sum(axis=0), atol=1e-8)
 
 
-def test_of_one_poke_five_to_eight_percent_stand_in_the_next_no_load_reading_and_less_in_later_ones():
+def test_residual_of_a_press_is_5_to_8_percent():
     once_T = np.zeros((5, 1, 1, 3))
     once_T[0] = 1e-3
     before_T, _ = field_memory(once_T, REMEMBERED)
@@ -127,18 +127,18 @@ def test_of_one_poke_five_to_eight_percent_stand_in_the_next_no_load_reading_and
     assert (np.diff(left[1:]) < 0).all()
 
 
-def test_a_tip_that_hovers_over_a_fresh_skin_finds_no_memory_of_the_press_to_come():
+def test_hovering_tip_leaves_no_memory():
     stops_T = np.zeros((2, 4, 1, 3))
-    stops_T[:, 2] = 1e-3  # hovers twice, presses, lifts off
+    stops_T[:, 2] = 1e-3  # hover twice, press, lift off
     _, added_T = field_memory(stops_T, REMEMBERED)
     assert not added_T[0, :2].any()
     assert (added_T[0, 2:] > 0).all()
-    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)  # a press of the same mean
+    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)  # a press with the same mean
     np.testing.assert_allclose(added_T[0, -1], field_memory(one_T, REMEMBERED)[1][0, 0])
 
 
 @given(st.floats(-3, 3))
-def test_memory_is_linear_and_without_time_there_is_none(factor):
+def test_memory_is_linear_and_needs_time(factor):
     change_T = np.random.default_rng(1).normal(0, 1e-4, (4, 3, 2, 3))
     for once, times in zip(
         field_memory(change_T, REMEMBERED), field_memory(factor * change_T, REMEMBERED), strict=True
@@ -157,44 +157,44 @@ DESIGN = {"settling": 0.10, "ageing": 0.01}
 counts = st.lists(st.integers(0, 10**6), min_size=1, max_size=50).map(lambda n: np.array(sorted(n)))
 
 
-def test_a_fresh_skin_is_neither_soft_nor_faded():
+def test_fresh_skin_is_unchanged():
     assert softening(np.array([0]), **DESIGN) == 1
     assert fading(np.array([0]), per_decade=0.005) == 0
 
 
-def test_softening_is_the_sum_of_settling_and_ageing():
+def test_softening_is_settling_plus_ageing():
     # by hand: 0.1 (1 - e^-1) = 0.0632121, 0.01 log10(1.3) = 0.0011394; after 999,000 contacts 0.1 + 0.01 * 3
     np.testing.assert_allclose(softening(np.array([300, 999_000]), **DESIGN), [0.9356485, 0.87], atol=1e-7)
 
 
-def test_softening_before_thirty_contacts_costs_what_the_specification_says():
-    # A scene may neglect it on a cycled skin: from contact 1000 to 1030 it is far below 1 %.
+def test_early_softening_matches_the_specification():
+    # A scene may neglect it for a cycled skin: from contact 1000 to 1030 it is far below 1 %.
     cycled = softening(np.array([1000, 1030]), **DESIGN)
     assert 0 < 1 - cycled[1] / cycled[0] < 0.01
 
 
 @given(counts)
-def test_a_skin_never_gets_stiffer_by_use(contacts_n):
+def test_use_never_stiffens_a_skin(contacts_n):
     left = softening(contacts_n, **DESIGN)
     assert (np.diff(left) <= 0).all()
     assert ((left > 0) & (left <= 1)).all()
 
 
-def test_fading_is_half_a_percent_for_each_decade():
+def test_fading_is_half_a_percent_per_decade():
     np.testing.assert_allclose(fading(np.array([9, 99, 999]), per_decade=0.005), [0.005, 0.010, 0.015], atol=1e-15)
 
 
-def test_the_baseline_wanders_with_the_square_root_of_the_contacts():
+def test_baseline_walks_with_the_square_root_of_contacts():
     walks_T = baseline_walk(np.array([100, 10_000]), 20_000, step_T=0.2e-6, rng=rng_for(0, "wear"))
     # 2 %: four times the sampling error 1 / sqrt(2 n)
     np.testing.assert_allclose(walks_T.std(axis=1), [2e-6, 20e-6], rtol=0.02)
-    np.testing.assert_allclose(np.corrcoef(walks_T)[0, 1], 0.1, atol=0.03)  # the later place holds the earlier one
+    np.testing.assert_allclose(np.corrcoef(walks_T)[0, 1], 0.1, atol=0.03)  # the later value contains the earlier one
 
 
-def test_the_same_generator_gives_the_same_walk():
+def test_walk_follows_the_generator():
     first, again = (baseline_walk(np.arange(50), 15, step_T=1e-7, rng=rng_for(0, "wear")) for _ in range(2))
     assert first.tobytes() == again.tobytes()
-    assert not first[0].any()  # no contact yet
+    assert not first[0].any()  # before the first contact
 
 
 @pytest.mark.parametrize(
@@ -205,12 +205,12 @@ def test_the_same_generator_gives_the_same_walk():
         lambda: baseline_walk(np.array([3, 2]), 1, step_T=1e-7, rng=rng_for(0, "wear")),
     ],
 )
-def test_counts_that_fall_or_lie_below_zero_are_refused(of):
+def test_invalid_counts_are_refused(of):
     with pytest.raises(ParamsError, match="contact count"):
         of()
 
 
-def test_wear_that_leaves_no_stiffness_is_refused():
+def test_wear_without_remaining_stiffness_is_refused():
     with pytest.raises(ParamsError, match="stiffness left"):
         softening(np.array([10_000]), settling=0.99, ageing=0.1)
 
@@ -218,23 +218,22 @@ def test_wear_that_leaves_no_stiffness_is_refused():
 HOW = Temperature(warming_K=4.0, warming_s=100.0, swing_K=0.0, swing_s=600.0, chip_sensitivity_per_K=0.0)
 
 
-def test_warmth_takes_3_6_uT_off_3_mT_for_each_kelvin():
+def test_magnetisation_loses_3_6_uT_of_3_mT_per_kelvin():
     np.testing.assert_allclose(
         3e-3 * (relative_remanence(np.array([-1.0, 0.0, 1.0])) - 1), [3.6e-6, 0.0, -3.6e-6], atol=1e-18
     )
 
 
-def test_a_board_warms_up_from_nothing_to_all_of_it():
+def test_board_warms_up_exponentially():
     np.testing.assert_allclose(temperature_rise_K(np.array([0.0, 100.0, 1e5]), HOW), [0.0, 4 * (1 - np.exp(-1)), 4.0])
 
 
 @given(st.floats(0, 1e5))
-def test_the_room_goes_up_and_down_about_the_warming(time_s):
+def test_room_temperature_oscillates_about_the_warming(time_s):
     room = HOW.model_copy(update={"swing_K": 2.0})
-    assert temperature_rise_K(np.zeros(1), room) == 0  # at the start it is as warm as at the start
-    assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(
-        np.array([150.0]), HOW
-    )  # and then warms up first
+    assert temperature_rise_K(np.zeros(1), room) == 0  # temperatures are relative to the start
+    # The oscillation starts with a rise.
+    assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(np.array([150.0]), HOW)
     time = np.array([time_s, time_s + 300.0])  # half a period apart
     swing_K = temperature_rise_K(time, room) - temperature_rise_K(time, HOW)
     assert swing_K.sum() == pytest.approx(0.0, abs=1e-9)

@@ -1,4 +1,4 @@
-"""A ball of iron against magpylib's sphere, the conditions on its surface, and the laws of what it induces."""
+"""An iron ball compared with magpylib's sphere, the boundary conditions on its surface, and laws of induced fields."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def outward(observers_m):
 
 
 @given(MU_R)
-def test_outside_the_ball_is_magpylibs_sphere_of_its_polarisation(mu_r):
+def test_field_outside_equals_magpylib_sphere(mu_r):
     observers_m = on_sphere(1.7 * RADIUS_M)
     polarisation_T = np.tile(3 * (mu_r - 1) / (mu_r + 2) * B_T, (len(observers_m), 1))
     diameters_m = np.full(len(observers_m), 2 * RADIUS_M)
@@ -47,7 +47,7 @@ def test_outside_the_ball_is_magpylibs_sphere_of_its_polarisation(mu_r):
 
 
 @given(MU_R)
-def test_across_its_surface_the_normal_field_and_the_tangential_h_go_on(mu_r):
+def test_boundary_conditions_on_the_surface(mu_r):
     observers_m = on_sphere(RADIUS_M)
     normal = outward(observers_m)
     outside_T, inside_T = B_T + field(observers_m, mu_r=mu_r), 3 * mu_r / (mu_r + 2) * B_T
@@ -57,26 +57,26 @@ def test_across_its_surface_the_normal_field_and_the_tangential_h_go_on(mu_r):
 
 
 @given(st.floats(-3, 3), st.floats(1.5, 20))
-def test_it_is_linear_in_the_field_and_falls_as_one_over_r3(factor, times):
+def test_linearity_and_decay_with_r3(factor, times):
     near_m, far_m = on_sphere(1.5 * RADIUS_M), on_sphere(1.5 * times * RADIUS_M)
     np.testing.assert_allclose(field(near_m, factor * B_T), factor * field(near_m), rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(field(far_m) * times**3, field(near_m), rtol=1e-9, atol=1e-16)
 
 
-def test_a_ball_as_permeable_as_air_is_not_there():
+def test_ball_of_air_has_no_field():
     assert not field(on_sphere(2 * RADIUS_M), mu_r=1.0).any()
 
 
-def test_lines_of_dipoles_and_images_together_meet_the_surface_upright():
+def test_field_of_dipoles_and_images_is_normal_to_the_surface():
     observers_m = on_sphere(RADIUS_M)
     together_T = magnet.field(*NEAR, observers_m) + images(observers_m)
     sideways_T = np.cross(together_T, outward(observers_m))
     assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()  # rounding
     without_T = np.cross(magnet.field(*NEAR, observers_m), outward(observers_m))
-    assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()  # the ball does bend them
+    assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()  # the ball does change the direction
 
 
-def test_what_images_add_has_no_pole_as_nothing_magnetic_has():
+def test_flux_of_images_is_zero():
     # Gauss's law, over a sphere of the ball's size and half as much again: exact for polynomials of 31st degree.
     cos, weights = np.polynomial.legendre.leggauss(60)
     angles = np.linspace(0, 2 * np.pi, 120, endpoint=False)
@@ -89,7 +89,7 @@ def test_what_images_add_has_no_pole_as_nothing_magnetic_has():
     assert abs(flux) < 1e-9 * np.abs(through_T).max()
 
 
-def test_images_of_a_far_dipole_are_those_of_its_uniform_field():
+def test_images_of_a_far_dipole_equal_those_of_its_uniform_field():
     far = np.array([[0.4, -0.6, 0.9]]), np.array([[1.0, 2.0, -3.0]])
     observers_m = on_sphere(2 * RADIUS_M)
     uniform_T = magnet.field(*far, CENTRE_M[None])[0]
@@ -99,13 +99,13 @@ def test_images_of_a_far_dipole_are_those_of_its_uniform_field():
     )
 
 
-def test_directions_are_unit_vectors_that_favour_none():
+def test_directions_are_uniform_unit_vectors():
     drawn = random_directions(20_000, rng_for(0, "directions"))
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, rtol=1e-12)
     np.testing.assert_allclose(drawn.mean(axis=0), 0, atol=5 / np.sqrt(3 * 20_000))  # five sd of a mean
     np.testing.assert_allclose(drawn.T @ drawn / 20_000, np.eye(3) / 3, atol=0.012)  # five sd: 0.3 / sqrt(n)
 
 
-def test_the_earths_field_has_its_size_and_dips():
+def test_earth_field_has_its_magnitude_and_dip():
     assert np.linalg.norm(EARTH_T) == pytest.approx(EARTH_SIZE_T)
     assert EARTH_T[2] < 0 < EARTH_T[0]

@@ -1,4 +1,4 @@
-"""The base of the skin against finite elements, which know no waves: layers, drags, rigid slides; what lies between."""
+"""The base of the skin, compared with finite elements: pressed layers, drags, rigid slides, finite friction."""
 
 import numpy as np
 import pytest
@@ -21,16 +21,16 @@ def gaussian(r_m):
     return -np.exp(-(r_m**2) / (2 * WIDTH_M**2))
 
 
-def of_elements(cells_n):
+def finite_elements(cells_n):
     return Layer(H_M, 3 * H_M, 8 * H_M, cells_n)
 
 
-def of_waves(at, waves):
+def sum_of_waves(at, waves):
     found = layer.displacement(at.r_m.ravel(), at.z_m.ravel(), waves)
     return np.stack([getattr(found, name).reshape(at.r_m.shape) for name in PARTS])
 
 
-def off(at, truth):
+def errors_of(at, truth):
     """Root mean square error of displacement and of gradient, each relative to that of the truth."""
     near, parts_n = at.r_m < 4 * H_M, len(at.parts_m)
     found = np.concatenate([at.parts_m, at.gradient.reshape(-1, *at.r_m.shape)])[:, near]
@@ -39,20 +39,20 @@ def off(at, truth):
 
 
 @pytest.mark.parametrize("base", ["slipping", "bonded"])
-def test_a_layer_under_a_given_pressure_moves_as_elements_do_the_better_the_finer_they_are(base):
+def test_pressed_layer_converges_to_finite_elements(base):
     k_per_m = layer.WAVES_KH / H_M
     amplitude_m = WIDTH_M**2 * np.exp(-((k_per_m * WIDTH_M) ** 2) / 2) / 2 * layer.WAVES_W / H_M
     waves = layer.Waves(k_per_m, amplitude_m, H_M, base)
-    solved = [of_elements(cells_n).solve(1, gaussian, **HELD[base]) for cells_n in (4, 8)]
-    errors = np.array([off(at.inside, of_waves(at.inside, waves)) for at in solved])
+    solved = [finite_elements(cells_n).solve(1, gaussian, **HELD[base]) for cells_n in (4, 8)]
+    errors = np.array([errors_of(at.inside, sum_of_waves(at.inside, waves)) for at in solved])
     assert (errors[1] < [1e-3, 2e-2]).all()  # at 8 cells: 3e-4 and 9e-3
     assert (errors[0] / errors[1] > 2 ** np.array([2.7, 1.7])).all()  # Taylor & Hood: orders 3 and 2
-    slip_m, truth_m = solved[1].base.parts_m[0], of_waves(solved[1].base, waves)[0]
+    slip_m, truth_m = solved[1].base.parts_m[0], sum_of_waves(solved[1].base, waves)[0]
     np.testing.assert_allclose(slip_m, truth_m, atol=5e-4 * np.abs(truth_m).max())
 
 
 @pytest.mark.parametrize("base", ["slipping", "bonded"])
-def test_the_pressure_of_a_contact_puts_the_elements_surface_on_the_tip(base):
+def test_contact_pressure_puts_the_surface_on_the_tip(base):
     contact = layer.contact_of_depth(DEPTH_M, thickness_m=H_M, tip_radius_m=TIP_M, base=base)
     # p^(k) / 2G = integral of chi cos(kx) dx: p(r) / 2G = -integral of chi'(x) / sqrt(x^2 - r^2); x^2 = r^2 + y^2
     chi = Polynomial.fit(contact.x_m**2, contact.weights_m2 / (contact.radius_m * layer.CONTACT_W), 12)
@@ -62,27 +62,27 @@ def test_the_pressure_of_a_contact_puts_the_elements_surface_on_the_tip(base):
         x2_m2 = r_m[..., None] ** 2 + (top_m[..., None] * layer.CONTACT_X) ** 2
         return 4 * top_m * (chi.deriv()(x2_m2) @ layer.CONTACT_W)
 
-    top = of_elements(8).solve(1, load, **HELD[base]).top
+    top = finite_elements(8).solve(1, load, **HELD[base]).top
     r_m, up_m = (of[top.r_m < contact.radius_m] for of in (top.r_m, top.parts_m[1]))
     # the pressure's edge falls inside a cell: 0.4 % and 0.7 % of the depth there
     np.testing.assert_allclose(up_m, TIP_M - np.sqrt(TIP_M**2 - r_m**2) - DEPTH_M, atol=1e-2 * DEPTH_M)
 
 
 def half_curl(at):
-    """Give D, E, S of `ShearMap` by the chain rule from A, B, C."""
+    """D, E, S of `ShearMap` by the chain rule from A, B, C."""
     ((a_r, a_z), (b_r, b_z), (c_r, _)), (_, b, c) = at.gradient, at.parts_m
     in_line, across = (a_z + b_z - c_r) / 2, (a_z - b_z - c / at.r_m) / 2
     return np.stack([(in_line + across) / 2, (in_line - across) / 2, b / at.r_m + (b_r - a_r) / 2])
 
 
-def test_the_deepest_drag_of_a_scene_is_among_those_that_elements_vouch_for():
+def test_deepest_drag_is_covered_by_finite_elements():
     contact = layer.contact_of_depth(DRAG_M, thickness_m=H_M, tip_radius_m=TIP_M, base="slipping")
     assert 0.7 < contact.radius_m / H_M < AS_ON_THE_SKIN
 
 
-# as on the skin, and a thin layer, whose load is wide beside a cell: errors of 0.8 % and 0.05 %
+# as on the skin, and a thin layer, whose load is wide relative to a cell: errors of 0.8 % and 0.05 %
 @pytest.mark.parametrize(("radius_h", "tolerance"), [(AS_ON_THE_SKIN, 0.012), (2.5, 1e-3)])
-def test_a_layer_dragged_along_its_top_moves_turns_and_resists_as_elements_do(radius_h, tolerance):
+def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     radius_m, chi = radius_h * H_M, layer.CONTACT_W * (1 - layer.CONTACT_X**2) ** 2.5
     traction = shear.Traction(radius_m, radius_m * layer.CONTACT_X, chi / chi.sum())
 
@@ -98,7 +98,7 @@ def test_a_layer_dragged_along_its_top_moves_turns_and_resists_as_elements_do(ra
     found = [*at.parts_m[:, near], *half_curl(at)[:, near]]
     errors = [np.linalg.norm(f - t) / np.linalg.norm(t) for f, t in zip(found, truth[:, near], strict=True)]
     assert max(errors[:3]) < tolerance
-    assert max(errors[3:]) < 4 * tolerance  # a gradient is of lower order
+    assert max(errors[3:]) < 4 * tolerance  # gradients converge one order slower
     assert 1 / solved.under_load_m == pytest.approx(table.stiffness_m, rel=5e-4)
     d, e, s = half_curl(solved.top)
     # beside the contact's edge: 4 % and 0.4 % lower
@@ -106,19 +106,19 @@ def test_a_layer_dragged_along_its_top_moves_turns_and_resists_as_elements_do(ra
 
 
 @pytest.mark.parametrize("sides_m", [(20e-3, 20e-3), (20e-3, 50e-3)])
-def test_a_plate_on_even_drag_moves_as_one_the_more_the_stiffer_it_is(sides_m):
+def test_plate_under_even_drag_moves_rigidly(sides_m):
     misses_m = []
     for stiffness in (1e3, 1e4):
         middle_m, move_m, spin_rad = plate(sides_m, (6e-3, -3e-3), TAKEN_M, stiffness)
         rigid = slide.rigid_motion(middle_m[None], TAKEN_M[None], sides_m)
         misses_m.append(np.append(move_m - rigid.move_m[0], (spin_rad - rigid.spin_rad[0]) * sides_m[0] / 2))
     assert np.abs(misses_m[1]).max() < 1e-4 * TAKEN_M.max()
-    # what is bent goes as drag over stiffness
+    # the deformation is proportional to drag over stiffness
     np.testing.assert_allclose(misses_m[0], 10 * misses_m[1], atol=1e-5 * TAKEN_M.max())
 
 
-def test_friction_at_the_base_leads_from_the_layer_that_slips_to_the_one_that_is_bonded():
-    of = of_elements(4)
+def test_base_friction_interpolates_between_slipping_and_bonded():
+    of = finite_elements(4)
     slipping_m, bonded_m = (of.solve(1, gaussian, **HELD[base]).under_load_m for base in HELD)
     between = [of.with_friction(gaussian, mu, **HELD["slipping"]) for mu in (1e-3, 0.5, 100.0)]
     held = [(slipping_m - at.under_load_m) / (slipping_m - bonded_m) for at in between]

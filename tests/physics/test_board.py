@@ -1,4 +1,4 @@
-"""Boards against the design they are drawn from: chips where the CAD says, turns as recorded, draws by name."""
+"""Boards compared with the design they are drawn from: chip positions, rotations, draws by name."""
 
 import numpy as np
 import pytest
@@ -50,10 +50,10 @@ def same(one, other):
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
 
 
-def test_without_spreads_the_chips_sit_as_in_the_cad_and_turn_as_recorded():
+def test_board_without_spreads_equals_cad_and_recordings():
     board = draw_board(design(), no_spread(), seed=1, name="b0")
     np.testing.assert_allclose(board.chips_m, 1e-3 * np.array([[*xy, -1.1] for xy in CROSS_MM]))
-    recorded = [  # lab boards 1 and 2 (tests/recordings/test_lab_frames.py); a board file has chips 2 and 4 exchanged
+    recorded = [  # lab boards 1 and 2 (tests/recordings/test_lab_frames.py); the board file swaps chips 2 and 4
         np.eye(3),
         np.diag([-1, -1, 1]),
         [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
@@ -66,20 +66,20 @@ def test_without_spreads_the_chips_sit_as_in_the_cad_and_turn_as_recorded():
 
 
 @given(st.integers(0, 10**6))
-def test_a_chips_axes_stay_orthonormal_and_right_handed_however_it_is_tilted(seed):
+def test_chip_axes_stay_orthonormal(seed):
     turn = draw_board(design(), spreads(chip_tilt_deg=10.0), seed=seed, name="b0").turn
     np.testing.assert_allclose(turn @ turn.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-12)
     assert (np.linalg.det(turn) > 0).all()
 
 
-def test_the_same_name_and_seed_give_the_same_board_and_another_name_another():
+def test_boards_depend_on_name_and_seed():
     first, again = (draw_board(design(), spreads(), seed=1, name="b0") for _ in range(2))
     assert same(first, again)
     assert not same(first, draw_board(design(), spreads(), seed=1, name="b1"))
     assert not same(first, draw_board(design(), spreads(), seed=2, name="b0"))
 
 
-def test_over_many_boards_the_draws_have_the_spreads_that_are_stated():
+def test_draws_have_the_given_spreads():
     boards = [draw_board(design(), spreads(), seed=0, name=f"b{i}") for i in range(400)]
     gains = np.array([np.diagonal(board.sensitivity, axis1=1, axis2=2) for board in boards])
     # 10 %: sampling error of a standard deviation is 1 / sqrt(2 n), 3.5 % for 400 boards and less for chips.
@@ -95,7 +95,7 @@ def test_over_many_boards_the_draws_have_the_spreads_that_are_stated():
 TILES = {"columns_n": 2, "rows_n": 4, "pitch_mm": 25.4}
 
 
-def test_eight_boards_side_by_side_have_forty_chips_board_by_board():
+def test_tiled_boards_have_forty_chips():
     board = draw_board(design(tiles=TILES), no_spread(), seed=1, name="v0")
     one = draw_board(design(), no_spread(), seed=1, name="b0")
     centres_mm = [(x, y, 0.0) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7)]
@@ -116,7 +116,7 @@ def test_boards_lie_evenly_around_the_middle(columns_n, rows_n, pitch_mm):
     assert apart_mm.min(initial=pitch_mm) == pytest.approx(pitch_mm)
 
 
-def test_one_board_in_tiles_is_the_board_itself():
+def test_single_tile_is_the_board():
     alone = {"columns_n": 1, "rows_n": 1, "pitch_mm": 25.4}
     assert same(
         draw_board(design(), spreads(), seed=1, name="b0"),
@@ -124,17 +124,17 @@ def test_one_board_in_tiles_is_the_board_itself():
     )
 
 
-def test_more_chips_than_a_frame_can_hold_are_refused():
+def test_too_many_chips_are_refused():
     with pytest.raises(ParamsError, match="tiles make at most 64 chips in all, not 65"):
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
 
-def test_gaps_stay_above_nothing_and_tilt_and_bow_are_told_of_one_board_alone():
+def test_gaps_stay_positive_and_tilt_and_bow_need_one_board():
     wide = spreads(board_gap=0.5, board_uneven=0.5)
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])
     assert (gaps_m > 0).all()
-    # log gap = log(middle) + 0.5 (a x + b y + c r^2), r = 1 at the outer chips: two tell tilt, all of them bow.
+    # log gap = log(middle) + 0.5 (a x + b y + c r^2), r = 1 at the outer chips: two give the tilt, all give the bow.
     log = np.log(gaps_m / gaps_m[:, :1])
     tilt, bow = (log[:, 1] - log[:, 3]) / 2, log[:, 1:].mean(axis=1)
     assert 0.35 < tilt.std() < 0.7
@@ -142,12 +142,12 @@ def test_gaps_stay_above_nothing_and_tilt_and_bow_are_told_of_one_board_alone():
     np.testing.assert_allclose(log[:, 1] + log[:, 3], log[:, 2] + log[:, 4], atol=1e-12)
 
 
-def test_a_chip_without_its_turn_is_refused():
+def test_chip_without_rotation_is_refused():
     with pytest.raises(ParamsError, match="chips_turn_deg needs one turn"):
         design(chips_turn_deg=[0.0])
 
 
 @pytest.mark.parametrize(("name", "value"), [("chip_gain", -0.1), ("chip_gain", 2.0), ("chip_gian", 0.1)])
-def test_a_spread_out_of_bounds_or_unknown_is_refused(name, value):
+def test_invalid_spread_is_refused(name, value):
     with pytest.raises(ParamsError, match=name):
         parse(Spreads, SPREADS | {name: value}, "test")

@@ -1,4 +1,4 @@
-"""The compiled change of field against one naive body in NumPy and against magpylib; linearity and exact zeros."""
+"""The compiled change of field, compared with a NumPy loop and magpylib; linearity and exact zeros."""
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ seeds = st.integers(0, 10**6)
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled():
-    """Compile before the clock of a single example runs."""
+    """Compile before Hypothesis measures the time of an example."""
     change_of_field(*scene(0))
 
 
 def naive(rest, moved, observers_m):
-    """The specification: the field of each dipole after, less its field before, then the sum."""
+    """The specification: the difference of each dipole's field, summed."""
     after_T = magnet.field_of_each(*moved, observers_m)
     return (after_T - magnet.field_of_each(*rest, observers_m)).sum(axis=1)
 
@@ -42,42 +42,42 @@ def size_T(rest, moved, observers_m):
 
 
 @given(seeds)
-def test_the_compiled_sum_is_the_naive_one(seed):
+def test_compiled_sum_equals_naive_sum(seed):
     args = scene(seed)
     np.testing.assert_allclose(change_of_field(*args), naive(*args), atol=ROUNDING * size_T(*args))
 
 
 @given(seeds, st.floats(-5, 5).filter(lambda factor: abs(factor) > 1e-6))
-def test_magpylib_agrees_and_the_change_is_linear_in_the_moments(seed, factor):
+def test_linearity_and_magpylib(seed, factor):
     assert not broken(dipoles(seed, factor))
 
 
 @given(seeds)
-def test_dipoles_that_stay_change_nothing_at_all(seed):
+def test_fixed_dipoles_change_nothing(seed):
     rest, _, observers_m = scene(seed)
     assert not change_of_field(rest, rest, observers_m).any()
 
 
-def test_dipoles_of_no_moment_change_nothing_at_all():
+def test_dipoles_without_moment_change_nothing():
     (nodes_m, moments), (moved_m, _), observers_m = scene(2)
     nothing = np.zeros_like(moments)
     assert not change_of_field((nodes_m, nothing), (moved_m, nothing), observers_m).any()
 
 
-def test_no_dipoles_make_no_change():
+def test_no_dipoles():
     nothing = (np.zeros((0, 3)), np.zeros((0, 3)))
     assert not change_of_field(nothing, nothing, np.ones((2, 3))).any()
 
 
 @given(seeds)
-def test_there_and_back_again_is_no_change(seed):
+def test_there_and_back_is_no_change(seed):
     rest, moved, observers_m = scene(seed)
     back_T = change_of_field(moved, rest, observers_m)
     np.testing.assert_allclose(back_T, -change_of_field(rest, moved, observers_m), atol=1e-20)
 
 
-def test_a_tiny_move_keeps_the_digits_that_two_large_sums_would_lose():
-    # The field's slope along the move is the truth; one step of 1e-9 m changes the field by 1e-6 of itself.
+def test_tiny_move_keeps_precision():
+    # Reference: the slope of the field along the move; one step of 1e-9 m changes the field by 1e-6 of itself.
     (nodes_m, moments), _, observers_m = scene(3)
     step_m = np.array([1e-9, 0.0, 0.0])
     found_T = change_of_field((nodes_m, moments), (nodes_m + step_m, moments), observers_m)
@@ -88,7 +88,7 @@ def test_a_tiny_move_keeps_the_digits_that_two_large_sums_would_lose():
 
 
 @pytest.mark.parametrize("place", [0.0, np.nan])
-def test_an_observer_on_a_dipole_is_refused(place):
+def test_observer_on_a_dipole_is_refused(place):
     at, away, moment = np.full((1, 3), place), np.ones((1, 3)), np.ones((1, 3))
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
         change_of_field((at, moment), (away, moment), np.zeros((1, 3)))

@@ -1,4 +1,4 @@
-"""The chip model against the data sheet: gains, range, noise, temperature, and the time of conversions."""
+"""The chip model compared with the data sheet: gains, range, noise, temperature, conversion times."""
 
 import numpy as np
 import pytest
@@ -37,11 +37,11 @@ def read(b_T, of=None, design=QUIET):
 
 
 @given(st.integers(0, 7), st.integers(0, 10**6))
-def test_steps_conversion_and_wrap_are_those_of_the_data_sheet(gain_sel, seed):
+def test_lsb_and_wrap_follow_the_data_sheet(gain_sel, seed):
     assert not broken([*signals.steps(), *signals.conversion(gain_sel, seed)])
 
 
-def test_a_quiet_chip_within_its_range_counts_nothing():
+def test_reading_within_range_counts_nothing():
     b_uT, overruns = read([4e-3, -4e-3, 4e-3])
     assert b_uT.dtype == np.float32
     assert overruns == Overruns(clipped_n=0, wrapped_n=0)
@@ -54,11 +54,11 @@ def test_a_quiet_chip_within_its_range_counts_nothing():
         ([0.0, 50_010.0, 0.0], 1, 1), ([0.0, -60e3, 0.0], 1, 1),
     ],
 )  # fmt: skip
-def test_past_its_range_a_reading_wraps_past_50_mT_it_is_held_and_both_are_counted(b_uT, wrapped_n, clipped_n):
+def test_out_of_range_fields_wrap_or_clip(b_uT, wrapped_n, clipped_n):
     assert out_of_range(np.array([b_uT]), "", "", wrapped_n=wrapped_n, clipped_n=clipped_n).holds
 
 
-def test_a_chip_turned_by_90_degrees_reads_the_boards_y_on_its_x():
+def test_rotated_chip():
     b_uT, _ = read([0, 300e-6, 0], board(turn=QUARTER))
     np.testing.assert_allclose(b_uT, [[300, 0, 0]], atol=0.08)  # half a step
 
@@ -68,19 +68,19 @@ def test_gain_and_offset_act_in_the_chips_frame():
     np.testing.assert_allclose(b_uT, [[230, 30, 30]], atol=0.13)  # half a step of z
 
 
-def test_readings_are_whole_steps():
+def test_readings_are_multiples_of_the_lsb():
     b_uT, _ = read(rng_for(1, "sensor").uniform(-4e-3, 4e-3, size=(500, 3)), design=LOUD)
     counts = b_uT.astype(np.float64) / steps_uT(7)
     np.testing.assert_allclose(counts, np.rint(counts), atol=2e-3)  # float32 of 4000 uT is off by 1e-3 steps
 
 
-def test_what_clips_is_the_field_that_the_chip_sees_and_not_its_offset():
+def test_clipping_ignores_the_offset():
     _, overruns = read([0, 0, 49.9e-3], board(offset_T=200e-6))
     assert overruns.clipped_n == 0
     assert read([0, 0, 49.9e-3], board(gain=1.1))[1].clipped_n == 1
 
 
-def test_noise_has_the_stated_spread_on_each_axis_and_temperature_the_steps_of_the_data_sheet():
+def test_noise_and_temperature_resolution():
     assert not broken([*signals.noise(LOUD, 0), signals.temperature(0)])
     b_uT, _ = read(np.zeros((40_000, 3)), design=LOUD)
     np.testing.assert_allclose(b_uT.mean(axis=0), 0, atol=0.1)  # four times 5 uT / sqrt(n)
@@ -89,7 +89,7 @@ def test_noise_has_the_stated_spread_on_each_axis_and_temperature_the_steps_of_t
     assert read_degC.mean() == pytest.approx(25, abs=0.01)
 
 
-def test_the_same_generator_gives_the_same_readings():
+def test_readings_follow_the_generator():
     first, again = (read(np.full((50, 3), 1e-3), design=LOUD)[0] for _ in range(2))
     assert first.tobytes() == again.tobytes()
 
@@ -99,17 +99,17 @@ phases_s = st.floats(0, CONVERSION_S)
 
 
 @given(rates_hz, phases_s)
-def test_a_frame_brings_the_last_conversion_that_was_finished(rate_hz, phase_s):
+def test_frame_has_the_last_finished_conversion(rate_hz, phase_s):
     frame_s = (1 + np.arange(40)) / rate_hz
     age_s, _ = last_conversions(frame_s, np.array([phase_s]))
     ends_s = phase_s + CONVERSION_S * np.arange(-1, int(frame_s[-1] / CONVERSION_S) + 2)
     truth_s = [t - max(end for end in ends_s if end <= t + 1e-12) for t in frame_s]
-    # a conversion that ends with the frame may count on either side
+    # a conversion that ends with the frame may count either way
     off_s = np.abs(age_s[:, 0] - truth_s)
     assert (np.minimum(off_s, CONVERSION_S - off_s) < 1e-9).all()
 
 
-def test_at_400_hz_no_frame_repeats_and_at_1000_hz_almost_every_second_one_does():
+def test_repeated_conversions_by_rate():
     for rate_hz, least, most in ((400, 0, 0), (1000, 0.44, 0.48)):  # 1 - 1 / (1.84 ms x 1 kHz) = 0.457
         _, source_i = last_conversions((1 + np.arange(2000)) / rate_hz, np.zeros(1))
         repeated = np.mean(source_i[:, 0] != np.arange(2000))
@@ -124,10 +124,10 @@ def test_chips_of_one_frame_are_not_simultaneous():
 
 
 @given(rates_hz)
-def test_what_is_seen_of_a_steady_change_is_as_old_as_the_conversion(rate_hz):
+def test_reading_is_as_old_as_its_conversion(rate_hz):
     frame_s = (1 + np.arange(30)) / rate_hz
     age_s, _ = last_conversions(frame_s, np.array([0.3e-3]))
     value = np.repeat(frame_s[:, None, None], 3, axis=2)
     seen = sample_at_conversion(value, age_s, rate_hz)
-    late = frame_s - age_s[:, 0] >= frame_s[0]  # before the first frame nothing is known: that frame's value
+    late = frame_s - age_s[:, 0] >= frame_s[0]  # before the first frame, its value is used
     np.testing.assert_allclose(seen[late, 0, 0], (frame_s - age_s[:, 0])[late], atol=1e-9)

@@ -1,4 +1,4 @@
-"""Finite deformation under a tip: laws of `verification` on both bases, the linear limit, convergence in the steps."""
+"""Finite deformation under a tip: laws of `verification` on both bases, linear limit, convergence of steps."""
 
 from itertools import pairwise
 
@@ -34,23 +34,23 @@ def det_f(at):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("depth_m", [0.2e-3, 0.6e-3, 1.2e-3])
-def test_the_sunken_surface_lies_on_the_sphere(depth_m, base):
+def test_surface_lies_on_the_tip(depth_m, base):
     # Without following the surface it is 27 % of the depth beside it at 1.2 mm.
     assert not broken(mechanics.sunken_surface(layer.IndentedLayer(H_M, TIP_M, base), depth_m))
 
 
 @pytest.mark.parametrize("base", BASES)
-def test_volume_and_base_are_kept_and_f_is_the_gradient_of_the_map(base):
+def test_volume_and_base_are_kept(base):
     assert not broken(mechanics.finite_deformation(layer.IndentedLayer(H_M, TIP_M, base), 1.2e-3))
 
 
-def test_the_angle_is_that_of_the_polar_decomposition():
+def test_angle_equals_polar_decomposition():
     f = follow(*nodes(14, 7)).f
     u, _, vt = np.linalg.svd(f)  # F = R U, R = u vt
     np.testing.assert_allclose((u @ vt)[:, 0, 1], np.sin(deformation.rotation_angle(f)), atol=1e-12)
 
 
-def test_volume_is_kept_where_one_linear_step_loses_most_of_it():
+def test_one_linear_step_would_lose_volume():
     r_m, z_m = nodes()
     linear = linear_at(r_m, z_m, 1.2e-3)
     one_shot = ((1 + linear.r_r) * (1 + linear.z_z) - linear.r_z * linear.z_r) * (1 + linear.hoop)
@@ -59,7 +59,7 @@ def test_volume_is_kept_where_one_linear_step_loses_most_of_it():
     assert np.mean(np.abs(followed - 1) < 0.01) > 0.97
 
 
-def test_what_flows_in_under_a_sliding_tip_flows_out_and_the_base_goes_along():
+def test_slipping_base_conserves_flow():
     press = layer.IndentedLayer(H_M, TIP_M, "slipping")
     assert not broken(mechanics.far_field(press, 1.2e-3))
     # Between a cone's and a cylinder's volume under the dent.
@@ -71,7 +71,7 @@ def test_what_flows_in_under_a_sliding_tip_flows_out_and_the_base_goes_along():
     assert (follow(base_m, np.zeros(20), base="slipping").r_m > base_m).all()
 
 
-def test_halving_the_steps_quarters_the_loss_of_volume_and_converges(monkeypatch):
+def test_steps_converge_quadratically(monkeypatch):
     r_m, z_m = nodes(12, 6)
     found = []
     for step in (0.1, 0.05, 0.025):
@@ -83,11 +83,11 @@ def test_halving_the_steps_quarters_the_loss_of_volume_and_converges(monkeypatch
     assert loss[2] < loss[1] / 2.5
     apart_m = [np.hypot(b.r_m - a.r_m, b.z_m - a.z_m).max() for a, b in pairwise(found)]
     assert apart_m[1] < apart_m[0] / 2
-    assert apart_m[1] < 0.03 * 1.2e-3  # the default step is this far from half of it
+    assert apart_m[1] < 0.03 * 1.2e-3  # difference between the default step and half of it
 
 
 @pytest.mark.parametrize("base", BASES)
-def test_a_shallow_poke_is_the_linear_one(base):
+def test_shallow_poke_is_linear(base):
     r_m, z_m = nodes(r_max_m=1e-3)
     at, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
     linear = linear_at(r_m, z_m, depth_m, base)
@@ -97,7 +97,7 @@ def test_a_shallow_poke_is_the_linear_one(base):
 
 
 @pytest.mark.parametrize("base", BASES)
-def test_material_goes_to_the_last_bit_where_it_goes_without_other_material(base):
+def test_material_points_are_independent(base):
     r_m, z_m = nodes(8, 4)
     alone = [follow(r_m + more_m, z_m, base=base) for more_m in (0.0, 3e-3)]
     together = follow(np.concatenate([r_m, r_m + 3e-3]), np.tile(z_m, 2), base=base)

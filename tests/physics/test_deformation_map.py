@@ -1,4 +1,4 @@
-"""The tabulated deformation against following each node; no contact, the base, the reach and rigid motion."""
+"""The tabulated deformation compared with following each node; no contact, base, reach and rigid motion."""
 
 from functools import cache
 
@@ -17,7 +17,7 @@ depths_m = st.floats(1e-5, 1.2e-3)
 bases = st.sampled_from(BASES)
 
 
-@cache  # not when this file is collected: every worker collects it, one runs it
+@cache  # not at collection, which every test worker repeats
 def table(base="bonded"):
     return deformation.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base)
 
@@ -42,7 +42,7 @@ def places(rng, places_n, half_m=10e-3):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize(("rung_i", "share"), [(4, 2e-3), (-1, 2e-3), (None, 0.05)])
-def test_the_table_gives_what_following_each_node_gives(rung_i, share, base):
+def test_table_equals_following_nodes(rung_i, share, base):
     # 2e-3 of the depth: between tables of R/h and places r. Between its depths 5 %: the contact's edge jumps outwards.
     depth_m = 0.55e-3 if rung_i is None else table(base).depth_m[rung_i]
     start_m = places(np.random.default_rng(0), 150) * (1, 0, 1)
@@ -57,7 +57,7 @@ def test_the_table_gives_what_following_each_node_gives(rung_i, share, base):
 
 
 @given(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3), depths_m, bases)
-def test_each_node_moves_and_leans_in_its_plane_through_the_axis(x_m, y_m, depth_m, base):
+def test_nodes_move_in_planes_through_the_axis(x_m, y_m, depth_m, base):
     moved = move(places(np.random.default_rng(1), 60), (x_m, y_m, depth_m), base)
     away_m = moved.before[0][:, :2] - (x_m, y_m)
     for part in ((moved.after[0] - moved.before[0]), 1e-3 * moved.after[1]):
@@ -72,22 +72,22 @@ def test_without_contact_no_node_moves(depth_m, base):
 
 
 @given(depths_m)
-def test_a_bonded_base_stays_where_it_is_to_the_last_bit(depth_m):
+def test_bonded_base_stays(depth_m):
     base_m = np.column_stack([np.linspace(0, 10e-3, 200), np.zeros(200), np.zeros(200)])
     np.testing.assert_array_equal(move(base_m, (0, 0, depth_m)).after[0], base_m)
 
 
 @settings(max_examples=25)
 @given(depths_m, depths_m, bases)
-def test_deeper_pokes_press_the_material_under_the_tip_deeper(first_m, second_m, base):
+def test_deeper_pokes_move_material_deeper(first_m, second_m, base):
     shallow_m, deep_m = sorted((first_m, second_m))
     column_m = np.column_stack([np.zeros((7, 2)), H_M * np.array(HEIGHTS[1:])])
     shallow, deep = (move(column_m, (0, 0, depth), base).after[0][:, 2] for depth in (shallow_m, deep_m))
     assert (deep <= shallow + 1e-12).all()
-    assert (np.diff(deep) > 0).all()  # what lay above stays above
+    assert (np.diff(deep) > 0).all()  # the order of layers is kept
 
 
-def test_what_lies_past_the_reach_does_not_move_and_would_hardly():
+def test_displacement_beyond_the_reach_is_negligible():
     radius_m = layer.contact_of_depth(1.2e-3, thickness_m=H_M, tip_radius_m=TIP_M, base="bonded").radius_m
     assert table().reach_m == pytest.approx(radius_m + 5 * H_M, rel=0.01)
     assert move([[1.001 * table().reach_m, 0, 1e-3]], (0, 0, 1.2e-3)).i.size == 0
@@ -95,7 +95,7 @@ def test_what_lies_past_the_reach_does_not_move_and_would_hardly():
 
 
 @given(depths_m)
-def test_past_its_reach_a_sliding_skin_moves_outward_as_one_and_loses_nothing(depth_m):
+def test_slipping_skin_moves_outward_beyond_the_reach(depth_m):
     r_m = np.repeat(table("slipping").reach_m * np.array([0.999, 1.001, 1.5, 2.2]), len(HEIGHTS))
     rest_m = np.column_stack([r_m, np.zeros_like(r_m), H_M * np.tile(HEIGHTS, 4)])
     moved = move(rest_m, (0, 0, depth_m), "slipping")
@@ -108,14 +108,14 @@ def test_past_its_reach_a_sliding_skin_moves_outward_as_one_and_loses_nothing(de
 
 
 @given(depths_m)
-def test_a_sliding_base_keeps_its_height_and_moves_outward(depth_m):
+def test_slipping_base_keeps_its_height(depth_m):
     base_m = np.column_stack([np.linspace(0.1e-3, 15e-3, 100), np.zeros(100), np.zeros(100)])
     after_m = move(base_m, (0, 0, depth_m), "slipping").after[0]
     assert not after_m[:, 2].any()
     assert (after_m[:, 0] > base_m[:, 0]).all()
 
 
-def test_a_thin_skin_flows_too():
+def test_thin_skin():
     thin = deformation.tabulate(0.2e-3, TIP_M, 0.058e-3, heights=(0.5, 1.0), base="bonded")
     assert deformation.at_depth(thin, 0.058e-3)[-1, 0, 1] * 0.2e-3 == pytest.approx(-0.058e-3, rel=0.02)
     with pytest.raises(ParamsError, match="depth must be such that"):
@@ -125,18 +125,18 @@ def test_a_thin_skin_flows_too():
 @pytest.mark.parametrize(
     ("thickness_m", "depth_m"), [(0.0, 1e-3), (np.nan, 1e-3), (H_M, H_M), (H_M, 1.95e-3), (H_M, np.nan), (H_M, -1e-3)]
 )
-def test_impossible_layers_and_pokes_are_refused(thickness_m, depth_m):
+def test_invalid_layers_and_pokes_are_refused(thickness_m, depth_m):
     with pytest.raises(ParamsError, match="must be"):
         deformation.tabulate(thickness_m, TIP_M, depth_m, heights=(0.5,), base="bonded")
 
 
 @pytest.mark.parametrize("depth_m", [1.3e-3, np.nan, np.inf, -np.inf])
-def test_pokes_deeper_than_the_table_or_of_no_depth_at_all_are_refused(depth_m):
+def test_invalid_depths_are_refused(depth_m):
     with pytest.raises(ParamsError, match="depth must be"):
         move(np.zeros((1, 3)), (0, 0, depth_m))
 
 
-def test_a_table_that_was_kept_is_the_table_that_is_computed_and_grows_with_depth(tmp_path, monkeypatch):
+def test_cached_table_equals_computed_table(tmp_path, monkeypatch):
     def of_depth(depth_m):
         for cached in (deformation._tabulate, deformation._displaced):
             cached.cache_clear()

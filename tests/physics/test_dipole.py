@@ -1,4 +1,4 @@
-"""The dipole field against closed forms on and off the axis, a naive sum, and the laws of magnetostatics."""
+"""The dipole field compared with closed forms, a naive sum and magpylib; laws of magnetostatics."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ SIX_STEPS = (np.eye(3)[:, None] * np.array([1.0, -1.0])[:, None]).reshape(6, 3)
 
 coordinates = st.floats(-1, 1, allow_subnormal=False)
 triples = st.tuples(coordinates, coordinates, coordinates).map(np.array)
-# Sources off the origin and observers well away: a wrong sign of the separation cannot hide.
+# Sources off the origin and distant observers reveal a wrong sign of the separation.
 sources_m = triples.map(lambda v: v + np.array([3.0, -2.0, 1.0]))
 observers_m = triples.map(lambda v: v + np.array([-3.0, 4.0, 5.0]))
 
@@ -25,25 +25,25 @@ def at(source_m, moment, observer_m):
     return field(np.atleast_2d(source_m), np.atleast_2d(moment).astype(float), np.atleast_2d(observer_m))[0]
 
 
-def test_the_constant_is_codata_and_not_exactly_1e_7():
+def test_constant_is_that_of_codata():
     assert mu_0 / (4 * np.pi) == MU0_4PI
     assert 0 < abs(MU0_4PI / 1e-7 - 1) < 1e-9
 
 
 @given(sources_m, st.floats(0.1, 5))
-def test_on_its_axis_the_field_is_twice_the_moment_over_r3_and_beside_it_minus_once(source_m, r_m):
+def test_field_on_axis_and_beside(source_m, r_m):
     # rtol: (source + r) - source loses digits
     for direction, times in (((0, 0, r_m), 2), ((r_m, 0, 0), -1)):
         truth_T = (0, 0, times * 2.0 * MU0_4PI / r_m**3)
         np.testing.assert_allclose(at(source_m, (0, 0, 2.0), source_m + direction), truth_T, rtol=1e-9, atol=1e-25)
 
 
-def test_at_45_degrees_it_leans_as_three_cos_sin_to_three_cos2_less_one():
+def test_field_at_45_degrees():
     b_T = at((1.0, 2.0, 3.0), (0, 0, 1), np.array([1.0, 2.0, 3.0]) + np.array([1, 0, 1]) / np.sqrt(2))
     np.testing.assert_allclose(b_T, MU0_4PI * np.array([1.5, 0, 0.5]), rtol=ROUNDING, atol=1e-20)
 
 
-def test_many_dipoles_equal_the_loop_over_the_textbook_formula():
+def test_sum_equals_textbook_loop():
     rng = rng_for(0, "dipole")
     positions, moments, observers = rng.normal(size=(7, 3)), rng.normal(size=(7, 3)), rng.normal(size=(4, 3)) + 5
     naive = np.zeros((4, 3))
@@ -57,19 +57,19 @@ def test_many_dipoles_equal_the_loop_over_the_textbook_formula():
 
 
 @given(st.integers(0, 10**6))
-def test_magpylib_agrees(seed):
+def test_field_equals_magpylib(seed):
     assert dipoles(seed)[0].holds
 
 
 @given(sources_m, triples, triples, observers_m, coordinates)
-def test_the_field_is_linear_in_the_moment(source_m, one, other, observer_m, share):
+def test_field_is_linear_in_the_moment(source_m, one, other, observer_m, share):
     together = at(source_m, one + share * other, observer_m)
     apart = at(source_m, one, observer_m) + share * at(source_m, other, observer_m)
     np.testing.assert_allclose(together, apart, rtol=1e-9, atol=1e-20)  # atol: terms may cancel
 
 
 @given(sources_m, triples, observers_m)
-def test_the_field_has_neither_divergence_nor_curl(source_m, moment, observer_m):
+def test_divergence_and_curl_are_zero(source_m, moment, observer_m):
     step_m = 1e-3
     b_T = field(source_m[None], moment[None], observer_m + step_m * SIX_STEPS).reshape(3, 2, 3)
     jacobian = (b_T[:, 0] - b_T[:, 1]) / (2 * step_m)
@@ -79,7 +79,7 @@ def test_the_field_has_neither_divergence_nor_curl(source_m, moment, observer_m)
 
 
 @given(sources_m, triples, observers_m)
-def test_turning_everything_by_90_degrees_turns_the_field(source_m, moment, observer_m):
+def test_rotation_by_90_degrees(source_m, moment, observer_m):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(
         at(turn @ source_m, turn @ moment, turn @ observer_m),
@@ -90,10 +90,10 @@ def test_turning_everything_by_90_degrees_turns_the_field(source_m, moment, obse
 
 
 @pytest.mark.parametrize("place", [0.0, np.nan])
-def test_an_observer_on_a_dipole_is_refused(place):
+def test_observer_on_a_dipole_is_refused(place):
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
         field(np.full((1, 3), place), np.ones((1, 3)), np.zeros((1, 3)))
 
 
-def test_no_dipoles_make_no_field():
+def test_no_dipoles():
     assert not field(np.zeros((0, 3)), np.zeros((0, 3)), np.ones((2, 3))).any()

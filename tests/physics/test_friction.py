@@ -1,4 +1,4 @@
-"""Friction: Q = min(k s, mu F), work and Coulomb's disc as truth; subdivision, turning and lifting as laws."""
+"""Friction: Q = min(k s, mu F), energy and Coulomb's disc; subdivision, rotation and lifting of paths."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from reskin.errors import ParamsError
 from reskin.physics.shear import drag_force
 
 ROUNDING = 1e-12  # some hundred steps on doubles
-K = 1000.0  # newtons per metre: the skin's order
+K = 1000.0  # N/m, the skin's order of magnitude
 paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st.floats(-1e-2, 1e-2)))
 frictions = st.floats(0, 2)
 
@@ -29,13 +29,13 @@ def slipped_m(path_m, found):
 
 
 @given(st.floats(1e-6, 1e-2), st.floats(1e-3, 5), st.floats(1e-3, 2), st.floats(0, 5e3), st.integers(1, 50))
-def test_along_a_straight_line_the_force_is_the_lesser_of_spring_and_friction(end_m, normal_N, mu, stiffness, steps_n):
+def test_straight_drag_is_spring_or_friction(end_m, normal_N, mu, stiffness, steps_n):
     path_m = np.linspace(0, end_m, steps_n + 1)
     assert straight_drag(path_m, mu * normal_N, stiffness_N_per_m=stiffness, coefficient=mu).holds
 
 
 @given(paths_m)
-def test_without_friction_there_is_no_tangential_force_at_all(path_m):
+def test_no_friction_no_force(path_m):
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.0)
     assert not found.force_N.any()
     assert not found.elastic_m.any()
@@ -44,14 +44,14 @@ def test_without_friction_there_is_no_tangential_force_at_all(path_m):
 
 
 @given(paths_m)
-def test_endless_friction_is_a_spring_tied_to_the_first_place(path_m):
+def test_infinite_friction_is_a_spring(path_m):
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=1e6)
     np.testing.assert_allclose(found.force_N, K * (path_m - path_m[0]), atol=ROUNDING * K * 1e-2)
     assert not found.sliding.any()
 
 
 @given(paths_m, frictions, st.data())
-def test_the_force_never_leaves_coulombs_disc_and_is_on_its_rim_where_the_tip_slides(path_m, mu, data):
+def test_force_stays_within_coulombs_disc(path_m, mu, data):
     t = len(path_m)
     normal_N = data.draw(arrays(float, t, elements=st.floats(0, 5)))
     stiffness = data.draw(arrays(float, t, elements=st.floats(0, 5e3)))
@@ -63,7 +63,7 @@ def test_the_force_never_leaves_coulombs_disc_and_is_on_its_rim_where_the_tip_sl
 
 
 @given(st.lists(st.floats(0, 1), max_size=20), st.floats(1e-4, 5e-3), frictions)
-def test_cutting_a_straight_path_into_other_steps_changes_nothing(cuts, end_m, mu):
+def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
     ahead = np.array([0.6, -0.8])
     fine_m = np.sort(np.array([0.0, *cuts, 1.0]))[:, None] * end_m * ahead
     ends = [
@@ -73,7 +73,7 @@ def test_cutting_a_straight_path_into_other_steps_changes_nothing(cuts, end_m, m
     np.testing.assert_allclose(*ends, atol=ROUNDING)
 
 
-def test_there_and_back_costs_friction_times_the_length_slid():
+def test_loop_dissipates_friction_times_length():
     reach_m, mu, steps_n = 3e-3, 0.8, 300
     stuck_m = mu * 1.0 / K  # 0.8 mm: with steps of 10 um, every change from sticking to sliding is a place of the path
     along_m = np.concatenate(
@@ -83,17 +83,17 @@ def test_there_and_back_costs_friction_times_the_length_slid():
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
-    # In a loop the spring turns over twice, by twice its length each time; the rest of 4 reaches is slid.
+    # In a loop the spring reverses twice, by twice its length each time; the rest of 4 reaches slides.
     assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)  # sums of 1200 straight pieces
     slid_m = np.hypot(*slipped_m(path_m, found)[-1200:].T).sum()
     assert slid_m == pytest.approx(4 * reach_m - 4 * stuck_m, rel=1e-9)
-    # From rest: what is neither slid away nor still in the spring was not put in.
+    # From rest: the work is dissipated or still stored in the spring.
     all_slid_m = np.hypot(*slipped_m(path_m, found).T).sum()
     assert work_J.sum() == pytest.approx(mu * 1.0 * all_slid_m + K * stuck_m**2 / 2, rel=1e-9)
 
 
 @given(paths_m, frictions)
-def test_slip_runs_along_the_force_so_friction_never_drives(path_m, mu):
+def test_friction_opposes_slip(path_m, mu):
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
     slip_m = slipped_m(path_m, found)
     power = (found.force_N[1:] * slip_m).sum(axis=1)
@@ -102,7 +102,7 @@ def test_slip_runs_along_the_force_so_friction_never_drives(path_m, mu):
 
 
 @given(paths_m, frictions, st.floats(-np.pi, np.pi))
-def test_turning_the_path_turns_the_forces(path_m, mu, angle_rad):
+def test_rotation_of_the_path(path_m, mu, angle_rad):
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
     still, turned = (
         drag_force(p, normals(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T)
@@ -110,7 +110,7 @@ def test_turning_the_path_turns_the_forces(path_m, mu, angle_rad):
     np.testing.assert_allclose(turned, still @ turn.T, atol=1e-10)  # 40 steps of up to 30 N before they are cut
 
 
-def test_the_drag_reaches_its_new_direction_within_a_few_spring_lengths_of_a_corner():
+def test_force_turns_within_a_few_spring_lengths():
     path_m = np.vstack([straight(4e-3, 400, 0.0), straight(8e-3, 800, np.pi / 2)[1:] + [4e-3, 0]])
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.8)
     sideways_N, past_m = found.force_N[401:, 0], path_m[401:, 1]
@@ -119,13 +119,13 @@ def test_the_drag_reaches_its_new_direction_within_a_few_spring_lengths_of_a_cor
     np.testing.assert_allclose(sideways_N, 0.8 * np.sin(angle_rad), atol=0.8 * 10e-6 / 0.8e-3)  # one step's turn
 
 
-def test_a_lighter_touch_lets_the_spring_go_slack_and_a_firmer_one_does_not_load_it():
+def test_spring_slackens_under_lighter_force():
     path_m = np.array([[0.0, 0.0], [2e-3, 0.0], [2e-3, 0.0], [2e-3, 0.0]])
     found = drag_force(path_m, np.array([1.0, 1.0, 0.25, 1.0]), stiffness_N_per_m=K, friction=0.8)
     np.testing.assert_allclose(found.force_N[:, 0], [0, 0.8, 0.2, 0.2], rtol=ROUNDING)
 
 
-def test_a_lifted_tip_forgets_and_starts_anew_where_it_lands():
+def test_lifting_resets_the_spring():
     path_m = np.array([[0.0, 0.0], [0.5e-3, 0.0], [5e-3, 0.0], [9e-3, 1e-3], [9.1e-3, 1e-3]])
     found = drag_force(path_m, np.array([1.0, 1.0, 0.0, 1.0, 1.0]), stiffness_N_per_m=K, friction=0.8)
     np.testing.assert_allclose(found.force_N, [[0, 0], [0.5, 0], [0, 0], [0, 0], [0.1, 0]], atol=1e-12)
@@ -133,7 +133,7 @@ def test_a_lifted_tip_forgets_and_starts_anew_where_it_lands():
     assert not found.sliding.any()
 
 
-def test_a_skin_without_stiffness_feels_no_drag():
+def test_skin_without_stiffness_has_no_drag():
     path_m = straight(5e-3, 10)
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=0.0, friction=0.8)
     assert not found.force_N.any()
@@ -153,7 +153,7 @@ def test_a_skin_without_stiffness_feels_no_drag():
         ("friction", {"friction": np.inf}),
     ],
 )
-def test_impossible_drags_are_refused_in_one_sentence(what, of):
+def test_invalid_drags_are_refused(what, of):
     fine = {"path_m": np.zeros((2, 2)), "normal_N": np.ones(2), "stiffness_N_per_m": K, "friction": 0.8}
     with pytest.raises(ParamsError, match=f"drag: {what} must be"):
         drag_force(**(fine | of))

@@ -1,4 +1,4 @@
-"""The bonded layer: the laws of `verification` for any layer, limits and 50 digits as truth; what is refused."""
+"""The bonded layer: laws of `verification` for any layer, limits, 50-digit arithmetic; invalid input."""
 
 from dataclasses import asdict
 
@@ -32,11 +32,11 @@ def field(r_m, z_m, depth_m=1.2e-3):
 
 
 @given(waves_kh)
-def test_the_compliance_is_that_of_50_digits(kh):
+def test_compliance_equals_50_digits(kh):
     assert mechanics.bonded_compliance(np.array([kh])).holds
 
 
-def test_long_waves_hardly_sink_and_short_ones_as_in_a_half_space():
+def test_compliance_limits():
     long, short = (
         layer.bonded_compliance(np.array([0.0, 1e-6, 1e-3])),
         layer.bonded_compliance(np.array([20.0, 1e4, 1e150])),
@@ -46,7 +46,7 @@ def test_long_waves_hardly_sink_and_short_ones_as_in_a_half_space():
 
 
 @given(st.floats(0.01, 30), st.floats(0, 1))
-def test_the_profile_over_depth_is_the_one_of_the_specification(kh, share):
+def test_profile_over_depth(kh, share):
     with mpmath.workdps(50):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh) * mpmath.mpf(share)
         ratio = (mpmath.cosh(a) + a * mpmath.sinh(a)) / (a * mpmath.cosh(a))
@@ -60,7 +60,7 @@ def test_the_profile_over_depth_is_the_one_of_the_specification(kh, share):
     np.testing.assert_allclose([float(part[0, 0]) for part in found], truth, atol=1e-12)  # relative to a half-space's 1
 
 
-def test_the_base_is_held_and_the_surface_free_of_shear():
+def test_base_is_fixed_and_surface_free_of_shear():
     kh = np.geomspace(0.01, 500, 40)
     base = layer.depth_profile(np.zeros((1, 40)), kh)
     top = layer.depth_profile(kh[None], kh)
@@ -71,14 +71,14 @@ def test_the_base_is_held_and_the_surface_free_of_shear():
 
 @settings(max_examples=30)  # a new layer takes 50 ms
 @given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
-def test_the_force_is_dimitriadis_where_the_tip_is_small_beside_the_layer(thickness_m, tip_radius_m, relative_depth):
+def test_force_equals_dimitriadis_for_small_tips(thickness_m, tip_radius_m, relative_depth):
     # From chi^2 on the series is low: 8 % at chi = sqrt(R d) / h = 0.5, 16 % at 1, as rings of pressure confirm.
     depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
     assert mechanics.dimitriadis(np.array([depth_m]), IndentedLayer(thickness_m, tip_radius_m, "bonded")).holds
 
 
 @pytest.mark.parametrize("tip_m", [2e-3, 3e-3, 4e-3])
-def test_the_force_is_that_of_published_solutions_scales_and_passes_through_each_contact(tip_m):
+def test_force_of_published_solutions(tip_m):
     press = IndentedLayer(2e-3, tip_m, "bonded")
     thick = mechanics.hertz("bonded", tip_m), *mechanics.sneddon(tip_m * np.array([0.1, 0.4, 0.7]), press)
     laws = mechanics.long_2011(DEPTHS_M, press), *mechanics.scaling(DEPTHS_M, press, 1e9)
@@ -86,25 +86,25 @@ def test_the_force_is_that_of_published_solutions_scales_and_passes_through_each
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_rings_of_pressure_give_the_same_force_and_pull_nowhere(base):
+def test_pressure_rings_give_the_same_force(base):
     press = IndentedLayer(2e-3, 3e-3, base)
     assert mechanics.rings(1e-3, press).holds
     _, pressure = mechanics.ring_pressures(1e-3, press)
-    assert (pressure > 0).all()  # the radius is not too large: nothing pulls
+    assert (pressure > 0).all()  # the contact radius is not too large: no tension
     assert pressure[-1] < 0.25 * pressure[0]  # nor too small: no edge
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.6e-3, 1.2e-3])
-def test_one_small_step_keeps_volume_and_base_and_puts_the_surface_on_the_tip(base, depth_m):
+def test_small_step_keeps_volume_and_base(base, depth_m):
     assert not broken(mechanics.one_small_step(IndentedLayer(2e-3, 3e-3, base), depth_m))
 
 
-def test_on_the_axis_the_hoop_strain_is_that_beside_it():
+def test_hoop_strain_on_the_axis():
     assert field([0.0], [1.5e-3]).hoop == pytest.approx(field([1e-7], [1.5e-3]).hoop, rel=1e-6)
 
 
-def test_the_forces_of_the_specification_come_out():
+def test_forces_of_the_specification():
     np.testing.assert_allclose(
         force(DEPTHS_M), [0.09, 0.33, 0.74, 1.33, 2.08, 3.00], atol=0.006
     )  # two printed decimals
@@ -112,7 +112,7 @@ def test_the_forces_of_the_specification_come_out():
 
 @settings(max_examples=15, deadline=None)
 @given(thicknesses_m, tips_m)
-def test_deeper_is_harder_and_thinner_is_harder(thickness_m, tip_radius_m):
+def test_force_grows_with_depth_and_thinness(thickness_m, tip_radius_m):
     depth_m = np.linspace(0, 0.99 * min(thickness_m, tip_radius_m), 200)
     thin = force(depth_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     thick = force(depth_m, thickness_m=1.1 * thickness_m, tip_radius_m=tip_radius_m)
@@ -120,12 +120,12 @@ def test_deeper_is_harder_and_thinner_is_harder(thickness_m, tip_radius_m):
     assert (thin[1:] > thick[1:]).all()
 
 
-def test_no_contact_or_no_stiffness_is_no_force_at_all():
+def test_no_contact_or_no_stiffness_is_no_force():
     assert not force([-1e-3, -1e-12, 0.0]).any()
     assert not force(DEPTHS_M, modulus_Pa=0.0).any()
 
 
-def test_a_thin_skin_has_a_finite_force():
+def test_thin_skin_has_a_finite_force():
     assert 0 < force(0.1e-3, thickness_m=0.2e-3)[0] < 1e3
 
 
@@ -145,7 +145,7 @@ def test_a_thin_skin_has_a_finite_force():
         ("depth", {"depth_m": -np.inf}),
     ],
 )
-def test_impossible_layers_and_pokes_are_refused(what, changes):
+def test_invalid_layers_and_pokes_are_refused(what, changes):
     with pytest.raises(ParamsError, match=f"{what} must be"):
         force(**({"depth_m": 1e-3} | changes))
 

@@ -1,4 +1,4 @@
-"""The magnets against magpylib's Cuboid and Maxwell, and the law by which the powder keeps their field."""
+"""Magnets compared with magpylib's Cuboid and Maxwell's equations; the magnetisation law of the powder."""
 
 import magpylib
 import numpy as np
@@ -22,11 +22,11 @@ polarities = st.sampled_from(["checkerboard", "same"])
 
 
 @given(seeds, st.floats(1e-4, 1e-2))
-def test_a_cube_has_the_field_of_magpylibs_and_far_away_that_of_a_dipole(seed, side_m):
+def test_cube_equals_magpylib_and_far_dipole(seed, side_m):
     assert not broken([*laws.boxes(seed, side_m), laws.octupole()])
 
 
-def test_a_box_of_unequal_sides_has_the_field_of_magpylibs():
+def test_cuboid_equals_magpylib():
     sides_m = (6e-3, 4e-3, 3e-3)
     places_m = rng_for(0, "cuboid").uniform(-20e-3, 20e-3, (2000, 3)) * rng_for(1, "cuboid").uniform(size=(2000, 1))
     theirs_T = magpylib.magnet.Cuboid(polarization=(0, 0, 1.3), dimension=sides_m).getB(places_m)
@@ -37,12 +37,12 @@ def test_a_box_of_unequal_sides_has_the_field_of_magpylibs():
 
 @settings(max_examples=10)
 @given(polarities, seeds)
-def test_the_array_has_the_field_of_magpylibs_obeys_maxwell_and_turns(polarity, seed):
+def test_array_equals_magpylib_and_maxwell(polarity, seed):
     assert not broken(laws.array(polarity, THICKNESS_M, seed))
 
 
 @pytest.mark.parametrize("polarity", ["checkerboard", "same"])
-def test_the_array_of_a_sleeve_has_the_field_of_magpylibs_256_cuboids(polarity):
+def test_sleeve_array_equals_magpylib(polarity):
     half_m = np.array([25.4e-3, 50.8e-3])
     places_m = np.column_stack([rng_for(0, "sleeve").uniform(-half_m, half_m, (60, 2)), np.linspace(1e-4, 1.9e-3, 60)])
     theirs_T = magpylib.getB(laws.cuboids(polarity, THICKNESS_M, (8, 16)), places_m, sumup=True)
@@ -51,7 +51,7 @@ def test_the_array_of_a_sleeve_has_the_field_of_magpylibs_256_cuboids(polarity):
 
 
 @pytest.mark.parametrize(("side_mm", "n"), [(20.0, 4), (25.4, 4), (50.8, 8), (101.6, 16), (101.7, 17), (3.0, 1)])
-def test_so_many_cubes_cover_a_side_and_their_seams_lie_evenly_around_its_middle(side_mm, n):
+def test_cubes_cover_a_side_symmetrically(side_mm, n):
     side_m = 1e-3 * side_mm
     assert magnet.cubes_along(side_m) == n
     seams_m = magnet.seams_m(side_m)
@@ -62,43 +62,43 @@ def test_so_many_cubes_cover_a_side_and_their_seams_lie_evenly_around_its_middle
 
 
 @given(places_m, polarities)
-def test_the_mirror_image_of_a_place_has_the_mirrored_field(point_m, polarity):
-    # Charges that keep their sign in the mirror x -> -x flip Bx alone; a checkerboard's are exchanged as well.
+def test_mirror_symmetry(point_m, polarity):
+    # Charges that keep their sign in the mirror x -> -x flip Bx alone; a checkerboard's are swapped as well.
     sign = -1 if polarity == "checkerboard" else 1
     here_T, there_T = (magnet.array_field((point_m * (side, 1, 1))[None], THICKNESS_M, polarity)[0] for side in (1, -1))
     np.testing.assert_allclose(there_T, sign * here_T * (-1, 1, 1), atol=1e-12)
 
 
-def test_the_array_gives_the_strength_that_the_specification_states():
+def test_array_strength_of_the_specification():
     # 0.38-0.65 T in the slab; the seam crossings are weaker and the faces stronger.
     size_T = np.linalg.norm(magnet.array_field(NODES_M, THICKNESS_M, "checkerboard"), axis=1)
     assert 0.38 < np.median(size_T) < 0.65
 
 
-def test_a_place_outside_the_slab_is_refused():
+def test_place_outside_the_slab_is_refused():
     with pytest.raises(ParamsError, match="places must be inside the slab"):
         magnet.array_field(np.array([[0.0, 0.0, 2.1e-3]]), THICKNESS_M, "same")
 
 
-def test_magnetisation_is_half_of_saturation_at_the_half_field_and_lies_along_the_field():
+def test_magnetisation_at_the_half_field():
     for b_T in rng_for(0, "magnet").normal(size=(50, 3)):
         strength_T = float(np.linalg.norm(b_T))
         j_T = magnet.magnetise(b_T[None], saturation_T=0.17, half_field_T=strength_T)[0]
         np.testing.assert_allclose(j_T, 0.17 / 2 * b_T / strength_T, rtol=1e-12)
 
 
-def test_magnetisation_saturates_in_a_strong_field_and_vanishes_as_the_cube_in_a_weak_one():
+def test_magnetisation_limits():
     direction = np.array([[2.0, -1.0, 2.0]]) / 3
     strong_T, weak_T = (magnet.magnetise(b * direction, saturation_T=0.1, half_field_T=0.5) for b in (5e3, 5e-3))
     np.testing.assert_allclose(strong_T, 0.1 * direction, rtol=1e-11)  # 1 - u^-3
     np.testing.assert_allclose(weak_T, 0.1e-6 * direction, rtol=2e-6)  # 1 - u^3
 
 
-def test_without_a_field_nothing_is_magnetised_and_nothing_is_nan():
+def test_zero_field_has_no_magnetisation():
     assert not magnet.magnetise(np.zeros((1, 3)), saturation_T=0.1, half_field_T=0.5).any()
 
 
-def test_the_mean_magnetisation_is_that_of_the_specification():
+def test_mean_magnetisation_of_the_specification():
     # 22-28 mT for phi Br = 0.11 T and B_half = 0.8 T
     rest = place_nodes(THICKNESS_M)
     b_T = magnet.array_field(rest.nodes_m, THICKNESS_M, "checkerboard")
@@ -106,7 +106,7 @@ def test_the_mean_magnetisation_is_that_of_the_specification():
     assert 22e-3 <= np.average(j_T, weights=rest.volumes_m3) <= 28e-3
 
 
-def test_far_away_the_uniform_skin_is_one_dipole_of_j_times_volume_over_mu0():
+def test_far_field_of_a_uniform_skin_is_a_dipole():
     rest = place_nodes(THICKNESS_M)
     j_T = np.tile([0.0, 0.0, 0.1], (len(rest.nodes_m), 1))
     above_m = np.array([[0.0, 0.0, 1.0]])
@@ -116,7 +116,7 @@ def test_far_away_the_uniform_skin_is_one_dipole_of_j_times_volume_over_mu0():
 
 
 @pytest.mark.parametrize("polarity", ["checkerboard", "same"])
-def test_the_array_is_the_sum_of_its_cubes(polarity):
+def test_array_is_the_sum_of_its_cubes(polarity):
     cubes_n, side_m = (3, 2), magnet.CUBE_SIDE_M
     truth_T = np.zeros_like(NODES_M)
     for i in range(cubes_n[0]):

@@ -1,4 +1,4 @@
-"""The quadrature of the skin against the box it fills, polynomials that it must integrate, and the magnets' seams."""
+"""The quadrature of the skin: volume, polynomials and the seams of the magnets."""
 
 from itertools import pairwise, product
 
@@ -23,7 +23,7 @@ rules = st.builds(Quadrature, cell_m=st.floats(0.3e-3, 5e-3), layers_n=st.intege
 
 
 @given(st.floats(2e-4, 1e-2), rules)
-def test_the_cells_fill_the_skin_and_balance(thickness_m, rule):
+def test_cells_fill_the_skin(thickness_m, rule):
     rest = place_nodes(thickness_m, rule)
     volume_m3 = SKIN_SIDE_M**2 * thickness_m
     np.testing.assert_allclose(rest.volumes_m3.sum(), volume_m3, rtol=1e-12)
@@ -31,7 +31,7 @@ def test_the_cells_fill_the_skin_and_balance(thickness_m, rule):
 
 
 @given(rules)
-def test_no_cell_is_wider_than_asked_and_none_crosses_a_seam(rule):
+def test_cells_respect_the_width_and_seams(rule):
     x_m = np.unique(place_nodes(THICKNESS_M, rule).nodes_m[:, 0])
     marks_m = np.array([-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2])
     for a_m, b_m in pairwise(marks_m):
@@ -41,12 +41,12 @@ def test_no_cell_is_wider_than_asked_and_none_crosses_a_seam(rule):
         np.testing.assert_allclose(inside_m, a_m + width_m * (0.5 + np.arange(len(inside_m))), atol=1e-12)
 
 
-def test_the_seams_are_those_of_the_array_of_cubes():
+def test_seams_are_those_of_the_magnet_array():
     np.testing.assert_allclose(SEAMS_M, CUBE_SIDE_M * np.array([-1, 0, 1]))
 
 
 @given(st.floats(1e-3, 60e-3), st.floats(1e-3, 60e-3), rules)
-def test_a_skin_of_any_sides_is_filled_and_cut_at_the_seams_of_its_own_array(x_m, y_m, rule):
+def test_skins_of_any_size_are_filled(x_m, y_m, rule):
     rest = place_nodes(THICKNESS_M, rule, sides_m=(x_m, y_m))
     np.testing.assert_allclose(rest.volumes_m3.sum(), x_m * y_m * THICKNESS_M, rtol=1e-12)
     for axis, side_m in enumerate((x_m, y_m)):
@@ -59,7 +59,7 @@ def test_a_skin_of_any_sides_is_filled_and_cut_at_the_seams_of_its_own_array(x_m
             assert (b_m - a_m) / cells_n <= rule.cell_m * (1 + 1e-6)
 
 
-def test_the_authors_skin_keeps_its_nodes_to_the_last_bit():
+def test_nodes_of_the_papers_skin_are_unchanged():
     rest, marks_m = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE), (-10e-3, -6.35e-3, 0.0, 6.35e-3, 10e-3)
     spans = [np.linspace(a, b, n + 1) for (a, b), n in zip(pairwise(marks_m), (8, 13, 13, 8), strict=True)]
     x_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
@@ -68,14 +68,14 @@ def test_the_authors_skin_keeps_its_nodes_to_the_last_bit():
     np.testing.assert_array_equal(rest.nodes_m, naive_m)
 
 
-def test_six_layers_integrate_every_polynomial_of_degree_eleven_over_the_thickness():
+def test_six_layers_integrate_degree_eleven():
     rest = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE)
     for power in range(12):
         mean = rest.volumes_m3 @ (rest.nodes_m[:, 2] / THICKNESS_M) ** power / rest.volumes_m3.sum()
         np.testing.assert_allclose(mean, 1 / (power + 1), rtol=1e-12)
 
 
-def test_over_x_and_y_the_error_falls_with_the_square_of_the_cell():
+def test_error_falls_with_the_square_of_the_cell():
     def error(cell_m):
         rest = place_nodes(THICKNESS_M, Quadrature(cell_m, 1))
         wave = np.cos(300 * rest.nodes_m[:, 0]) * np.cos(200 * rest.nodes_m[:, 1])
@@ -88,7 +88,7 @@ def test_over_x_and_y_the_error_falls_with_the_square_of_the_cell():
     assert coarse / fine == pytest.approx(4, rel=0.05)
 
 
-def test_the_nodes_are_the_same_however_the_skin_is_turned_by_90_degrees():
+def test_rotation_by_90_degrees():
     nodes_m = place_nodes(THICKNESS_M).nodes_m
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
@@ -102,6 +102,6 @@ def test_the_nodes_are_the_same_however_the_skin_is_turned_by_90_degrees():
     ("thickness_m", "cell_m", "layers_n"),
     [v for v in product((0.0, -1e-3, np.nan, 2e-3), (0.0, np.nan, 5e-4), (0, 6)) if v != (2e-3, 5e-4, 6)],
 )
-def test_a_skin_or_a_rule_of_nothing_is_refused(thickness_m, cell_m, layers_n):
+def test_empty_skin_or_rule_is_refused(thickness_m, cell_m, layers_n):
     with pytest.raises(ParamsError, match="thickness, cell and layers must be above 0"):
         place_nodes(thickness_m, Quadrature(cell_m, layers_n))

@@ -1,4 +1,4 @@
-"""Shear under a dragged tip: 50 digits, a boundary value problem, Mindlin, Johnson, thin layers as truth; laws."""
+"""Shear under a dragged tip, compared with 50 digits, a boundary value problem, Mindlin, Johnson, thin layers; laws."""
 
 import mpmath
 import numpy as np
@@ -38,7 +38,7 @@ def sliding(depth_m=0.6e-3):
 
 
 def displacement_m(traction, places_m, thickness_m=H_M):
-    """The displacement as `ShearMap` says in words, per Q / G along x, without a table."""
+    """The displacement as documented for `ShearMap`, per Q / G along x, without a table."""
     found = []
     for x, y, z in np.atleast_2d(places_m):
         r, f = np.hypot(x, y), np.arctan2(y, x)
@@ -48,7 +48,7 @@ def displacement_m(traction, places_m, thickness_m=H_M):
 
 
 def gradients(traction, places_m, step_m=2e-6):
-    """u_i,j by central differences; the field's shortest wave is 0.3 mm long, so they are good to 3e-4 of it."""
+    """u_i,j by central differences; relative error 3e-4 for the field's shortest wavelength of 0.3 mm."""
     steps = step_m * np.eye(3)
     pairs = [(displacement_m(traction, places_m + e) - displacement_m(traction, places_m - e)) for e in steps]
     return np.stack(pairs, axis=-1) / (2 * step_m)
@@ -67,7 +67,7 @@ def moved(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUN
 
 
 @given(st.floats(0.01, 200), st.floats(0, 1))
-def test_the_response_to_a_wave_is_that_of_50_digits(kh, share):
+def test_response_equals_50_digits(kh, share):
     with mpmath.workdps(250):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh * share)
         size = mpmath.cosh(a) ** 2 + a**2
@@ -90,7 +90,7 @@ def test_the_response_to_a_wave_is_that_of_50_digits(kh, share):
 
 
 @pytest.mark.parametrize("kh", [0.05, 0.5, 1.5, 4.0, 12.0])
-def test_the_response_solves_elasticity_as_a_boundary_value_problem(kh):
+def test_response_solves_the_boundary_value_problem(kh):
     """Equilibrium and Hooke's law at k = G = 1: in the wave's plane two u and two stresses, across one each."""
 
     def slopes(_z, at):
@@ -116,7 +116,7 @@ def test_the_response_solves_elasticity_as_a_boundary_value_problem(kh):
         np.testing.assert_allclose(getattr(found, name)[:, 0], values, atol=1e-6, err_msg=name)  # 100 x tol
 
 
-def test_the_base_is_held_and_the_top_feels_the_traction_alone_however_short_the_wave():
+def test_boundary_conditions_of_short_waves():
     kh = np.geomspace(1e-3, 500, 40)
     base, top = shear.wave_response(np.zeros((1, 40)), kh), shear.wave_response(kh[None], kh)
     np.testing.assert_allclose([base.w, base.w_slope, base.v], 0, atol=1e-15)
@@ -124,15 +124,15 @@ def test_the_base_is_held_and_the_top_feels_the_traction_alone_however_short_the
     np.testing.assert_allclose(top.v_slope, 1, atol=1e-14)
 
 
-def test_what_a_traction_lifts_is_what_a_pressure_moves_aside():
-    """Betti: work of either load on the other's displacement; `layer` solves the other load."""
+def test_bettis_reciprocity_with_pressure():
+    """Betti: the work of each load on the other's displacement is equal; `layer` solves the other load."""
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(shear.wave_response(kh[None], kh).w, aside, atol=1e-14)
 
 
 @pytest.mark.parametrize("radius_m", [0.6e-3, 1.5e-3])
-def test_the_surface_moves_as_johnson_has_it_on_a_half_space_less_what_the_base_holds(radius_m):
+def test_surface_equals_johnson_minus_the_base(radius_m):
     traction, r_m = hertzian(radius_m), np.linspace(0, radius_m, 12)
     found = shear.evaluate_map(traction, r_m, np.array([H_M]), thickness_m=H_M)[:, 0, :2].T
     # Johnson 1985, 3.91 at nu = 1/2: u_x = pi q0 / 32 G a (6 a^2 - 2.5 x^2 - 3.5 y^2), u_y = pi q0 / 32 G a x y
@@ -145,11 +145,11 @@ def test_the_surface_moves_as_johnson_has_it_on_a_half_space_less_what_the_base_
         return 3 * (np.sin(ka) - ka * np.cos(ka)) / ka**3 * missing * jv(order, k * r) / (8 * np.pi)
 
     base = [[quad(held, 1e-3, 25 / H_M, args=(r, order), limit=200)[0] for r in r_m] for order in (0, 2)]
-    # 1 % of the middle: the table's waves end at 0.3 mm
+    # 1 % of the middle: the table has no waves below 0.3 mm
     np.testing.assert_allclose(found, free - np.array(base), atol=0.01 * found[0, 0])
 
 
-def test_the_surface_under_the_tip_carries_the_traction_and_no_other_shear():
+def test_traction_is_the_only_shear_stress():
     traction, step_m = hertzian(), 4e-6
     r_m, f = np.linspace(0, 0.9, 10) * traction.radius_m, np.linspace(0, 3, 10)
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full(10, H_M)], axis=1)
@@ -166,7 +166,7 @@ def test_the_surface_under_the_tip_carries_the_traction_and_no_other_shear():
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(2e-3, H_M)])
-def test_every_level_of_the_layer_carries_the_whole_force(traction):
+def test_every_level_carries_the_force(traction):
     r_m, step_m = np.linspace(0, 12 * H_M, 1500), 1e-6
     for z_m in (0.0, 0.4 * H_M, 0.8 * H_M):
         z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
@@ -176,7 +176,7 @@ def test_every_level_of_the_layer_carries_the_whole_force(traction):
         assert np.trapezoid(2 * np.pi * r_m * slope, r_m) == pytest.approx(1, abs=1e-3)
 
 
-def test_volume_is_kept_and_the_turning_is_half_the_curl():
+def test_volume_is_kept_and_rotation_is_half_the_curl():
     traction, places_m = sliding(), some_places_m()
     grad = gradients(traction, places_m)
     size = np.abs(grad).max()
@@ -190,7 +190,7 @@ def test_volume_is_kept_and_the_turning_is_half_the_curl():
 
 
 @pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])
-def test_the_table_gives_the_field_it_was_made_of(force):
+def test_table_equals_direct_integration(force):
     traction, places_m = sliding(), some_places_m(top=1.0)
     found = moved(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
     turn = np.array([[force[0], -force[1], 0], [force[1], force[0], 0], [0, 0, 1]])
@@ -199,13 +199,13 @@ def test_the_table_gives_the_field_it_was_made_of(force):
 
 
 @pytest.mark.parametrize("radius_m", [0.05e-3, 0.3e-3])
-def test_on_a_thick_layer_a_tip_that_sticks_is_as_stiff_as_mindlins_and_one_that_slides_a_sixth_softer(radius_m):
+def test_stiffness_of_mindlin_on_thick_layers(radius_m):
     assert not broken([mechanics.sticking(radius_m), mechanics.sliding(radius_m, TIP_M, "bonded")])
     # mean of 6 a^2 - 3 r^2 over q ~ sqrt(a^2 - r^2) is 24/5 a^2: u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a
     assert shear.tangential_stiffness_m(hertzian(radius_m), 100.0) == pytest.approx(40 / 9 * radius_m, rel=1e-4)
 
 
-def test_a_thin_layer_shears_like_a_block_with_a_seam_round_it():
+def test_thin_layer_shears_like_a_block():
     wide_m = np.array([4.0, 5.0, 6.0]) * H_M
     blocks_m = np.sqrt(
         [H_M / np.pi * shear.tangential_stiffness_m(shear.stick_traction(a_m, H_M), H_M) for a_m in wide_m]
@@ -220,26 +220,26 @@ def test_a_thin_layer_shears_like_a_block_with_a_seam_round_it():
     np.testing.assert_allclose(middle_m / middle_m[-1], np.linspace(0, 1, 9), atol=0.01)  # u = q z / G, edges 3 h away
 
 
-def test_a_tip_that_sticks_moves_its_contact_as_one():
+def test_sticking_contact_moves_rigidly():
     for a_h in (0.5, 1.0, 2.0):
         traction = shear.stick_traction(a_h * H_M, H_M)
         parts = shear.evaluate_map(traction, np.linspace(0, 0.8, 9) * a_h * H_M, np.array([H_M]), thickness_m=H_M)[
             :, 0, :2
         ].T
         mean_per_m = 1 / shear.tangential_stiffness_m(traction, H_M)
-        np.testing.assert_allclose(parts[0], mean_per_m, rtol=0.03)  # an edge of endless traction, cut at 0.3 mm
-        assert np.abs(parts[1]).max() < 0.05 * mean_per_m  # what the shape, the same all round, cannot do
+        np.testing.assert_allclose(parts[0], mean_per_m, rtol=0.03)  # infinite traction at the edge, cut off at 0.3 mm
+        assert np.abs(parts[1]).max() < 0.05 * mean_per_m  # error of the axisymmetric shape
 
 
 @given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
-def test_no_other_traction_is_as_stiff_as_sticking(a_h, square, fourth):
-    """Thomson: of all tractions with one sum, that of the rigid motion stores the least work."""
+def test_sticking_is_the_stiffest_traction(a_h, square, fourth):
+    """Thomson: of all tractions with equal sum, that of the rigid motion stores the least energy."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
     best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
     assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)
 
 
-def test_the_specifications_sum_of_limits_is_up_to_5_percent_too_stiff_for_sticking():
+def test_sum_of_limits_is_at_most_5_percent_too_stiff():
     a_m = np.geomspace(0.01, 6, 40) * H_M
     ratio = [shear.tangential_stiffness_m(shear.stick_traction(a, H_M), H_M) for a in a_m] / (
         16 / 3 * a_m + np.pi * a_m**2 / H_M
@@ -249,7 +249,7 @@ def test_the_specifications_sum_of_limits_is_up_to_5_percent_too_stiff_for_stick
     assert ratio.min() == pytest.approx(0.955, abs=0.005)
 
 
-def test_sliding_is_19_to_20_percent_softer_than_sticking_on_the_skin():
+def test_sliding_is_19_to_20_percent_softer_than_sticking():
     tractions = [sliding(float(depth_m)) for depth_m in DEPTHS_M]
     ratio = [
         shear.tangential_stiffness_m(t, H_M) / shear.tangential_stiffness_m(shear.stick_traction(t.radius_m, H_M), H_M)
@@ -259,7 +259,7 @@ def test_sliding_is_19_to_20_percent_softer_than_sticking_on_the_skin():
 
 
 @given(forces_N, forces_N, st.floats(-3, 3))
-def test_the_skin_answers_in_proportion_and_sums(one_N, other_N, times):
+def test_displacement_is_linear(one_N, other_N, times):
     nodes_m = some_places_m(30)
     both = moved(one_N + times * other_N, nodes_m)
     first, second = moved(one_N, nodes_m), moved(other_N, nodes_m)
@@ -269,19 +269,19 @@ def test_the_skin_answers_in_proportion_and_sums(one_N, other_N, times):
 
 
 @given(forces_N, st.floats(-np.pi, np.pi))
-def test_turning_force_and_nodes_turns_everything(force_N, angle_rad):
+def test_rotation_of_force_and_nodes(force_N, angle_rad):
     nodes_m, (c, s) = some_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     still, turned = (
         moved(force_N, nodes_m, centre_m=(0, 0)),
         moved(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
     )
-    # a node at the edge of a cell of the table may fall into the next, where it has the same value
+    # a node at the edge of a table cell may fall into the next, with the same value
     np.testing.assert_allclose(turned.displacement_m, still.displacement_m @ turn.T, atol=1e-10)
     np.testing.assert_allclose(turned.half_curl, still.half_curl @ turn.T, atol=1e-9)
 
 
-def test_a_mirror_along_the_force_shows_the_same_skin():
+def test_mirror_symmetry_along_the_force():
     nodes_m, mirror = some_places_m(), np.array([1, -1, 1])
     here, there = moved([0.5, 0], nodes_m, centre_m=(0, 0)), moved([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
     np.testing.assert_allclose(there.displacement_m, here.displacement_m * mirror, atol=1e-18)
@@ -290,7 +290,7 @@ def test_a_mirror_along_the_force_shows_the_same_skin():
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
 
 
-def test_the_skin_follows_the_tip_and_leans_forward():
+def test_skin_follows_the_tip_and_leans_forward():
     middle = moved([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
     assert (middle.displacement_m[:, 0] > 0).all()
     assert not middle.displacement_m[:, 1:].any()
@@ -298,7 +298,7 @@ def test_the_skin_follows_the_tip_and_leans_forward():
     assert not middle.half_curl[:, [0, 2]].any()
 
 
-def test_nothing_moves_on_the_base_or_out_of_reach():
+def test_base_and_far_nodes_do_not_move():
     base = moved([0.5, 0.3], some_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
     assert base.half_curl.any()  # the material on the base shears, and so turns
@@ -307,7 +307,7 @@ def test_nothing_moves_on_the_base_or_out_of_reach():
     assert not away.half_curl.any()
 
 
-def test_the_reach_leaves_out_displacements_below_half_a_percent():
+def test_displacement_beyond_the_reach_is_below_half_a_percent():
     for depth_m in DEPTHS_M:
         of = shear.tabulate_depth(float(depth_m), **SKIN)
         assert np.abs(of.parts[-1, :, :3]).max() < 0.005 * of.parts[..., 0].max()
@@ -315,7 +315,7 @@ def test_the_reach_leaves_out_displacements_below_half_a_percent():
 
 @settings(max_examples=10, deadline=None)  # a table takes 20 ms
 @given(st.floats(0.1, 10), st.floats(0.1, 10))
-def test_size_and_stiffness_scale_away(size, hardness):
+def test_scaling_of_size_and_stiffness(size, hardness):
     nodes_m = some_places_m(30)
     large = shear.tabulate_depth(size * 0.6e-3, thickness_m=size * H_M, tip_radius_m=size * TIP_M, base="bonded")
     here = moved([0.5, 0.2], nodes_m, centre_m=(0, 0))
@@ -332,7 +332,7 @@ def test_size_and_stiffness_scale_away(size, hardness):
 
 # the square of less than 1e-150 loses digits
 @given(st.floats(-20, 20).filter(lambda amount: amount == 0 or abs(amount) > 1e-150), st.floats(-np.pi, np.pi))
-def test_in_simple_shear_the_turning_is_the_one_of_the_polar_decomposition(amount, towards_rad):
+def test_rotation_equals_polar_decomposition_in_simple_shear(amount, towards_rad):
     ahead = np.array([np.cos(towards_rad), np.sin(towards_rad), 0.0])
     truth, _ = polar(np.eye(3) + amount * np.outer(ahead, [0, 0, 1]))
     half_curl = amount / 2 * np.array([[-ahead[1], ahead[0], 0]])
@@ -344,17 +344,17 @@ def test_in_simple_shear_the_turning_is_the_one_of_the_polar_decomposition(amoun
     assert np.linalg.norm(axis) == pytest.approx(1)
 
 
-def test_the_table_moves_the_traction_by_force_over_stiffness():
+def test_traction_moves_by_force_over_stiffness():
     traction = hertzian()
     of, r_m = shear.tabulate(traction, H_M), np.linspace(0, 1, 2000) * traction.radius_m
     surface_per_m = np.interp(r_m, of.r_m, of.parts[:, -1, 0])
     q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
     mean_per_m = np.trapezoid(2 * np.pi * r_m * q_per_m2 * surface_per_m, r_m)
-    assert mean_per_m == pytest.approx(1 / of.stiffness_m, rel=1e-3)  # waves that end at 0.3 mm
+    assert mean_per_m == pytest.approx(1 / of.stiffness_m, rel=1e-3)  # no waves below 0.3 mm
 
 
 def followed(force_N, nodes_m, of, steps_n):
-    """The force in many small steps, each where nodes and traction are by then; the centre rests at 0."""
+    """Apply the force in many small steps, updating nodes and traction; the centre rests at 0."""
     at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / of.stiffness_m
     for step_i in range(steps_n):
         centre_m = ahead_m * (step_i + 0.5) / steps_n
@@ -363,7 +363,7 @@ def followed(force_N, nodes_m, of, steps_n):
     return at_m - nodes_m
 
 
-def test_midpoint_steps_go_where_many_small_steps_go():
+def test_midpoint_steps_equal_many_small_steps():
     nodes_m, over = [0.5, 0.5, 1] * some_places_m(200), []
     for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):  # mu = 0.8, 0.4, 0.8; 1, 1, 2 steps
         of = shear.tabulate_depth(depth_m, **SKIN)
@@ -379,7 +379,7 @@ def test_midpoint_steps_go_where_many_small_steps_go():
     assert over[1] < over[0] / 3  # second order: 4, and the table's corners
 
 
-def test_a_small_force_needs_no_midpoint():
+def test_small_force_needs_no_midpoint():
     nodes_m = some_places_m()
     once, half_way = (moved([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps))
     size_m = np.abs(once.displacement_m).max()
@@ -387,7 +387,7 @@ def test_a_small_force_needs_no_midpoint():
     np.testing.assert_allclose(half_way.displacement_m, once.displacement_m, atol=2e-4 * size_m)
 
 
-def test_carrying_turns_with_the_force_and_leaves_the_base_alone():
+def test_carried_nodes_rotate_with_the_force():
     nodes_m, turn = some_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
     here = moved([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
     there = moved([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
@@ -397,7 +397,7 @@ def test_carrying_turns_with_the_force_and_leaves_the_base_alone():
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
-def test_the_table_knows_its_steepest_place(traction):
+def test_steepest_place_of_the_table(traction):
     of, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
     r_m, f = (part.ravel() for part in np.meshgrid(of.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)
@@ -405,7 +405,7 @@ def test_the_table_knows_its_steepest_place(traction):
     assert of.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: beside one of the table's
 
 
-def test_a_rim_above_the_thickness_moves_as_the_surface():
+def test_nodes_above_the_surface_move_with_it():
     rim_m = np.array([[2e-3, 1e-3, 1.1 * H_M], [2e-3, 1e-3, H_M]])
     rim, surface = moved([0.5, 0.2], rim_m).displacement_m
     np.testing.assert_array_equal(rim, surface)
@@ -414,7 +414,7 @@ def test_a_rim_above_the_thickness_moves_as_the_surface():
 @pytest.mark.parametrize(
     ("depth_m", "force_N", "loss"), [(0.6e-3, 0.5, 0.03), (0.6e-3, 0.59, 0.05), (0.8e-3, 1.0, 0.08)]
 )
-def test_midpoint_steps_keep_volume_where_one_linear_step_loses_several_times_as_much(depth_m, force_N, loss):
+def test_midpoint_steps_keep_volume(depth_m, force_N, loss):
     of, step_m = shear.tabulate_depth(depth_m, **SKIN), 20e-6
     sides_m = np.linspace(-3.5e-3, 3.5e-3, 36), np.linspace(0, 2.5e-3, 8), np.linspace(0.05, 0.95, 10) * H_M
     places_m = np.stack(np.meshgrid(*sides_m), axis=-1).reshape(-1, 3)
@@ -426,7 +426,7 @@ def test_midpoint_steps_keep_volume_where_one_linear_step_loses_several_times_as
         ]
         grad = np.moveaxis(np.array(ends[0]) - np.array(ends[1]), 0, -1) / (2 * step_m)
         losses.append(np.abs(np.linalg.det(np.eye(3) + grad) - 1))
-    assert losses[1].max() < loss  # the larger, the steeper; a step of the midpoint rule is good to second order
+    assert losses[1].max() < loss  # grows with steepness; midpoint steps are second order
     assert losses[0].max() > 4 * losses[1].max()
     assert losses[0].mean() > 4 * losses[1].mean()
 
@@ -450,6 +450,6 @@ def test_midpoint_steps_keep_volume_where_one_linear_step_loses_several_times_as
         ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.shear_in_steps)),
     ],
 )
-def test_impossible_drags_are_refused(what, of):
+def test_invalid_drags_are_refused(what, of):
     with pytest.raises(ParamsError, match=f"{what} must be"):
         of()

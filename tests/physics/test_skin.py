@@ -1,4 +1,4 @@
-"""The change of field under a poke: a naive loop as truth; quadrature, symmetry, no contact, amplitude as laws."""
+"""The change of field under a poke, compared with a naive loop; quadrature, symmetries, no contact, amplitude."""
 
 import numpy as np
 import pytest
@@ -21,9 +21,9 @@ SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
 PEAK_T = 1e-3  # size of the fields; tolerances are rounding relative to it
 COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)  # for laws that hold for any rule, and for draws
-DEPTH_M = 0.6e-3  # the laws of place hold at any depth; one depth is one table
+DEPTH_M = 0.6e-3  # one depth needs one table, and these laws hold at any depth
 places_m = st.floats(-8e-3, 8e-3)
-# No deadline: the first example tabulates the flow for all the others.
+# No deadline: the first example computes the tables for all others.
 patient = settings(max_examples=20, deadline=None)
 
 
@@ -60,7 +60,7 @@ def table_of(one, rest, depth_m):
     return deformation.tabulate(one.thickness_m, one.tip_radius_m, depth_m, heights=rest.heights, base=one.base)
 
 
-def turned_dipoles_in_a_loop(one, board, poke_m):
+def change_by_loop(one, board, poke_m):
     """The specification: for each node that moves, the difference of its field."""
     moved, total_T = moved_by(one, poke_m), np.zeros_like(board.chips_m)
     for i, place, after in zip(moved.i, *moved.after, strict=True):
@@ -77,13 +77,13 @@ def one_dipole(position, moment, chip):
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_a_poke_equals_the_loop_over_turned_dipoles(base):
+def test_poke_equals_loop_over_rotated_dipoles(base):
     one, poke_m = skin(UNEVEN, base=base), (1.1e-3, -2.3e-3, 0.7e-3)
-    truth_T = turned_dipoles_in_a_loop(one, BOARD, poke_m)
+    truth_T = change_by_loop(one, BOARD, poke_m)
     np.testing.assert_allclose(change(poke_m, one), truth_T, atol=1e-12 * PEAK_T)
 
 
-def test_material_under_the_tips_flank_leans_as_the_dent_does():
+def test_material_leans_towards_the_dent():
     # Beside the tip the surface falls towards the axis: an arrow that points up leans inwards, over the dent.
     one = skin()
     moved = moved_by(one, (0.0, 0.0, DEPTH_M))
@@ -100,7 +100,7 @@ def test_material_under_the_tips_flank_leans_as_the_dent_does():
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.2e-3, 1.0e-3])
-def test_cells_half_as_wide_change_a_poke_by_less_than_2_percent_and_more_layers_by_half_a_percent(depth_m, base):
+def test_quadrature_error(depth_m, base):
     # Compares dB, not the field at rest; the pattern is shifted, so that no symmetry hides errors. For a shallow
     # indentation over a seam 2 % is below the resolution of a chip: there the bound is a tenth of its noise, 3.3 uT.
     rules = (
@@ -113,7 +113,7 @@ def test_cells_half_as_wide_change_a_poke_by_less_than_2_percent_and_more_layers
     assert not broken(mechanics.quadrature(BOARD, used, tuple(fine), rules=rules, pokes_m=pokes_m, unseen_uT=0.33))
 
 
-def test_without_the_rotation_of_the_moments_the_change_would_be_wrong_by_more_than_itself():
+def test_rotation_of_moments_matters():
     # 156-242 % over indentations of the grid: moments are rotated, R.M, not only moved
     one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
@@ -125,14 +125,14 @@ def test_without_the_rotation_of_the_moments_the_change_would_be_wrong_by_more_t
     assert np.sum(wrong) > np.sum(size)
 
 
-def test_the_field_at_rest_is_the_loop_over_dipoles():
+def test_field_at_rest_equals_loop_over_dipoles():
     one = skin(UNEVEN)
     truth_T = sum(one_dipole(n, m, BOARD.chips_m[3]) for n, m in zip(one.nodes_m, one.moments_A_m2, strict=True))
     rest_T, _ = changes_of_field(BOARD, one, np.zeros((0, 3)))
     np.testing.assert_allclose(rest_T[3], truth_T, atol=1e-12 * PEAK_T)
 
 
-def test_the_change_is_what_two_large_sums_differ_by():
+def test_change_equals_difference_of_sums():
     one, poke_m = skin(UNEVEN), (1.1e-3, -2.3e-3, 1e-3)
     moved = moved_by(one, poke_m)
     places_m, moments = one.nodes_m.copy(), one.moments_A_m2.copy()
@@ -143,7 +143,7 @@ def test_the_change_is_what_two_large_sums_differ_by():
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
-def test_extreme_skins_and_pokes_end_as_they_should(base):
+def test_extreme_skins_and_pokes(base):
     usual, again, renamed = (skin(UNEVEN, name, base=base) for name in ("s7", "s7", "s8"))
     soft, hard = (skin(UNEVEN, "s7", base=base, modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))
     bare, strong = (skin(UNEVEN, "s7", base=base, saturation_T=times * 0.11) for times in (0, 5))
@@ -157,25 +157,25 @@ def test_extreme_skins_and_pokes_end_as_they_should(base):
 
 @patient
 @given(places_m, places_m, st.sampled_from(["checkerboard", "same"]), st.sampled_from(["bonded", "slipping"]))
-def test_turning_mirroring_and_shifting_board_and_poke_does_so_to_the_change(x_m, y_m, polarity, base):
+def test_symmetries_of_board_and_poke(x_m, y_m, polarity, base):
     even = skin(polarity=polarity, base=base)
     assert not broken(mechanics.symmetries(BOARD, even, polarity, np.array([[x_m, y_m]])))
 
 
 @patient
 @given(places_m, places_m, st.floats(0.01, 5))
-def test_the_change_is_proportional_to_the_magnetisation(x_m, y_m, factor):
+def test_change_is_proportional_to_magnetisation(x_m, y_m, factor):
     skins, pokes_m = (skin(saturation_T=size_T) for size_T in (0.1, 0.1 * factor)), np.array([[x_m, y_m, DEPTH_M]])
     assert mechanics.amplitude(BOARD, *skins, pokes_m=pokes_m, factor=factor).holds
 
 
-def test_a_tip_that_starts_too_high_makes_no_contact_at_a_shallow_command():
+def test_high_tip_makes_no_contact():
     high = next(s for s in (skin(UNEVEN, f"s{i}", SPARSE) for i in range(50)) if s.depth_zero_m < -0.05e-3)
     assert not change((0.0, 0.0, 0.05e-3), high).any()
 
 
-def test_the_pattern_sits_where_the_skin_does_and_the_poke_where_the_board_says():
-    # A skin off its place sees the poke elsewhere: shifting it is poking it, and sensing it, from the other side.
+def test_offsets_of_skin_and_poke():
+    # Shifting the skin is equivalent to shifting poke and sensors the other way.
     exact, seated = skin(), skin(SEATED)
     assert np.abs(seated.seat_m).min() > 0
     there_m = np.append(seated.seat_m, 0.0)
@@ -186,7 +186,7 @@ def test_the_pattern_sits_where_the_skin_does_and_the_poke_where_the_board_says(
     assert np.abs(found - change((2e-3, 1e-3, DEPTH_M))).max() > 1e-3 * PEAK_T
 
 
-def test_far_from_its_edges_a_skin_is_as_one_that_is_wider_still():
+def test_wider_skin_changes_nothing_far_from_its_edges():
     # 8 cubes and 12, both even, so that the same poles stand over the chips; 25 mm and more from the nearer edge.
     wide, wider = (
         draw_skin(design(), EXACT, seed=0, name="s0", rule=COARSE, sides_m=(side_m, side_m))
@@ -195,12 +195,12 @@ def test_far_from_its_edges_a_skin_is_as_one_that_is_wider_still():
     poke_m = (1.3e-3, -2.1e-3, DEPTH_M)
     once_T, again_T = change(poke_m, wide), change(poke_m, wider)
     # Only the magnets past the edge act there; they alternate, so that their fields nearly cancel. On the authors'
-    # 20 mm, whose outer chips lie 3 mm from an edge, the same poke is told from one on an endless skin.
+    # 20 mm, whose outer chips lie 3 mm from an edge, the same poke differs from one on an infinite skin.
     assert np.linalg.norm(once_T - again_T) < 1e-4 * np.linalg.norm(again_T)
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
 
-def test_a_skin_takes_pokes_up_to_its_own_edges():
+def test_pokes_are_accepted_up_to_the_edges():
     large = draw_skin(design(), EXACT, seed=0, name="s0", rule=SPARSE, sides_m=(50.8e-3, 101.6e-3))
     assert np.isfinite(change((25.3e-3, -50.7e-3, DEPTH_M), large)).all()
     for place_m in ((25.5e-3, 0.0), (0.0, -50.9e-3)):
@@ -208,7 +208,7 @@ def test_a_skin_takes_pokes_up_to_its_own_edges():
             change((*place_m, DEPTH_M), large)
 
 
-def test_many_pokes_are_what_each_poke_is_alone_to_the_last_bit():
+def test_many_pokes_equal_single_pokes():
     pokes_m = np.array([[0.0, 0.0, 1.1e-3], [3e-3, -8e-3, 0.23e-3], [1e-3, 1e-3, 0.0]])
     _, together = changes_of_field(BOARD, skin(), pokes_m)
     for poke_m, of_many in zip(pokes_m, together, strict=True):
@@ -224,7 +224,7 @@ def test_many_pokes_are_what_each_poke_is_alone_to_the_last_bit():
         ("slipping", 2.0, 0.0, 0.003),
     ],
 )
-def test_tables_give_the_change_that_following_every_node_gives(thickness_mm, at, error, base):
+def test_tables_equal_following_nodes(thickness_mm, at, error, base):
     # 1.82 mm lies halfway between two tables. At the tables' depths: what interpolating in R/h and r costs. Between
     # them 0.6 %: following ends there with half a step, and half steps change dB by as much themselves (flow.STEP).
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
@@ -245,7 +245,7 @@ def test_tables_give_the_change_that_following_every_node_gives(thickness_mm, at
         assert np.linalg.norm(change(poke_m, one) - truth_T) < error * np.linalg.norm(truth_T)
 
 
-def test_over_many_skins_the_draws_have_the_spreads_that_are_stated():
+def test_draws_have_the_given_spreads():
     skins = [skin(UNEVEN, f"s{i}", SPARSE) for i in range(100)]
     # 25 %: three and a half times the sampling error 1 / sqrt(2 n) of 100 skins
     assert np.std([one.seat_m for one in skins]) == pytest.approx(0.25e-3, rel=0.25)
@@ -255,7 +255,7 @@ def test_over_many_skins_the_draws_have_the_spreads_that_are_stated():
     assert np.std(np.log([one.modulus_Pa for one in skins])) == pytest.approx(0.1, rel=0.25)
 
 
-def test_filler_and_amplitude_scale_the_moments_by_their_spreads():
+def test_filler_and_amplitude_scale_the_moments():
     # One layer has its nodes at half height, where the field vanishes at seam crossings but not at these middles.
     exact = np.linalg.norm(skin(rule=SPARSE).moments_A_m2, axis=1)
     for spread, within in ((no_spread(skin_amplitude=0.1), False), (no_spread(skin_filler=0.1), True)):
@@ -265,31 +265,31 @@ def test_filler_and_amplitude_scale_the_moments_by_their_spreads():
         assert (np.std(factors, axis=1).min() > 0.01) == within
 
 
-def test_the_field_at_rest_lies_in_the_plane_and_is_as_strong_as_a_recorded_one():
+def test_field_at_rest_has_the_recorded_magnitude():
     # Recorded B0 in-plane up to 3.6 mT; a factor of two, since the amplitude is one number for all skins.
     rest_T, _ = changes_of_field(BOARD, skin(rule=DEFAULT_QUADRATURE), np.zeros((0, 3)))
     assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
 
 
-def test_a_skin_that_slides_is_softer_and_is_felt_where_a_bonded_one_is_not():
+def test_slipping_skin_is_softer_and_reaches_farther():
     bonded, slipping = skin(), skin(base="slipping")
     assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))  # 1.8 times at 1.2 mm
     far = [np.linalg.norm(change((-8e-3, 0.0, 1e-3), one)[3]) for one in (bonded, slipping)]  # chip 3, 15 mm away
     assert far[1] > 10 * far[0]
 
 
-def test_the_force_at_the_deepest_poke_is_that_of_the_specification():
+def test_force_of_the_specification():
     assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)  # known to two digits
 
 
 @pytest.mark.parametrize("place_m", [(10.1e-3, 0.0), (0.0, -12e-3), (np.nan, 0.0)])
-def test_a_poke_beside_the_skin_is_refused(place_m):
+def test_poke_beside_the_skin_is_refused(place_m):
     with pytest.raises(ParamsError, match="skin s0: poke must be on the skin, within 10 and 10 mm of its middle"):
         change((*place_m, DEPTH_M))
 
 
-def test_the_edge_is_the_skins_and_not_the_boards():
+def test_edge_is_that_of_the_skin():
     one = skin(SEATED)
     corner_m = np.append(one.seat_m + np.sign(one.seat_m) * 9.99e-3, 0.0)
     assert np.abs(corner_m).max() > 10e-3
@@ -299,12 +299,12 @@ def test_the_edge_is_the_skins_and_not_the_boards():
 
 
 @pytest.mark.parametrize("depth_m", [2.5e-3, np.nan])
-def test_a_poke_through_the_skin_or_of_no_depth_is_refused(depth_m):
+def test_invalid_depth_is_refused(depth_m):
     with pytest.raises(ParamsError, match="depth"):
         change((0.0, 0.0, depth_m))
 
 
-def test_depths_past_what_is_verified_are_counted_from_where_the_skin_begins():
+def test_unverified_depths_are_counted():
     one = skin()
     high, low = (type(one)(**{**one.__dict__, "depth_zero_m": zero_m}) for zero_m in (-0.1e-3, 0.1e-3))
     depths_m = np.array([0.6, 1.15, 1.25]) * 1e-3  # verified to 1.2 mm of true depth
@@ -318,7 +318,7 @@ def held(spread=UNEVEN, **changes):
     return skin(spread, base="slipping", hold=HELD | changes)
 
 
-def test_a_held_skin_is_the_free_one_slid_as_one_and_without_slide_the_free_one():
+def test_held_skin_slides_rigidly():
     one, free = skin(UNEVEN, base="slipping", hold=HELD, modulus_kPa=30), skin(UNEVEN, base="slipping")
     poke_m = np.array([[3e-3, -2e-3, 0.7e-3]])
     [(_, _, free_m)] = moved_dipoles(free, poke_m)
@@ -327,7 +327,7 @@ def test_a_held_skin_is_the_free_one_slid_as_one_and_without_slide_the_free_one(
     assert np.abs(apart_m[:, 2]).max() == 0
     distance_m = np.linalg.norm(held_m[0][:50, None] - held_m[0][50:100], axis=2)
     np.testing.assert_allclose(distance_m, np.linalg.norm(free_m[0][:50, None] - free_m[0][50:100], axis=2), rtol=1e-9)
-    # At the place of the poke it is taken by give - away (1 - load) p, p from the middle, as far as friction holds.
+    # The skin at the poke moves by give - away (1 - load) p, with p from the middle, limited by friction.
     away_m, depth_m = poke_m[0, :2] - one.seat_m, poke_m[0, 2:]
     (normal_N,) = forces(one, depth_m)
     taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / one.modulus_Pa / 40e-6) * away_m
@@ -340,7 +340,7 @@ def test_a_held_skin_is_the_free_one_slid_as_one_and_without_slide_the_free_one(
     np.testing.assert_array_equal(change(poke_m[0], still), change(poke_m[0], free))
 
 
-def test_force_on_a_held_skin_stiffens_as_it_thins_and_the_modulus_decides_the_grip_alone():
+def test_force_on_a_held_skin():
     one, free = held(EXACT), skin(base="slipping")
     depth_m = np.array([0.4e-3, 1.0e-3])
     stiffer = (1 - depth_m / one.thickness_m) ** -1.5
@@ -349,12 +349,12 @@ def test_force_on_a_held_skin_stiffens_as_it_thins_and_the_modulus_decides_the_g
     assert not broken(stability.modulus(BOARD, held(), soft, hard))
 
 
-def test_a_bonded_skin_is_not_held():
+def test_bonded_skin_is_not_held():
     with pytest.raises(ValueError, match="hold is of a skin that slides"):
         skin(base="bonded", hold=HELD)
 
 
-def test_a_turned_skin_senses_what_a_turned_board_does():
+def test_rotated_skin_equals_rotated_board():
     turned = skin(EXACT.model_copy(update={"skin_rotation_deg": 5.0}), base="slipping")
     first = skin(base="slipping").nodes_m
     angle = np.arctan2(turned.nodes_m[0, 1], turned.nodes_m[0, 0]) - np.arctan2(first[0, 1], first[0, 0])

@@ -1,4 +1,4 @@
-"""The slide of a finite skin: least drag piece by piece, closed forms on a square, nothing where nothing is taken."""
+"""The slide of a finite skin: least drag over pieces, closed forms on a square, no slide without a force."""
 
 import numpy as np
 import pytest
@@ -22,8 +22,8 @@ def one(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
     return found.move_m[0], float(found.spin_rad[0])
 
 
-def dragged(pieces_n, sides_m):
-    """Piece by piece: the matrix of the drag that a motion (f_x, f_y, theta) does, as a loop."""
+def drag_matrix(pieces_n, sides_m):
+    """Reference: the matrix of the drag of a motion (f_x, f_y, theta), summed over pieces."""
     drag = np.zeros((3, 3))
     for i in range(pieces_n):
         for j in range(pieces_n):
@@ -34,18 +34,18 @@ def dragged(pieces_n, sides_m):
 
 
 @pytest.mark.parametrize("sides_m", [SQUARE, (20e-3, 50e-3)])
-def test_the_motion_is_that_of_the_least_drag_over_all_pieces(sides_m):
+def test_motion_minimises_the_drag(sides_m):
     place_m, taken_m = np.array([6e-3, -3e-3]), np.array([4e-5, 7e-5])
     # Least drag with the place taken so far: Lagrange's equations. 80 pieces along a side miss rho^2 by 1/80^2.
     held = np.array([[1, 0, -place_m[1]], [0, 1, place_m[0]]])
-    equations = np.block([[dragged(80, sides_m), held.T], [held, np.zeros((2, 2))]])
+    equations = np.block([[drag_matrix(80, sides_m), held.T], [held, np.zeros((2, 2))]])
     *expected, spin_rad = np.linalg.solve(equations, np.append(np.zeros(3), taken_m))[:3]
     move_m, found_rad = one(place_m, taken_m, sides_m)
     np.testing.assert_allclose(move_m, expected, rtol=1e-3)
     np.testing.assert_allclose(found_rad, spin_rad, rtol=1e-3)
 
 
-def test_on_a_square_a_pull_across_at_the_edge_is_one_of_two_and_a_half_parts_slide():
+def test_pull_at_the_edge_of_a_square():
     # p = (L/2, 0), D along y: f = D / (1 + (L/2)^2 / (L^2/6)) = D / 2.5, theta = 6 f (L/2) / L^2 = 3 f / L.
     move_m, spin_rad = one((SIDE_M / 2, 0.0), (0.0, 1e-4))
     np.testing.assert_allclose(move_m, (0.0, 1e-4 / 2.5), rtol=1e-12)
@@ -53,14 +53,14 @@ def test_on_a_square_a_pull_across_at_the_edge_is_one_of_two_and_a_half_parts_sl
 
 
 @given(place, taken)
-def test_the_place_goes_as_far_as_it_is_taken(place_m, taken_m):
+def test_place_moves_by_the_given_displacement(place_m, taken_m):
     move_m, spin_rad = one(place_m, taken_m)
     x, y = place_m
     np.testing.assert_allclose(move_m + spin_rad * np.array([-y, x]), taken_m, atol=1e-18, rtol=1e-12)
 
 
 @given(place, taken)
-def test_a_square_turned_by_a_quarter_turns_its_motion_and_a_pull_along_the_radius_spins_nothing(place_m, taken_m):
+def test_quarter_turn_and_radial_pull(place_m, taken_m):
     (move_m, spin_rad), quarter = one(place_m, taken_m), np.array([[0, -1], [1, 0]])
     turned_m, turned_rad = one(quarter @ place_m, quarter @ taken_m)
     np.testing.assert_allclose(turned_m, quarter @ move_m, atol=1e-18, rtol=1e-12)
@@ -68,7 +68,7 @@ def test_a_square_turned_by_a_quarter_turns_its_motion_and_a_pull_along_the_radi
     assert one(place_m, 0.01 * np.array(place_m))[1] == pytest.approx(0, abs=1e-17)
 
 
-def test_material_goes_away_from_the_middle_less_under_more_force_and_with_the_arm():
+def test_displacement_follows_force_and_distance():
     places_m = np.array([[4e-3, 0.0]] * 3)
     found_m = slide.press_displacement_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
     # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the load that lets go.
@@ -76,7 +76,7 @@ def test_material_goes_away_from_the_middle_less_under_more_force_and_with_the_a
 
 
 @given(place, st.floats(1e3, 1e5))
-def test_a_force_slides_a_skin_as_far_as_the_same_motion_asks_for(place_m, springs_N_per_m):
+def test_force_and_motion_agree(place_m, springs_N_per_m):
     # Springs spread evenly: the force moves by f / springs, and spins by its moment over springs rho^2 (a loop's sum).
     force_N, (x, y) = np.array([0.7, -0.4]), place_m
     taken_m = slide.compliance_m_per_N(np.array([place_m]), SQUARE, springs_N_per_m)[0] @ force_N
@@ -87,8 +87,8 @@ def test_a_force_slides_a_skin_as_far_as_the_same_motion_asks_for(place_m, sprin
 
 
 @given(place, taken, st.floats(1e-6, 20.0))
-@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # a force over it overflows
-def test_friction_bounds_a_slide_in_the_direction_that_it_has(place_m, taken_m, force_N):
+@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # dividing a force by it overflows
+def test_friction_bounds_the_slide(place_m, taken_m, force_N):
     hold = slide.HoldDesign(**HELD).in_si()
     whole = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), SQUARE)
     found = slide.limit_by_friction(whole, np.array([force_N]), hold.grip_N_per_m)
@@ -103,7 +103,7 @@ def test_friction_bounds_a_slide_in_the_direction_that_it_has(place_m, taken_m, 
         np.testing.assert_allclose(found.spin_rad, share * whole.spin_rad, rtol=1e-9, atol=1e-20)
 
 
-def test_a_firm_press_takes_the_whole_slide_and_none_takes_none():
+def test_firm_press_takes_the_whole_slide():
     whole = slide.RigidMotion(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
     for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
         found = slide.limit_by_friction(whole, np.full(2, force_N), 8750.0)
@@ -111,7 +111,7 @@ def test_a_firm_press_takes_the_whole_slide_and_none_takes_none():
         np.testing.assert_array_equal(found.spin_rad, share * whole.spin_rad)
 
 
-def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit():
+def test_zero_slide_keeps_the_slipping_flow():
     rng = np.random.default_rng(0)
     heights = (0.2, 0.8)
     nodes_m = np.column_stack([rng.uniform(-8e-3, 8e-3, (60, 2)), H_M * rng.choice(heights, 60)])
@@ -129,7 +129,7 @@ def test_without_give_and_slide_the_sliding_flow_is_what_it_was_to_the_last_bit(
     )
 
 
-def test_every_dipole_turns_about_the_middle_and_moves_as_a_loop_says():
+def test_dipoles_rotate_about_the_middle():
     rng = np.random.default_rng(1)
     nodes_m, moments = rng.normal(0, 5e-3, (7, 3)), rng.normal(0, 1e-6, (7, 3))
     motion = slide.RigidMotion(np.array([[0.0, 0.0], [3e-5, -2e-5]]), np.array([0.0, 0.2]))
@@ -148,13 +148,13 @@ TIP = {"thickness_m": H_M, "tip_radius_m": 2e-3}
 
 
 @given(st.floats(0, 0.71 * H_M), st.floats(1e5, 1e7))
-def test_the_depth_of_a_force_is_the_depth_that_gives_it(depth_m, modulus_Pa):
+def test_depth_inverts_force(depth_m, modulus_Pa):
     of = TIP | {"modulus_Pa": modulus_Pa}
     found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **of), **of)
     assert abs(found_m[0] - depth_m) < 1e-6 * H_M
 
 
-def test_force_begins_as_hertz_has_it_and_has_no_end_as_the_layer_is_used_up():
+def test_force_limits():
     of = TIP | {"modulus_Pa": 2e5}
     np.testing.assert_allclose(  # incompressible: 4/3 E / (1 - 1/4) sqrt(R) d^(3/2)
         slide.force_at(np.array([0.0, 1e-9]), **of), [0, 16 / 9 * 2e5 * np.sqrt(2e-3) * 1e-9**1.5], rtol=2e-3
@@ -171,7 +171,7 @@ def test_force_begins_as_hertz_has_it_and_has_no_end_as_the_layer_is_used_up():
         slide.depth_at(np.array([1.0]), **(of | {"modulus_Pa": 0.0}))
 
 
-def test_a_tip_sharper_than_the_layer_is_thick_is_followed_to_its_own_radius():
+def test_sharp_tip_is_limited_by_its_radius():
     of = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
     assert slide.depth_at(np.array([0.1]), **of)[0] < 0.5e-3
     assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(0.999 * 0.5e-3)

@@ -1,4 +1,4 @@
-"""The slipping layer against a dense solve in 50 digits; limits, volume, and the bonded layer beside it."""
+"""The slipping layer compared with a dense solve in 50 digits; limits, volume, and the bonded layer."""
 
 import mpmath
 import numpy as np
@@ -15,7 +15,7 @@ waves_kh = st.floats(0.01, 30)
 
 @settings(max_examples=20, deadline=None)
 @given(waves_kh, st.floats(0.05, 0.95))
-def test_profile_and_compliance_are_those_of_a_dense_solve(kh, share):
+def test_profile_and_compliance_equal_dense_solve(kh, share):
     with mpmath.workdps(50):
         w, z = mechanics.dense_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
         truth = [float(mpmath.diff(w, z, n)) for n in range(3)]
@@ -26,42 +26,42 @@ def test_profile_and_compliance_are_those_of_a_dense_solve(kh, share):
 
 
 @given(st.floats(1e-3, 300))
-def test_the_base_keeps_its_height_and_feels_no_shear_and_the_surface_none_either(kh):
+def test_base_and_surface_are_free_of_shear(kh):
     g, _, bend = layer.depth_profile(np.array([[0.0], [kh]]), np.array([kh]), "slipping")
     assert g[0, 0] == 0.0
     np.testing.assert_allclose((g + bend)[:, 0], 0.0, atol=1e-12 * max(1.0, float(np.abs(bend).max())))
     np.testing.assert_allclose(g[1], layer.slipping_compliance(np.array([kh])), rtol=1e-9)
 
 
-def test_long_waves_sink_by_half_their_kh_and_short_ones_as_in_a_half_space():
+def test_compliance_limits():
     found = layer.slipping_compliance(np.array([0.0, 1e-6, 1e-3, 20.0, 1e4, 1e150]))
     # next term: (kh)^3 / 6 and smaller
     np.testing.assert_allclose(found, [0, 5e-7, 5e-4, 1, 1, 1], rtol=1e-6)
 
 
-def test_far_away_a_sliding_skin_moves_outward_as_one_and_a_held_one_does_not():
+def test_far_motion_of_slipping_and_bonded_skins():
     under = layer.contact_of_depth(0.2e-3, **SKIN, base="slipping")
     r_m, z_m = np.repeat([8e-3, 12e-3], 3), np.tile([0.0, 1e-3, 2e-3], 2)
     far = layer.displacement(r_m, z_m, layer.waves(under, SKIN["thickness_m"], "slipping"))
     volume_m3 = 2 * np.pi * r_m * SKIN["thickness_m"] * far.r_m
-    # Nothing is lost: what the tip pushes aside passes every circle, evenly over the thickness.
+    # Volume is conserved: the displaced volume passes every circle, evenly over the thickness.
     np.testing.assert_allclose(volume_m3, volume_m3.mean(), rtol=0.01)  # 0.01: waves exp(-pi r / h) are left at 4 h
     assert volume_m3.mean() > 0
     bonded = layer.contact_of_depth(0.2e-3, **SKIN, base="bonded")
     held = layer.displacement(r_m, z_m, layer.waves(bonded, SKIN["thickness_m"], "bonded"))
-    # At the surface, half as far again: a sliding skin moves two thirds as much, a held one less than a quarter.
+    # At the surface, half as far again: a slipping skin moves two thirds as much, a bonded one less than a quarter.
     assert far.r_m[5] == pytest.approx(far.r_m[2] * 2 / 3, rel=0.01)
     assert held.r_m[5] < held.r_m[2] / 4
 
 
-def test_on_a_thick_layer_the_base_does_not_matter():
+def test_base_does_not_matter_on_a_thick_layer():
     depth_m = np.array([0.1e-3])
     deep = {"thickness_m": 0.5, "tip_radius_m": 3e-3, "modulus_Pa": 190e3}
     sliding, held = (layer.force(depth_m, **deep, base=base) for base in ("slipping", "bonded"))
     np.testing.assert_allclose(sliding, held, rtol=0.005)  # chi = sqrt(R d) / h = 1e-3, times 1.1
 
 
-def test_on_the_skin_a_sliding_base_takes_1_8_off_the_force():
+def test_slipping_base_is_1_8_times_softer():
     at = {**SKIN, "modulus_Pa": 190e3}
     held, sliding = (layer.force(np.array([1.2e-3]), **at, base=base) for base in ("bonded", "slipping"))
     assert held / sliding == pytest.approx(1.8, abs=0.05)  # a factor of 1.8, known to two digits
@@ -69,6 +69,6 @@ def test_on_the_skin_a_sliding_base_takes_1_8_off_the_force():
 
 @given(st.floats(0.05, 0.55))
 @settings(max_examples=20, deadline=None)
-def test_a_held_base_is_always_harder_than_a_sliding_one(relative_depth):
+def test_bonded_base_is_always_harder(relative_depth):
     depth_m, at = np.array([relative_depth * 2e-3]), {**SKIN, "modulus_Pa": 190e3}
     assert layer.force(depth_m, **at, base="bonded") > layer.force(depth_m, **at, base="slipping")
