@@ -28,7 +28,7 @@ def check_protocols(simulation: SimulationSettings, where: str) -> None:
     """Raise ParamsError, which names `where`, if an experiment cannot read one of the protocols."""
     main = simulation.main.boards
     if simulation.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
-        raise ParamsError(f"{where}: skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}. Mend it there.")
+        raise ParamsError(f"{where}: skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}. Correct it there.")
     for name, protocol in simulation.protocols.items():
         kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
         faults = {
@@ -38,7 +38,7 @@ def check_protocols(simulation: SimulationSettings, where: str) -> None:
             f"skins_n is 1, as its experiment reads one skin, not {skins_n}": name in OF_ONE_SKIN and skins_n != 1,
         }
         for fault in (rule for rule, is_broken in faults.items() if is_broken):
-            raise ParamsError(f"{where}: protocol {name}: {fault}. Mend it there.")
+            raise ParamsError(f"{where}: protocol {name}: {fault}. Correct it there.")
 
 
 def load_protocol(settings: Settings, protocol: str) -> Load:
