@@ -34,10 +34,10 @@ SCHEDULE = Schedule(steps_n=STEPS_N, batch_n=128, rate_max=3e-3, gradient_norm_m
 
 
 def digest(arrays: Iterable[np.ndarray]) -> str:
-    found = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for array in arrays:
-        found.update(array.tobytes())
-    return found.hexdigest()[:16]
+        sha256.update(array.tobytes())
+    return sha256.hexdigest()[:16]
 
 
 def paper_networks() -> str:

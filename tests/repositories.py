@@ -4,12 +4,12 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
-WHO = ("-c", "user.name=rig", "-c", "user.email=rig@example.org", "-c", "commit.gpgsign=false")
+AUTHOR = ("-c", "user.name=rig", "-c", "user.email=rig@example.org", "-c", "commit.gpgsign=false")
 
 
-def git(folder: Path, *words: str) -> str:
-    done = subprocess.run(["git", *WHO, "-C", str(folder), *words], capture_output=True, text=True, check=True)
-    return done.stdout.strip()
+def git(folder: Path, *arguments: str) -> str:
+    result = subprocess.run(["git", *AUTHOR, "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
+    return result.stdout.strip()
 
 
 def commit(folder: Path, files: Mapping[str, bytes]) -> str:

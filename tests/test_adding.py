@@ -1,4 +1,4 @@
-"""Adding recordings as a user does: it works, or it is refused in one sentence and leaves nothing behind."""
+"""Tests of adding recordings: the result, or a one-line error without leftover files."""
 
 import shutil
 from pathlib import Path
@@ -33,7 +33,7 @@ from tests.universal.skins import fields_uT
 
 @pytest.fixture(scope="module")
 def empty(tmp_path_factory) -> Path:
-    """A checkout that runs no scene yet."""
+    """Return a checkout without running scenes."""
     root = copy_checkout(tmp_path_factory.mktemp("checkout"))
     plan.use(root, [])
     with (root / SCENES / "small.yaml").open("w") as stream:
@@ -56,8 +56,8 @@ def labels(board: str = "board1", skin: str = "skin1", name: str | None = None) 
     return CaptureNames(board, skin, name)
 
 
-def add_lab(root: Path, file: Path, *, allow_copy: bool = False, **words: str):
-    return add.add(root, "small", preparing.foreign(file, "lab", labels(**words), {}), allow_copy=allow_copy)
+def add_lab(root: Path, file: Path, *, allow_copy: bool = False, **arguments: str):
+    return add.add(root, "small", preparing.foreign(file, "lab", labels(**arguments), {}), allow_copy=allow_copy)
 
 
 def contents(root: Path) -> dict[str, bytes]:
@@ -67,15 +67,15 @@ def contents(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in found if "__pycache__" not in str(path)}
 
 
-def refuse(root: Path, act, sentence: str) -> None:
+def assert_refused(root: Path, attempt, message: str) -> None:
     before = contents(root)
-    with pytest.raises(ReskinError, match=sentence) as caught:
-        act()
+    with pytest.raises(ReskinError, match=message) as caught:
+        attempt()
     assert "\n" not in str(caught.value)
     assert contents(root) == before
 
 
-def test_a_recording_that_was_added_is_tracked_registered_and_planned(root, lab_file):
+def test_added_recording_is_tracked_registered_and_planned(root, lab_file):
     header = add_lab(root, lab_file)
     assert header.capture == "board1_skin1_readings"
     assert (root / "data/raw/small/board1_skin1_readings.dvc").exists()
@@ -89,32 +89,32 @@ def test_a_recording_that_was_added_is_tracked_registered_and_planned(root, lab_
 
 
 @pytest.mark.parametrize("found", ["Against the scene, chips 1 and 2 are exchanged.", None, CaptureError("no places")])
-def test_what_departs_from_section_compare_is_a_warning_and_no_refusal(root, lab_file, monkeypatch, capsys, found):
+def test_departure_from_section_compare_is_a_warning(root, lab_file, monkeypatch, capsys, found):
     def departure(*_: object) -> str | None:
         if isinstance(found, CaptureError):
             raise found
         return found
 
     monkeypatch.setattr("pipeline.experiments.compare.find_departure", departure)
-    words = recorded()
-    words["experiments"] = [*words["experiments"], "compare"]
-    words["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
+    arguments = recorded()
+    arguments["experiments"] = [*arguments["experiments"], "compare"]
+    arguments["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
     with (root / SCENES / "small.yaml").open("w") as stream:
-        YAML().dump(words, stream)
+        YAML().dump(arguments, stream)
     add_lab(root, lab_file)
     assert "board1_skin1_readings" in read_registry(root).captures["small"]
-    said = capsys.readouterr().err
-    assert ("warning: capture board1_skin1_readings: " in said) == (found is not None)
-    assert str(found or "") in said
+    output_of = capsys.readouterr().err
+    assert ("warning: capture board1_skin1_readings: " in output_of) == (found is not None)
+    assert str(found or "") in output_of
 
 
-def test_a_scene_without_section_compare_is_held_against_nothing(root, lab_file, monkeypatch, capsys):
-    monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("was asked"))
+def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypatch, capsys):
+    monkeypatch.setattr("pipeline.experiments.compare.find_departure", lambda *_: pytest.fail("was called"))
     add_lab(root, lab_file)
     assert "warning" not in capsys.readouterr().err
 
 
-def test_places_that_lie_otherwise_than_those_of_other_captures_are_a_warning(root, tmp_path, lab_file, capsys):
+def test_exchanged_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
     columns = table.columns_of(5)
     for i, exchanged in enumerate((False, True)):
         places_mm = rng_for(i, "places").uniform(0, 16, (40, 2)).round(2)
@@ -130,54 +130,54 @@ def test_places_that_lie_otherwise_than_those_of_other_captures_are_a_warning(ro
         assert ("other captures only with x and y exchanged" in capsys.readouterr().err) == exchanged
 
 
-def test_the_same_recording_twice_is_refused_and_another_label_needs_a_word(root, lab_file):
+def test_duplicates_are_refused_unless_allowed(root, lab_file):
     add_lab(root, lab_file)
-    refuse(root, lambda: add_lab(root, lab_file), "the name .* is taken in this scene")
-    refuse(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
-    refuse(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
-    refuse(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the readings of")
+    assert_refused(root, lambda: add_lab(root, lab_file), "the name .* is taken in this scene")
+    assert_refused(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
+    assert_refused(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
+    assert_refused(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the readings of")
     add_lab(root, lab_file, board="board2", skin="skin2", allow_copy=True)
     assert len(plan.check(root).stages["ingest"]) == 2
 
 
-def test_a_copy_written_with_a_digit_more_is_still_a_copy(root, lab_file, tmp_path):
+def test_copy_with_other_formatting_is_a_copy(root, lab_file, tmp_path):
     add_lab(root, lab_file)
     (tmp_path / "copy.csv").write_text(lab_file.read_text().replace("21.5,", "21.50,"))
-    refuse(root, lambda: add_lab(root, tmp_path / "copy.csv", board="board2", skin="skin2"), "--allow-copy")
+    assert_refused(root, lambda: add_lab(root, tmp_path / "copy.csv", board="board2", skin="skin2"), "--allow-copy")
 
 
-def test_a_removal_that_cannot_be_planned_changes_nothing(root, lab_file):
+def test_failed_removal_changes_nothing(root, lab_file):
     add_lab(root, lab_file)
     file = root / PLAN
     file.write_text(file.read_text().replace("  small: [lobo]\n", "  small: [lobo]\n  nowhere: [lobo]\n", 1))
-    refuse(root, lambda: add.remove(root, "small", "board1_skin1_readings"), "nowhere")
+    assert_refused(root, lambda: add.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
 
-def test_what_a_killed_add_left_is_told_from_a_capture(root, lab_file):
+def test_leftovers_of_a_killed_add_are_an_error(root, lab_file):
     (root / "data/raw/small/board1_skin1_readings").mkdir(parents=True)
-    refuse(root, lambda: add_lab(root, lab_file), "an add was killed there")
+    assert_refused(root, lambda: add_lab(root, lab_file), "an add was killed there")
 
 
-def test_errors_name_the_users_file_and_not_a_copy_of_it(root, tmp_path):
+def test_errors_name_the_users_file(root, tmp_path):
     (tmp_path / "mine.csv").write_bytes(b"indent,phase,x_mm,y_mm,T0,Bx0,By0,Bz0,Fx,Fy,Fz\n")
-    refuse(root, lambda: add_lab(root, tmp_path / "mine.csv"), str(tmp_path / "mine.csv"))
+    assert_refused(root, lambda: add_lab(root, tmp_path / "mine.csv"), str(tmp_path / "mine.csv"))
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_rate_that_is_none_is_refused(root, tmp_path, rate_hz):
+def test_invalid_rate_is_an_error(root, tmp_path, rate_hz):
     for name in ("dump.bin", "probe.csv"):
         (tmp_path / name).write_bytes(b"")
     what = Dump("binary", 2, rate_hz, tmp_path / "probe.csv", ())
-    refuse(root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), what), "--rate-hz")
+    assert_refused(root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), what), "--rate-hz")
 
 
-@pytest.mark.parametrize("word", ["", "1", "1,2,3", "a,b", "nan,1"])
-def test_a_mark_that_is_none_is_refused(word):
+@pytest.mark.parametrize("text", ["", "1", "1,2,3", "a,b", "nan,1"])
+def test_invalid_mark_is_an_error(text):
     with pytest.raises(ReskinError, match="--mark: a mark must be STREAM_S,PROBE_S"):
-        preparing.parse_marks([word])
+        preparing.parse_marks([text])
 
 
-def test_marks_join_the_clock_of_a_capture(tmp_path):
+def test_marks_are_added_to_the_clock(tmp_path):
     header, _ = preparing.native(native_folder(tmp_path / "run1"), labels(), None, preparing.parse_marks(["1.5,2e1"]))
     assert header.clock.marks == ((0.0, 0.0), (1.5, 20.0))
 
@@ -185,31 +185,31 @@ def test_marks_join_the_clock_of_a_capture(tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"x", bytes(range(256)) * 40, b"indent,phase\n0,contact\n", b"\x00" * 4096, "µ".encode() * 9]
 )
-def test_a_broken_recording_leaves_nothing_behind(root, tmp_path, content):
+def test_broken_recording_leaves_no_files(root, tmp_path, content):
     (tmp_path / "broken.csv").write_bytes(content)
-    refuse(root, lambda: add_lab(root, tmp_path / "broken.csv"), "broken.csv|readings.csv")
+    assert_refused(root, lambda: add_lab(root, tmp_path / "broken.csv"), "broken.csv|readings.csv")
 
 
-def test_a_recording_that_is_not_there_is_called_missing(root, tmp_path):
+def test_missing_recording_is_an_error(root, tmp_path):
     missing = "none: file not found"
     for layout in ("lab", "ini", "eflesh", "eflash7"):
-        refuse(root, lambda: preparing.foreign(tmp_path / "none", layout, labels(), {}), missing)  # noqa: B023
-    refuse(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)
+        assert_refused(root, lambda: preparing.foreign(tmp_path / "none", layout, labels(), {}), missing)  # noqa: B023
+    assert_refused(root, lambda: preparing.native(tmp_path / "none", labels(), None, ()), missing)
 
 
-def test_the_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
+def test_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
     (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
     cases = {
         lab_file: ("ini", "lab"),
         native_folder(tmp_path / "run1"): ("eflesh", "capture"),
         tmp_path / "dump.bin": ("lab", "serial-binary"),
     }
-    for recording, (said, right) in cases.items():
+    for recording, (output_of, right) in cases.items():
         with (
             pytest.raises(ReskinError, match=f"It can be read with --layout {right}."),
-            preparing.suggesting_layout(recording, said),
+            preparing.suggesting_layout(recording, output_of),
         ):
-            preparing.foreign(recording, said, labels(), {})
+            preparing.foreign(recording, output_of, labels(), {})
     with (
         pytest.raises(ReskinError, match=r"one that is taken\. Choose another\.$"),
         preparing.suggesting_layout(lab_file, "lab"),
@@ -217,34 +217,36 @@ def test_the_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
         raise ReskinError("capture c", "its name", "new", "one that is taken", "Choose another.")
 
 
-def test_a_recording_in_the_wrong_layout_is_refused(root, lab_file):
+def test_recording_in_a_wrong_layout_is_an_error(root, lab_file):
     for layout in ("ini", "eflesh", "eflash7"):
-        refuse(root, lambda: preparing.foreign(lab_file, layout, labels(), {}), "readings.csv")  # noqa: B023
-    refuse(root, lambda: preparing.native(lab_file.parent, labels(), None, ()), "header.json")
+        assert_refused(root, lambda: preparing.foreign(lab_file, layout, labels(), {}), "readings.csv")  # noqa: B023
+    assert_refused(root, lambda: preparing.native(lab_file.parent, labels(), None, ()), "header.json")
 
 
 @pytest.mark.parametrize("name", ["../up", "a b", "", "x" * 80, "ä", "/abs"])
-def test_a_name_that_is_no_name_is_refused(root, lab_file, tmp_path, name):
-    refuse(root, lambda: add_lab(root, lab_file, board=name), "--board: a name must be")
+def test_invalid_name_is_an_error(root, lab_file, tmp_path, name):
+    assert_refused(root, lambda: add_lab(root, lab_file, board=name), "--board: a name must be")
     folder = native_folder(tmp_path / "run1")
-    refuse(root, lambda: preparing.native(folder, labels(name=name), None, ()), "--name: a name must be")
+    assert_refused(root, lambda: preparing.native(folder, labels(name=name), None, ()), "--name: a name must be")
 
 
-def test_an_unknown_scene_is_named_beside_the_known_ones(root, lab_file):
+def test_unknown_scene_is_an_error(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
-    refuse(root, lambda: add.add(root, "smal", prepared, allow_copy=False), "no scene smal. The scenes are: .*small")
+    assert_refused(
+        root, lambda: add.add(root, "smal", prepared, allow_copy=False), "no scene smal. The scenes are: .*small"
+    )
 
 
-def test_a_recording_does_not_join_a_simulated_scene(root, lab_file):
+def test_recording_cannot_join_a_simulated_scene(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
-    refuse(
+    assert_refused(
         root,
         lambda: add.add(root, "ci", prepared, allow_copy=False),
         "source must be simulated, as scene ci is; got recorded",
     )
 
 
-# A native capture: two indentations of one place each, ten frames a dwell, at 400 Hz.
+# A native capture: two indentations, ten frames per dwell, at 400 Hz.
 FRAMES = make_frames(60, 2, seed=0)
 
 
@@ -268,7 +270,7 @@ def native_folder(folder: Path, stream: bytes = encode(FRAMES, "binary")) -> Pat
     return folder
 
 
-def test_a_native_capture_is_added_with_its_own_header(root, tmp_path):
+def test_native_capture_keeps_its_header(root, tmp_path):
     folder = native_folder(tmp_path / "run1")
     header = add.add(root, "small", preparing.native(folder, labels(), None, ()), allow_copy=False)
     assert header == read_header(root / "data/raw/small/run1")
@@ -276,105 +278,105 @@ def test_a_native_capture_is_added_with_its_own_header(root, tmp_path):
     assert sum(map(len, blocks)) == account["frames_contact_n"] > 0
 
 
-def test_a_native_capture_under_another_label_or_with_changed_bytes_is_refused(root, tmp_path):
+def test_native_capture_with_other_label_or_bytes_is_an_error(root, tmp_path):
     folder = native_folder(tmp_path / "run1")
-    refuse(
+    assert_refused(
         root,
         lambda: preparing.native(folder, labels(board="board7"), None, ()),
         "--board is 'board7', but the header says 'board1'",
     )
     (folder / "stream.bin").write_bytes(b"other")
-    refuse(
+    assert_refused(
         root,
         lambda: preparing.native(folder, labels(), None, ()),
         "stream.bin: the file has changed since it was recorded",
     )
     (folder / "header.json").write_bytes(b"\xff{")
-    refuse(root, lambda: preparing.native(folder, labels(), None, ()), "header.json")
+    assert_refused(root, lambda: preparing.native(folder, labels(), None, ()), "header.json")
 
 
 @pytest.mark.parametrize(
-    ("damage", "sentence"),
+    ("damage", "message"),
     [(b"", "no frame found in 0 bytes"), (b"x", "no frame found"), (bytes(range(251)) * 99, "no frame found")],
 )
-def test_a_dump_without_a_frame_is_refused(root, tmp_path, damage, sentence):
+def test_dump_without_frames_is_an_error(root, tmp_path, damage, message):
     (tmp_path / "dump.bin").write_bytes(damage)
     (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
     what = Dump("binary", 2, 400.0, tmp_path / "probe.csv", ())
-    refuse(
+    assert_refused(
         root,
         lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
-        sentence,
+        message,
     )
 
 
-def test_a_dump_of_the_wrong_number_of_chips_says_what_fits(root, tmp_path):
+def test_dump_of_another_number_of_chips_suggests_the_right_one(root, tmp_path):
     (tmp_path / "dump.bin").write_bytes(encode(FRAMES, "binary"))
     (tmp_path / "probe.csv").write_text(probe.render(probe_log()))
     what = Dump("binary", 5, 400.0, tmp_path / "probe.csv", ())
-    refuse(
+    assert_refused(
         root,
         lambda: add.add(root, "small", preparing.dump(tmp_path / "dump.bin", labels(), what), allow_copy=False),
         "It fits binary with 2 chips",
     )
-    refuse(
+    assert_refused(
         root, lambda: preparing.dump(tmp_path / "dump.bin", labels(), Dump("binary", 2, 400.0, None, ())), "Add --probe"
     )
 
 
-def test_a_capture_that_lost_too_much_is_refused_with_the_counts(root, tmp_path):
+def test_capture_with_many_lost_bytes_is_an_error(root, tmp_path):
     stream = encode(FRAMES, "binary")
     damaged = native_folder(tmp_path / "run1", stream[:1000] + bytes(1500) + stream[1000:])
-    refuse(
+    assert_refused(
         root,
         lambda: add.add(root, "small", preparing.native(damaged, labels(), None, ()), allow_copy=False),
         r"more than 5% of \d+ bytes are lost: .*skipped_resync_bytes",
     )
 
 
-def test_the_command_line_says_what_is_wrong_without_a_traceback(root, tmp_path):
+def test_command_line_prints_one_line_without_traceback(root, tmp_path):
     (tmp_path / "broken.csv").write_bytes(b"")
-    words = ["--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
-    done = run(root, "reskin", "add", str(tmp_path / "broken.csv"), *words, check=False)
+    arguments = ["--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
+    done = run(root, "reskin", "add", str(tmp_path / "broken.csv"), *arguments, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def said(words: list[str]) -> str:
-    """Give what a command says in the working directory, without a process of its own: it or its error."""
-    done = CliRunner().invoke(app, words)
+def output_of(arguments: list[str]) -> str:
+    """Return the output or the error of a command in the working directory, run in this process."""
+    done = CliRunner().invoke(app, arguments)
     return str(done.exception) if isinstance(done.exception, ReskinError) else done.stdout
 
 
-def test_the_command_line_says_that_a_scene_was_switched_on(root, lab_file, monkeypatch):
+def test_command_line_reports_a_switched_on_scene(root, lab_file, monkeypatch):
     monkeypatch.chdir(root)
-    words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
-    assert "switched scene small on in pipeline/plan.yaml" in run(root, "reskin", *words).stdout
-    again = said([*words, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
+    arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
+    assert "switched scene small on in pipeline/plan.yaml" in run(root, "reskin", *arguments).stdout
+    again = output_of([*arguments, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
     assert "added small/again" in again
     assert "switched" not in again
 
 
-def test_a_scene_that_is_new_is_a_copy_of_one_and_goes_again_if_nothing_joins_it(root, lab_file, monkeypatch):
+def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root, lab_file, monkeypatch):
     monkeypatch.chdir(root)
     known = contents(root)
-    words = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
-    assert "no scene nowhere. The scenes are:" in said([*words, "nowhere"])
-    up = said([*words[:-2], "../up", "--like", "small"])
+    arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
+    assert "no scene nowhere. The scenes are:" in output_of([*arguments, "nowhere"])
+    up = output_of([*arguments[:-2], "../up", "--like", "small"])
     assert "--scene: a name must be 1 to 64 of" in up
-    assert "no truths_" in said([*words[:3], "ini", *words[4:], "ini"])
+    assert "no truths_" in output_of([*arguments[:3], "ini", *arguments[4:], "ini"])
     assert contents(root) == known
-    run(root, "reskin", *words, "small")
+    run(root, "reskin", *arguments, "small")
     text = (root / SCENES / "mine.yaml").read_text()
     assert YAML(typ="safe").load(text) == recorded()
     assert read_registry(root).captures.keys() == {"mine"}
-    again = said([*words, "small", "--name", "again"])
+    again = output_of([*arguments, "small", "--name", "again"])
     assert "scene mine exists already" in again
     assert (root / SCENES / "mine.yaml").read_text() == text
 
 
-def test_a_scene_that_asks_for_folds_its_data_cannot_give_says_so(root, lab_file):
+def test_scene_with_too_little_data_is_an_error(root, lab_file):
     add_lab(root, lab_file)
     done = run(root, "dvc", "repro", "split@small", check=False)
     assert done.returncode != 0

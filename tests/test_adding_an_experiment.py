@@ -1,4 +1,4 @@
-"""An edit re-runs only the stages that depend on it, by DVC's own index and hashes; no stage is run here."""
+"""An edit reruns only the stages that depend on it, by DVC's index and hashes; no stage runs here."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -53,7 +53,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """A checkout that runs scene ci."""
+    """Return a checkout that runs scene ci."""
     folder = copy_checkout(tmp_path_factory.mktemp("edited"))
     run(folder, "reskin", "scenes", "use", "ci")
     return folder
@@ -65,9 +65,9 @@ def before(root) -> dict[str, tuple[Any, ...]]:
 
 
 def state(root: Path) -> dict[str, tuple[Any, ...]]:
-    """By stage what DVC decides by: its command, its parameters, hashes of dependencies that exist; and its outputs.
+    """Return the command, the hashes of dependencies and parameters, and the outputs of each stage.
 
-    Stage `code` has run: it follows every edit, and what it writes tells the others.
+    Stage `code`, which runs after every edit, has run.
     """
     from dvc.dependency.param import read_param_file
     from dvc.repo import Repo
@@ -96,7 +96,7 @@ def state(root: Path) -> dict[str, tuple[Any, ...]]:
 
 
 def run_again(before: dict[str, tuple[Any, ...]], after: dict[str, tuple[Any, ...]]) -> set[str]:
-    """Name the stages that changed, and those that read an output of one that runs again."""
+    """Return the changed stages and those that depend on their outputs."""
     stale: set[str] = set()
     more = {name for name in after if after[name] != before.get(name)}
     while more - stale:
@@ -111,9 +111,9 @@ def _overlap(path: Path, other: Path) -> bool:
 
 
 @contextmanager
-def edited(root: Path, files: dict[str, str]) -> Iterator[None]:
-    """Write files, and undo it with the plan."""
-    held = {root / name: (root / name).read_text() for name in [PLAN, *files] if (root / name).exists()}
+def edited_files(root: Path, files: dict[str, str]) -> Iterator[None]:
+    """Write files; restore them and the plan at the end."""
+    original = {root / name: (root / name).read_text() for name in [PLAN, *files] if (root / name).exists()}
     try:
         for name, text in files.items():
             (root / name).parent.mkdir(exist_ok=True)
@@ -122,48 +122,48 @@ def edited(root: Path, files: dict[str, str]) -> Iterator[None]:
     finally:
         for name in files:
             (root / name).unlink()
-        for file, text in held.items():
+        for file, text in original.items():
             file.write_text(text)
 
 
-def inserted(file: Path, line: str, text: str) -> str:
-    """Give the content of a file with a text before some line."""
+def insert_before(file: Path, line: str, text: str) -> str:
+    """Return the content of a file with a text inserted before a line."""
     assert line in file.read_text()
     return file.read_text().replace(line, f"{text}{line}", 1)
 
 
-def test_a_new_experiment_runs_its_own_stage_and_the_report(root, before):
+def test_new_experiment_runs_its_stage_and_the_report(root, before):
     scene = f"{SCENES}/ci.yaml"
     files = {f"pipeline/experiments/{name}": text for name, text in FILES.items()} | {
-        FLOW: inserted(root / FLOW, "  report: #", STAGE),
-        scene: inserted(root / scene, "single_random,", "repeat, "),
+        FLOW: insert_before(root / FLOW, "  report: #", STAGE),
+        scene: insert_before(root / scene, "single_random,", "repeat, "),
     }
-    with edited(root, files):
+    with edited_files(root, files):
         run(root, "reskin", "scenes", "use", "ci")
         after = state(root)
     assert run_again(before, after) == {
-        "repeat@ci", "table2@ci", "report@ci", "publish@ci",  # all that show numbers
-        "contacts@ci",  # which depends on all of the scene's file
+        "repeat@ci", "table2@ci", "report@ci", "publish@ci",  # stages that show numbers
+        "contacts@ci",  # depends on the whole scene file
     }  # fmt: skip
 
 
-def test_a_new_caption_runs_the_report_and_the_code_of_an_experiment_its_stage_too(root, before):
+def test_new_caption_runs_the_report_and_new_code_the_experiment(root, before):
     captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
-    with edited(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
+    with edited_files(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
         after = state(root)
-    assert run_again(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # one module shows all
-    with edited(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
+    assert run_again(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # one module makes all tables
+    with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
     assert run_again(before, after) == {"shear@ci", "table2@ci", "report@ci", "publish@ci"}
 
 
-def test_comments_in_a_module_that_every_stage_imports_run_nothing(root, before):
+def test_comments_run_nothing(root, before):
     io = "reskin/io.py"
-    with edited(root, {io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1)}):
+    with edited_files(root, {io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1)}):
         assert run_again(before, state(root)) == set()
 
 
-def test_comments_in_the_code_of_training_change_no_cache_key_and_code_does(tmp_path, monkeypatch):
+def test_comments_in_training_code_keep_cache_keys(tmp_path, monkeypatch):
     files = {name: f"{name.replace('.', '/')}.py" for name in CODE_MODULES}
     sources = {name: (ROOT / file).read_text() for name, file in files.items()}
     (tmp_path / "reskin/models").mkdir(parents=True)
@@ -175,9 +175,9 @@ def test_comments_in_the_code_of_training_change_no_cache_key_and_code_does(tmp_
         code.digest.cache_clear()
         return JobKeys(example_data()).key(pooled())
 
-    told = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
+    commented = {name: "# More.\n" + text.replace('"""', '"""More. ', 1) for name, text in sources.items()}
     assert (
-        key(told)
+        key(commented)
         == key(sources)
         != key(sources | {"reskin.models.train": sources["reskin.models.train"] + "\nWEIGHT = 1.0\n"})
     )

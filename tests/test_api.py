@@ -63,12 +63,12 @@ def test_simulate_pokes_equals_a_simulated_capture_without_noise():
     noload_uT, b_uT, Fz_N = reskin.simulate_pokes(skin, places.tolist(), board=board, chip=QUIET_CHIP)
 
     per_poke = capture.b_uT.reshape(len(places), -1, 15)
-    step_uT = 0.5  # the chip's own, at most; a float32 place moves a field by less
+    step_uT = 0.5  # the largest step of the chip; rounding of float32 places is smaller
     assert np.abs(per_poke[:, 1] - noload_uT).max() <= step_uT
     last_contact_i = per_poke.shape[1] - 1 - shared["rig"]["moving_frames_n"]
     assert np.abs(per_poke[:, last_contact_i] - b_uT).max() <= step_uT
     assert np.abs(b_uT - noload_uT).max() > 100 * step_uT
-    np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)  # the sensor's own steps
+    np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)  # steps of the sensor
 
 
 def test_designs_take_plain_values_and_wrong_ones_raise():

@@ -1,4 +1,4 @@
-"""Damaged objects of DVC's cache are found and set aside with their copies; intact ones stay."""
+"""Tests of `reskin check-cache`: damaged objects of DVC's cache are moved away and restored where possible."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ def md5(content: bytes) -> str:
 
 @pytest.fixture
 def root(tmp_path, monkeypatch) -> Path:
-    """A checkout with a folder of two files, one file and one recording, all of them outputs and in DVC's cache."""
+    """Return a checkout whose outputs (a folder of two files, a file, a recording) are in DVC's cache."""
     subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
     subprocess.run([sys.executable, "-m", "dvc", "init", "-q"], cwd=tmp_path, check=True)
     (tmp_path / "dvc.yaml").write_text("stages: {}\n")
@@ -31,7 +31,7 @@ def root(tmp_path, monkeypatch) -> Path:
     folder = {"a.safetensors": b"weights", "a.json": b"card"}
     listed = json.dumps([{"md5": md5(content), "relpath": name} for name, content in folder.items()]).encode()
     outs = {"train_multi@one": (WEIGHTS, f"{md5(listed)}.dir"), "split@one": (FOLDS, md5(b"folds"))}
-    stages = {name: {"cmd": "x", "outs": [{"path": path, "md5": name_}]} for name, (path, name_) in outs.items()}
+    stages = {name: {"cmd": "x", "outs": [{"path": path, "md5": digest}]} for name, (path, digest) in outs.items()}
     files = {FOLDS: b"folds", RECORDED: b"recorded"} | {
         f"{WEIGHTS}/{name}": content for name, content in folder.items()
     }
@@ -39,7 +39,7 @@ def root(tmp_path, monkeypatch) -> Path:
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_bytes(content)
     for content in (*files.values(), listed):
-        keep(tmp_path, md5(content) + (".dir" if content is listed else ""), content)
+        put_in_cache(tmp_path, md5(content) + (".dir" if content is listed else ""), content)
     with (tmp_path / LOCK).open("w") as stream:
         YAML().dump({"schema": "2.0", "stages": stages}, stream)
     with (tmp_path / f"{RECORDED}.dvc").open("w") as stream:
@@ -47,15 +47,15 @@ def root(tmp_path, monkeypatch) -> Path:
     return Path()
 
 
-def at(root: Path, name: str) -> Path:
+def cache_file(root: Path, name: str) -> Path:
     return root / ".dvc/cache/files/md5" / name[:2] / name[2:]
 
 
-def keep(root: Path, name: str, content: bytes) -> None:
-    at(root, name).parent.mkdir(parents=True, exist_ok=True)
-    at(root, name).unlink(missing_ok=True)
-    at(root, name).write_bytes(content)
-    at(root, name).chmod(0o444)
+def put_in_cache(root: Path, name: str, content: bytes) -> None:
+    cache_file(root, name).parent.mkdir(parents=True, exist_ok=True)
+    cache_file(root, name).unlink(missing_ok=True)
+    cache_file(root, name).write_bytes(content)
+    cache_file(root, name).chmod(0o444)
 
 
 def check(root: Path) -> tuple[int, str]:
@@ -63,53 +63,53 @@ def check(root: Path) -> tuple[int, str]:
     return done.exit_code, done.output
 
 
-def test_an_intact_cache_has_no_damaged_objects(root):
-    next(root.glob(".dvc/cache/files/md5/??")).joinpath(".tmpXYZ.tmp").write_bytes(b"ha")  # of a DVC that was killed
+def test_intact_cache_has_no_damaged_objects(root):
+    next(root.glob(".dvc/cache/files/md5/??")).joinpath(".tmpXYZ.tmp").write_bytes(b"ha")  # left by a killed DVC
     assert check(root) == (0, "DVC's cache: 5 objects, 0 of them damaged\n")
 
 
-def test_a_damaged_object_is_set_aside_and_its_copies_are_removed(root):
-    keep(root, md5(b"weights"), b"w3ights")
+def test_damaged_object_and_its_copies_are_removed(root):
+    put_in_cache(root, md5(b"weights"), b"w3ights")
     (root / WEIGHTS / "a.safetensors").write_bytes(b"w3ights")
     status, output = check(root)
     assert status == 1
     assert "is damaged: its MD5 is not its name" in output
     assert f"removed from {WEIGHTS}/a.safetensors. Run: dvc repro train_multi@one" in output
-    assert not at(root, md5(b"weights")).exists()
+    assert not cache_file(root, md5(b"weights")).exists()
     assert [file.name for file in (root / WEIGHTS).iterdir()] == ["a.json"]
     assert (root / cache.DAMAGED / md5(b"weights")).read_bytes() == b"w3ights"
     assert check(root) == (0, "DVC's cache: 4 objects, 0 of them damaged\n")
 
 
-def test_an_object_is_restored_from_an_intact_output(root):
-    keep(root, md5(b"folds"), b"f0lds")
+def test_object_is_restored_from_an_intact_output(root):
+    put_in_cache(root, md5(b"folds"), b"f0lds")
     assert f"It was restored from {FOLDS}." in check(root)[1]
-    assert at(root, md5(b"folds")).read_bytes() == (root / FOLDS).read_bytes() == b"folds"
-    assert at(root, md5(b"folds")).stat().st_mode & 0o777 == 0o444
+    assert cache_file(root, md5(b"folds")).read_bytes() == (root / FOLDS).read_bytes() == b"folds"
+    assert cache_file(root, md5(b"folds")).stat().st_mode & 0o777 == 0o444
     assert check(root)[0] == 0
 
 
-def test_an_output_that_was_edited_since_is_kept(root):
-    keep(root, md5(b"folds"), b"f0lds")
+def test_edited_output_is_kept(root):
+    put_in_cache(root, md5(b"folds"), b"f0lds")
     (root / FOLDS).write_bytes(b"by hand")
     assert check(root)[0] == 1
     assert (root / FOLDS).read_bytes() == b"by hand"
 
 
-def test_the_files_of_a_folder_with_a_damaged_list_are_kept(root):
+def test_files_of_a_folder_with_a_damaged_list_are_kept(root):
     name = cache.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
-    keep(root, name, b"[")
+    put_in_cache(root, name, b"[")
     assert f"It was moved to {cache.DAMAGED}/{name}. Run: dvc repro train_multi@one" in check(root)[1]
     assert len(list((root / WEIGHTS).iterdir())) == 2
 
 
-def test_a_damaged_recording_is_kept(root):
-    keep(root, md5(b"recorded"), b"rec0rded")
+def test_damaged_recording_is_kept(root):
+    put_in_cache(root, md5(b"recorded"), b"rec0rded")
     (root / RECORDED).write_bytes(b"rec0rded")
     assert f"dvc pull {RECORDED}.dvc, or add the recording again" in check(root)[1]
     assert (root / cache.DAMAGED / md5(b"recorded")).read_bytes() == b"rec0rded"
 
 
-def test_an_unused_object_is_only_set_aside(root):
-    keep(root, "0" * 32, b"of an older run")
+def test_unused_object_is_only_moved(root):
+    put_in_cache(root, "0" * 32, b"of an older run")
     assert "No output in dvc.lock uses it" in check(root)[1]

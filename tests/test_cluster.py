@@ -1,4 +1,4 @@
-"""The same trainings on two workers of a real scheduler on this machine give the bytes that they give here."""
+"""Tests of trainings on a Dask cluster: two workers of a scheduler on this machine."""
 
 import importlib.util
 import json
@@ -32,7 +32,7 @@ HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
 
 
 @contextmanager
-def started(kind: str, *options: str) -> Iterator[None]:
+def dask_process(kind: str, *options: str) -> Iterator[None]:
     paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = {"OMP_NUM_THREADS": "1", **os.environ, "PYTHONPATH": paths}
     command = [sys.executable, "-W", "ignore", "-c", CLI.format(kind), *HERE_ONLY, *options]
@@ -46,21 +46,24 @@ def started(kind: str, *options: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory) -> Iterator[str]:
-    """The address of a scheduler with two workers, each a process of one thread."""
-    reason = "Dask is not installed, so no cluster is tried: pip install -c constraints.txt -e '.[dask]'"
+    """Yield the address of a scheduler with two single-threaded workers."""
+    reason = "Dask is not installed: pip install -c constraints.txt -e '.[dask]'"
     distributed = pytest.importorskip("distributed", reason=reason)
     file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
     with ExitStack() as processes:
-        processes.enter_context(started("scheduler", "--port", "0", "--no-jupyter", "--scheduler-file", str(file)))
+        options = ["--scheduler-file", str(file)]
+        processes.enter_context(dask_process("scheduler", "--port", "0", "--no-jupyter", *options))
         for _ in range(2):
-            processes.enter_context(started("worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny"))
+            processes.enter_context(
+                dask_process("worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-nanny")
+            )
         end_s = time.monotonic() + START_MAX_s
         while not file.exists() and time.monotonic() < end_s:
             time.sleep(0.05)
-        found = json.loads(file.read_text())["address"]
-        with distributed.Client(found, set_as_default=False) as client:
+        scheduler_address = json.loads(file.read_text())["address"]
+        with distributed.Client(scheduler_address, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=START_MAX_s)
-        yield found
+        yield scheduler_address
 
 
 def where(i: int) -> tuple[int, str, int]:
@@ -68,8 +71,8 @@ def where(i: int) -> tuple[int, str, int]:
     return os.getpid(), os.getcwd(), i
 
 
-def test_a_sweep_on_two_workers_gives_the_bytes_of_a_local_one(address, tmp_path, monkeypatch):
-    some = [replace(job, seed_i=seed_i) for job in jobs(2, steps_n=10) for seed_i in (0, 1)]
+def test_sweep_on_two_workers_equals_a_local_one(address, tmp_path, monkeypatch):
+    small_jobs = [replace(job, seed_i=seed_i) for job in jobs(2, steps_n=10) for seed_i in (0, 1)]
     results = []
     for name, place in (("here", "here"), ("there", f"dask:{address}")):
         monkeypatch.setenv("RESKIN_EXECUTOR", place)
@@ -77,17 +80,17 @@ def test_a_sweep_on_two_workers_gives_the_bytes_of_a_local_one(address, tmp_path
         prepare_workers("reskin.models.train")
         with make_executor(imports="reskin.models.train") as executor:
             cache = tmp_path / name
-            results.append(run_jobs(some, example_data(), executor=executor, cache=cache, log=lambda _: None))
+            results.append(run_jobs(small_jobs, example_data(), executor=executor, cache=cache, log=lambda _: None))
             ran = [future.result() for future in [executor.submit(where, i) for i in range(6)]]
     for a, b in zip(*results, strict=True):
         assert (a.key, a.predicted.tobytes()) == (b.key, b.predicted.tobytes())
         assert alike(a, b)
     assert [i for _, _, i in ran] == list(range(6))
     assert len({process for process, _, _ in ran} - {os.getpid()}) == 2
-    assert {folder for _, folder, _ in ran} == {os.getcwd()}  # paths of stages are relative
+    assert {folder for _, folder, _ in ran} == {os.getcwd()}  # paths in stages are relative
 
 
-def test_an_error_on_a_worker_comes_back_as_it_was(address, monkeypatch):
+def test_error_on_a_worker_is_raised_here(address, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", f"dask:{address}")
     monkeypatch.setenv("OMP_NUM_THREADS", os.environ.get("OMP_NUM_THREADS", "1"))
     with make_executor(1, imports="json") as executor, pytest.raises(ValueError, match="invalid literal"):
@@ -108,7 +111,7 @@ def test_an_error_on_a_worker_comes_back_as_it_was(address, monkeypatch):
         ({"w": {"scipy": "0.1"}}, "scipy of worker w must be .* got 0.1"),
     ],
 )
-def test_workers_that_would_give_other_bits_are_refused(workers, expected):
+def test_workers_with_other_arithmetic_are_an_error(workers, expected):
     threads = {name: {"nthreads": changed.get("threads", 1)} for name, changed in workers.items()}
     client = SimpleNamespace(
         scheduler_info=lambda n_workers: {"workers": threads},
@@ -118,24 +121,24 @@ def test_workers_that_would_give_other_bits_are_refused(workers, expected):
         _check_workers(client, "tcp://there")
 
 
-def test_a_scheduler_that_goes_away_is_one_sentence():
+def test_lost_scheduler_is_an_error():
     pytest.importorskip("distributed", reason="Dask is not installed")
     submitted, future = Future(), Future()
-    submitted.cancel()  # as Dask does with every call when it loses the scheduler
+    submitted.cancel()  # as Dask does with all calls after losing the scheduler
     cluster._copy_outcome(future, "tcp://there", submitted)
     with pytest.raises(ParamsError, match="Lost the Dask scheduler at tcp://there. Finished trainings are cached"):
         future.result(0)
 
 
 def imported_from(file: Path) -> ModuleType:
-    """The module as a process has it that imports it now."""
+    """Return the module as a newly started process imports it."""
     spec = importlib.util.spec_from_file_location("cluster_of_a_copy", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a_new_one_passes(tmp_path, monkeypatch):
+def test_worker_older_than_an_edit_is_an_error(tmp_path, monkeypatch):
     for package in ("pipeline", "reskin"):
         (tmp_path / package).mkdir()
         shutil.copy(ROOT / package / "__init__.py", tmp_path / package)
@@ -152,7 +155,7 @@ def test_a_worker_that_was_started_before_an_edit_of_any_module_is_refused_and_a
         cluster.run_on_worker(str(tmp_path), before.describe_process(), os.getcwd)
 
 
-def test_workers_that_are_as_this_process_pass():
+def test_workers_equal_to_this_process_are_accepted():
     client = SimpleNamespace(
         scheduler_info=lambda n_workers: {"workers": {"w": {"nthreads": 1}}}, run=lambda call: {"w": describe_process()}
     )

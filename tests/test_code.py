@@ -1,4 +1,4 @@
-"""The digest of a module: code changes it, words and line breaks do not."""
+"""Tests of the digest of a module: code changes it; comments and line breaks do not."""
 
 import pytest
 
@@ -38,7 +38,7 @@ def digest(monkeypatch, folder, source: str, beside: str = "") -> str:
         ("2 * x", "(\n            2 * x)"),
     ],
 )
-def test_words_and_line_breaks_change_no_digest(monkeypatch, tmp_path, old, new):
+def test_comments_and_line_breaks_keep_the_digest(monkeypatch, tmp_path, old, new):
     assert old in SOURCE
     assert digest(monkeypatch, tmp_path, SOURCE.replace(old, new)) == digest(monkeypatch, tmp_path, SOURCE)
 
@@ -51,18 +51,18 @@ def test_code_changes_the_digest(monkeypatch, tmp_path, old, new):
     assert digest(monkeypatch, tmp_path, SOURCE.replace(old, new)) != digest(monkeypatch, tmp_path, SOURCE)
 
 
-def test_a_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_path):
+def test_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_path):
     assert digest(monkeypatch, tmp_path, SOURCE, "a: 1") != digest(monkeypatch, tmp_path, SOURCE, "a: 2")
 
 
-def test_imports_are_followed_within_the_package():
+def test_imports_are_followed_within_the_packages():
     names = code.imported("reskin.models.train")
     assert {"reskin.models.train", "reskin.seeds"} <= set(names)
-    assert {"reskin", "reskin.models"} <= set(names)  # whose __init__ runs before
+    assert {"reskin", "reskin.models"} <= set(names)  # whose __init__ runs first
     assert all(name.split(".")[0] in code.PACKAGES for name in names)
 
 
-def test_an_edit_of_the_library_runs_the_stages_again_that_use_it():
+def test_edit_of_the_library_reruns_its_stages():
     assert {"reskin.models.train", "pipeline.stages.train"} <= set(code.imported("pipeline.stages.train"))
 
 
@@ -70,12 +70,12 @@ DISPLAY = {"pipeline.report", *(f"pipeline.report.{name}" for name in ("drawing"
 
 
 @pytest.mark.parametrize("stage", sorted({*MODULES, *experiment_stages()} - {"table2", "report", "publish"}))
-def test_a_stage_that_computes_imports_of_the_report_only_what_its_digest_may_leave_out(stage):
+def test_computing_stages_import_only_display_modules_of_the_report(stage):
     imported = {name for name in code.imported(module_name(stage)) if name.startswith("pipeline.report")}
     assert imported <= DISPLAY
 
 
-def test_an_editors_backup_beside_a_module_changes_nothing(monkeypatch, tmp_path):
+def test_editor_backups_change_nothing(monkeypatch, tmp_path):
     before = digest(monkeypatch, tmp_path, SOURCE)
     (tmp_path / "pipeline/one.py~").write_text("old")
     (tmp_path / "pipeline/one.py.orig").write_text("old")

@@ -1,4 +1,4 @@
-"""`reskin compare`: one line where all values are equal, else tables of differences, machines and verdicts."""
+"""Tests of `reskin compare`: its command line, and which values and verdicts differ."""
 
 import subprocess
 
@@ -25,12 +25,12 @@ def write(reports, accuracy_pct: float, *, verdict: str = "yes", device: str = X
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A checkout whose committed accuracy is 80 %."""
+    """Return a checkout with a committed accuracy of 80 %."""
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
-    for words in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"], ["tag", "first"]):
-        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    for arguments in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"], ["tag", "first"]):
+        subprocess.run(["git", *arguments], cwd=tmp_path, check=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -41,12 +41,12 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def rows(output: str) -> list[list[str]]:
-    """Cells of the tables in an output."""
+    """Return the cells of the tables in an output."""
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in output.splitlines() if line[:1] == "|"]
 
 
 @pytest.mark.parametrize("against", [[], ["--against", "first"]])
-def test_equal_values_are_one_line_of_good_news_whatever_the_machine_and_its_seconds(checkout, against):
+def test_equal_values_are_one_line(checkout, against):
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     provenance = io.read_json(checkout / "reports/quick/provenance.json")
     io.write_json(checkout / "reports/quick/provenance.json", provenance | {"device": EPYC, "seconds": 9.0})
@@ -57,7 +57,7 @@ def test_equal_values_are_one_line_of_good_news_whatever_the_machine_and_its_sec
     )
 
 
-def test_a_difference_is_told_with_machines_places_and_sizes(checkout):
+def test_difference_lists_machines_and_sizes(checkout):
     write(checkout / "reports/quick", 60.0, device=EPYC)
     code, output = run("quick")
     assert code == 1
@@ -71,14 +71,14 @@ def test_a_difference_is_told_with_machines_places_and_sizes(checkout):
     assert "0 verdicts changed" in summary
 
 
-def test_a_difference_in_the_last_digit_is_one(checkout):
+def test_last_digit_is_a_difference(checkout):
     write(checkout / "reports/quick", 80.00000000000001)
     code, output = run("quick")
     assert code == 1
     assert "not equal: 2 of 7 values" in output
 
 
-def test_every_verdict_that_changed_is_named(checkout):
+def test_changed_verdicts_are_listed(checkout):
     write(checkout / "reports/quick", 80.0, verdict="inconclusive")
     code, output = run("quick")
     assert code == 1
@@ -86,7 +86,7 @@ def test_every_verdict_that_changed_is_named(checkout):
     assert "1 verdicts changed" in output.splitlines()[-1]
 
 
-def test_values_that_only_one_run_has_are_counted_by_section(checkout):
+def test_values_of_only_one_run_are_counted_by_section(checkout):
     numbers = io.read_json(checkout / "reports/quick/numbers.json")
     io.write_json(checkout / "reports/quick/numbers.json", numbers | {"drift": {"each": [{"contacts_n": 1}]}})
     (checkout / "reports/quick/tables/order.csv").unlink()
@@ -98,27 +98,27 @@ def test_values_that_only_one_run_has_are_counted_by_section(checkout):
 
 
 @pytest.mark.parametrize("where", ["", "quick", "reports/quick", "quick/numbers.json"])
-def test_a_folder_or_a_file_in_it_may_stand_for_the_revision(checkout, where):
+def test_folder_or_file_can_replace_the_revision(checkout, where):
     other = checkout / "other"
     write(other / (where.removesuffix("numbers.json") if where.endswith(".json") else where), 80.0)
     assert run("quick", "--against", str(other if where == "reports/quick" else other / where))[0] == 0
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("arguments", "message"),
     [
         (["quick", "--against", "nowhere"], "git revision nowhere has no reports/quick/numbers.json"),
         (["quick", "--against", "reports"], None), (["lab"], "reports/lab/numbers.json: file not found"),
         (["quick", "--against", ".git"], ".git: no quick/numbers.json there"),
     ],
 )  # fmt: skip
-def test_what_is_not_there_is_one_sentence_and_exit_status_2(checkout, words, sentence):
-    code, output = run(*words)
-    assert code == (2 if sentence else 0)
-    assert sentence is None or f"error: {sentence}" in output
+def test_missing_reports_are_an_error(checkout, arguments, message):
+    code, output = run(*arguments)
+    assert code == (2 if message else 0)
+    assert message is None or f"error: {message}" in output
 
 
-def test_outside_git_nothing_is_committed(tmp_path, monkeypatch):
+def test_outside_git_there_is_no_commit(tmp_path, monkeypatch):
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     monkeypatch.chdir(tmp_path)
@@ -127,7 +127,7 @@ def test_outside_git_nothing_is_committed(tmp_path, monkeypatch):
     assert "has no reports/" in output
 
 
-def test_without_a_scene_all_that_run_are_compared_and_the_worst_is_told(checkout, monkeypatch):
+def test_all_scenes_are_compared_without_an_argument(checkout, monkeypatch):
     monkeypatch.setattr(plan, "check", lambda root: type("Plan", (), {"scenes": ("lab", "quick")}))
     code, output = run()
     assert code == 2

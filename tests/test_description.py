@@ -1,4 +1,4 @@
-"""What is read off readings of a made-up skin, against what it was made of; skins and missing values as laws."""
+"""Tests of the description of captures, against the values that synthetic readings are made of."""
 
 from dataclasses import replace
 
@@ -15,8 +15,8 @@ INDENTATIONS_N, READINGS_N = 400, 5
 REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
 
 
-def made(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known_force=True):
-    """Two chips; the second feels a quarter of what the first does."""
+def example_readings(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known_force=True):
+    """Return readings of two chips, the second a quarter as sensitive as the first."""
     rng, f = rng_for(0, "made"), INDENTATIONS_N * READINGS_N
     forces_N = force_N * np.repeat(rng.uniform(0.9, 1.1, INDENTATIONS_N), READINGS_N)
     shape = np.array([0, 0, 4.0, 0, 0, 1.0]) / np.sqrt(17)
@@ -33,8 +33,8 @@ def made(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known
     )  # fmt: skip
 
 
-def test_fields_noise_steps_and_forces_are_those_it_was_made_of():
-    found = describe(made())
+def test_fields_noise_steps_and_forces_are_recovered():
+    found = describe(example_readings())
     assert found["field_at_rest_chip_median_uT"] == pytest.approx((500 + np.hypot(1000, 2500)) / 2)
     assert found["field_at_rest_channel_max_uT"] == 2500
     assert found["noise_xy_uT"] == pytest.approx(3.0, rel=0.05)  # 1600 degrees of freedom: 2 %
@@ -47,8 +47,8 @@ def test_fields_noise_steps_and_forces_are_those_it_was_made_of():
     assert found["rate_hz"] == pytest.approx(400.0)
 
 
-def test_a_field_at_rest_that_walks_changes_by_the_root_of_the_contacts_and_a_short_one_is_not_asked():
-    still = made()
+def test_random_walk_at_rest_grows_with_the_root_of_contacts():
+    still = example_readings()
     steps_uT = 0.5 * rng_for(0, "walk").standard_normal((INDENTATIONS_N, 6))
     walked = replace(
         still, noload_uT=REST_uT + np.repeat(np.cumsum(steps_uT, axis=0), READINGS_N, axis=0).astype(np.float32)
@@ -61,60 +61,58 @@ def test_a_field_at_rest_that_walks_changes_by_the_root_of_the_contacts_and_a_sh
     assert describe(still)["rest_changes_in_100_uT"] == 0
 
 
-def test_a_recording_without_a_clock_has_no_rate():
-    assert "rate_hz" not in describe(replace(made(), t_s=np.full(INDENTATIONS_N * READINGS_N, np.nan)))
+def test_recording_without_clock_has_no_rate():
+    assert "rate_hz" not in describe(replace(example_readings(), t_s=np.full(INDENTATIONS_N * READINGS_N, np.nan)))
 
 
-def test_what_moves_between_stops_of_one_indentation_is_no_noise():
-    line = made()
+def test_motion_between_stops_is_not_noise():
+    line = example_readings()
     moved = replace(line, indentation=line.indentation // 2, x_mm=(line.indentation % 2).astype(np.float32))
     assert describe(moved)["noise_z_uT"] == describe(line)["noise_z_uT"]
 
 
-def test_forces_that_were_not_reached_have_no_change_of_field():
-    assert {"change_at_0.5_N_uT", "change_at_1_N_uT", "change_at_3_N_uT"}.isdisjoint(describe(made()))
+def test_unreached_forces_have_no_change_of_field():
+    assert {"change_at_0.5_N_uT", "change_at_1_N_uT", "change_at_3_N_uT"}.isdisjoint(describe(example_readings()))
 
 
-def test_without_force_the_field_is_described_all_the_same():
-    found = describe(made(known_force=False))
+def test_field_is_described_without_forces():
+    found = describe(example_readings(known_force=False))
     assert "force_max_N" not in found
     assert "change_at_2_N_uT" not in found
     assert found["noise_z_uT"] == pytest.approx(5.0, rel=0.05)
     assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
 
 
-def test_contacts_that_nobody_labelled_are_described_by_their_fields():
-    found = describe(made(places=False, known_force=False))
+def test_unlabelled_contacts_are_described_by_fields():
+    found = describe(example_readings(places=False, known_force=False))
     assert found["field_at_rest_channel_max_uT"] == 2500
     assert found["weakest_over_strongest_chip"] == pytest.approx(0.25, rel=0.1)
 
 
-def test_rows_without_contact_are_described_by_their_field_at_rest():
-    found = describe(made(places=False))
+def test_rows_without_contact_are_described_at_rest():
+    found = describe(example_readings(places=False))
     assert found["field_at_rest_channel_max_uT"] == 2500
     assert {"force_max_N", "noise_z_uT", "weakest_over_strongest_chip"}.isdisjoint(found)
 
 
 def test_captures_of_one_skin_count_once():
-    together = over_skins([("s0", {"a": 1.0}), ("s0", {"a": 3.0}), ("s1", {"a": 4.0, "b": 7.0})])
-    assert together["a"] == {"mean": 3.0, "least": 2.0, "most": 4.0, "sd": pytest.approx(np.sqrt(2)), "n": 2}
-    assert together["b"] == {"mean": 7.0, "least": 7.0, "most": 7.0, "n": 1}
+    summary = over_skins([("s0", {"a": 1.0}), ("s0", {"a": 3.0}), ("s1", {"a": 4.0, "b": 7.0})])
+    assert summary["a"] == {"mean": 3.0, "least": 2.0, "most": 4.0, "sd": pytest.approx(np.sqrt(2)), "n": 2}
+    assert summary["b"] == {"mean": 7.0, "least": 7.0, "most": 7.0, "n": 1}
 
 
-def test_how_the_change_grows_with_force_is_asked_of_a_skin_over_all_its_captures():
-    together = over_skins(
-        [("s0", {"change_at_1_N_uT": 200.0}), ("s0", {"change_at_3_N_uT": 500.0}), ("s1", {"a": 1.0})]
-    )
-    assert together["change_at_3_N_over_1_N"]["mean"] == pytest.approx(2.5)
-    assert together["change_at_3_N_over_1_N"]["n"] == 1
+def test_growth_with_force_is_over_all_captures_of_a_skin():
+    summary = over_skins([("s0", {"change_at_1_N_uT": 200.0}), ("s0", {"change_at_3_N_uT": 500.0}), ("s1", {"a": 1.0})])
+    assert summary["change_at_3_N_over_1_N"]["mean"] == pytest.approx(2.5)
+    assert summary["change_at_3_N_over_1_N"]["n"] == 1
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=9))
-def test_the_mean_lies_between_least_and_most(values):
+def test_mean_is_between_least_and_most(values):
     one = over_skins([(f"s{i}", {"a": value}) for i, value in enumerate(values)])["a"]
     assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
 
 
-def test_without_rest_nothing_tells_of_fields_at_rest():
-    told = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
-    assert without_rest(told) == {"rate_hz": 9.0}
+def test_without_rest_drops_fields_at_rest():
+    description = {"field_at_rest_chip_median_uT": 80.0, "rest_changes_in_1_uT": 0.0, "rate_hz": 9.0}
+    assert without_rest(description) == {"rate_hz": 9.0}

@@ -1,4 +1,4 @@
-"""Stage `code` follows the imports of every stage, and dvc.yaml declares every path of its commands."""
+"""Tests of dvc.yaml: dependencies on code, and declared paths of commands."""
 
 import shutil
 import subprocess
@@ -20,27 +20,27 @@ MANUAL = "pipeline.experiments.manual"
 OTHERS = sorted(STAGES.keys() - {"code"})
 
 
-def test_every_stage_depends_on_the_digests_of_its_code():
+def test_every_stage_depends_on_its_code_digests():
     assert {*all_stages(), "code"} == STAGES.keys()
     assert {name: [dep for dep in STAGES[name]["deps"] if "code/" in dep] for name in OTHERS} == {
         name: [f"data/code/{name}"] for name in OTHERS
     }
 
 
-def test_stage_code_depends_on_all_imported_modules_and_no_others():
+def test_stage_code_depends_on_exactly_the_imported_modules():
     named = {ROOT / path for path in STAGES["code"]["deps"]}
     needed = {file_of(name) for stage in all_stages() for name in digests_of(stage)}
     homes = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}
     assert homes == named
 
 
-def test_the_digests_of_a_stage_hold_the_modules_that_decide_its_results():
+def test_digests_contain_the_modules_of_a_stage():
     assert "reskin.models.train" in digests_of("train_multi")
     assert "reskin.models.train" not in digests_of("simulate")
     assert {f"pipeline.experiments.{name}" for name in ANALYSES} <= digests_of("report").keys()
 
 
-def test_a_caption_runs_only_the_report_again(monkeypatch):
+def test_caption_reruns_only_the_report(monkeypatch):
     monkeypatch.setattr(code, "normalised", lambda file, content: b"other" if file == "manual.yaml" else b"same")
     code.digest.cache_clear()
     other = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
@@ -54,7 +54,7 @@ def test_a_caption_runs_only_the_report_again(monkeypatch):
 
 
 @pytest.mark.parametrize("name", sorted(STAGES))
-def test_every_path_that_a_command_takes_is_declared(name):
+def test_paths_of_commands_are_declared(name):
     stage = STAGES[name]
     outs = [one if isinstance(one, str) else next(iter(one)) for key in ("outs", "plots") for one in stage.get(key, [])]
     params = [next(iter(one)) for one in stage.get("params", [])]
@@ -64,11 +64,11 @@ def test_every_path_that_a_command_takes_is_declared(name):
     assert unknown == []
 
 
-def test_the_flow_stays_below_thirty_stages_beside_experiments():
+def test_fewer_than_thirty_stages_besides_experiments():
     assert len(STAGES.keys() - set(ANALYSES)) < 30
 
 
-def test_recordings_that_git_ignores_are_tracked_by_dvc(tmp_path):
+def test_ignored_recordings_are_tracked_by_dvc(tmp_path):
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     shutil.copy(ROOT / ".gitignore", tmp_path)
     (tmp_path / ".dvc").mkdir()
@@ -78,6 +78,6 @@ def test_recordings_that_git_ignores_are_tracked_by_dvc(tmp_path):
     (capture / "readings.csv").write_text("x\n")
     (tmp_path / "data/raw/lab/one.dvc").write_text("outs:\n- path: one\n  md5: d41d8cd98f00b204e9800998ecf8427e.dir\n")
     with Repo(str(tmp_path)) as repo:
-        assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]  # so they are pushed
+        assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]  # they are pushed
     status = subprocess.check_output(["git", "status", "--porcelain", "-uall", "data"], cwd=tmp_path, text=True)
     assert status == "?? data/raw/lab/one.dvc\n"

@@ -11,20 +11,20 @@ from reskin.models import job
 from reskin.numerics import device
 
 
-def test_trainings_run_in_processes_of_their_own(monkeypatch):
+def test_trainings_run_in_separate_processes(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
 
 
-def test_what_workers_took_counts_when_they_are_ended(monkeypatch):
+def test_cpu_time_of_ended_workers_is_counted(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         executor.submit(burn, 0.3).result()
     before_s = children_s()
     end_workers()
     assert children_s() - before_s >= 0.3
-    end_workers()  # of which there are none any more
+    end_workers()  # without workers
 
 
 def children_s() -> float:
@@ -32,7 +32,7 @@ def children_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def test_what_tasks_need_is_imported_before_they_begin(monkeypatch):
+def test_modules_are_imported_before_tasks(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     end_workers()
     with make_executor(imports="colorsys") as executor:
@@ -49,14 +49,14 @@ def burn(seconds: float) -> None:
         pass
 
 
-@pytest.mark.parametrize("word", ["", "threads:2", "dask:", "processes", "processes:0", "processes:-1", "processes:x"])
-def test_an_unknown_executor_is_one_sentence(monkeypatch, word):
-    monkeypatch.setenv("RESKIN_EXECUTOR", word)
+@pytest.mark.parametrize("value", ["", "threads:2", "dask:", "processes", "processes:0", "processes:-1", "processes:x"])
+def test_unknown_executor_is_an_error(monkeypatch, value):
+    monkeypatch.setenv("RESKIN_EXECUTOR", value)
     with pytest.raises(ParamsError, match="RESKIN_EXECUTOR: the executor must be processes:N"):
         make_executor(imports="json")
 
 
-def test_trainings_can_run_here_and_fail_as_they_would_elsewhere(monkeypatch):
+def test_trainings_can_run_in_this_process(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() == os.getpid()
@@ -64,42 +64,42 @@ def test_trainings_can_run_here_and_fail_as_they_would_elsewhere(monkeypatch):
             executor.submit(lambda: 1 // 0).result()
 
 
-def test_networks_are_trained_on_the_cpu_unless_told_otherwise(monkeypatch):
+def test_default_device_is_the_cpu(monkeypatch):
     monkeypatch.delenv("RESKIN_DEVICE", raising=False)
     assert device() == "cpu"
-    for word in ("cpu", "cuda"):
-        monkeypatch.setenv("RESKIN_DEVICE", word)
-        assert device() == word
+    for value in ("cpu", "cuda"):
+        monkeypatch.setenv("RESKIN_DEVICE", value)
+        assert device() == value
 
 
-@pytest.mark.parametrize("word", ["", "gpu", "CUDA", "cuda:0", "cpu "])
-def test_an_unknown_device_is_one_sentence(monkeypatch, word):
-    monkeypatch.setenv("RESKIN_DEVICE", word)
-    with pytest.raises(ParamsError) as refused:
+@pytest.mark.parametrize("value", ["", "gpu", "CUDA", "cuda:0", "cpu "])
+def test_unknown_device_is_an_error(monkeypatch, value):
+    monkeypatch.setenv("RESKIN_DEVICE", value)
+    with pytest.raises(ParamsError) as error:
         device()
-    assert str(refused.value) == (
-        f"RESKIN_DEVICE: the device must be one of ('cpu', 'cuda'); got {word!r}. Unset it for cpu."
+    assert str(error.value) == (
+        f"RESKIN_DEVICE: the device must be one of ('cpu', 'cuda'); got {value!r}. Unset it for cpu."
     )
 
 
-def test_a_call_is_timed_after_one_that_warms_and_the_middle_time_counts(monkeypatch):
+def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
     now_s, calls = [0.0], []
 
     def call() -> None:
         calls.append(len(calls))
-        now_s[0] += 1000.0 if len(calls) == 1 else float(len(calls))  # cold once, then 2 s, 3 s, ...
+        now_s[0] += 1000.0 if len(calls) == 1 else float(len(calls))  # a cold call, then 2 s, 3 s, ...
 
     monkeypatch.setattr(job, "perf_counter", lambda: now_s[0])
     median_s = job.median_call_s(call)
     assert len(calls) == job.REPEATS_N + 1
-    assert median_s == (2 + job.REPEATS_N + 1) / 2  # of 2 .. 26 s
+    assert median_s == (2 + job.REPEATS_N + 1) / 2  # the median of 2 .. 26 s
 
 
-def test_one_slow_call_changes_little(monkeypatch):
-    now_s, took_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * job.REPEATS_N)
+def test_single_slow_call_changes_little(monkeypatch):
+    now_s, durations_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * job.REPEATS_N)
 
     def call() -> None:
-        now_s[0] += next(took_s)
+        now_s[0] += next(durations_s)
 
     monkeypatch.setattr(job, "perf_counter", lambda: now_s[0])
     assert job.median_call_s(call) == 1.0

@@ -1,4 +1,4 @@
-"""Public recordings come whole, checked and once; what cannot be had, or is other than it should be, leaves nothing."""
+"""Tests of fetching public recordings: checked and added once; errors leave no files."""
 
 import errno
 import os
@@ -35,7 +35,7 @@ SOURCES = fetching.read_sources(ROOT)
 
 
 def boards(folder: Path) -> dict[str, bytes]:
-    """Two recordings, of one board each, with line ends that git would change."""
+    """Return two recordings, of one board each, with line ends that git would change."""
     folder.mkdir()
     text = (write(folder, *PRESSES) / lab.READINGS).read_text().replace("\n", "\r\n")
     return {"board1.csv": text.encode(), "board2.csv": text.replace("160.0000", "160.4000").encode()}
@@ -50,13 +50,13 @@ def source_of(files: dict[str, bytes], home: str, commit: str | None, **changes:
         {"path": name, "layout": "lab", "board": Path(name).stem, "skin": f"skin-{Path(name).stem}", "options": {}}
         for name in files
     ]
-    words = {"home": home, "commit": commit, "licence": "MIT", "scene": "small", "note": None}
-    return words | {"files": pinned, "recordings": recordings} | changes
+    fields = {"home": home, "commit": commit, "licence": "MIT", "scene": "small", "note": None}
+    return fields | {"files": pinned, "recordings": recordings} | changes
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> SimpleNamespace:
-    """A checkout that runs no scene yet, and a home of two recordings with a later commit in which one was changed."""
+    """Return a checkout without running scenes, and a repository of two recordings, one changed by a later commit."""
     root, away = copy_checkout(tmp_path_factory.mktemp("checkout")), tmp_path_factory.mktemp("away")
     plan.use(root, [])
     with (root / SCENES / "small.yaml").open("w") as stream:
@@ -71,27 +71,27 @@ def world(tmp_path_factory) -> SimpleNamespace:
 
 @pytest.fixture
 def root(world, tmp_path) -> Path:
-    """A checkout whose one source is that home."""
+    """Return a checkout whose only source is that repository."""
     root = shutil.copytree(world.root, tmp_path / "checkout", symlinks=True)
-    pin(root, source_of(world.files, world.url, world.commit))
+    write_source(root, source_of(world.files, world.url, world.commit))
     return root
 
 
-def pin(root: Path, source: dict[str, object]) -> None:
+def write_source(root: Path, source: dict[str, object]) -> None:
     with (root / fetching.SOURCES).open("w") as stream:
         YAML().dump({"rig": source}, stream)
 
 
-def fetch(root: Path, where: str | Path | None = None, *, agreed: bool = False) -> str:
-    said: list[str] = []
-    fetching.fetch(root, "rig", None if where is None else str(where), agree=lambda _: agreed, say=said.append)
-    return "\n".join(said)
+def fetch(root: Path, origin: str | Path | None = None, *, consent: bool = False) -> str:
+    output: list[str] = []
+    fetching.fetch(root, "rig", None if origin is None else str(origin), agree=lambda _: consent, say=output.append)
+    return "\n".join(output)
 
 
-def refuse(root: Path, sentence: str, where: str | Path | None = None) -> None:
+def assert_refused(root: Path, message: str, origin: str | Path | None = None) -> None:
     before = contents(root)
-    with pytest.raises(ReskinError, match=sentence) as caught:
-        fetch(root, where)
+    with pytest.raises(ReskinError, match=message) as caught:
+        fetch(root, origin)
     assert "\n" not in str(caught.value)
     assert contents(root) == before
 
@@ -102,41 +102,41 @@ def fetched(root: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def not_added(monkeypatch) -> None:
-    """Fetch alone: adding takes seconds, and is not what these tests are about."""
+def only_fetched(monkeypatch) -> None:
+    """Fetch without adding, which takes seconds."""
     monkeypatch.setattr(fetching, "_add_all", lambda *_: None)
     monkeypatch.setattr(fetching, "_say_what_runs", lambda *_: None)
 
 
-def test_recordings_come_from_their_home_once_and_are_added_once(root, world):
-    said = fetch(root)
+def test_recordings_are_fetched_and_added_once(root, world):
+    output = fetch(root)
     assert fetched(root) == world.files
     assert sorted(read_registry(root).captures["small"]) == ["board1_skin-board1_board1", "board2_skin-board2_board2"]
     for board in ("board1", "board2"):
         raw = root / adding.RAW / "small" / f"{board}_skin-{board}_{board}"
         assert (raw / lab.READINGS).read_bytes() == world.files[f"{board}.csv"]
     assert list(plan.check(root).scenes) == ["small"]
-    assert "switched scene small on in pipeline/plan.yaml, beside no other" in said
-    assert "now: dvc repro" in said
+    assert "switched scene small on in pipeline/plan.yaml, beside no other" in output
+    assert "now: dvc repro" in output
     before = contents(root)
-    said = fetch(root)
-    assert "there already and unchanged" in said
-    assert "small/board1_skin-board1_board1: added already" in said
+    output = fetch(root)
+    assert "there already and unchanged" in output
+    assert "small/board1_skin-board1_board1: added already" in output
     assert contents(root) == before
     plan.use(root, [])
     assert "scene small is switched off; now: reskin scenes use small; dvc repro" in fetch(root)
 
 
-def test_adding_that_was_stopped_goes_on_where_it_was(root, monkeypatch):
+def test_interrupted_add_continues(root, monkeypatch):
     add, calls = adding.add, []
 
-    def stopped(*words, **options):
-        calls.append(words)
+    def interrupted(*fields, **options):
+        calls.append(fields)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return add(*words, **options)
+        return add(*fields, **options)
 
-    monkeypatch.setattr(adding, "add", stopped)
+    monkeypatch.setattr(adding, "add", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fetch(root)
     assert list(read_registry(root).captures["small"]) == ["board1_skin-board1_board1"]
@@ -145,7 +145,7 @@ def test_adding_that_was_stopped_goes_on_where_it_was(root, monkeypatch):
     assert len(calls) == 3
 
 
-def test_a_recording_that_was_added_by_hand_under_another_name_is_not_added_again(root, world, tmp_path):
+def test_recording_added_by_hand_is_not_added_again(root, world, tmp_path):
     (tmp_path / "mine.csv").write_bytes(world.files["board1.csv"])
     prepared = preparing.foreign(tmp_path / "mine.csv", "lab", CaptureNames("b", "s", "mine"), {})
     adding.add(root, "small", prepared, allow_copy=False)
@@ -154,39 +154,39 @@ def test_a_recording_that_was_added_by_hand_under_another_name_is_not_added_agai
 
 
 @pytest.mark.usefixtures("not_added")
-def test_a_mirror_or_a_folder_takes_the_place_of_the_home(root, world, tmp_path):
-    pin(root, source_of(world.files, (tmp_path / "away").as_uri(), world.commit))
-    refuse(root, "cannot read the repository")
+def test_mirror_or_folder_replaces_the_home(root, world, tmp_path):
+    write_source(root, source_of(world.files, (tmp_path / "away").as_uri(), world.commit))
+    assert_refused(root, "cannot read the repository")
     (tmp_path / "files/deep").mkdir(parents=True)
     for name, content in world.files.items():
         (tmp_path / "files/deep" / name).write_bytes(content)
-    for where in (world.url, world.away / "mirror.git", world.away / "home", tmp_path / "files"):
-        assert f"taken from: {where}" in fetch(root, where)
+    for origin in (world.url, world.away / "mirror.git", world.away / "home", tmp_path / "files"):
+        assert f"taken from: {origin}" in fetch(root, origin)
         assert fetched(root) == world.files
         shutil.rmtree(root / fetching.FETCHED)
 
 
-def test_a_commit_that_the_home_has_not_is_refused_and_no_other_is_taken(root, world):
-    pin(root, source_of(world.files, world.url, "1" * 40))
-    refuse(root, f"the repository does not have commit {'1' * 40}, at which")
+def test_missing_commit_is_an_error(root, world):
+    write_source(root, source_of(world.files, world.url, "1" * 40))
+    assert_refused(root, f"the repository does not have commit {'1' * 40}, at which")
 
 
-def test_a_file_with_another_checksum_is_named_with_both(root, world):
-    pin(root, source_of(world.files, world.url, None))  # the newest, in which one file is another
+def test_wrong_checksum_is_an_error(root, world):
+    write_source(root, source_of(world.files, world.url, None))  # the newest commit, with one other file
     other, right = sha256(b"mended\n").hexdigest(), sha256(world.files["board1.csv"]).hexdigest()
-    refuse(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")
+    assert_refused(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")
 
 
-def test_a_file_that_was_cut_or_is_missing_in_a_folder_is_named(root, world, tmp_path):
+def test_truncated_or_missing_file_is_an_error(root, world, tmp_path):
     (tmp_path / "board1.csv").write_bytes(world.files["board1.csv"])
     (tmp_path / "board2.csv").write_bytes(world.files["board2.csv"][:-1])
-    refuse(root, "board2.csv: sha256 must be", tmp_path)
+    assert_refused(root, "board2.csv: sha256 must be", tmp_path)
     (tmp_path / "board2.csv").unlink()
-    refuse(root, "no file data/board2.csv or board2.csv", tmp_path)
+    assert_refused(root, "no file data/board2.csv or board2.csv", tmp_path)
 
 
 @pytest.mark.usefixtures("not_added")
-def test_a_fetched_file_that_was_changed_since_is_fetched_again(root, world):
+def test_changed_file_is_fetched_again(root, world):
     fetch(root)
     (root / fetching.FETCHED / "rig/board2.csv").write_bytes(b"changed")
     assert "every checksum is right" in fetch(root)
@@ -194,17 +194,17 @@ def test_a_fetched_file_that_was_changed_since_is_fetched_again(root, world):
 
 
 @pytest.mark.usefixtures("not_added")
-def test_what_has_no_licence_is_fetched_only_when_somebody_agrees(root, world):
-    pin(root, source_of(world.files, world.url, world.commit, licence=None))
-    refuse(root, "use without a licence was not agreed to. Nothing was fetched.*--yes")
-    said = fetch(root, agreed=True)
-    assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in said
-    assert f"home: {world.url}, commit {world.commit}" in said
+def test_unlicensed_data_need_consent(root, world):
+    write_source(root, source_of(world.files, world.url, world.commit, licence=None))
+    assert_refused(root, "use without a licence was not consent to. Nothing was fetched.*--yes")
+    output = fetch(root, consent=True)
+    assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in output
+    assert f"home: {world.url}, commit {world.commit}" in output
     assert fetched(root) == world.files
 
 
-def test_without_a_terminal_a_licence_is_agreed_to_in_words(root, world, monkeypatch):
-    pin(root, source_of(world.files, world.url, world.commit, licence=None, scene=None, note="Not added."))
+def test_consent_can_be_given_on_the_command_line(root, world, monkeypatch):
+    write_source(root, source_of(world.files, world.url, world.commit, licence=None, scene=None, note="Not added."))
     monkeypatch.chdir(root)
     done = CliRunner().invoke(app, ["fetch", "rig"])
     assert "add --yes" in str(done.exception)
@@ -214,7 +214,7 @@ def test_without_a_terminal_a_licence_is_agreed_to_in_words(root, world, monkeyp
     assert done.stdout.endswith("Not added.\n")
 
 
-def test_samples_in_archives_are_checked_and_added_as_the_table_that_they_become(root, tmp_path):
+def test_archives_are_checked_as_converted_tables(root, tmp_path):
     rows = [
         f"{i},{phase},{4 * i},2,{','.join(f'{value * (1 + i):.4f}' for value in range(20))},0.000000,0.000000,{force}"
         for i in range(2)
@@ -226,18 +226,18 @@ def test_samples_in_archives_are_checked_and_added_as_the_table_that_they_become
     commit = repositories.commit(tmp_path / "home", {"raw/port_1.npz": archive})
     source = source_of({"board1.csv": table}, str(tmp_path / "home"), commit)
     source["files"][0]["at"] = "raw/port_1.npz"
-    pin(root, source)
+    write_source(root, source)
     fetch(root)
     assert fetched(root) == {"board1.csv": table}
     assert list(read_registry(root).captures["small"]) == ["board1_skin-board1_board1"]
 
 
 @pytest.mark.usefixtures("not_added")
-def test_a_fetch_that_was_stopped_leaves_nothing_and_can_be_run_again(root, world, monkeypatch):
+def test_interrupted_fetch_leaves_no_files(root, world, monkeypatch):
     opened, reads = fetching.open_origin, []
 
-    def stopped(*words) -> Origin:
-        origin = opened(*words)
+    def interrupted(*fields) -> Origin:
+        origin = opened(*fields)
 
         def read(path: str) -> bytes:
             reads.append(path)
@@ -247,7 +247,7 @@ def test_a_fetch_that_was_stopped_leaves_nothing_and_can_be_run_again(root, worl
 
         return Origin(origin.name, origin.paths, read)
 
-    monkeypatch.setattr(fetching, "open_origin", stopped)
+    monkeypatch.setattr(fetching, "open_origin", interrupted)
     before = contents(root)
     with pytest.raises(KeyboardInterrupt):
         fetch(root)
@@ -257,31 +257,31 @@ def test_a_fetch_that_was_stopped_leaves_nothing_and_can_be_run_again(root, worl
     assert fetched(root) == world.files
 
 
-def test_a_disk_without_room_is_told_before_and_while_it_fills(root, monkeypatch):
+def test_full_disk_is_an_error(root, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
-    refuse(root, "needs .* MB of free disk space; 0 MB are free. Free some")
+    assert_refused(root, "needs .* MB of free disk space; 0 MB are free. Free some")
     monkeypatch.undo()
 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(fetching, "_read_checked", full)
-    refuse(root, "cannot write: No space left on device")
+    assert_refused(root, "cannot write: No space left on device")
 
 
-def test_a_source_that_is_not_known_is_named_beside_those_that_are(root):
+def test_unknown_source_is_an_error(root):
     with pytest.raises(ReskinError, match="a source must be one of rig; got lab"):
         fetching.fetch(root, "lab", None, agree=lambda _: True, say=print)
 
 
-def test_without_a_name_all_sources_are_listed(monkeypatch):
+def test_sources_are_listed_without_a_name(monkeypatch):
     monkeypatch.chdir(ROOT)
     lines = CliRunner().invoke(app, ["fetch"]).stdout.splitlines()
     assert [line.split(":")[0] for line in lines] == list(SOURCES)
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_what_is_added_was_fetched_and_its_scene_is_there(name):
+def test_recordings_of_sources_are_fetched_into_known_scenes(name):
     source, paths = SOURCES[name], {Path(file.path) for file in SOURCES[name].files}
     assert len(paths) == len(source.files)
     for recording in source.recordings:
@@ -295,9 +295,9 @@ def test_what_is_added_was_fetched_and_its_scene_is_there(name):
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_real_recordings_have_the_checksums_on_record_and_are_read(name, shared_data, tmp_path):
+def test_real_recordings_have_their_checksums_and_are_read(name, shared_data, tmp_path):
     fetching.download(SOURCES[name], str(shared_data / name), tmp_path / name)
-    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # rows, as data/README.md tells
+    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # rows, as in data/README.md
     readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7}
     for recording in SOURCES[name].recordings[:1]:
         labels = CaptureNames(recording.board, recording.skin, None)
@@ -308,7 +308,7 @@ def test_real_recordings_have_the_checksums_on_record_and_are_read(name, shared_
 
 
 @pytest.mark.timeout(600)
-def test_real_boards_are_in_their_scene_after_one_command(shared_data, tmp_path, monkeypatch):
+def test_real_boards_join_their_scene(shared_data, tmp_path, monkeypatch):
     (tmp_path / "checkout").mkdir()
     root = copy_checkout(tmp_path / "checkout")
     plan.use(root, ["quick"])
@@ -325,6 +325,6 @@ def test_real_boards_are_in_their_scene_after_one_command(shared_data, tmp_path,
 
 
 @pytest.mark.parametrize("path", ["../elsewhere.csv", "/etc/elsewhere.csv", "a/../../elsewhere.csv"])
-def test_a_file_never_lands_outside_the_folder_of_its_source(path):
+def test_paths_outside_the_folder_are_an_error(path):
     with pytest.raises(ValueError, match="a path below the folder of its source"):
         fetching.File(path=path, at="a.csv", bytes_n=1, sha256="0" * 64)

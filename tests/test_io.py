@@ -15,7 +15,7 @@ from reskin.schema import UNITS
 from tests.data.tables import readings
 
 
-def test_readings_come_back_as_they_were_written(tmp_path):
+def test_readings_round_trip(tmp_path):
     before = readings(x_mm=np.array([0, np.nan, 2, 3, 4, 5], np.float32))
     io.write_readings(tmp_path / "c0.parquet", [before], {"rows_n": 6})
     after = io.read_readings(tmp_path / "c0.parquet")
@@ -26,7 +26,7 @@ def test_readings_come_back_as_they_were_written(tmp_path):
     assert io.read_ingest_counts(tmp_path / "c0.parquet") == {"rows_n": 6}
 
 
-def test_every_column_of_the_file_has_its_unit_and_the_file_its_schema_version(tmp_path):
+def test_columns_have_units_and_the_file_a_schema_version(tmp_path):
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     schema = pq.read_schema(tmp_path / "c0.parquet")
     assert {field.name: field.metadata[b"unit"].decode() for field in schema if field.name in UNITS} == UNITS
@@ -35,25 +35,25 @@ def test_every_column_of_the_file_has_its_unit_and_the_file_its_schema_version(t
     assert pq.ParquetFile(tmp_path / "c0.parquet").metadata.row_group(0).column(5).compression == "ZSTD"
 
 
-def test_blocks_and_one_piece_hold_the_same_rows(tmp_path):
+def test_blocks_equal_one_piece(tmp_path):
     io.write_readings(tmp_path / "whole.parquet", [readings()], {})
     io.write_readings(tmp_path / "blocks.parquet", [readings(), readings()], {})
     assert len(io.read_readings(tmp_path / "blocks.parquet")) == 2 * len(io.read_readings(tmp_path / "whole.parquet"))
 
 
-def test_same_readings_same_bytes(tmp_path):
+def test_readings_are_written_reproducibly(tmp_path):
     for name in ("one", "other"):
         io.write_readings(tmp_path / name, [readings()], {"rows_n": 6})
     assert (tmp_path / "one").read_bytes() == (tmp_path / "other").read_bytes()
 
 
-def test_a_capture_without_readings_writes_nothing(tmp_path):
+def test_capture_without_readings_is_an_error(tmp_path):
     with pytest.raises(SchemaError, match="no reading left"):
         io.write_readings(tmp_path / "c0.parquet", [], {})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failure_in_the_middle_leaves_the_old_file(tmp_path):
+def test_failed_write_keeps_the_old_file(tmp_path):
     io.write_text(tmp_path / "a.txt", "old")
     with pytest.raises(RuntimeError), io.replacing(tmp_path / "a.txt") as temporary:
         temporary.write_text("half")
@@ -61,25 +61,29 @@ def test_a_failure_in_the_middle_leaves_the_old_file(tmp_path):
     assert [file.read_text() for file in tmp_path.iterdir()] == ["old"]
 
 
-def test_a_file_that_is_read_for_another_keeps_its_name_when_the_machine_refuses_it(tmp_path):
-    def refused(*names: Path) -> tuple[str, ...]:
-        """Say which file the error names, if the disk named these while a.txt was written."""
+def test_os_errors_name_the_right_file(tmp_path):
+    def names_in_errors(*names: Path) -> tuple[str, ...]:
+        """Return the file that the error names, if the disk reports these names while a.txt is written."""
         found = []
         for number in (errno.EACCES, errno.ENOSPC, errno.EIO):
-            words = (names[0], None, names[1]) if len(names) == 2 else names
+            metadata = (names[0], None, names[1]) if len(names) == 2 else names
             with pytest.raises(OSError, match="refused") as raised, io.replacing(tmp_path / "a.txt"):
-                raise OSError(number, "refused", *words)
+                raise OSError(number, "refused", *metadata)
             found.append("" if raised.value.filename is None else Path(raised.value.filename).name)
         return tuple(found)
 
     source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
-    assert refused(source) == ("source", "source", "source")
-    assert refused(temporary) == ("a.txt", "a.txt", "a.txt")
-    assert refused(source, temporary) == ("a.txt", "a.txt", "source")  # of a copy; who refused an EIO is not known
-    assert refused() == ("a.txt", "a.txt", "")
+    assert names_in_errors(source) == ("source", "source", "source")
+    assert names_in_errors(temporary) == ("a.txt", "a.txt", "a.txt")
+    assert names_in_errors(source, temporary) == (
+        "a.txt",
+        "a.txt",
+        "source",
+    )  # of a copy; EIO may be of either
+    assert names_in_errors() == ("a.txt", "a.txt", "")
 
 
-def test_a_disk_that_refuses_all_is_told_by_the_name_of_the_target(tmp_path, monkeypatch):
+def test_read_only_disk_error_names_the_target(tmp_path, monkeypatch):
     def refuse(path: Path) -> None:
         raise OSError(errno.EROFS, "Read-only file system", str(path))
 
@@ -89,7 +93,7 @@ def test_a_disk_that_refuses_all_is_told_by_the_name_of_the_target(tmp_path, mon
     assert raised.value.filename == str(tmp_path / "a.txt")
 
 
-def test_a_source_without_rights_is_named_and_not_its_copy(tmp_path):
+def test_unreadable_source_is_named(tmp_path):
     with (
         pytest.raises(IsADirectoryError, match="source"),
         explaining("ingest_many"),
@@ -100,35 +104,35 @@ def test_a_source_without_rights_is_named_and_not_its_copy(tmp_path):
     assert not (tmp_path / "copy").exists()
 
 
-def texts(folder: Path) -> dict[str, str]:
+def read_texts(folder: Path) -> dict[str, str]:
     return {file.name: file.read_text(encoding="utf-8") for file in folder.iterdir()}
 
 
-def test_a_folder_of_texts_holds_them_and_nothing_of_what_was_there_before(tmp_path):
+def test_folder_of_texts_is_replaced(tmp_path):
     io.write_texts(tmp_path / "tables", {"a.md": "old", "gone.md": "old"})
     io.write_texts(tmp_path / "tables", {"a.md": "±1 µT", "b.md": ""})
-    assert texts(tmp_path / "tables") == {"a.md": "±1 µT", "b.md": ""}
+    assert read_texts(tmp_path / "tables") == {"a.md": "±1 µT", "b.md": ""}
     io.write_texts(tmp_path / "tables", {})
-    assert texts(tmp_path / "tables") == {}
+    assert read_texts(tmp_path / "tables") == {}
     assert [path.name for path in tmp_path.iterdir()] == ["tables"]
 
 
-def test_a_text_that_cannot_be_written_leaves_the_whole_old_folder(tmp_path):
+def test_failed_text_keeps_the_old_folder(tmp_path):
     io.write_texts(tmp_path / "tables", {"a.md": "old", "b.md": "old"})
     with pytest.raises(UnicodeEncodeError):
         io.write_texts(tmp_path / "tables", {"a.md": "new", "b.md": "half a pair: \ud800"})
-    assert texts(tmp_path / "tables") == {"a.md": "old", "b.md": "old"}
+    assert read_texts(tmp_path / "tables") == {"a.md": "old", "b.md": "old"}
     assert [path.name for path in tmp_path.iterdir()] == ["tables"]
 
 
 @pytest.mark.parametrize("content", [b"", b"x", bytes(range(256)) * 9])
-def test_what_is_no_parquet_is_one_sentence(tmp_path, content):
+def test_non_parquet_file_is_an_error(tmp_path, content):
     (tmp_path / "c0.parquet").write_bytes(content)
     with pytest.raises(SchemaError, match=r"c0.parquet: the file is not readable as Parquet"):
         io.read_readings(tmp_path / "c0.parquet")
 
 
-def test_a_column_in_another_unit_is_refused(tmp_path):
+def test_wrong_unit_is_an_error(tmp_path):
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     table = pq.read_table(tmp_path / "c0.parquet")
     i = table.schema.get_field_index("b_uT")
@@ -138,86 +142,89 @@ def test_a_column_in_another_unit_is_refused(tmp_path):
         io.read_readings(tmp_path / "c1.parquet")
 
 
-def test_a_missing_column_is_named(tmp_path):
+def test_missing_column_is_an_error(tmp_path):
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     io.write_table(tmp_path / "c1.parquet", pq.read_table(tmp_path / "c0.parquet").drop_columns(["noload_uT"]))
     with pytest.raises(SchemaError, match="no column noload_uT"):
         io.read_readings(tmp_path / "c1.parquet")
 
 
-def test_json_refuses_what_json_cannot_say(tmp_path):
+def test_json_without_nan(tmp_path):
     with pytest.raises(ValueError, match="Out of range float"):
         io.write_json(tmp_path / "a.json", {"x": float("nan")})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_broken_safetensors_are_one_sentence(tmp_path):
+def test_broken_safetensors_are_an_error(tmp_path):
     (tmp_path / "m.safetensors").write_bytes(b"junk")
     with pytest.raises(SchemaError, match="is not safetensors"):
         io.read_tensors(tmp_path / "m.safetensors")
 
 
-def flipped(file: Path) -> Iterator[int]:
-    """Change one bit of a file after another, and give the byte."""
-    whole = file.read_bytes()
-    for i in range(len(whole)):
-        content = bytearray(whole)
+def flip_bits(file: Path) -> Iterator[int]:
+    """Flip each bit in turn and yield the index of its byte."""
+    content_before = file.read_bytes()
+    for i in range(len(content_before)):
+        content = bytearray(content_before)
         content[i] ^= 1 << i % 8
         file.write_bytes(content)
         yield i
-    file.write_bytes(whole)
+    file.write_bytes(content_before)
 
 
-def test_whichever_bit_of_arrays_changes_it_is_told_or_changes_nothing(tmp_path):
+def test_flipped_bits_of_tensors_are_detected(tmp_path):
     file, tensors = tmp_path / "m.safetensors", {"a": np.arange(6.0, dtype=np.float32), "b": np.arange(4)}
     io.write_tensors(file, tensors, {"format": "1", "trial": "x"})
-    told_n = 0
-    for _ in flipped(file):
+    detected_n = 0
+    for _ in flip_bits(file):
         try:
-            found, words = io.read_tensors(file)
+            found, metadata = io.read_tensors(file)
         except SchemaError as error:
-            told_n += "m.safetensors: the file" in str(error)
+            detected_n += "m.safetensors: the file" in str(error)
             continue
         assert all(np.array_equal(found[name], tensors[name]) for name in tensors)
-        assert {name: words[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
-    assert told_n > file.stat().st_size - 8  # but for bits of the digest's own name
+        assert {name: metadata[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
+    assert detected_n > file.stat().st_size - 8  # except for bits of the name of the digest
 
 
-def test_a_changed_bit_among_the_readings_of_a_table_is_told(tmp_path):
+def test_flipped_bits_of_tables_are_detected(tmp_path):
     file = tmp_path / "c0.parquet"
     io.write_readings(file, [readings()], {"rows_n": 6})
     before, chunks = repr(io.read_table(file).to_pydict()), pq.read_metadata(file).row_group(0)
-    end, told_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0  # behind it: names of columns, the account
-    for i in flipped(file):
+    end, detected_n = (
+        chunks.column(chunks.num_columns - 1).data_page_offset,
+        0,
+    )  # followed by metadata
+    for i in flip_bits(file):
         try:
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
-            told_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert told_n > end // 2  # the other bits are of the pages' headers, which say nothing of what is read
+            detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
+    assert detected_n > end // 2  # the other bits are of the pages' headers, which say nothing of what is read
 
 
-def test_arrays_without_a_digest_are_of_older_code_and_are_read(tmp_path):
+def test_tensors_without_digest_are_read(tmp_path):
     safetensors.numpy.save_file({"a": np.arange(3.0)}, tmp_path / "m.safetensors", {"format": "1"})
-    tensors, words = io.read_tensors(tmp_path / "m.safetensors")
+    tensors, metadata = io.read_tensors(tmp_path / "m.safetensors")
     np.testing.assert_array_equal(tensors["a"], np.arange(3.0))
-    assert words == {"format": "1"}
+    assert metadata == {"format": "1"}
 
 
-def test_same_arrays_same_bytes_in_every_process(tmp_path):
-    words = {name: name for name in "cabdhgfe"}
+def test_tensors_are_written_reproducibly(tmp_path):
+    metadata = {name: name for name in "cabdhgfe"}
     for seed in range(6):
-        io.write_tensors(tmp_path / str(seed), {"b": np.arange(3), "a": np.ones((2, 2))}, words)
+        io.write_tensors(tmp_path / str(seed), {"b": np.arange(3), "a": np.ones((2, 2))}, metadata)
     assert len({file.read_bytes() for file in tmp_path.iterdir()}) == 1
     assert list(safetensors.safe_open(tmp_path / "0", framework="numpy").keys()) == ["a", "b"]
 
 
 @pytest.mark.parametrize("read", [io.read_bytes, io.read_json, io.read_table, io.read_readings, io.read_tensors])
-def test_a_missing_file_is_called_missing(tmp_path, read):
+def test_missing_file_is_an_error(tmp_path, read):
     with pytest.raises(SchemaError, match="none: file not found"):
         read(tmp_path / "none")
 
 
-def test_a_file_that_cannot_be_read_now_is_not_called_damaged(tmp_path, monkeypatch):
+def test_unreadable_file_is_not_called_damaged(tmp_path, monkeypatch):
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
 
     def refuse(path, **_):

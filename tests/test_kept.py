@@ -1,4 +1,4 @@
-"""Kept arrays: the same bits come back; a changed source, setting or file gives none; no rights are no fault."""
+"""Tests of cached arrays."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def files(package):
     return sorted((package / "__pycache__").glob("*"))
 
 
-def test_what_was_kept_comes_back_to_the_last_bit(package):
+def test_cached_array_round_trips(package):
     array = np.random.default_rng(0).normal(size=(3, 2))
     assert io.load_cached_array(package, "flow 1") is None
     io.save_cached_array(package, "flow 1", array)
@@ -26,7 +26,7 @@ def test_what_was_kept_comes_back_to_the_last_bit(package):
 
 
 @pytest.mark.parametrize("what", ["source", "another source", "setting"])
-def test_another_state_gives_nothing_and_takes_the_place_of_the_old(package, monkeypatch, what):
+def test_changed_source_or_setting_invalidates_the_array(package, monkeypatch, what):
     io.save_cached_array(package, "flow", np.ones(3))
     if what == "setting":
         monkeypatch.setenv("ATEN_CPU_CAPABILITY", "default")
@@ -39,13 +39,13 @@ def test_another_state_gives_nothing_and_takes_the_place_of_the_old(package, mon
 
 
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"no array"])
-def test_a_file_that_is_no_array_is_computed_again(package, content):
+def test_damaged_array_is_not_loaded(package, content):
     io.save_cached_array(package, "flow", np.ones(3))
     files(package)[0].write_bytes(content)
     assert io.load_cached_array(package, "flow") is None
 
 
-def test_where_nothing_can_be_written_nothing_is_kept(package):
+def test_unwritable_folder_is_no_error(package):
     (package / "__pycache__").write_text("a file in the way")
     io.save_cached_array(package, "flow", np.ones(3))
     assert io.load_cached_array(package, "flow") is None

@@ -1,8 +1,9 @@
-"""Errors of the machine become one sentence; programming errors pass unchanged."""
+"""Tests of errors of the machine, which become one line; programming errors pass unchanged."""
 
 import errno
 import os
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -14,7 +15,7 @@ from reskin.errors import MachineError, SchemaError, explaining
 
 
 @pytest.mark.parametrize(
-    ("error", "sentence"),
+    ("error", "message"),
     [
         (OSError(errno.ENOSPC, "No space left on device", "models"), "split: models: No space left on device. Free"),
         (OSError(errno.EROFS, "Read-only file system", "reports"), "split: reports: Read-only file system. Check its"),
@@ -24,10 +25,10 @@ from reskin.errors import MachineError, SchemaError, explaining
         (OSError(errno.ENOMEM, "Cannot allocate memory"), "split: out of memory: .*Cannot allocate memory"),
     ],
 )
-def test_errors_of_the_machine_become_one_sentence(error, sentence):
-    with pytest.raises(MachineError, match=f"^{sentence}") as found, explaining("split"):
+def test_os_errors_are_explained(error, message):
+    with pytest.raises(MachineError, match=f"^{message}") as error_info, explaining("split"):
         raise error
-    assert str(found.value).endswith("Run it again: finished work is kept.")
+    assert str(error_info.value).endswith("Run it again: finished work is kept.")
 
 
 @pytest.mark.parametrize(
@@ -40,7 +41,7 @@ def test_other_errors_pass_unchanged(error):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk without room, on Linux only")
 @pytest.mark.parametrize("write", [io.write_json, io.write_table, io.write_tensors])
-def test_a_full_disk_names_the_target(tmp_path, write):
+def test_full_disk_error_names_the_target(tmp_path, write):
     target, (temporary,) = tmp_path / "out", [tmp_path / f".out.{os.getpid()}.tmp"]
     content = {io.write_table: pa.table({"a": np.zeros(9)}), io.write_tensors: {"a": np.zeros(9)}}.get(write, [1])
     with pytest.MonkeyPatch.context() as patch:
@@ -54,7 +55,7 @@ def test_a_full_disk_names_the_target(tmp_path, write):
     assert not target.exists()
 
 
-def test_a_damaged_table_raises_one_sentence(tmp_path):
+def test_damaged_table_is_an_error(tmp_path):
     io.write_table(tmp_path / "t.parquet", pa.table({"a": np.random.default_rng(0).normal(size=9999)}))
     content = (tmp_path / "t.parquet").read_bytes()
     for damaged in (content[:-20], bytes(500) + content[500:], b""):
@@ -63,9 +64,9 @@ def test_a_damaged_table_raises_one_sentence(tmp_path):
             io.read_table(tmp_path / "t.parquet")
 
 
-def test_a_stage_prints_the_error_and_exits_with_its_status(tmp_path, monkeypatch, capsys):
-    def split(folds: str) -> None:
-        raise OSError(errno.EROFS, "Read-only file system", folds)
+def test_stage_prints_the_error_and_exits(tmp_path, monkeypatch, capsys):
+    def split(folds: Path) -> None:
+        raise OSError(errno.EROFS, "Read-only file system", str(folds))
 
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match="2"):

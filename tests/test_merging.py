@@ -1,4 +1,4 @@
-"""Two people add recordings in two clones and merge: both are kept, and contradictions are refused."""
+"""Tests of merging clones in which two people added recordings."""
 
 import shutil
 import subprocess
@@ -19,8 +19,8 @@ NOTHING = Registry(captures={})
 PERSON = ["-c", "user.name=Tester", "-c", "user.email=tester@example.org", "-c", "commit.gpgsign=false"]
 
 
-def git(root: Path, *words: str, check: bool = True) -> str:
-    done = subprocess.run(["git", *PERSON, *words], cwd=root, capture_output=True, text=True, check=check)
+def git(root: Path, *arguments: str, check: bool = True) -> str:
+    done = subprocess.run(["git", *PERSON, *arguments], cwd=root, capture_output=True, text=True, check=check)
     return done.stdout
 
 
@@ -29,8 +29,8 @@ def entry(skin: str, board: str, *fingerprints: str) -> Entry:
     return Entry(board=board, skin=skin, layout="table", chips_n=5, fingerprints=hashes, copy_of=None)
 
 
-def added(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
-    """What `reskin add` and `dvc repro` change of the files that git holds."""
+def add_and_commit(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
+    """Commit the changes that `reskin add` and `dvc repro` make to files in git."""
     write_registry(root, with_entry(read_registry(root), scene, name, entry(skin, board), allow_copy=False))
     plan.use(root, sorted({*plan.read_plan(root / PLAN).scenes, scene}))
     lock = YAML(typ="safe").load((root / "dvc.lock").read_text())
@@ -43,7 +43,7 @@ def added(root: Path, name: str, skin: str, board: str, scene: str = "shared") -
 
 
 @pytest.fixture(scope="module")
-def start(tmp_path_factory) -> Path:
+def initial_checkout(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("start")
     for name in (FLOW, PARAMS, ".gitattributes"):
         shutil.copy(ROOT / name, root)
@@ -60,36 +60,36 @@ def start(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def root(start, tmp_path) -> Path:
-    return shutil.copytree(start, tmp_path / "clone")
+def root(initial_checkout, tmp_path) -> Path:
+    return shutil.copytree(initial_checkout, tmp_path / "clone")
 
 
-def two(root: Path, ours: tuple[str, ...], theirs: tuple[str, ...]) -> None:
+def merge_two(root: Path, ours: tuple[str, ...], theirs: tuple[str, ...]) -> None:
     git(root, "checkout", "-qb", "theirs")
-    added(root, *theirs)
+    add_and_commit(root, *theirs)
     git(root, "checkout", "-q", "main")
-    added(root, *ours)
+    add_and_commit(root, *ours)
     git(root, "merge", "theirs", check=False)
 
 
-def test_both_recordings_are_in_the_registry_the_plan_and_the_lock(root):
-    two(root, ("mine", "s1", "b1"), ("yours", "s2", "b2"))
+def test_registry_plan_and_lock_have_both_recordings(root):
+    merge_two(root, ("mine", "s1", "b1"), ("yours", "s2", "b2"))
     assert "2 captures" in merge.merge(root)
     assert list(read_registry(root).captures["shared"]) == ["mine", "yours"]
     assert list(plan.check(root).stages["ingest"]) == ["shared-mine", "shared-yours"]
     stages = YAML(typ="safe").load((root / "dvc.lock").read_text())["stages"]
     assert {"report@quick", "ingest@shared-mine", "ingest@shared-yours"} <= stages.keys()
-    assert stages["report@shared"] == {"cmd": "with mine"}  # whole, and DVC runs it again as its inputs are new
+    assert stages["report@shared"] == {"cmd": "with mine"}  # taken whole; DVC runs it again
     assert (root / "reports/shared/tables/lobo.md").read_text() == "with mine\n"
     assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
     git(root, "commit", "-qm", "Merge")
     assert git(root, "status", "--porcelain") == ""
 
 
-def test_a_report_that_we_deleted_and_they_changed_stays_deleted(root):
-    added(root, "first", "s0", "b0")
+def test_deleted_report_stays_deleted(root):
+    add_and_commit(root, "first", "s0", "b0")
     git(root, "checkout", "-qb", "theirs")
-    added(root, "yours", "s2", "b2")
+    add_and_commit(root, "yours", "s2", "b2")
     git(root, "checkout", "-q", "main")
     git(root, "rm", "-q", "reports/shared/tables/lobo.md")
     git(root, "commit", "-qm", "Delete a report")
@@ -100,7 +100,7 @@ def test_a_report_that_we_deleted_and_they_changed_stays_deleted(root):
 
 
 def test_contradicting_recordings_change_nothing(root):
-    two(root, ("mine", "s1", "b1"), ("yours", "s1", "b2"))
+    merge_two(root, ("mine", "s1", "b1"), ("yours", "s1", "b2"))
     before = {name: (root / name).read_bytes() for name in merge.RESOLVED}
     with pytest.raises(ReskinError, match="the board of skin s1 must be b1, as in mine; got b2"):
         merge.merge(root)
@@ -109,25 +109,25 @@ def test_contradicting_recordings_change_nothing(root):
 
 
 @pytest.mark.parametrize(
-    ("theirs", "sentence"),
+    ("theirs", "message"),
     [
         ({"yours": entry("s1", "b2")}, "the board of skin s1 must be b1, as in mine; got b2"),
         ({"yours": entry("s2", "b2", "b1-s1")}, "it has the same readings as mine"),
         ({"mine": entry("s2", "b2")}, "the name mine is taken in scene"),
     ],
 )
-def test_a_merged_registry_keeps_the_rules_of_one(theirs, sentence):
+def test_merged_registry_is_validated(theirs, message):
     ours = Registry(captures={"shared": {"mine": entry("s1", "b1")}})
-    with pytest.raises(ReskinError, match=sentence):
+    with pytest.raises(ReskinError, match=message):
         merge.merge_registries(NOTHING, ours, Registry(captures={"shared": theirs}))
 
 
-def test_scenes_that_one_side_added_run_and_those_that_one_removed_do_not():
+def test_added_scenes_run_and_removed_ones_do_not():
     assert merge.merge_scenes(["a", "b"], ["a", "b", "mine"], ["yours", "b"]) == ["b", "mine", "yours"]
     assert merge.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
 
 
-def test_files_written_by_people_are_theirs_to_merge(root):
+def test_hand_written_files_are_not_merged(root):
     git(root, "checkout", "-qb", "theirs")
     (root / PARAMS).write_text("theirs: 1\n")
     git(root, "commit", "-qam", "Change a parameter")
@@ -139,12 +139,12 @@ def test_files_written_by_people_are_theirs_to_merge(root):
         merge.merge(root)
 
 
-def test_without_a_conflict_merge_is_refused(root):
+def test_merge_without_conflict_is_an_error(root):
     with pytest.raises(ReskinError, match="No file is in conflict"):
         merge.merge(root)
 
 
-def test_captures_that_one_side_removed_or_replaced_stay_so():
+def test_removed_and_replaced_captures_stay_so():
     kept, gone, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
     base = Registry(captures={"scene": {"kept": kept, "gone": gone, "replaced": old}})
     theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})
@@ -153,7 +153,7 @@ def test_captures_that_one_side_removed_or_replaced_stay_so():
     assert merge.merge_registries(base, theirs, theirs) == theirs
 
 
-def test_an_entry_of_the_lock_is_taken_whole():
+def test_lock_entries_are_taken_whole():
     base, changed = {"a": {"in": 1, "out": 1}, "b": 1}, {"a": {"in": 2, "out": 2}}
     assert merge.merge_stages(base, base, changed) == (changed, [])
     assert merge.merge_stages(base, changed, base) == (changed, [])

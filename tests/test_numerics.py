@@ -1,4 +1,4 @@
-"""Trainings are the same bits on every processor with AVX2, and the user's own settings stand."""
+"""Trainings are equal to the last bit on all processors with AVX2; settings of the user are kept."""
 
 import os
 import subprocess
@@ -23,9 +23,11 @@ needs_avx2 = pytest.mark.skipif("avx2" not in cpu_flags(), reason="nothing is se
 
 @cache
 def digests_under(*settings: str) -> str:
-    """Digests of tiny trainings in a fresh process, in which these variables are set and no other that matters."""
-    kept = {name: value for name, value in os.environ.items() if name not in VARIABLES and not name.startswith("MKL")}
-    environment = kept | dict(setting.split("=") for setting in settings)
+    """Return digests of tiny trainings in a new process with these environment variables."""
+    inherited = {
+        name: value for name, value in os.environ.items() if name not in VARIABLES and not name.startswith("MKL")
+    }
+    environment = inherited | dict(setting.split("=") for setting in settings)
     command = [sys.executable, "-m", "tests.arithmetic"]
     return subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
@@ -34,24 +36,24 @@ def digests_under(*settings: str) -> str:
 @pytest.mark.parametrize(
     "settings",
     [
-        ("MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41"),  # as on a processor that MKL and oneDNN do not know
+        ("MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41"),  # as on a processor unknown to MKL and oneDNN
         ("MKL_ENABLE_INSTRUCTIONS=AVX2",),
         ("OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"),
     ],
     ids=" ".join,
 )
-def test_trainings_are_the_same_bits_whatever_mkl_does_and_however_many_threads_there_are(settings):
+def test_trainings_do_not_depend_on_mkl_or_threads(settings):
     assert digests_under(*settings) == digests_under()
 
 
 @needs_avx2
 @pytest.mark.parametrize("setting", ["ATEN_CPU_CAPABILITY=default", "OPENBLAS_CORETYPE=Prescott"])
-def test_each_of_the_three_trainings_depends_on_what_is_selected(setting):
+def test_trainings_depend_on_the_selected_instructions(setting):
     pairs = zip(digests_under(setting).split(), digests_under().split(), strict=True)
     assert all(one != other for one, other in pairs)
 
 
-def test_affine_and_its_gradients_equal_pytorchs():
+def test_affine_equals_pytorch():
     rng = rng_for(0, "affine")
     for shapes in (((3, 7, 5), (3, 5, 4), (3, 1, 4)), ((3, 7, 5), (5, 4), (1, 4)), ((7, 5), (5, 4), (1, 4))):
         ours = [torch.from_numpy(rng.normal(size=shape)).requires_grad_() for shape in shapes]
@@ -64,47 +66,49 @@ def test_affine_and_its_gradients_equal_pytorchs():
         torch.testing.assert_close(affine(*ours), torch.matmul(theirs[0], theirs[1]) + theirs[2])
 
 
-def test_what_overflows_becomes_infinite_without_a_warning():
+def test_affine_overflow_is_infinite():
     assert affine(torch.full((2, 3), 1e30), torch.full((3, 1), 1e30), torch.zeros(1, 1)).isinf().all()
 
 
 @given(st.floats(-80, 80, width=32))
-def test_exp_is_the_exponential_to_float32(value):
-    # 80 x log2(e) = 115 is rounded to 2^-18, so that its power of two is off by 3e-6 at most.
+def test_exp_equals_numpy_in_float32(value):
+    # 80 x log2(e) = 115 is rounded to 2^-18: an error of at most 3e-6 of the power of two.
     assert float(exp(torch.tensor([value]))) == pytest.approx(np.exp(np.float64(value)), rel=5e-6)
 
 
-def test_numpy_that_was_loaded_before_is_reported():
+def test_numpy_imported_too_early_is_reported():
     code = "import numpy; from reskin.numerics import departures; import os; print(departures(os.environ))"
-    kept = {name: value for name, value in os.environ.items() if name not in VARIABLES}
-    done = subprocess.run([sys.executable, "-c", code], env=kept, cwd=ROOT, capture_output=True, text=True, check=True)
+    inherited = {name: value for name, value in os.environ.items() if name not in VARIABLES}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=inherited, cwd=ROOT, capture_output=True, text=True, check=True
+    )
     assert (TOO_LATE in done.stdout) == ("avx2" in cpu_flags())
 
 
-def test_a_variable_that_the_user_has_changed_is_reported():
+def test_changed_variable_is_reported():
     assert departures(PINNED) == []
     assert departures({**PINNED, "OPENBLAS_CORETYPE": "Zen"}) == ["OPENBLAS_CORETYPE=Zen"]
 
 
-def test_what_the_user_has_set_is_left_alone():
-    mine = {"ATEN_CPU_CAPABILITY": "default", "NPY_DISABLE_CPU_FEATURES": ""}
-    assert not set(pinned(NEWEST, mine)) & set(mine)
+def test_variables_of_the_user_are_kept():
+    own_settings = {"ATEN_CPU_CAPABILITY": "default", "NPY_DISABLE_CPU_FEATURES": ""}
+    assert not set(pinned(NEWEST, own_settings)) & set(own_settings)
 
 
-def test_an_empty_variable_counts_as_not_set():
+def test_empty_variable_counts_as_unset():
     assert pinned(AVX2, {"OPENBLAS_CORETYPE": ""}) == PINNED
 
 
-def test_numpy_disables_only_features_that_the_processor_has():
+def test_numpy_disables_only_existing_features():
     assert "NPY_DISABLE_CPU_FEATURES" not in pinned(AVX2, {})
     assert pinned(NEWEST, {})["NPY_DISABLE_CPU_FEATURES"].split() == list(BEYOND_AVX2)
 
 
-def test_another_kind_of_processor_is_left_alone():
+def test_other_processors_are_not_pinned():
     assert pinned(frozenset(), {}) == {}
 
 
-def test_flags_are_read_where_the_system_lists_them(tmp_path, monkeypatch):
+def test_cpu_flags_are_read_from_cpuinfo(tmp_path, monkeypatch):
     monkeypatch.setattr("platform.machine", lambda: "x86_64")
     (tmp_path / "cpuinfo").write_text("processor\t: 0\nflags\t\t: fpu avx2 fma\n\nprocessor\t: 1\nflags\t\t: fpu\n")
     assert cpu_flags(tmp_path / "cpuinfo") == {"fpu", "avx2", "fma"}

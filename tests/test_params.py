@@ -14,17 +14,17 @@ LEARNING = ("models", "curve", "study")
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "pipeline/scenes").glob("*.yaml")), ids=lambda file: file.stem)
-def test_every_scene_of_the_checkout_is_legal(file):
+def test_scenes_are_valid(file):
     read_scene(ROOT, file.stem)
 
 
-def test_the_params_of_the_checkout_are_legal():
+def test_params_and_plan_are_valid():
     read_shared(ROOT / "params.yaml")
     read_plan(ROOT / "pipeline/plan.yaml")
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "message"),
     [
         ({"sead": 3}, "scene.yaml: sead is not a known parameter .its value: 3"),
         ({"seed": "3"}, "scene.yaml: seed must be a valid integer; got '3'"),
@@ -47,8 +47,8 @@ def test_the_params_of_the_checkout_are_legal():
         ({"train_multi": TRAINING | {"variants": {"paper": {}}}}, "a variant's name must be other than paper"),
     ],
 )
-def test_a_wrong_scene_is_refused_with_the_name_of_the_parameter(changes, sentence):
-    with pytest.raises(ParamsError, match=sentence):
+def test_invalid_scene_names_the_parameter(changes, message):
+    with pytest.raises(ParamsError, match=message):
         check(recorded(**changes))
 
 
@@ -70,16 +70,16 @@ def scene(*experiments: str, **changes: object) -> Scene:
         ("contacts", ("lobo",)),
     ],
 )
-def test_an_experiment_without_one_that_it_needs_is_refused(experiment, others):
+def test_missing_required_experiment_is_an_error(experiment, others):
     assert experiment in scene(*others, experiment).experiments
-    with pytest.raises(ParamsError) as refused:
+    with pytest.raises(ParamsError) as error:
         scene(*others[:-1], experiment)
     message = f"scene.yaml: experiment {experiment} needs {others[-1]} in the same scene. Correct it there."
-    assert str(refused.value) == message
+    assert str(error.value) == message
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "message"),
     [
         ({"train_n": 2}, "train_n is at most every_n, 1"),
         ({"test_n": 2}, "test_n is at most every_n, 1"),
@@ -88,48 +88,48 @@ def test_an_experiment_without_one_that_it_needs_is_refused(experiment, others):
         ({"policies": ["each", "each"]}, "policies names each policy once"),
     ],
 )
-def test_contradictory_windows_are_refused(changes, sentence):
-    with pytest.raises(ParamsError, match=sentence):
+def test_contradictory_drift_windows_are_an_error(changes, message):
+    with pytest.raises(ParamsError, match=message):
         scene("lobo", "drift", drift=SECTIONS["drift"]["drift"] | changes)
 
 
-def test_an_experiment_on_simulated_skins_is_refused_for_recorded_scenes():
+def test_simulated_experiment_needs_a_simulated_scene():
     with pytest.raises(ParamsError, match="only a simulated scene can run experiments sensitivity"):
         parse_scene(recorded(experiments=["lobo", "sensitivity"]), "scene.yaml")
 
 
 @pytest.mark.parametrize("dropped", ["drift", "shear"])
-def test_a_removed_experiment_leaves_neither_its_section_nor_its_protocol(dropped):
-    own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
-    own["experiments"].remove(dropped)
-    own.pop(dropped)
-    if dropped == "drift":  # its captures are asked for variation as well
-        parse_scene(own, "ci.yaml")
+def test_removed_experiment_removes_section_and_protocol(dropped):
+    settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
+    settings["experiments"].remove(dropped)
+    settings.pop(dropped)
+    if dropped == "drift":  # variation uses its captures too
+        parse_scene(settings, "ci.yaml")
         return
     with pytest.raises(ParamsError, match="no experiment uses drag of simulate.protocols"):
-        parse_scene(own, "ci.yaml")
-    own["simulate"]["protocols"].pop("drag")
-    parse_scene(own, "ci.yaml")
+        parse_scene(settings, "ci.yaml")
+    settings["simulate"]["protocols"].pop("drag")
+    parse_scene(settings, "ci.yaml")
 
 
 @pytest.mark.parametrize(
     "unit",
     ["train_multi", "drift", "simulate-wear", "ingest_simulated-wear", "simulate", "report", "neglected_effects"],
 )
-def test_a_scene_runs_the_stages_of_its_experiments_and_protocols(unit):
-    own = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
-    assert parse_scene(own, "ci.yaml").runs(unit)
+def test_stages_follow_experiments_and_protocols(unit):
+    settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
+    assert parse_scene(settings, "ci.yaml").runs(unit)
     gone = ("drift", "variation")
-    own["experiments"] = [
-        experiment for experiment in own["experiments"] if experiment not in (*gone, "neglected_effects")
+    settings["experiments"] = [
+        experiment for experiment in settings["experiments"] if experiment not in (*gone, "neglected_effects")
     ]
-    own = {name: section for name, section in own.items() if name not in gone}
-    own["simulate"]["protocols"].pop("wear")
-    left = parse_scene(own, "ci.yaml")
+    settings = {name: section for name, section in settings.items() if name not in gone}
+    settings["simulate"]["protocols"].pop("wear")
+    left = parse_scene(settings, "ci.yaml")
     assert left.runs(unit) == (unit in ("train_multi", "simulate", "report"))
 
 
-def test_all_missing_experiments_are_named_at_once():
+def test_all_missing_experiments_are_listed():
     with pytest.raises(ParamsError, match="experiment choice needs adapt, triplet in the same scene"):
         scene("lobo", "choice")
 
@@ -137,22 +137,22 @@ def test_all_missing_experiments_are_named_at_once():
 ALL = (*ADAPTED, "transfer", "pokes", "sensors", "labels", "baselines", "audit", "choice")
 
 
-def test_a_scene_may_run_all_experiments_and_names_their_stages():
-    asked = scene(*ALL)
-    assert set(stages(asked.experiments, *LEARNING)) == {
+def test_scene_with_all_experiments():
+    checked = scene(*ALL)
+    assert set(stages(checked.experiments, *LEARNING)) == {
         "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
         "few_labels", "audit",
     }  # fmt: skip
-    assert asked.model_stages == ["train_single", "train_multi", "train_triplet", "adapt"]
-    assert asked.curves == {
+    assert checked.model_stages == ["train_single", "train_multi", "train_triplet", "adapt"]
+    assert checked.curves == {
         "pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"
     }  # fmt: skip
-    assert set(asked.with_folds) == {"lobo", "transfer", "sensors", "labels"}  # these have folds of their own
+    assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}  # experiments with folds
 
 
-def test_a_scene_of_one_experiment_has_one_stage_and_no_curve():
-    asked = scene("lobo")
-    assert (stages(asked.experiments, *LEARNING), asked.model_stages, asked.curves) == (
+def test_scene_with_one_experiment():
+    one = scene("lobo")
+    assert (stages(one.experiments, *LEARNING), one.model_stages, one.curves) == (
         ["train_multi"],
         ["train_multi"],
         {},
@@ -160,31 +160,34 @@ def test_a_scene_of_one_experiment_has_one_stage_and_no_curve():
 
 
 @pytest.mark.parametrize("experiment", [one for one in ALL if SECTIONS[one]])
-def test_a_scene_has_a_section_if_and_only_if_it_runs_its_experiment(experiment):
-    ((section, words),) = SECTIONS[experiment].items()
+def test_scene_sections_match_experiments(experiment):
+    ((section, settings),) = SECTIONS[experiment].items()
     lacking = {name: value for name, value in scene_with(*ALL).items() if name != section}
     with pytest.raises(ParamsError, match=f"the scene lacks {section}. Correct it there."):
         parse_scene(lacking, "scene.yaml")
     with pytest.raises(ParamsError, match=f"no experiment uses {section} of the scene[.;]"):
-        scene("single_temporal" if experiment == "lobo" else "lobo", **{section: words})
+        scene("single_temporal" if experiment == "lobo" else "lobo", **{section: settings})
 
 
 @pytest.mark.parametrize("experiment", DRAWN_WITH)
-def test_split_has_the_keys_of_the_folds_of_its_experiments_and_no_others(experiment):
-    own, others = DRAWN_WITH[experiment], ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else []))
-    asked = scene_with(*others, experiment)
-    parse_scene(asked, "scene.yaml")
-    unasked = scene_with(*others)
-    for key, value in own.items():
-        lacking = {name: value for name, value in asked["split"].items() if name != key}
+def test_split_settings_match_experiments(experiment):
+    keys, others = (
+        DRAWN_WITH[experiment],
+        ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else [])),
+    )
+    with_experiment = scene_with(*others, experiment)
+    parse_scene(with_experiment, "scene.yaml")
+    without = scene_with(*others)
+    for key, value in keys.items():
+        lacking = {name: value for name, value in with_experiment["split"].items() if name != key}
         with pytest.raises(ParamsError, match=f"split lacks {key}"):
-            parse_scene(asked | {"split": lacking}, "scene.yaml")
+            parse_scene(with_experiment | {"split": lacking}, "scene.yaml")
         with pytest.raises(ParamsError, match=f"no experiment uses {key} of split"):
-            parse_scene(unasked | {"split": unasked["split"] | {key: value}}, "scene.yaml")
+            parse_scene(without | {"split": without["split"] | {key: value}}, "scene.yaml")
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "message"),
     [
         ({"audit": {"settings": "guessed"}}, "audit: settings must be 'chosen' or 'for speed'; got 'guessed'"),
         ({"adapt": ADAPTATIONS | {"pokes_n": 0}}, "adapt: pokes_n must be greater than or equal"),
@@ -193,19 +196,19 @@ def test_split_has_the_keys_of_the_folds_of_its_experiments_and_no_others(experi
         ({"sweep_pokes": {"pokes_n": [8], "boards_n": 0}}, "sweep_pokes: boards_n must be greater than or equal to 1"),
     ],
 )
-def test_a_wrong_setting_of_an_experiment_is_refused(changes, sentence):
-    with pytest.raises(ParamsError, match=sentence):
+def test_invalid_experiment_setting_is_an_error(changes, message):
+    with pytest.raises(ParamsError, match=message):
         scene(*ALL, **changes)
 
 
-def test_all_missing_and_unused_settings_of_a_scene_are_named_at_once():
-    words = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "sensitivity"]}
-    words["split"] = {}
-    words["simulate"]["protocols"].pop("glass")
-    with pytest.raises(ParamsError) as refused:
-        parse_scene(words, "ci.yaml")
-    assert "no experiment uses adapt, ambient, audit, contacts, drift" in str(refused.value)
-    assert "simulate.protocols lacks glass; no experiment uses drag, flexible" in str(refused.value)
+def test_all_missing_and_unused_settings_are_listed():
+    settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml") | {"experiments": ["lobo", "sensitivity"]}
+    settings["split"] = {}
+    settings["simulate"]["protocols"].pop("glass")
+    with pytest.raises(ParamsError) as error:
+        parse_scene(settings, "ci.yaml")
+    assert "no experiment uses adapt, ambient, audit, contacts, drift" in str(error.value)
+    assert "simulate.protocols lacks glass; no experiment uses drag, flexible" in str(error.value)
 
 
 def test_settings_have_no_defaults():
@@ -215,7 +218,7 @@ def test_settings_have_no_defaults():
         parse_scene(words, "scene.yaml")
 
 
-def test_a_misspelt_parameter_is_named_as_it_was_written():
+def test_misspelt_parameter_is_named():
     with pytest.raises(ParamsError, match=r"recipes.fast.rat_max is not a known parameter .its value: 4"):
         check(recorded(train_multi=TRAINING | {"variants": {"fast": {"rat_max": 4}}}))
     words = {name: value for name, value in TRAINING.items() if name != "steps_n"} | {"step_n": 4}
@@ -223,31 +226,31 @@ def test_a_misspelt_parameter_is_named_as_it_was_written():
         check(recorded(train_multi=words))
 
 
-def test_yaml_reads_exponents_as_numbers(tmp_path):
+def test_yaml_exponents_are_numbers(tmp_path):
     (tmp_path / "a.yaml").write_text("rate: 1e-3\n")
     assert read_yaml(tmp_path / "a.yaml") == {"rate": 0.001}
 
 
 @pytest.mark.parametrize("content", [b"a: [1", b"a: 1\na: 2\n", b"\xff\xfe\x00"])
-def test_broken_yaml_is_refused(tmp_path, content):
+def test_broken_yaml_is_an_error(tmp_path, content):
     (tmp_path / "a.yaml").write_bytes(content)
     with pytest.raises(ParamsError, match="a.yaml: the file is not YAML"):
         read_yaml(tmp_path / "a.yaml")
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_missing_file_is_an_error(tmp_path):
     with pytest.raises(ParamsError, match="none.yaml: file not found"):
         read_yaml(tmp_path / "none.yaml")
 
 
-def test_a_base_that_is_no_recipe_of_train_triplet_is_refused():
+def test_unknown_base_recipe_is_an_error():
     scene = copy.deepcopy(scene_with("lobo", "triplet", "adapt"))
     scene["adapt"]["base"] = "nope"
     with pytest.raises(ParamsError, match=r"adapt: base of paper must be one of \['paper'\]; got 'nope'"):
         check(scene)
 
 
-def test_adaptation_without_its_training_is_refused():
+def test_adaptation_without_training_is_an_error():
     scene = scene_with("lobo", "triplet", "adapt")
     scene["experiments"] = ["lobo", "adapt"]
     with pytest.raises(ParamsError, match="experiment adapt needs triplet in the same scene"):

@@ -1,4 +1,4 @@
-"""A pickle is read as pickle reads it, for plain values and NumPy's, and nothing in it is run."""
+"""Tests of the safe pickle decoder for plain values and NumPy arrays, and of archives of samples."""
 
 import hashlib
 import os
@@ -28,25 +28,25 @@ values = st.recursive(
 
 
 @given(values, st.sampled_from(PROTOCOLS))
-def test_plain_values_come_back(value, protocol):
+def test_plain_values_round_trip(value, protocol):
     assert decode(pickle.dumps(value, protocol), "a") == value
 
 
-def test_a_value_that_stands_twice_comes_back_twice():
+def test_repeated_value_is_repeated():
     row = [1.5, 2.5]
     assert decode(pickle.dumps({"a": row, "b": [row, row]}, 3), "a") == {"a": row, "b": [row, row]}
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("kind", ["<f4", ">f8", "<i8", "u1", "bool"])
-def test_numbers_and_arrays_of_numpy_come_back_as_numbers_and_lists(kind, protocol):
+def test_numpy_values_become_lists(kind, protocol):
     array = np.arange(6).reshape(2, 3).astype(kind)
     found = decode(pickle.dumps({"array": array, "columns": array.T, "number": array[1, 2]}, protocol), "a")
     assert found == {"array": array.tolist(), "columns": array.T.tolist(), "number": array[1, 2].item()}
 
 
-class Shout:
-    """Something whose pickle runs a command when it is loaded."""
+class CommandPickle:
+    """An object whose pickle runs a command when loaded."""
 
     def __init__(self, command: str) -> None:
         self.command = command
@@ -56,17 +56,17 @@ class Shout:
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_nothing_that_a_pickle_asks_for_is_run(tmp_path, protocol):
+def test_pickled_commands_are_not_run(tmp_path, protocol):
     command = f"touch {tmp_path / 'ran'}"
     with pytest.raises(CaptureError, match="a call of posix system"):
-        decode(pickle.dumps([Shout(command)], protocol), "a")
+        decode(pickle.dumps([CommandPickle(command)], protocol), "a")
     assert not (tmp_path / "ran").exists()
-    pickle.loads(pickle.dumps([Shout(command)], protocol))
-    assert (tmp_path / "ran").exists()  # so it would have
+    pickle.loads(pickle.dumps([CommandPickle(command)], protocol))
+    assert (tmp_path / "ran").exists()  # pickle itself runs it
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=50).map(lambda tail: pickle.dumps([1, {"a": 2.5}], 4)[:-1] + tail))
-def test_any_bytes_give_a_value_or_one_error(content):
+def test_arbitrary_bytes_give_a_value_or_an_error(content):
     with suppress(CaptureError):
         decode(content, "a")
 
@@ -82,7 +82,7 @@ def archive_of(**samples) -> bytes:
 
 
 def archive_of_csv(text: str) -> bytes:
-    """Put the rows of a lab CSV into an archive, as the rig that recorded them did."""
+    """Return an archive with the rows of a lab CSV, as the rig writes it."""
     parts: dict[str, list] = {"noload": [], "contact": []}
     for line in text.splitlines()[1:]:
         indent, phase, *cells = line.split(",")
@@ -94,7 +94,7 @@ def archive_of_csv(text: str) -> bytes:
 FIELDS = [float(i) for i in range(20)]
 
 
-def test_samples_become_rows_by_indentation_no_load_first():
+def test_samples_become_rows_by_indentation():
     text = to_lab_csv(
         archive_of(
             bl_arr=[sample(0, [4, 0], FIELDS, [0, 0, 0]), sample(1, [6, 0], FIELDS, [0, 0, 0])],
@@ -114,7 +114,7 @@ def test_samples_become_rows_by_indentation_no_load_first():
     assert rows[-1].split(",")[-3:] == ["0.000000", "0.250000", "-3.000000"]
 
 
-def test_an_archive_becomes_a_recording_that_layout_lab_reads(tmp_path):
+def test_archive_becomes_a_lab_recording(tmp_path):
     presses = [sample(i, [4 * i, 2], FIELDS, [0, 0, 0]) for i in range(3)]
     contacts = [sample(i, [4 * i, 2], [2 * value for value in FIELDS], [0, 0, -1 - i]) for i in range(3)]
     (tmp_path / lab.READINGS).write_bytes(to_lab_csv(archive_of(bl_arr=presses, cont_arr=contacts), "a"))
@@ -125,7 +125,7 @@ def test_an_archive_becomes_a_recording_that_layout_lab_reads(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("archive", "sentence"),
+    ("archive", "message"),
     [
         (b"", "not a .npz with samples under bl_arr and cont_arr: BadZipFile"),
         (archive_of(bl_arr=[sample(0, [0, 0], FIELDS, [0, 0, 0])]), "cont_arr.npy"),
@@ -138,22 +138,22 @@ def test_an_archive_becomes_a_recording_that_layout_lab_reads(tmp_path):
         ),
     ],
 )
-def test_another_archive_is_refused_with_its_reason(archive, sentence):
-    with pytest.raises(CaptureError, match=sentence) as caught:
+def test_invalid_archive_is_an_error(archive, message):
+    with pytest.raises(CaptureError, match=message) as caught:
         to_lab_csv(archive, "port_1.npz")
     assert str(caught.value).startswith("port_1.npz")
     assert "\n" not in str(caught.value)
 
 
-def test_real_samples_give_the_file_that_is_on_record(shared_data):
-    """Not the archive of the rig itself, which is not here: one of the same values, made as the rig makes it."""
+def test_real_samples_give_the_recorded_file(shared_data):
+    """The archive is rebuilt from the recorded values, as the original is not available."""
     file = shared_data / "lab/board1_depth1.csv"
     known = {entry.path: entry.sha256 for entry in read_sources(ROOT)["lab"].files}
     again = to_lab_csv(archive_of_csv(file.read_text()), "a")
     assert hashlib.sha256(again).hexdigest() == known[file.name]
 
 
-def test_what_refers_to_itself_many_times_is_turned_once():
+def test_nested_references_are_converted_once():
     nested: list = []
     for _ in range(60):
         nested = [nested, nested]  # 2^60 paths

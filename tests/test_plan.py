@@ -23,15 +23,15 @@ def scene(**changes: object) -> Scene:
     return parse_scene(recorded(**changes), "scene.yaml")
 
 
-def test_the_plan_of_the_checkout_is_up_to_date():
+def test_plan_of_the_checkout_is_up_to_date():
     plan.check(ROOT)
 
 
-def test_an_experiment_that_no_scene_runs_has_no_stage():
-    made = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
-    assert made["train_multi"] == ["lab"]
-    assert made["train_single"] == made["verification"] == made["runtime"] == []
-    assert made["simulate"] == made["ingest_simulated"] == {}
+def test_stages_without_scenes_are_empty():
+    generated = make_plan({"lab": scene()}, Registry(captures={"lab": {"c0": ENTRY}}))["stages"]
+    assert generated["train_multi"] == ["lab"]
+    assert generated["train_single"] == generated["verification"] == generated["runtime"] == []
+    assert generated["simulate"] == generated["ingest_simulated"] == {}
 
 
 ADAPTED = ("lobo", "triplet", "adapt")
@@ -49,65 +49,65 @@ ADAPTED = ("lobo", "triplet", "adapt")
         ("audit", ("lobo", "audit")),
     ],
 )
-def test_a_stage_runs_for_the_scenes_with_its_experiment_and_for_no_other(stage, experiments):
-    asked, plain = (parse_scene(scene_with(*own), "scene.yaml") for own in (experiments, ("lobo",)))
+def test_stage_runs_only_for_scenes_with_its_experiment(stage, experiments):
+    with_experiment, plain = (parse_scene(scene_with(*names), "scene.yaml") for names in (experiments, ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
-    made = make_plan({"one": plain, "two": asked}, captures)
-    parse(Plan, made, "plan")
-    assert list(made["stages"][stage]) == ["two"]
-    assert all(list(made["stages"][every]) == ["one", "two"] for every in ("train_multi", "report", "publish"))
+    generated = make_plan({"one": plain, "two": with_experiment}, captures)
+    parse(Plan, generated, "plan")
+    assert list(generated["stages"][stage]) == ["two"]
+    assert all(list(generated["stages"][every]) == ["one", "two"] for every in ("train_multi", "report", "publish"))
     assert make_plan({"one": plain}, captures)["stages"][stage] == []
 
 
-def test_an_experiment_of_a_recorded_scene_reads_its_captures():
-    asked, plain = (parse_scene(scene_with(*own), "scene.yaml") for own in (("lobo", "drift"), ("lobo",)))
+def test_recorded_experiment_reads_its_captures():
+    with_experiment, plain = (parse_scene(scene_with(*names), "scene.yaml") for names in (("lobo", "drift"), ("lobo",)))
     captures = Registry(captures={"one": {"c0": ENTRY}, "two": {"c0": ENTRY}})
-    made = make_plan({"one": plain, "two": asked}, captures)
-    parse(Plan, made, "plan")
-    assert made["stages"]["drift"] == {"two": "two"}
-    assert made["captures"] == {"one": ["c0"], "two": ["c0"]}
-    assert not any(made["stages"][experiment] for experiment in ANALYSES if experiment != "drift")
+    generated = make_plan({"one": plain, "two": with_experiment}, captures)
+    parse(Plan, generated, "plan")
+    assert generated["stages"]["drift"] == {"two": "two"}
+    assert generated["captures"] == {"one": ["c0"], "two": ["c0"]}
+    assert not any(generated["stages"][experiment] for experiment in ANALYSES if experiment != "drift")
 
 
-def test_a_choice_of_settings_needs_no_stage_of_its_own():
-    chosen, plain = (parse_scene(scene_with(*own), "scene.yaml") for own in ((*ADAPTED, "choice"), ADAPTED))
+def test_choice_needs_no_stage():
+    chosen, plain = (parse_scene(scene_with(*names), "scene.yaml") for names in ((*ADAPTED, "choice"), ADAPTED))
     captures = Registry(captures={"lab": {"c0": ENTRY}})
     with_choice, without = (make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
     assert with_choice == without
 
 
-def test_the_report_refuses_a_plan_that_lacks_an_experiment_of_the_scene(tmp_path, monkeypatch):
+def test_report_rejects_a_plan_without_an_experiment(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("pipeline").mkdir()
     Path(PLAN).write_text("scenes: {tiny: [lobo, baselines]}\n")
-    own = settings(scene_with("lobo", "baselines"))
-    assert planned_scene(own).experiments == ("lobo", "baselines")
+    tiny = settings(scene_with("lobo", "baselines"))
+    assert planned_scene(tiny).experiments == ("lobo", "baselines")
     Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
     with pytest.raises(ParamsError, match="baselines only in one. Try: reskin scenes use tiny"):
-        planned_scene(own)
+        planned_scene(tiny)
 
 
-def test_every_recorded_capture_has_an_ingest_of_its_own():
-    made = make_plan({"lab": scene()}, Registry(captures={"lab": {"c1": ENTRY, "c0": ENTRY}, "ini": {"x": ENTRY}}))
-    parse(Plan, made, "plan")
-    assert made["stages"]["ingest"] == {
+def test_each_recorded_capture_has_an_ingest_stage():
+    generated = make_plan({"lab": scene()}, Registry(captures={"lab": {"c1": ENTRY, "c0": ENTRY}, "ini": {"x": ENTRY}}))
+    parse(Plan, generated, "plan")
+    assert generated["stages"]["ingest"] == {
         "lab-c0": {"scene": "lab", "capture": "c0"},
         "lab-c1": {"scene": "lab", "capture": "c1"},
     }
-    assert made["stages"]["split"] == ["lab"]
-    assert made["captures"] == {"lab": ["c0", "c1"]}
+    assert generated["stages"]["split"] == ["lab"]
+    assert generated["captures"] == {"lab": ["c0", "c1"]}
 
 
-def test_a_scene_of_many_captures_has_one_ingest_for_all():
+def test_many_captures_have_one_ingest_stage():
     names = [f"c{i:02}" for i in range(plan.MANY_N + 1)]
-    made = make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names, ENTRY)}))["stages"]
-    assert made["ingest"] == {}
-    assert made["ingest_many"] == ["lab"]
+    generated = make_plan({"lab": scene()}, Registry(captures={"lab": dict.fromkeys(names, ENTRY)}))["stages"]
+    assert generated["ingest"] == {}
+    assert generated["ingest_many"] == ["lab"]
     fewer = Registry(captures={"lab": dict.fromkeys(names[1:], ENTRY)})
     assert make_plan({"lab": scene()}, fewer)["stages"]["ingest_many"] == []
 
 
-def test_a_recorded_scene_without_recordings_says_how_to_add_one():
+def test_recorded_scene_without_captures_is_an_error():
     with pytest.raises(ParamsError, match="reskin add RECORDING --scene lab"):
         make_plan({"lab": scene()}, Registry(captures={}))
 
@@ -127,31 +127,31 @@ def checkout(folder: Path, running: str = "{}") -> Path:
     return folder
 
 
-def test_use_writes_the_plan_and_no_other_file(tmp_path):
+def test_use_writes_only_the_plan(tmp_path):
     root = checkout(tmp_path)
     others = [root / PARAMS, *(root / SCENES).iterdir()]
     before = [file.read_bytes() for file in others]
     plan.use(root, ["two", "one", "two"])
-    made = plan.check(root)
-    assert list(made.scenes) == ["two", "one"]
-    assert list(made.stages["train_multi"]) == ["two", "one"]
+    generated = plan.check(root)
+    assert list(generated.scenes) == ["two", "one"]
+    assert list(generated.stages["train_multi"]) == ["two", "one"]
     assert "do not edit" in (root / PLAN).read_text()
     assert [file.read_bytes() for file in others] == before
 
 
-def test_a_plan_that_is_out_of_date_is_refused(tmp_path):
+def test_outdated_plan_is_an_error(tmp_path):
     root = checkout(tmp_path, "{one: [lobo]}")
     with pytest.raises(ParamsError, match="Try: reskin scenes use one"):
         plan.check(root)
 
 
-def test_an_unknown_scene_is_named_beside_the_known_ones(tmp_path):
+def test_unknown_scene_is_an_error(tmp_path):
     with pytest.raises(ParamsError, match="no scene three. The scenes are: one, two"):
         plan.use(checkout(tmp_path), ["three"])
 
 
 def simulated(tmp_path, **changes):
-    """A checkout whose scene `one` is the tiny one, changed: in its section simulate, or in what scenes share."""
+    """Return a checkout whose scene `one` is ci with changes of its section simulate."""
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     shutil.copy(ROOT / SCENES / "ci.yaml", root / SCENES / "one.yaml")
@@ -168,19 +168,19 @@ def simulated(tmp_path, **changes):
     return root
 
 
-def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
+def test_each_protocol_has_a_folder_and_stages(tmp_path):
     root = simulated(tmp_path)
     plan.use(root, ["one"])
     stages = plan.check(root).stages
     protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
     assert set(stages["simulate"]) == {"one", *(f"one-{protocol}" for protocol in protocols)}
-    assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}  # an SD card has no probe to join
+    assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}  # an SD card has no probe file
     assert stages["describe"] == ["one"]
     assert stages["drift"] == {"one": "one-wear"}
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "message"),
     [
         ({"protocols__wear__terms": ["wind"]}, r"protocols.wear.terms.0 must be 'ageing', 'friction', "),
         ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than rigid boards have, 6"),
@@ -188,31 +188,31 @@ def test_every_protocol_has_a_folder_and_stages_of_its_own(tmp_path):
         ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards is another kind than that of grid"),
     ],
 )
-def test_a_scene_that_cannot_be_simulated_is_refused_before_anything_runs(tmp_path, changes, sentence):
+def test_invalid_simulation_is_an_error_before_any_stage(tmp_path, changes, message):
     root = simulated(tmp_path, **changes)
     before = (root / PLAN).read_text()
-    with pytest.raises(ParamsError, match=sentence):
+    with pytest.raises(ParamsError, match=message):
         plan.use(root, ["one"])
     assert (root / PLAN).read_text() == before
 
 
 STAND_IN = """
 import pathlib, sys
-out = pathlib.Path(sys.argv[-1])  # what a stage writes
+out = pathlib.Path(sys.argv[-1])  # the output of a stage
 out.mkdir(parents=True, exist_ok=True)
-(out / "simulate").touch()  # of stage code: the digest that stage simulate depends on
+(out / "simulate").touch()  # the digest that stage simulate depends on
 if sys.argv[1] == "scenes":
     from reskin.cli import main
     main()
 """
 
 
-def test_dvc_checkout_keeps_the_outputs_of_scenes_that_left_the_plan(tmp_path):
+def test_dvc_checkout_keeps_outputs_of_other_scenes(tmp_path):
     root = copy_checkout(tmp_path)
     (root / "pipeline/__main__.py").write_text(STAND_IN)
     run(root, "reskin", "scenes", "use", "ci")
     run(root, "dvc", "repro", "simulate@ci")
     run(root, "reskin", "scenes", "use", "quick")
     run(root, "dvc", "repro", "simulate@quick")
-    run(root, "dvc", "checkout", check=False)  # it fails: other stages of quick never ran
+    run(root, "dvc", "checkout", check=False)  # fails: other stages of quick never ran
     assert sorted(path.name for path in (root / "data/raw").iterdir() if path.is_dir()) == ["ci", "quick"]

@@ -1,4 +1,4 @@
-"""A log and a model give a CSV of places and forces; a network whose prediction is known; errors."""
+"""Tests of `reskin predict` with a network of constant output, and its errors."""
 
 import json
 
@@ -20,7 +20,7 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import make_header
 
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
-ANSWER = np.array([8.0, 4.0, 1.5], np.float32)
+ESTIMATE = np.array([8.0, 4.0, 1.5], np.float32)
 CARD = {
     "format": "reskin-model/3", "recipe": {"inputs": "raw", "architecture": "paper"},
     "input": {"quantity": "change of field", "unit": "uT", "channels_n": 15},
@@ -32,14 +32,14 @@ CARD = {
 def model(tmp_path):
     weights = {name: 0 * value for name, value in draw_weights(paper_layers(15), rng_for(0, "net")).items()}
     scaler = {"input_shift": np.zeros(15, np.float32), "input_scale": np.ones(15, np.float32)}
-    scaler |= {"target_shift": ANSWER, "target_scale": np.ones(3, np.float32)}
+    scaler |= {"target_shift": ESTIMATE, "target_scale": np.ones(3, np.float32)}
     io.write_tensors(tmp_path / "model.safetensors", weights | scaler, {})
     io.write_json(tmp_path / "model.json", CARD)
     return tmp_path / "model.safetensors"
 
 
 def log_of(chips_n=5):
-    """Time, field to two decimals and temperature of the frames of a log."""
+    """Return time, field (two decimals) and temperature of the frames of a log."""
     frames_n = QUIET_N + TOUCHED_N
     touched = np.arange(frames_n) >= QUIET_N
     noise_uT = 3 * rng_for(0, "log").standard_normal((frames_n, 3 * chips_n))
@@ -54,7 +54,7 @@ def write_log(folder, chips_n=5, scale=1.0):
 
 
 def write_stream(folder, wire):
-    """The same frames as bytes of a port, in a capture folder as `reskin record` leaves it."""
+    """Write the same frames to a capture folder, as `reskin record` does."""
     t_s, b_uT, temperature_degC = log_of()
     stream = encode(Frames(b_uT, temperature_degC, t_s, np.zeros(len(t_s), np.int64)), wire)
     ends = np.cumsum([len(line) + 1 for line in stream.split(b"\n")[:-1]])
@@ -100,7 +100,7 @@ def test_every_line_has_a_row_and_contacts_have_estimates(tmp_path, model):
     assert len(rows) == QUIET_N + TOUCHED_N == counts["rows_n"]
     assert all(row[1:] == ["", "", "", "0"] for row in rows[:QUIET_N])
     np.testing.assert_array_equal(
-        [[float(cell) for cell in row[1:]] for row in rows[QUIET_N:]], [[*ANSWER, 1]] * TOUCHED_N
+        [[float(cell) for cell in row[1:]] for row in rows[QUIET_N:]], [[*ESTIMATE, 1]] * TOUCHED_N
     )
     np.testing.assert_allclose([float(row[0]) for row in rows], (1 + np.arange(len(rows))) / RATE_HZ)
 
@@ -116,7 +116,7 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
     log, out = write_log(tmp_path), tmp_path / "out.csv"
     four = tmp_path / "four"
     four.mkdir()
-    refusals = [
+    cases = [
         (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model 15"),
         (log, tmp_path / "other.safetensors", out, r"model file not found. Models in its folder: model\.safetensors"),
         (log, model, log, "is the log, the model or its card"),
@@ -127,7 +127,7 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
     ]
     files = (log, model, model.with_suffix(".json"))
     before = [file.read_bytes() for file in files]
-    for *paths, message in refusals:
+    for *paths, message in cases:
         with pytest.raises(ReskinError, match=message):
             predict(*paths)
     assert not out.exists()

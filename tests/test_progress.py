@@ -1,4 +1,4 @@
-"""Which stage of how many runs."""
+"""Tests of the printed position of a stage among all stages."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ ORDER = ["code", "split@tiny", "ingest@tiny-tiny_1", "report@tiny"]
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch) -> Path:
-    """A checkout with a flow and a plan; it is the working directory."""
+    """Return a checkout with dvc.yaml and a plan, the working directory."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pipeline").mkdir()
     (tmp_path / "pipeline/plan.yaml").write_text("scenes: {tiny: [lobo]}\n")
@@ -25,13 +25,13 @@ def checkout(tmp_path, monkeypatch) -> Path:
     ("stage", "line"),
     [("split@tiny", "stage 2 of 4"), ("dvc.yaml:report@tiny", "stage 4 of 4"), ("other@tiny", None)],
 )
-def test_a_stage_tells_its_place(checkout, monkeypatch, stage, line):
+def test_stage_prints_its_position(checkout, monkeypatch, stage, line):
     monkeypatch.setattr(progress, "_ask_dvc", lambda: ORDER)
     monkeypatch.setenv(progress.VARIABLE, stage)
     assert progress.announce() == line
 
 
-def test_dvc_is_asked_again_when_the_plan_changes(checkout, monkeypatch):
+def test_order_is_read_again_when_the_plan_changes(checkout, monkeypatch):
     for stages in (ORDER, ORDER[:2]):
         monkeypatch.setattr(progress, "_ask_dvc", lambda stages=stages: stages)
         assert progress.stages_in_order() == stages
@@ -39,19 +39,19 @@ def test_dvc_is_asked_again_when_the_plan_changes(checkout, monkeypatch):
             plan.write("stages: {}\n")
 
 
-def test_an_unknown_place_ends_no_stage(tmp_path, monkeypatch):
+def test_unknown_position_is_no_error(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(progress.VARIABLE, "split@tiny")
     assert "unknown (FileNotFoundError" in progress.announce()
 
 
-def test_a_stage_outside_dvc_says_nothing(monkeypatch):
+def test_stage_outside_dvc_prints_nothing(monkeypatch):
     monkeypatch.delenv(progress.VARIABLE, raising=False)
     assert progress.announce() is None
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
-def test_table_2_comes_before_every_further_protocol_and_dvc_is_asked_once(tmp_path, monkeypatch):
+def test_table_2_precedes_other_protocols(tmp_path, monkeypatch):
     root = copy_checkout(tmp_path)
     run(root, "reskin", "scenes", "use", "ci")
     monkeypatch.chdir(root)

@@ -25,11 +25,11 @@ XEON = "processor\t: 0\nmodel name\t: Intel(R) Xeon(R) Gold 6442Y\nflags\t\t: fp
 OLD = "processor\t: 1\nmodel name\t: Another one\nflags\t\t: fpu sse2\n"
 
 
-def test_a_result_names_the_commit_of_its_code_or_says_that_it_cannot():
+def test_code_version_is_a_commit_or_unknown():
     assert re.fullmatch(r"[0-9a-f]{12}(\+dirty)?|unknown", code_version())
 
 
-def test_the_commit_of_modules_is_the_last_that_changed_what_they_do(tmp_path, monkeypatch):
+def test_code_version_of_modules_is_their_last_functional_change(tmp_path, monkeypatch):
     monkeypatch.setattr(provenance, "ROOT", tmp_path)
     monkeypatch.setattr(code, "ROOT", tmp_path)
     (tmp_path / "pipeline").mkdir()
@@ -42,13 +42,13 @@ def test_the_commit_of_modules_is_the_last_that_changed_what_they_do(tmp_path, m
     def commit(**texts: str) -> str:
         write(**texts)
         author = ("-c", "user.name=a", "-c", "user.email=a@b")
-        for words in (["add", "."], [*author, "commit", "-qm", "x"]):
-            subprocess.run(["git", *words], cwd=tmp_path, check=True)
+        for arguments in (["add", "."], [*author, "commit", "-qm", "x"]):
+            subprocess.run(["git", *arguments], cwd=tmp_path, check=True)
         found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=tmp_path, capture_output=True, text=True, check=True)
         return found.stdout[:12]
 
     write(one_py="A = 1\n", two_py="B = 1\n")
-    assert code_version_of(modules) == "unknown"  # no repository
+    assert code_version_of(modules) == "unknown"  # not a repository
     subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
     first = commit(one_yaml="a: 1\n")
     assert code_version_of(modules) == first
@@ -67,66 +67,66 @@ def test_the_commit_of_modules_is_the_last_that_changed_what_they_do(tmp_path, m
     assert code_version_of(["pipeline.two"]) == third
 
 
-def test_the_machine_is_told_in_words():
+def test_machine_is_described():
     assert re.search(r"cpu .*, \d+ cores, Python 3\.", machine())
 
 
-def test_a_processor_is_named_with_its_instruction_sets_and_what_holds_libraries_to_fewer():
+def test_processor_name_has_instruction_sets_and_limits():
     assert processor_name(XEON, {}, otherwise="") == "Intel Xeon Gold 6442Y (AVX2, AVX-512, AMX)"
-    held = {"OPENBLAS_CORETYPE": "Zen", "ATEN_CPU_CAPABILITY": "", "HOME": "/home/me"}
-    assert processor_name(XEON, held, otherwise="").endswith("(AVX2, AVX-512, AMX; OPENBLAS_CORETYPE=Zen)")
+    environment = {"OPENBLAS_CORETYPE": "Zen", "ATEN_CPU_CAPABILITY": "", "HOME": "/home/me"}
+    assert processor_name(XEON, environment, otherwise="").endswith("(AVX2, AVX-512, AMX; OPENBLAS_CORETYPE=Zen)")
 
 
-def test_the_first_processor_is_named_where_a_machine_has_two_kinds():
+def test_first_of_two_processors_is_named():
     assert processor_name(XEON + OLD, {}, otherwise="") == processor_name(XEON, {}, otherwise="")
     assert processor_name(OLD + XEON, {}, otherwise="") == "Another one"
 
 
 @pytest.mark.parametrize("cpuinfo", ["", "\n\n", "no colon here", "model name:\nflags:"])
-def test_a_machine_that_tells_nothing_is_named_by_what_python_knows(cpuinfo):
+def test_unknown_processor_is_named_by_python(cpuinfo):
     assert processor_name(cpuinfo, {}, otherwise="arm") == "arm"
     assert processor_name(cpuinfo, {}, otherwise="") == "unknown processor"
 
 
 @pytest.mark.parametrize("name", VARIABLES)
-def test_every_variable_that_changes_sums_is_told(name):
+def test_variables_that_change_sums_are_listed(name):
     assert f"{name}=x" in processor_name(XEON, {name: "x"}, otherwise="")
 
 
-def test_what_every_run_sets_by_itself_is_not_told():
+def test_pinned_variables_are_not_listed():
     flags = frozenset({"avx2", "avx512vl", "avx512_vbmi2"})
     assert processor_name(XEON, pinned(flags, {}), otherwise="") == processor_name(XEON, {}, otherwise="")
 
 
 @pytest.mark.parametrize(("flag", "name"), INSTRUCTIONS.items())
-def test_every_instruction_set_is_told_if_and_only_if_it_is_offered(flag, name):
+def test_instruction_sets_are_listed_if_available(flag, name):
     assert name in processor_name(f"Features : {flag}", {}, otherwise="arm")
     assert processor_name("Features : fp", {}, otherwise="arm") == "arm"
 
 
-def test_a_machine_without_cpuinfo_is_told_all_the_same(tmp_path, monkeypatch):
+def test_machine_without_cpuinfo_is_described(tmp_path, monkeypatch):
     monkeypatch.setattr(provenance, "CPUINFO", tmp_path / "none")
     assert re.search(r"cpu .*, \d+ cores, Python 3\.", machine())
 
 
-def test_costs_are_kept_a_stage_in_seconds_and_megabytes(tmp_path):
+def test_costs_are_in_seconds_and_megabytes(tmp_path):
     record_cost(tmp_path, "split", 1.234)
     record_cost(tmp_path, "split", 2.345)
     costs = read_costs(tmp_path)
     assert list(costs) == ["split"]
-    assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # halves round to even
-    assert 0.1 < costs["split"]["cpu_s"] < 100_000  # this process', its imports included
-    assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # a Python process; not KiB, not bytes
+    assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # half to even
+    assert 0.1 < costs["split"]["cpu_s"] < 100_000  # of this process, with imports
+    assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # a Python process, in MB
 
 
-def test_a_stage_costs_what_its_trainings_cost_when_they_were_computed_reused_or_not(tmp_path):
+def test_stage_cost_includes_reused_trainings(tmp_path):
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, False), "b": (9.0, False)}, waited_s=10.0)
     record_cost(tmp_path, "train", 12.0)
     first = read_costs(tmp_path)["train"]
     assert first["seconds"] == 12.0
     assert first["reused_n"] == 0
-    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # and what the stage did besides
+    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # and the rest of the stage
 
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)
@@ -137,7 +137,7 @@ def test_a_stage_costs_what_its_trainings_cost_when_they_were_computed_reused_or
 
 
 @given(st.floats(0, 9), st.floats(0, 9), st.lists(st.tuples(st.floats(0, 9), st.booleans()), max_size=4))
-def test_a_stage_never_costs_less_than_its_last_run_took(tmp_path_factory, waited_s, other_s, trained):
+def test_stage_costs_at_least_its_last_run(tmp_path_factory, waited_s, other_s, trained):
     folder = tmp_path_factory.mktemp("costs")
     record_trainings(folder, "train", {str(i): one for i, one in enumerate(trained)}, waited_s)
     record_cost(folder, "train", waited_s + other_s)
@@ -145,7 +145,7 @@ def test_a_stage_never_costs_less_than_its_last_run_took(tmp_path_factory, waite
     assert total_cost_s([cost]) >= cost["seconds"] - 0.02  # both are rounded to 0.01 s
 
 
-def test_trainings_that_one_run_asks_for_twice_are_neither_counted_twice_nor_reused(tmp_path):
+def test_repeated_training_of_a_run_counts_once(tmp_path):
     clear_cost(tmp_path, "sweep")
     record_trainings(tmp_path, "sweep", {"a": (8.0, False)}, waited_s=4.0)
     record_trainings(tmp_path, "sweep", {"a": (8.0, True), "c": (1.0, True)}, waited_s=1.0)
@@ -156,17 +156,17 @@ def test_trainings_that_one_run_asks_for_twice_are_neither_counted_twice_nor_reu
     assert total_cost_s([cost]) == 10.0
 
 
-def test_a_training_that_two_stages_share_costs_once(tmp_path):
+def test_shared_training_costs_once(tmp_path):
     for stage in ("one", "other"):
         clear_cost(tmp_path, stage)
         record_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
         record_cost(tmp_path, stage, 3.0)
-    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # the one that reused it waited, too
+    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # the stage that reused it waited too
 
 
-def test_what_a_killed_run_left_is_forgotten(tmp_path):
+def test_costs_of_a_killed_run_are_dropped(tmp_path):
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"old": (8.0, False)}, waited_s=1.0)
-    clear_cost(tmp_path, "train")  # killed before its end, and begun anew
+    clear_cost(tmp_path, "train")  # killed and started again
     record_cost(tmp_path, "train", 2.0)
     assert read_costs(tmp_path)["train"]["trainings_s"] == {}

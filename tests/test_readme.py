@@ -11,12 +11,12 @@ from reskin.config import read_yaml
 from tests.report.synthetic import all_experiments
 from tests.stages.checkout import ROOT, copy_checkout, run
 
-OWN = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md", "docs"]
+INPUTS = ["reports", "params.yaml", "data/captures.yaml", "dvc.yaml", "README.md", "docs"]
 
 
-def test_the_readme_shows_what_the_committed_results_say():
+def test_readme_shows_the_committed_results():
     status = subprocess.run(
-        ["git", "status", "--porcelain", "--", *OWN], cwd=ROOT, capture_output=True, text=True, check=False
+        ["git", "status", "--porcelain", "--", *INPUTS], cwd=ROOT, capture_output=True, text=True, check=False
     )
     if status.returncode or status.stdout:
         pytest.skip("this checkout has results or scenes of its own; `reskin readme` would show those")
@@ -31,7 +31,7 @@ def copy_results(root, scenes):
             shutil.copy(ROOT / "reports" / name / file, root / "reports" / name)
 
 
-def test_the_pages_show_the_same_scenes_whichever_scene_runs(tmp_path):
+def test_pages_do_not_depend_on_the_running_scene(tmp_path):
     root = copy_checkout(tmp_path)
     copy_results(root, [file.parent.name for file in (ROOT / "reports").glob("*/numbers.json")])
     run(root, "reskin", "readme")
@@ -43,9 +43,9 @@ def test_the_pages_show_the_same_scenes_whichever_scene_runs(tmp_path):
     shared, of_this_run = split(numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
     io.write_json(root / "reports/ci/numbers.json", shared)
     io.write_json(root / "reports/ci/provenance.json", of_this_run)
-    said = run(root, "reskin", "readme").stdout
+    output = run(root, "reskin", "readme").stdout
     assert [page.read_bytes() for page in pages] == before
-    assert said.startswith("rewritten: nothing; results shown: scenes paper, quick, ")
+    assert output.startswith("rewritten: nothing; results shown: scenes paper, quick, ")
 
     (root / "reports/paper/numbers.json").unlink()
     failed = run(root, "reskin", "readme", check=False)
@@ -53,23 +53,23 @@ def test_the_pages_show_the_same_scenes_whichever_scene_runs(tmp_path):
     assert "reports/paper/numbers.json is missing" in failed.stderr
 
 
-def test_what_was_rewritten_is_said_with_the_scenes_shown(tmp_path):
+def test_rewritten_pages_and_scenes_are_printed(tmp_path):
     root = copy_checkout(tmp_path)
     copy_results(root, ["quick", "paper"])
     readme = root / "README.md"
     readme.write_text(re.sub(r"(<!-- headline -->\n).*?(<!-- /headline)", r"\1\2", readme.read_text(), flags=re.DOTALL))
-    said = run(root, "reskin", "readme").stdout
-    assert re.fullmatch(r"rewritten: README\.md, .*; results shown: scenes paper, quick\n", said)
+    output = run(root, "reskin", "readme").stdout
+    assert re.fullmatch(r"rewritten: README\.md, .*; results shown: scenes paper, quick\n", output)
 
 
-def test_the_readme_links_the_code_of_every_stage():
+def test_readme_links_the_code_of_every_stage():
     stages = read_yaml(ROOT / "dvc.yaml")["stages"]
     links = re.findall(r"\]\((\S+)\)", blocks_of([all_experiments()], [], stages, None)["stages"])
     assert len(links) == len(stages)
     assert [link for link in links if not (ROOT / "docs" / link).is_file()] == []
 
 
-def test_the_readme_is_short_and_every_link_of_readme_and_docs_leads_somewhere():
+def test_readme_is_short_and_links_are_valid():
     assert len((ROOT / "README.md").read_text(encoding="utf-8")) <= 8000
     broken = []
     for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), ROOT / "data/README.md"]:

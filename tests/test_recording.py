@@ -1,4 +1,4 @@
-"""From a port to a capture that can be added, over a pseudo-terminal; whatever ends the recording."""
+"""Tests of `reskin record` over a pseudo-terminal, however the recording ends."""
 
 import os
 import signal
@@ -30,7 +30,7 @@ from tests.board.signals import make_frames
 from tests.stages.checkout import ROOT
 
 FRAMES = make_frames(200, 5, seed=0)
-LONG_S = 120.0  # a process that starts on a busy machine
+LONG_S = 120.0  # for a process on a busy machine
 
 
 @pytest.fixture
@@ -42,13 +42,13 @@ def terminal() -> Iterator[tuple[int, str]]:
     os.close(near)
 
 
-def start(name: str, out: Path, *words: str) -> subprocess.Popen:
+def start(name: str, out: Path, *options: str) -> subprocess.Popen:
     labels = ["--port", name, "--board", "b0", "--skin", "s0", "--out", out]
-    command = [ROOT / ".venv/bin/reskin", "record", *labels, *words]
+    command = [ROOT / ".venv/bin/reskin", "record", *labels, *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def send_until_something_came(far: int, part: Path) -> None:
+def send_until_recorded(far: int, part: Path) -> None:
     stream = part / "stream.bin"
     end_s = time.monotonic() + LONG_S
     while time.monotonic() < end_s:
@@ -63,12 +63,12 @@ def send_until_something_came(far: int, part: Path) -> None:
 def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     far, name = terminal
     recorder = start(name, tmp_path / "run1", "--scan", "random")
-    send_until_something_came(far, tmp_path / "run1.part")
+    send_until_recorded(far, tmp_path / "run1.part")
     recorder.send_signal(signal.SIGINT)
-    said, complained = recorder.communicate(timeout=LONG_S)
-    assert recorder.returncode == 0, complained
-    assert complained == ""
-    assert "stopped" in said
+    stdout, stderr = recorder.communicate(timeout=LONG_S)
+    assert recorder.returncode == 0, stderr
+    assert stderr == ""
+    assert "stopped" in stdout
     header = parse((tmp_path / "run1" / HEADER_FILE).read_text(), "header")
     assert set(header.files) == {"stream.bin", "arrivals.csv"}
     assert header.options == {"scan": "random"}
@@ -79,7 +79,7 @@ def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
     assert set(files) == {"stream.bin", "arrivals.csv", "probe.csv"}
 
 
-def test_a_terminal_is_told_rate_frames_and_losses_and_a_file_only_the_end(monkeypatch, capsys):
+def test_progress_on_a_terminal(monkeypatch, capsys):
     now_s = iter([0.0, 0.5, 1.0, 1.5, 3.0])
     monkeypatch.setattr(time, "monotonic", lambda: next(now_s))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
@@ -91,10 +91,10 @@ def test_a_terminal_is_told_rate_frames_and_losses_and_a_file_only_the_end(monke
     assert capsys.readouterr().err.splitlines() == lines
 
 
-def test_what_a_killed_recorder_had_read_can_still_be_added(terminal, tmp_path):
+def test_killed_recording_can_be_added(terminal, tmp_path):
     far, name = terminal
     recorder = start(name, tmp_path / "run1")
-    send_until_something_came(far, tmp_path / "run1.part")
+    send_until_recorded(far, tmp_path / "run1.part")
     recorder.kill()
     recorder.communicate()
     probe = tmp_path / "probe.csv"
@@ -104,16 +104,16 @@ def test_what_a_killed_recorder_had_read_can_still_be_added(terminal, tmp_path):
     assert files["stream.bin"].stat().st_size > 0
 
 
-def test_a_port_that_is_not_there_leaves_nothing_behind(tmp_path):
+def test_missing_port_leaves_no_files(tmp_path):
     recorder = start(str(tmp_path / "none"), tmp_path / "run1")
-    _, complained = recorder.communicate(timeout=LONG_S)
+    _, stderr = recorder.communicate(timeout=LONG_S)
     assert recorder.returncode == 2
-    assert "cannot open the port" in complained
-    assert "Traceback" not in complained
+    assert "cannot open the port" in stderr
+    assert "Traceback" not in stderr
     assert list(tmp_path.iterdir()) == []
 
 
-def test_labels_that_fail_before_a_frame_came_say_why(terminal, tmp_path):
+def test_failing_label_source_is_reported(terminal, tmp_path):
     def no_gauge(_):
         raise CaptureError("the gauge: cannot open the port. Plug it in.")
 
@@ -125,7 +125,7 @@ def test_labels_that_fail_before_a_frame_came_say_why(terminal, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_label_thread_that_hangs_writes_no_header_after_the_end(tmp_path):
+def test_stuck_label_thread_writes_no_header(tmp_path):
     part, header = begin_capture(tmp_path / "run1", NO_INFO, wire="binary", chips_n=5, by="a test")
     headers = [header]
     context = _label_context(part, headers, threading.Event())
@@ -137,9 +137,9 @@ def test_a_label_thread_that_hangs_writes_no_header_after_the_end(tmp_path):
     assert parse((part / HEADER_FILE).read_text(), "header").clock.marks == ((5.0, 6.0),)
 
 
-def test_a_folder_that_is_there_is_not_written_over(tmp_path):
+def test_existing_folder_is_not_overwritten(tmp_path):
     (tmp_path / "run1").mkdir()
     recorder = start("/dev/null", tmp_path / "run1")
-    _, complained = recorder.communicate(timeout=LONG_S)
+    _, stderr = recorder.communicate(timeout=LONG_S)
     assert recorder.returncode == 2
-    assert "the folder exists already" in complained
+    assert "the folder exists already" in stderr

@@ -12,23 +12,23 @@ def header(capture: str = "c0", board: str = "b0", skin: str = "s0", chips_n: in
     return make_header(capture=capture, board=board, skin=skin, chips_n=chips_n)
 
 
-def added(registry: Registry, one: Header, fingerprint: str, *, allow_copy: bool = False) -> Registry:
-    return with_capture(registry, "lab", one, (fingerprint, f"stream of {fingerprint}"), allow_copy=allow_copy)
+def added(registry: Registry, entry_header: Header, fingerprint: str, *, allow_copy: bool = False) -> Registry:
+    return with_capture(registry, "lab", entry_header, (fingerprint, f"stream of {fingerprint}"), allow_copy=allow_copy)
 
 
 ONE = added(EMPTY, header(), "aa")
 
 
-def test_a_board_and_skin_may_have_several_captures():
+def test_board_and_skin_can_have_several_captures():
     assert sorted(added(ONE, header("c1"), "bb").captures["lab"]) == ["c0", "c1"]
 
 
-def test_the_same_recording_twice_is_refused():
+def test_same_recording_twice_is_an_error():
     with pytest.raises(CaptureError, match="it has the same readings as c0. It is in the scene already"):
         added(ONE, header("c1"), "aa", allow_copy=True)
 
 
-def test_a_relabelled_copy_is_refused_unless_allowed():
+def test_relabelled_copy_is_an_error_unless_allowed():
     copy = header("c1", board="b1", skin="s1")
     with pytest.raises(CaptureError, match="--allow-copy"):
         added(ONE, copy, "aa")
@@ -36,23 +36,23 @@ def test_a_relabelled_copy_is_refused_unless_allowed():
 
 
 @pytest.mark.parametrize(
-    ("second", "sentence"),
+    ("second", "message"),
     [
         (header("c0"), "the name c0 is taken in scene"),
         (header("c1", board="b1"), "the board of skin s0 must be b0, as in c0; got b1"),
         (header("c1", skin="s1", chips_n=10), "10 chips, but c0 in the same scene has 5"),
     ],
 )
-def test_a_capture_that_contradicts_the_others_is_refused(second, sentence):
-    with pytest.raises(CaptureError, match=sentence):
+def test_contradicting_capture_is_an_error(second, message):
+    with pytest.raises(CaptureError, match=message):
         added(ONE, second, "bb")
 
 
-def test_removing_an_added_capture_restores_the_registry():
+def test_removing_a_capture_restores_the_registry():
     assert without_capture(added(ONE, header("c1"), "bb"), "lab", "c1") == ONE
     assert without_capture(ONE, "lab", "c0") == EMPTY
 
 
-def test_an_unknown_capture_cannot_be_removed():
+def test_unknown_capture_cannot_be_removed():
     with pytest.raises(CaptureError, match="no capture c7. Its captures: c0"):
         without_capture(ONE, "lab", "c7")

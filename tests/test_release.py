@@ -1,4 +1,4 @@
-"""The release: files of the wheel, version, licences, and a library that needs no optional package."""
+"""Tests of the release: files of the wheel, version, licences, required packages."""
 
 import re
 import subprocess
@@ -18,21 +18,33 @@ from reskin.errors import ParamsError, explaining, require
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-CORE = (  # what runs outside a checkout
+CORE = (  # works outside a checkout
     "reskin.cli", "reskin", "reskin.api", "reskin.recordings.recorder", "reskin.recordings.decode", "reskin.board.find",
     "reskin.predicting", "reskin.live.emulator", "reskin.live.server",
 )  # fmt: skip
-AWAY = ("dvc", "grimp", "jinja2", "magpylib", "matplotlib", "mlflow", "mpmath", "onnx", "pandas", "sklearn", "torch")
-# Every package that is not of the core, as if it were not installed.
-WITHOUT = """
+OPTIONAL = (
+    "dvc",
+    "grimp",
+    "jinja2",
+    "magpylib",
+    "matplotlib",
+    "mlflow",
+    "mpmath",
+    "onnx",
+    "pandas",
+    "sklearn",
+    "torch",
+)
+# Imports the core as if the optional packages were not installed.
+WITHOUT_OPTIONAL = """
 import importlib, sys
 
-class Away:
+class Missing:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in {away}:
+        if name.partition(".")[0] in {missing}:
             raise ModuleNotFoundError(name, name=name)
 
-sys.meta_path.insert(0, Away())
+sys.meta_path.insert(0, Missing())
 for name in {core}:
     importlib.import_module(name)
 from reskin.universal.model import load_universal
@@ -42,11 +54,11 @@ print(load_universal().predict([[0.0] * 15]).shape)
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """The package as setuptools lays it into a wheel."""
+    """Return the files that setuptools puts into a wheel."""
     folder = tmp_path_factory.mktemp("wheel")
-    words = ["-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder / "lib")]
+    arguments = ["-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder / "lib")]
     subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", "import setuptools; setuptools.setup()", *words],
+        [sys.executable, "-W", "ignore", "-c", "import setuptools; setuptools.setup()", *arguments],
         cwd=ROOT,
         check=True,
         capture_output=True,
@@ -72,12 +84,15 @@ def test_foreign_scripts_have_a_licence(wheel):
 
 def test_library_imports_only_required_packages():
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT.format(core=CORE, away=AWAY)], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-c", WITHOUT_OPTIONAL.format(core=CORE, missing=OPTIONAL)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert done.stdout == "(1, 3)\n", done.stderr
 
 
-def test_a_missing_package_names_its_extra():
+def test_missing_package_names_its_extra():
     with pytest.raises(ParamsError, match=r"model.safetensors: package nowhere is not installed.*\[pipeline\]"):
         require("nowhere", "model.safetensors")
     with pytest.raises(ParamsError, match=r"package torch is not installed.*'\.\[train\]'"), explaining("reskin"):
@@ -95,8 +110,8 @@ def test_imported_packages_are_declared():
     imported = names - sys.stdlib_module_names - {"pipeline", "reskin"}
     known = {"sklearn": "scikit-learn", "serial": "pyserial", "ruamel": "ruamel.yaml", "zc": "zc.lockfile"}
     lines = [line for extra in (None, "train", "pipeline", "onnx", "dask") for line in wanted(extra)]
-    asked = {re.split(r"[\[<>=]", line)[0] for line in lines}
-    assert {known.get(name, name) for name in imported} <= asked
+    required = {re.split(r"[\[<>=]", line)[0] for line in lines}
+    assert {known.get(name, name) for name in imported} <= required
 
 
 def test_version_is_the_same_everywhere():
@@ -107,12 +122,12 @@ def test_version_is_the_same_everywhere():
 
 
 def test_licences_are_compatible():
-    assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # none is tolerated that need not be
+    assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # no needless exception
     assert closure(wanted()).keys() & TOLERATED.keys() == set()
 
 
 @pytest.mark.parametrize(
-    ("licence", "fits"),
+    ("licence", "compatible"),
     [
         ("MIT", True), ("Apache-2.0 WITH LLVM-exception AND BSD-2-Clause", True), ("GPL-3.0-only OR MIT", True),
         ("GPL-3.0-only", False), ("MIT AND AGPL-3.0", False), ("GNU Lesser General Public License", False),
@@ -121,8 +136,8 @@ def test_licences_are_compatible():
         ("MIT License; my own words", False), ("BSD License (3-clause)", True),
     ],
 )  # fmt: skip
-def test_a_licence_is_compatible_if_one_alternative_is(licence, fits):
-    assert is_compatible(licence) is fits
+def test_licence_is_compatible_if_one_alternative_is(licence, compatible):
+    assert is_compatible(licence) is compatible
 
 
 def test_constraints_are_replaced_atomically(tmp_path, monkeypatch):
@@ -136,18 +151,18 @@ def test_constraints_are_replaced_atomically(tmp_path, monkeypatch):
     assert old.read_text() == "torch==1.0\n"
 
 
-def test_constraints_leave_out_reskin_and_gpu_packages():
+def test_constraints_omit_reskin_and_gpu_packages():
     lines = render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin": "0.1"}).splitlines()
     assert lines[1:] == ["Attrs==1.0", "torch==2.0"]
 
 
-def test_checkout_commands_are_all_named():
+def test_checkout_commands_are_listed():
     names = {one.name or one.callback.__name__.replace("_", "-") for one in checkout.registered_commands}
     assert {"scenes", *names} == {*CHECKOUT_COMMANDS}
 
 
 @pytest.mark.parametrize("name", CHECKOUT_COMMANDS)
-def test_outside_a_checkout_its_commands_raise(tmp_path, monkeypatch, name):
+def test_checkout_commands_raise_outside_a_checkout(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["reskin", name, "any.csv"])
     with pytest.raises(ParamsError, match=f"reskin {name} works in a checkout of the project"):

@@ -1,4 +1,4 @@
-"""Comparing two runs: what counts as equal, how values are named, and when a verdict has changed."""
+"""Tests of comparing two runs: equality, names of values and changed verdicts."""
 
 import pytest
 from hypothesis import given, settings
@@ -14,16 +14,16 @@ VALUES = st.one_of(
 )  # fmt: skip
 NESTED = st.recursive(
     VALUES,
-    lambda own: st.lists(own, max_size=3) | st.dictionaries(st.sampled_from(NAMES), own, max_size=3),
+    lambda children: st.lists(children, max_size=3) | st.dictionaries(st.sampled_from(NAMES), children, max_size=3),
     max_leaves=9,
 )
 NUMBERS = st.dictionaries(st.sampled_from(NAMES), NESTED, max_size=4)
-FEW = settings(max_examples=40, deadline=None)  # a nest of values takes milliseconds to draw
+FEW = settings(max_examples=40, deadline=None)  # drawing nested values takes milliseconds
 
 
 @FEW
 @given(NUMBERS)
-def test_a_run_equals_itself(numbers):
+def test_run_equals_itself(numbers):
     done = compare(numbers, numbers)
     assert done.reproduced
     assert done.equal.total() == len(list(leaves(numbers)))
@@ -31,16 +31,16 @@ def test_a_run_equals_itself(numbers):
 
 @FEW
 @given(NUMBERS, NUMBERS)
-def test_every_value_is_counted_once_and_the_runs_may_be_exchanged(one, other):
-    there, back = compare(one, other), compare(other, one)
-    assert there.equal.total() == back.equal.total()
-    both_n = there.equal.total() + len(there.differing)
+def test_values_are_counted_once_and_symmetrically(one, other):
+    forwards, backwards = compare(one, other), compare(other, one)
+    assert forwards.equal.total() == backwards.equal.total()
+    both_n = forwards.equal.total() + len(forwards.differing)
     assert (
-        both_n + len(there.missing)
+        both_n + len(forwards.missing)
         == len(list(leaves(one)))
-        == back.equal.total() + len(back.differing) + len(back.new)
+        == backwards.equal.total() + len(backwards.differing) + len(backwards.new)
     )
-    assert both_n + len(there.new) == len(list(leaves(other)))
+    assert both_n + len(forwards.new) == len(list(leaves(other)))
 
 
 @pytest.mark.parametrize(
@@ -50,13 +50,13 @@ def test_every_value_is_counted_once_and_the_runs_may_be_exchanged(one, other):
         ("a", "b", None),
     ],
 )  # fmt: skip
-def test_any_difference_counts_however_small(old, new, relative):
+def test_any_difference_counts(old, new, relative):
     (difference,) = compare({"shear": {"mean": old}}, {"shear": {"mean": new}}).differing
     assert difference.name == "shear.mean"
     assert difference.relative == (None if relative is None else pytest.approx(relative))
 
 
-def test_equal_counts_stand_by_section():
+def test_equal_values_are_counted_by_section():
     numbers = {"table2": {"a": 1.0, "b": 2.0}, "labels": [{"method": "ridge", "mean": 1.0}]}
     assert compare(numbers, numbers).equal == {"table2": 2, "labels": 2}
 
@@ -65,7 +65,7 @@ def test_nan_equals_nan():
     assert compare({"a": float("nan")}, {"a": float("nan")}).reproduced
 
 
-def test_an_additional_row_shifts_no_other():
+def test_additional_row_shifts_no_other():
     rows = [{"method": "ridge", "labels_n": n, "accuracy_pct": float(n)} for n in (0, 10)]
     done = compare({"labels": rows}, {"labels": [{"method": "ridge", "labels_n": 5, "accuracy_pct": 50.0}, *rows]})
     assert done.differing == []
@@ -73,12 +73,12 @@ def test_an_additional_row_shifts_no_other():
     assert done.missing == []
 
 
-def test_rows_that_begin_alike_are_numbered():
+def test_equal_labels_are_numbered():
     names = [name for name, _ in leaves({"audit": [{"what": "a"}, {"what": "a"}, {"what": "b"}, {"x_mm": 8.0}]})]
     assert names == ["audit[a].what", "audit[a #2].what", "audit[b].what", "audit[#1].x_mm"]
 
 
-def test_rows_whose_leading_words_changed_are_paired_by_place():
+def test_changed_labels_are_paired_by_position():
     old = [{"claim": "better", "holds": "no"}, {"claim": "better", "holds": "yes"}]
     new = [old[0], {"claim": "better", "holds": "inconclusive"}]
     (difference,) = compare({"order": old}, {"order": new}).differing
@@ -86,7 +86,7 @@ def test_rows_whose_leading_words_changed_are_paired_by_place():
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "turned"),
+    ("old", "new", "verdicts"),
     [
         ("inconclusive: -2.08 [-4.4, 0.2]", "yes: -2.1 [-4.1, -0.1]", ("inconclusive", "yes")),
         ("yes", "no", ("yes", "no")), ("no, known", "yes", ("no", "yes")),
@@ -95,12 +95,12 @@ def test_rows_whose_leading_words_changed_are_paired_by_place():
         (True, False, None), (1.0, 2.0, None),
     ],
 )  # fmt: skip
-def test_a_verdict_has_changed_if_the_words_that_cells_begin_with_differ(old, new, turned):
+def test_verdict_changes_with_the_leading_word(old, new, verdicts):
     (difference,) = compare({"cell": old}, {"cell": new}).differing
-    assert difference.verdicts == turned
+    assert difference.verdicts == verdicts
 
 
 @pytest.mark.parametrize("file", sorted(ROOT.glob("reports/*/numbers.json")), ids=lambda file: file.parent.name)
-def test_every_committed_value_has_a_name_of_its_own(file):
+def test_names_of_committed_values_are_unique(file):
     named = list(leaves(read_json(file)))
     assert len(dict(named)) == len(named) > 100

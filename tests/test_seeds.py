@@ -7,7 +7,7 @@ names = st.lists(st.text(max_size=5), max_size=3)
 
 
 @given(st.integers(0, 2**40), names)
-def test_a_generator_is_known_by_its_names(seed, path):
+def test_generator_depends_on_seed_and_names(seed, path):
     assert rng_for(seed, *path).integers(2**60) == rng_for(seed, *path).integers(2**60)
 
 
@@ -18,5 +18,5 @@ def test_other_names_or_seeds_give_other_streams(seed, one, other):
     assert seed_for(seed, *one) != seed_for(seed + 1, *one)
 
 
-def test_a_name_cannot_be_split_in_another_way():
+def test_names_are_not_concatenated():
     assert seed_for(0, "a", "bc") != seed_for(0, "ab", "c")

@@ -1,4 +1,4 @@
-"""The params of a stage cover the settings that its code reads; an override runs the stages again that read it."""
+"""The params of a stage cover the settings that it reads; an override reruns the stages that read it."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -25,7 +25,7 @@ SCENE, SKIN = f"{SCENES}/ci.yaml", str(NOMINAL.relative_to(ROOT))
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
 
 
-class Noting(Mapping[str, Any]):
+class RecordingMapping(Mapping[str, Any]):
     """A mapping that records which keys are read."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -46,43 +46,43 @@ class Noting(Mapping[str, Any]):
 
 
 def declared(stage: str) -> tuple[set[str], set[str]]:
-    """The sections of a scene, and the sections that scenes share, which dvc.yaml lists for a stage."""
-    of_scene: set[str] = set()
+    """Return the sections of a scene and the shared sections that dvc.yaml lists for a stage."""
+    scene_sections: set[str] = set()
     shared: set[str] = set()
     for entry in FLOW[stage]["do"].get("params", []):
         for file, keys in entry.items():
             if file.startswith(SCENES):
-                of_scene |= {key.partition(".")[0] for key in keys} if keys else {"*"}
+                scene_sections |= {key.partition(".")[0] for key in keys} if keys else {"*"}
             elif file in (PARAMS, SKIN):
                 shared |= set(keys)
-    return of_scene, shared
+    return scene_sections, shared
 
 
 MODELS = {stage: section_of(getattr(module_of(stage), stage)) for stage in FLOW if stage != "code"}
 
 
-def test_the_stages_that_take_a_section_are_those_of_which_a_scene_holds_settings():
+def test_stages_with_a_section_are_those_with_scene_settings():
     assert {stage for stage, model in MODELS.items() if model} == SECTIONS | {"split"}
 
 
 @pytest.mark.parametrize("stage", [stage for stage, model in MODELS.items() if model])
-def test_the_params_of_a_stage_cover_the_settings_that_it_reads(stage):
-    scene = next(one for one in ("ci", "lab", "eflash7", "decide", "universal") if stage_of(one, stage))
+def test_params_cover_the_settings_a_stage_reads(stage):
+    scene = next(one for one in ("ci", "lab", "eflash7", "decide", "universal") if scene_runs(one, stage))
     given = read_settings(scene, ROOT)
-    asked = Settings(scene, given.where, Noting(given.of_scene), Noting(given.shared), given.captures)
-    asked.section(MODELS[stage], stage)
-    of_scene, shared = declared(stage)
-    assert asked.of_scene.read - of_scene == set() or "*" in of_scene
-    assert asked.shared.read - shared == set()
+    of_scene, of_all = RecordingMapping(given.of_scene), RecordingMapping(given.shared)
+    Settings(scene, given.where, of_scene, of_all, given.captures).section(MODELS[stage], stage)
+    scene_sections, shared = declared(stage)
+    assert of_scene.read - scene_sections == set() or "*" in scene_sections
+    assert of_all.read - shared == set()
 
 
-def stage_of(scene: str, stage: str) -> bool:
+def scene_runs(scene: str, stage: str) -> bool:
     return read_scene(ROOT, scene).runs(stage)
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """A checkout that runs scene ci."""
+    """Return a checkout that runs scene ci."""
     folder = copy_checkout(tmp_path_factory.mktemp("settings"))
     plan.use(folder, ["ci"])
     return folder
@@ -90,7 +90,7 @@ def root(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def stages(root) -> list[Any]:
-    """The stages as DVC makes them of dvc.yaml and the plan."""
+    """Return the stages as DVC builds them from dvc.yaml and the plan."""
     from dvc.repo import Repo
 
     with Repo(str(root)) as repo:
@@ -98,7 +98,7 @@ def stages(root) -> list[Any]:
 
 
 def tracked(root: Path, stages: list[Any]) -> dict[str, str]:
-    """The values of its parameters that DVC compares, for every stage."""
+    """Return the parameter values that DVC compares, by stage."""
     from dvc.dependency.param import read_param_file
 
     return {
@@ -113,26 +113,26 @@ def tracked(root: Path, stages: list[Any]) -> dict[str, str]:
 
 @contextmanager
 def overridden(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
-    """Do what `dvc exp run -S file:key=value` does to files, and undo it."""
+    """Change files as `dvc exp run -S file:key=value` does; restore them at the end."""
     from dvc.utils.hydra import apply_overrides
 
     before = {file: (root / file).read_bytes() for file, _ in overrides}
     try:
-        for file, words in overrides:
-            apply_overrides(root / file, [words])
+        for file, override in overrides:
+            apply_overrides(root / file, [override])
         yield
     finally:
         for file, content in before.items():
             (root / file).write_bytes(content)
 
 
-OWN = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
-SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in OWN)}
+FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
+SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
 BASED = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 RECIPES = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient", *BASED}
-PHYSICS = {"audit", "report"}  # its fingerprint is compared with that of scene tuning
+PHYSICS = {"audit", "report"}  # compare its fingerprint with that of scene tuning
 DRAWN = {"flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects"}
-# By override the stages that DVC runs again. Sections of params.yaml are taken whole: finished trainings are cached.
+# The stages that DVC reruns. Sections of params.yaml are dependencies as a whole; trainings are cached.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", RECIPES),
     (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *BASED}),
@@ -151,25 +151,25 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
 ]
 
 
-@pytest.mark.parametrize(("file", "words", "readers"), OVERRIDES, ids=[words for _, words, _ in OVERRIDES])
-def test_an_override_runs_the_stages_again_that_read_it(root, stages, file, words, readers):
+@pytest.mark.parametrize(("file", "override", "readers"), OVERRIDES, ids=[override for _, override, _ in OVERRIDES])
+def test_override_reruns_the_stages_that_read_it(root, stages, file, override, readers):
     before = tracked(root, stages)
-    with overridden(root, (file, words)):
+    with overridden(root, (file, override)):
         after = tracked(root, stages)
     known = {name if "@" in name else f"{name}@ci" for name in set().union(*(named for _, _, named in OVERRIDES))}
     changed = {name for name in before if before[name] != after[name]}
     assert changed & known == {name if "@" in name else f"{name}@ci" for name in readers}
 
 
-def test_an_edit_of_a_protocol_simulates_that_protocol_again_and_no_other(root, stages):
+def test_protocol_edit_simulates_only_that_protocol(root, stages):
     before = tracked(root, stages)
-    for protocol in OWN:
+    for protocol in FURTHER_PROTOCOLS:
         with overridden(root, (SCENE, f"+simulate.protocols.{protocol}.note=1")):
             after = tracked(root, stages)
         assert {name for name in SIMULATE if before[name] != after[name]} == {f"simulate@ci-{protocol}"}
 
 
-def test_the_code_reads_what_an_override_sets(root):
+def test_override_changes_the_settings(root):
     with overridden(root, (SCENE, "train_multi.recipe=slow")):
         assert read_settings("ci", root).section(Training, "train_multi").recipes["paper"].rate_max == 0.003
 
@@ -178,14 +178,14 @@ YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / PARAMS, NOMINAL, ROOT / PLAN, *sorted((
 
 
 @pytest.mark.parametrize("file", YAML_OF_DVC, ids=lambda file: file.name)
-def test_no_file_that_dvc_reads_holds_an_anchor_an_alias_or_a_merge_key(file):
-    # An override reaches one copy of what an alias names, or all of them.
+def test_dvc_files_have_no_anchors_or_merge_keys(file):
+    # It is unclear whether an override changes one copy or all copies of an alias.
     tokens = [type(token).__name__ for token in YAML(pure=True).scan(file.read_text())]
     assert {"AnchorToken", "AliasToken"} & set(tokens) == set()
     assert not re.search(r"^\s*<<\s*:|[{,]\s*<<\s*:", file.read_text(), re.MULTILINE)
 
 
-def test_a_stage_fails_on_mistakes_in_its_own_sections_only(root):
+def test_stage_fails_only_on_its_own_sections(root):
     with overridden(root, (SCENE, "shear.repeats_n=0")):
         read_settings("ci", root).section(Training, "train_multi")
         with pytest.raises(ParamsError, match="shear: repeats_n must be greater than or equal to 1; got 0"):
@@ -194,7 +194,7 @@ def test_a_stage_fails_on_mistakes_in_its_own_sections_only(root):
             plan.check(root)
 
 
-def test_the_control_of_an_adaptation_follows_it(root):
+def test_control_follows_its_adaptation(root):
     with overridden(root, (PARAMS, "adaptations.paper.rate_max=0.5")):
         adapt = read_settings("ci", root).section(Adaptations, "adapt")
     assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}

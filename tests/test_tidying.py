@@ -1,4 +1,4 @@
-"""Outputs of experiments that a scene no longer runs are found and removed; all other files stay."""
+"""Tests of `reskin scenes tidy`, which removes outputs of experiments that a scene no longer runs."""
 
 import shutil
 from pathlib import Path
@@ -22,7 +22,7 @@ WRITTEN = {
 
 @pytest.fixture
 def root(tmp_path) -> Path:
-    """Scene one ran drift and a protocol `gone`, and now runs lobo only; scene two ran once, and is not in the plan."""
+    """Return a checkout: scene one ran drift and protocol `gone` and now runs lobo; scene two is not in the plan."""
     folder = checkout(tmp_path / "checkout")
     plan.use(folder, ["one"])
     for path in WRITTEN.values():
@@ -34,48 +34,48 @@ def root(tmp_path) -> Path:
     return folder
 
 
-def test_stale_stages_are_listed_with_their_files(root):
+def test_stale_stages_are_listed_with_files(root):
     assert tidy.stale_outputs(root, plan.check(root)) == {
         "drift@one": [root / WRITTEN["drift@one"]],
         "simulate@one-gone": [root / WRITTEN["simulate@one-gone"]],
     }
 
 
-def test_tidying_removes_stale_outputs_only(root):
+def test_tidy_removes_only_stale_outputs(root):
     tidy.tidy(root, plan.check(root))
-    there = {name for name, path in WRITTEN.items() if (root / path).exists()}
-    assert there == {"train_multi@one", "drift@two", "split@one"}
+    existing = {name for name, path in WRITTEN.items() if (root / path).exists()}
+    assert existing == {"train_multi@one", "drift@two", "split@one"}
     lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
-    assert set(lock["stages"]) == there
+    assert set(lock["stages"]) == existing
     assert lock["schema"] == "2.0"
     assert tidy.stale_outputs(root, plan.check(root)) == {}
 
 
-def test_a_file_that_a_planned_stage_writes_too_stays(root):
+def test_file_of_a_planned_stage_is_kept(root):
     lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
-    lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]  # holds what train_multi writes
+    lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]  # contains outputs of train_multi
     with (root / tidy.LOCK).open("w") as stream:
         YAML().dump(lock, stream)
     assert tidy.stale_outputs(root, plan.check(root))["drift@one"] == []
 
 
-def test_scenes_with_a_common_prefix_are_told_apart(root):
+def test_scenes_with_a_common_prefix_are_distinguished(root):
     shutil.copy(root / SCENES / "one.yaml", root / SCENES / "one-gone.yaml")
     assert set(tidy.stale_outputs(root, plan.check(root))) == {"drift@one"}
 
 
-def test_an_experiment_that_runs_has_no_stale_outputs(root):
+def test_running_experiment_has_no_stale_outputs(root):
     with (root / SCENES / "one.yaml").open("w") as stream:
         YAML().dump(scene_with("lobo", "drift"), stream)
     plan.use(root, ["one"])
     assert set(tidy.stale_outputs(root, plan.check(root))) == {"simulate@one-gone"}
 
 
-def test_a_stage_that_ran_only_elsewhere_is_not_listed(root):
+def test_outputs_of_other_machines_are_not_listed(root):
     (root / WRITTEN["drift@one"]).unlink()
     assert set(tidy.stale_outputs(root, plan.check(root))) == {"simulate@one-gone"}
 
 
-def test_a_checkout_without_a_run_has_no_stale_outputs(root):
+def test_checkout_without_a_run_has_no_stale_outputs(root):
     (root / tidy.LOCK).unlink()
     assert tidy.stale_outputs(root, plan.check(root)) == tidy.tidy(root, plan.check(root)) == {}

@@ -19,7 +19,7 @@ from reskin import io
 
 @pytest.fixture(scope="module")
 def empty_store(tmp_path_factory) -> Path:
-    """A store without runs: to make one takes seconds, to copy it none."""
+    """Return a store without runs, which is copied as creating it takes seconds."""
     store = tmp_path_factory.mktemp("store") / "mlflow.db"
     mlflow.MlflowClient(f"sqlite:///{store}").search_experiments()
     return store
@@ -33,7 +33,7 @@ def _embedded(monkeypatch, tmp_path, empty_store):
 
 @pytest.fixture
 def silent_server() -> Iterator[str]:
-    """A server that accepts and never answers."""
+    """Yield the address of a server that accepts and never responds."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         accepted: list[socket.socket] = []
         threading.Thread(target=lambda: accepted.append(server.accept()[0]), daemon=True).start()
@@ -45,7 +45,7 @@ def silent_server() -> Iterator[str]:
 @pytest.fixture
 def dead_address() -> str:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"http://127.0.0.1:{server.getsockname()[1]}"  # closed again on return
+        return f"http://127.0.0.1:{server.getsockname()[1]}"  # closed on return
 
 
 def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -> None:
@@ -89,7 +89,7 @@ def runs(root: Path, query: str) -> list:
     return list(client.search_runs([client.get_experiment_by_name("ci").experiment_id], query))
 
 
-def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_path):
+def test_each_training_is_published_once(tmp_path):
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 2, "kept_n": 0, "superseded_n": 0}
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 0}
     children = runs(tmp_path, "tags.kind = 'training'")
@@ -110,12 +110,12 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     contexts = {one.tags[0].value: one.dataset.name for one in client.get_run(run.info.run_id).inputs.dataset_inputs}
     assert contexts == {part: f"ci, {run.data.tags['fold']}, {part}" for part in ("train", "test")}
 
-    # Other settings: the new result is shown, the old one is kept and marked.
+    # Other settings: the new result is current, the old one is kept.
     assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k9"]
 
-    # A half-written run of a killed process is replaced, and going back shows the old result again.
+    # An incomplete run of a killed process is replaced; restored settings make the old result current.
     client.set_terminated(next(run.info.run_id for run in current if run.data.tags["cell"] == "k9"), "KILLED")
     assert write(tmp_path, b0="k0", b1="k9")["new_n"] == 1
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 2}
@@ -123,21 +123,21 @@ def test_every_training_is_a_child_run_once_however_often_it_is_published(tmp_pa
     assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k1"]
 
 
-def test_a_new_score_replaces_the_old_one_and_a_dropped_experiment_is_not_current(tmp_path):
+def test_new_score_replaces_the_old_and_dropped_experiments_are_not_current(tmp_path):
     write(tmp_path, b0="k0", b1="k1")
-    # The same training, scored anew: the old score is not what is shown.
+    # The same training with a new score.
     write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
     counts = publish({"train_multi": tmp_path / "models"}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     assert counts == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.metrics["accuracy_pct"] for run in current) == [50.0, 77.0]
 
-    # An experiment that is asked no more has no current runs.
+    # A dropped experiment has no current runs.
     publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     assert [run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")] == ["report"]
 
 
-def test_the_report_is_one_run_with_every_figure_the_page_and_its_numbers(tmp_path):
+def test_report_run_has_figures_page_and_numbers(tmp_path):
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     write(tmp_path)
     (run,) = runs(tmp_path, "tags.stage = 'report'")
@@ -150,7 +150,7 @@ def test_the_report_is_one_run_with_every_figure_the_page_and_its_numbers(tmp_pa
     curve = client.get_metric_history(run.info.run_id, "drift.each.accuracy_pct")
     assert [(point.step, point.value) for point in curve] == [(5, 90.0), (10, 80.0)]
 
-    # Other costs are the same report, whose files are renewed; another number is another report.
+    # Other costs update the files of the report; another number makes a new report.
     write_report(tmp_path / "reports", seconds=2.0)
     publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     (same,) = runs(tmp_path, "tags.stage = 'report'")
@@ -162,7 +162,7 @@ def test_the_report_is_one_run_with_every_figure_the_page_and_its_numbers(tmp_pa
     assert current.data.metrics["table2.multi.accuracy_pct.mean"] == 60.0
 
 
-def test_a_sweep_is_one_run_whose_metrics_go_over_its_steps(tmp_path):
+def test_sweep_run_has_metrics_over_steps(tmp_path):
     write_report(tmp_path / "reports")
     curves = {"sweep_pokes": [("adapted", 0, {"accuracy_pct": 60.0}), ("adapted", 65, {"accuracy_pct": 70.0})]}
     publish({}, curves, tmp_path / "reports", scene="ci", root=tmp_path)
@@ -176,8 +176,8 @@ def test_a_sweep_is_one_run_whose_metrics_go_over_its_steps(tmp_path):
 CURVES = {old: {"sweep_pokes": [("adapted", 0, {"accuracy_pct": pct})]} for old, pct in ((True, 60.0), (False, 61.0))}
 
 
-def leave(root: Path, old: bool, reported: bool = True) -> dict:
-    """Let a state of the workspace lie there, as `git checkout` and `dvc checkout` do, or `dvc checkout` alone."""
+def publish_state(root: Path, old: bool, reported: bool = True) -> dict:
+    """Write and publish the state of a workspace, as after `git checkout` and `dvc checkout`, or the latter alone."""
     io.remove(root / "models")
     write_model(root / "models", "b0", "k0" if old else "k9", accuracy_pct=50.0 if old else 51.0)
     if reported:
@@ -189,15 +189,15 @@ def current(root: Path) -> set[str]:
     return {run.info.run_id for run in runs(root, "tags.current = 'true'")}
 
 
-def test_current_follows_a_restored_state_and_nothing_is_written_again(tmp_path):
-    leave(tmp_path, old=True)
+def test_restored_state_becomes_current_without_new_runs(tmp_path):
+    publish_state(tmp_path, old=True)
     first = current(tmp_path)
-    leave(tmp_path, old=False)
+    publish_state(tmp_path, old=False)
     assert len(first) == 4  # a training, its stage, a sweep, the report
     assert current(tmp_path) & first == set()
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     counted = {run.info.run_id: history_n(client, run) for run in runs(tmp_path, "")}
-    assert leave(tmp_path, old=True) == {"new_n": 0, "kept_n": 1, "superseded_n": 4}
+    assert publish_state(tmp_path, old=True) == {"new_n": 0, "kept_n": 1, "superseded_n": 4}
     assert current(tmp_path) == first
     assert {run.info.run_id: history_n(client, run) for run in runs(tmp_path, "")} == counted
 
@@ -206,64 +206,64 @@ def history_n(client: mlflow.MlflowClient, run) -> int:
     return sum(len(client.get_metric_history(run.info.run_id, name)) for name in run.data.metrics)
 
 
-@pytest.mark.parametrize("there", [True, False])
-def test_a_report_that_dvc_does_not_restore_is_found_by_the_results_that_it_showed(tmp_path, there):
-    leave(tmp_path, old=True)
+@pytest.mark.parametrize("restored", [True, False])
+def test_unrestored_report_is_found_by_its_results(tmp_path, restored):
+    publish_state(tmp_path, old=True)
     first = current(tmp_path)
-    leave(tmp_path, old=False)
-    if not there:
+    publish_state(tmp_path, old=False)
+    if not restored:
         io.remove(tmp_path / "reports")
-    leave(tmp_path, old=True, reported=False)
+    publish_state(tmp_path, old=True, reported=False)
     assert current(tmp_path) == first
 
 
-def test_results_that_were_never_reported_are_published_without_a_report(tmp_path):
-    leave(tmp_path, old=True)
+def test_unreported_results_are_published(tmp_path):
+    publish_state(tmp_path, old=True)
     io.remove(tmp_path / "reports")
-    leave(tmp_path, old=False, reported=False)
+    publish_state(tmp_path, old=False, reported=False)
     assert {run.data.tags["stage"] for run in runs(tmp_path, "tags.current = 'true'")} == {"train_multi", "sweep_pokes"}
 
 
-def test_a_curve_that_a_killed_process_left_is_written_again(tmp_path):
-    leave(tmp_path, old=True)
+def test_interrupted_curve_is_written_again(tmp_path):
+    publish_state(tmp_path, old=True)
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     for run in runs(tmp_path, "tags.kind = 'stage'"):
         client.set_terminated(run.info.run_id, "KILLED")
-    leave(tmp_path, old=True)
+    publish_state(tmp_path, old=True)
     again = runs(tmp_path, "tags.current = 'true'")
     assert len(again) == 4
     assert {run.info.status for run in again} == {"FINISHED"}
 
 
-def test_a_store_that_is_broken_costs_no_result(tmp_path):
+def test_broken_store_is_reported(tmp_path):
     (tmp_path / "mlflow.db").write_bytes(b"junk" * 99)
     with pytest.raises(TrackingAway, match="Results are kept"):
         write(tmp_path, b0="k0")
 
 
 @pytest.mark.parametrize("uri", ["http://localhost:notaport", "http://", "https://[::1", "http://127.0.0.1:99999"])
-def test_a_mistyped_address_is_a_server_that_is_away(uri):
+def test_mistyped_address_is_reported(uri):
     with pytest.raises(TrackingAway, match="does not answer"):
         probe(uri)
 
 
 @pytest.mark.parametrize("kind", ["silent_server", "dead_address"])
-def test_a_server_that_is_away_is_noticed_within_seconds(kind, request, tmp_path, monkeypatch):
+def test_unreachable_server_is_reported_within_seconds(kind, request, tmp_path, monkeypatch):
     uri = request.getfixturevalue(kind)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     start_s = time.monotonic()
     with pytest.raises(TrackingAway, match="`reskin publish` sends them when it is back"):
         write(tmp_path, b0="k0")
-    assert time.monotonic() - start_s < 15  # two of them the time-out; with its own ways MLflow would take 20
+    assert time.monotonic() - start_s < 15  # two of these the time-out; MLflow's retries take 20
 
 
-def test_an_embedded_store_that_is_not_there_yet_is_made_by_nobody_who_only_asks(tmp_path):
+def test_probe_creates_no_store(tmp_path):
     probe(None)
     probe(f"sqlite:///{tmp_path / 'somewhere.db'}")
     assert not (tmp_path / "somewhere.db").exists()
 
 
-def test_a_store_that_another_program_holds_costs_seconds_and_no_result(tmp_path, monkeypatch):
+def test_locked_store_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(tracking, "LOCK_TIMEOUT_S", 0.1)
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
         other.execute("BEGIN EXCLUSIVE")
@@ -272,27 +272,27 @@ def test_a_store_that_another_program_holds_costs_seconds_and_no_result(tmp_path
     write(tmp_path, b0="k0")
 
 
-def test_a_store_that_fails_in_mid_run_is_one_sentence_and_no_traceback(tmp_path, monkeypatch):
+def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
     write(tmp_path, b0="k0")
-    find, told = tracking.Publisher.find, []
+    find, messages = tracking.Publisher.find, []
 
-    def fails(self, *words, **tags):
+    def fails(self, *arguments, **tags):
         with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
             other.execute("DROP TABLE IF EXISTS tags")
-        return find(self, *words, **tags)
+        return find(self, *arguments, **tags)
 
     monkeypatch.setattr(tracking.Publisher, "find", fails)
-    hears = logging.Handler()
-    hears.emit = told.append
-    logging.getLogger("mlflow.store.db.utils").addHandler(hears)
+    handler = logging.Handler()
+    handler.emit = messages.append
+    logging.getLogger("mlflow.store.db.utils").addHandler(handler)
     with pytest.raises(TrackingAway, match=r"failed \(.*no such table: tags\)\. Results are kept"):
         write(tmp_path, b0="k1")
-    logging.getLogger("mlflow.store.db.utils").removeHandler(hears)
-    assert told == []
+    logging.getLogger("mlflow.store.db.utils").removeHandler(handler)
+    assert messages == []
 
 
-def test_a_server_that_is_too_slow_is_left_with_what_is_written_and_taken_up_again(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # none left for two trainings
+def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
+    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # no time for two trainings
     with pytest.raises(TrackingAway, match="took longer than 0 s"):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()

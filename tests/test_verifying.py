@@ -1,4 +1,4 @@
-"""Reports are verified against the commit: by those of a clean rerun, or by finished ones."""
+"""Tests of `reskin verify-reports`: reports of a rerun or finished reports against the commit."""
 
 import json
 import subprocess
@@ -21,24 +21,24 @@ def write(reports, accuracy_pct, score=80.0, model="network"):
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A checkout whose committed accuracy is 80 %."""
+    """Return a checkout with a committed accuracy of 80 %."""
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     io.write_text(tmp_path / "data/captures.yaml", "captures: {}\n")
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
-    for words in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"]):
-        subprocess.run(["git", *words], cwd=tmp_path, check=True)
+    for arguments in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"]):
+        subprocess.run(["git", *arguments], cwd=tmp_path, check=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def said(*words: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["verify-reports", *words])
+def run_command(*arguments: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["verify-reports", *arguments])
     return done.exit_code, done.output
 
 
 @pytest.mark.parametrize(
-    ("changed", "status", "told"),
+    ("changed", "status", "expected"),
     [
         ((80.0,), 0, "quick: reproduced: all 6 values"),
         ((90.0,), 1, "| table2.accuracy_pct.mean "),
@@ -46,24 +46,24 @@ def said(*words: str) -> tuple[int, str]:
         ((80.0, 80.0, "ridge"), 1, "| tables | table2    | 1       | 1        |"),
     ],
 )
-def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factory, changed, status, told):
+def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factory, changed, status, expected):
     other = tmp_path_factory.mktemp("other")
     write(other / "quick", *changed)
-    write(checkout / "reports/quick", 0.0)  # what lies in the working tree is not asked
-    code, output = said("quick", "--against", str(other))
+    write(checkout / "reports/quick", 0.0)  # the working tree is not compared
+    code, output = run_command("quick", "--against", str(other))
     assert code == status
-    assert told in output
+    assert expected in output
 
 
-def test_a_rerun_starts_from_the_commit_without_its_reports_and_is_kept(checkout, monkeypatch):
-    def run(clone, environment, *words, quiet=False):
-        if words[0] == "dvc":
+def test_rerun_starts_from_the_commit_and_is_kept(checkout, monkeypatch):
+    def run(clone, environment, *arguments, quiet=False):
+        if arguments[0] == "dvc":
             assert not (clone / "reports/quick").exists()
-            assert words[-1] == "report@quick"
+            assert arguments[-1] == "report@quick"
             write(clone / "reports/quick", 90.0)
 
     monkeypatch.setattr(verify, "_run", run)
-    code, output = said("quick")
+    code, output = run_command("quick")
     assert code == 1
     assert "| 80          | 90      |" in output
     kept = json.loads((checkout / verify.VERIFIED / "quick/numbers.json").read_text())
@@ -72,17 +72,17 @@ def test_a_rerun_starts_from_the_commit_without_its_reports_and_is_kept(checkout
 
 
 @pytest.mark.parametrize(
-    ("words", "sentence"),
+    ("arguments", "message"),
     [
         (["lab"], "has no reports/lab/numbers.json"),
         (["quick", "--against", "data"], "data: no quick/numbers.json there"),
     ],
 )
-def test_what_is_not_there_is_one_sentence(checkout, words, sentence):
-    done = CliRunner().invoke(app, ["verify-reports", *words])
+def test_missing_reports_are_an_error(checkout, arguments, sentence):
+    done = CliRunner().invoke(app, ["verify-reports", *arguments])
     assert sentence in str(done.exception)
 
 
-def test_a_command_that_fails_says_where(tmp_path):
+def test_failed_command_is_named(tmp_path):
     with pytest.raises(verify.SchemaError, match="`json.tool nowhere` failed in a clone of the last commit"):
         verify._run(tmp_path, {}, "json.tool", "nowhere", quiet=True)

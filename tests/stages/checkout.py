@@ -1,4 +1,4 @@
-"""A copy of this checkout to run stages in: code and configuration without data or git, with this environment."""
+"""Copies of this checkout to run stages in: code, configuration and environment, without data or git."""
 
 import compileall
 import os
@@ -16,8 +16,8 @@ NOT_COPIED = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlart
 TEST_BYTECODE = ("*.opt-jaxtyping*.pyc", "*-pytest-*.pyc")  # stages do not read it
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1",
-    "RESKIN_EXECUTOR": "here",  # the imports of a worker take longer than these trainings
-    "PYTHONDONTWRITEBYTECODE": "",  # stages start a hundred times: keep their bytecode
+    "RESKIN_EXECUTOR": "here",  # starting workers takes longer than these trainings
+    "PYTHONDONTWRITEBYTECODE": "",  # keep the bytecode for a hundred starts of stages
 }  # fmt: skip
 
 DONE, FAILED = "these stages ended", "these stages did not end"  # printed by warm.py
@@ -83,11 +83,11 @@ def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
         warm.stdin.close()
 
 
-def run(folder: Path, *words: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(folder: Path, *arguments: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run a program of the environment in the copy."""
-    words = (str(folder / ".venv/bin" / words[0]), *words[1:])
+    arguments = (str(folder / ".venv/bin" / arguments[0]), *arguments[1:])
     env = variables(folder, **environment)
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, env=env, check=False)
+    done = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, env=env, check=False)
     if check and done.returncode:
-        raise AssertionError(f"{' '.join(words)} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
+        raise AssertionError(f"{' '.join(arguments)} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
     return done

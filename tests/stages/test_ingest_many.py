@@ -1,4 +1,4 @@
-"""A scene of many recorded captures is read in one stage, each capture once."""
+"""Tests of the stage that reads all recorded captures of a scene, each once."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from reskin.errors import CaptureError
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Run the stage on three captures; it gives the names of those that were read anew."""
+    """Return a function that runs the stage on three captures and returns the names of those read."""
     monkeypatch.chdir(tmp_path)
     read, shared = [], {"faults": {"stuck": "drop"}, "lost_fraction_max": 0.05}
     names = ["c0", "c1", "c2"]
@@ -38,7 +38,7 @@ def run(tmp_path, monkeypatch):
     return run
 
 
-def test_a_capture_more_is_read_alone_and_one_that_is_gone_leaves_nothing(run):
+def test_only_new_captures_are_read(run):
     assert run() == ["c0", "c1", "c2"]
     assert run() == []
     run.names.remove("c1")
@@ -48,7 +48,7 @@ def test_a_capture_more_is_read_alone_and_one_that_is_gone_leaves_nothing(run):
     assert run() == ["c1"]
 
 
-def test_other_bytes_settings_or_code_are_read_anew(run):
+def test_changed_bytes_settings_or_code_are_read_again(run):
     run()
     io.write_text(run.folder / "raw/c1/stream.bin", "other")
     assert run() == ["c1"]
@@ -57,7 +57,7 @@ def test_other_bytes_settings_or_code_are_read_anew(run):
     assert run() == ["c0", "c1", "c2"]
 
 
-def test_what_was_read_before_a_broken_capture_is_not_lost(run):
+def test_finished_captures_survive_a_broken_one(run):
     io.write_text(run.folder / "raw/c2/stream.bin", "broken")
     with pytest.raises(CaptureError):
         run()
@@ -65,7 +65,7 @@ def test_what_was_read_before_a_broken_capture_is_not_lost(run):
     assert run() == ["c2"]
 
 
-def test_a_damaged_kept_copy_is_said_and_read_again(run, capsys):
+def test_damaged_cached_file_is_read_again(run, capsys):
     run()
     (kept,) = [file for file in (run.folder / stage.CACHE / "lab").iterdir() if file.read_text() == "c1"]
     kept.write_text("c9")
@@ -74,7 +74,7 @@ def test_a_damaged_kept_copy_is_said_and_read_again(run, capsys):
     assert run() == []
 
 
-def test_what_was_read_when_the_stage_was_killed_before_it_had_its_name_is_read_again(run):
+def test_partial_file_of_a_killed_stage_is_read_again(run):
     run()
     kept = run.folder / stage.CACHE / "lab"
     (file,) = [file for file in kept.iterdir() if file.read_text() == "c2"]

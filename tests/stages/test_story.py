@@ -1,4 +1,4 @@
-"""The whole pipeline on scene ci: run twice, killed during a stage, with outputs deleted and restored."""
+"""Tests of the whole pipeline on scene ci: repeated and killed runs, deleted outputs, wrong settings."""
 
 import json
 import os
@@ -35,7 +35,7 @@ LEARNING = (
     "train_single", "train_multi", "train_triplet", "adapt", "sweep_pokes", "sweep_sensors", "train_classical",
     "few_labels", "audit",
 )  # fmt: skip
-RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws of their own
+RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
 OF_CI = set(ANALYSES) - {
     "compare",
     "reference_methods",
@@ -44,7 +44,7 @@ OF_CI = set(ANALYSES) - {
     "worlds",
 }  # experiments on recordings or on many skins
 OUTPUT = "output.txt"  # of the first run
-pytestmark = pytest.mark.timeout(1800)  # against a hang; a busy machine takes four times as long as a quiet one
+pytestmark = pytest.mark.timeout(1800)  # against hanging; a busy machine takes four times as long as an idle one
 
 
 def compile_kernels() -> None:
@@ -80,14 +80,14 @@ def numbers(story) -> dict[str, Any]:
     return json.loads((story / "reports/ci/numbers.json").read_text())
 
 
-def test_the_first_tables_have_all_numbers_and_name_their_source(story, numbers):
+def test_first_tables_have_all_numbers_and_their_source(story, numbers):
     assert numbers["provenance"]["source"] == "simulated"
     provenance = json.loads((story / "reports/ci/provenance.json").read_text())
     assert {"git", "trained", "device", "versions", "seconds", "runtime"} == set(provenance)
     for row in ("single", "multi", "triplet", "adapted"):
         for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
             assert {"mean", "sd", "n"} <= set(numbers["table2"][row][metric])
-    assert numbers["table2"]["multi"]["accuracy_pct"]["n"] == 3  # boards, from the data
+    assert numbers["table2"]["multi"]["accuracy_pct"]["n"] == 3  # boards
     assert {"mean", "sd"} <= set(numbers["single_sensor"]["accuracy_pct"])
     capture = numbers["capture"]
     skipped = sum(n for key, n in capture.items() if key.startswith("skipped_") and key.endswith("_bytes_n"))
@@ -96,14 +96,14 @@ def test_the_first_tables_have_all_numbers_and_name_their_source(story, numbers)
     assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
 
 
-def test_every_stage_prints_its_position_among_all_stages(story):
+def test_stages_print_their_position(story):
     order = json.loads((story / ".reskin/order.json").read_text())["stages"]
     output = (story / OUTPUT).read_text()
     numbers = [int(number) for number in re.findall(rf"stage (\d+) of {len(order)}\b", output)]
-    assert sorted(numbers) == list(range(2, len(order) + 1))  # stage code, the first, prints nothing
+    assert sorted(numbers) == list(range(2, len(order) + 1))  # the first stage, code, prints nothing
 
 
-def test_the_early_table_2_equals_that_of_the_report(story, numbers):
+def test_early_table_2_equals_that_of_the_report(story, numbers):
     assert (story / "data/table2/ci/headline.svg").read_text() == table2_figure(numbers, "simulated")
     table = (story / "data/table2/ci/table2.md").read_text()
     assert table == to_markdown(table_2_summary(numbers))
@@ -118,17 +118,17 @@ def test_dvc_metrics_are_numbers_of_the_report(story, numbers):
     assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
 
 
-def test_the_cost_of_a_stage_counts_its_trainings(story):
+def test_stage_costs_count_trainings(story):
     stages = json.loads((story / "reports/ci/provenance.json").read_text())["runtime"]["stages"]
-    for arm in ("train_single", "train_multi", "train_triplet", "adapt", "sweep_sensors", "drift", "few_labels"):
-        assert stages[arm]["trainings_n"] > 0
-        assert stages[arm]["computed_s"] > 0
+    for stage_name in ("train_single", "train_multi", "train_triplet", "adapt", "sweep_sensors", "drift", "few_labels"):
+        assert stages[stage_name]["trainings_n"] > 0
+        assert stages[stage_name]["computed_s"] > 0
     assert stages["train_multi"]["reused_n"] == 0
     assert stages["split"]["trainings_n"] == 0
     assert stages["split"]["computed_s"] == stages["split"]["seconds"]
 
 
-def test_every_protocol_is_recorded_into_its_own_folder(story):
+def test_protocols_are_recorded_into_separate_folders(story):
     names = {"ci-wear": "b0_s0-wear", "ci-flexible": "f0_s0-flexible", "ci-hand": "b0_s0-hand", "ci-drag": "b0_s0-drag"}
     for folder, capture in names.items():
         assert [file.stem for file in (story / "data/indentations" / folder).glob("*.parquet")] == [capture]
@@ -143,14 +143,14 @@ def test_every_protocol_is_recorded_into_its_own_folder(story):
     assert wear.n_contacts.max() == 2 * 2 * 65 - 1
 
 
-def test_experiments_on_many_skins_test_the_same_rows(story, numbers):
+def test_experiments_on_many_skins_share_test_rows(story, numbers):
     assert [row["pokes_n"] for row in numbers["sweep_pokes"]] == [0, 30, 65]
     assert {(row["method"], row["skins_n"]) for row in numbers["sweep_sensors"]} == {
         (method, skins_n) for method in ("multi", "triplet", "adapted") for skins_n in (1, 4)
     }
     assert {(row["of"], row["over"]) for row in numbers["paired"]} >= {("triplet", "multi"), ("adapted", "triplet")}
     boards_n = {(row["of"], row["over"]): row["accuracy_pct"]["n"] for row in numbers["paired"]}
-    assert boards_n.pop(("multi", "single")) == 1  # one skin of each of two boards was tested on the third
+    assert boards_n.pop(("multi", "single")) == 1  # one skin of each of two boards is tested on the third
     assert set(boards_n.values()) == {3}
     assert all(len(row["by_board"]) == row["accuracy_pct"]["n"] for row in numbers["paired"])
     assert all(row["accuracy_pct"]["n"] == 3 for row in [*numbers["sweep_sensors"], *numbers["sweep_pokes"]])
@@ -159,8 +159,8 @@ def test_experiments_on_many_skins_test_the_same_rows(story, numbers):
     assert all(check["holds"] or check["known"] for check in numbers["audit"])
     rows_n = {
         json.loads(file.read_text())["scores"]["rows_n"]
-        for arm in ("train_multi", "train_triplet")
-        for file in (story / f"data/models/ci/{arm}").glob("*.json")
+        for stage_name in ("train_multi", "train_triplet")
+        for file in (story / f"data/models/ci/{stage_name}").glob("*.json")
     }
     assert rows_n == {2 * 130 * 5}  # two skins, the second pass, five readings
     for name in ("sweep_pokes", "sweep_sensors"):
@@ -187,22 +187,22 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
         assert f'src="figures/{figure.name}"' in page
 
 
-def test_another_commit_machine_and_time_change_only_provenance_and_run_times(story, tmp_path):
+def test_commit_machine_and_time_change_only_provenance(story, tmp_path):
     again = tmp_path / "again"
     shutil.copytree(
         story, again, symlinks=True, ignore=shutil.ignore_patterns(".dvc", "raw", "mlflow.db", "mlartifacts")
     )
     for file in (again / ".reskin").glob("*/ci/*.json"):
-        text = re.sub(r"(?<=: )\d+\.\d+(e-?\d+)?", lambda found: str(3 * float(found[0]) + 1), file.read_text())
+        text = re.sub(r"(?<=: )\d+\.\d+(e-?\d+)?", lambda match: str(3 * float(match[0]) + 1), file.read_text())
         file.write_text(text)
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
-    for words in (["init", "-q"], ["add", "pipeline", "reskin"], [*author, "commit", "-qm", "x"]):
-        subprocess.run(["git", *words], cwd=again, check=True)
-    words = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/models/ci/folds.json",
+    for arguments in (["init", "-q"], ["add", "pipeline", "reskin"], [*author, "commit", "-qm", "x"]):
+        subprocess.run(["git", *arguments], cwd=again, check=True)
+    arguments = ["--scene", "ci", "--indentations", "data/indentations/ci", "--folds", "data/models/ci/folds.json",
              "--models", "data/models/ci", "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     on_one_core = "import os, runpy; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
     on_one_core += "runpy.run_module('pipeline', run_name='__main__', alter_sys=True)"
-    run(again, "python", "-c", on_one_core, "report", *words)
+    run(again, "python", "-c", on_one_core, "report", *arguments)
     before, after = (
         {str(file.relative_to(reports)): file.read_bytes() for file in reports.rglob("*") if file.is_file()}
         for reports in (story / "reports", again / "reports")
@@ -213,10 +213,12 @@ def test_another_commit_machine_and_time_change_only_provenance_and_run_times(st
     assert {"ci/runtime/index.html", "ci/runtime/stages.md", "ci/runtime/quadratures.svg"} <= changed
 
 
-def test_experiments_on_single_boards_report_the_spread_over_seeds(story, numbers):
+def test_experiments_on_single_boards_report_spread_over_seeds(story, numbers):
     for experiment in ("manual", "flexible"):
         assert numbers[experiment]["seeds_n"] == 2
-        assert all("sd_seeds" in numbers[experiment][arm]["accuracy_pct"] for arm in ("before", "after", "control"))
+        assert all(
+            "sd_seeds" in numbers[experiment][variant]["accuracy_pct"] for variant in ("before", "after", "control")
+        )
         assert "sd_seeds" in numbers[experiment]["paired"]["after_minus_before"]["accuracy_pct"]
     assert numbers["shear"]["seeds_n"] == numbers["drift"]["seeds_n"] == numbers["logs"]["networks_n"] == 2
     assert all("sd_seeds" in numbers["shear"][name] for name in ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2"))
@@ -233,19 +235,19 @@ def test_experiments_on_single_boards_report_the_spread_over_seeds(story, number
         assert re.search("over (2 |the )?network seeds", table)
 
 
-def test_every_row_of_the_checklist_finds_its_number_and_files(story):
+def test_checklist_rows_resolve_to_numbers_and_files(story):
     reports = story / "reports/ci"
     numbers = json.loads((reports / "numbers.json").read_text())
     rows = [row for row in read_rows() if row.only != "recorded"]
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
-    assert [row.id for row in missing] == ["plateau"]  # this sweep is too short for it
+    assert [row.id for row in missing] == ["plateau"]  # the sweep is too short
     assert all(row.experiment and resolve(numbers, row.experiment) is not None for row in missing)
     assert (reports / "tables/checklist.md").read_text().count(NOT_REACHED) == len(missing)
-    found = [row for row in rows if row not in missing]
-    assert [row.id for row in found if row.reach and resolve(numbers, row.reach.ours) is None] == []
-    there = {file.name for file in (reports / "figures").iterdir()}
-    there |= {file.stem for file in (reports / "tables").glob("*.md")}
-    assert {name for row in rows for name in row.shown} - there == set()
+    resolved = [row for row in rows if row not in missing]
+    assert [row.id for row in resolved if row.reach and resolve(numbers, row.reach.ours) is None] == []
+    files = {file.name for file in (reports / "figures").iterdir()}
+    files |= {file.stem for file in (reports / "tables").glob("*.md")}
+    assert {name for row in rows for name in row.shown} - files == set()
 
 
 def test_losses_of_all_protocols_are_counted(story, numbers):
@@ -256,18 +258,18 @@ def test_losses_of_all_protocols_are_counted(story, numbers):
         assert account["frames_n"] == sum(io.read_ingest_counts(file)["frames_n"] for file in files)
 
 
-def test_a_model_of_the_scene_predicts_an_sd_card_log(story):
+def test_model_predicts_an_sd_card_log(story):
     model = min((story / "data/models/ci/train_multi").glob("lobo.paper.b0.*.safetensors"))
     (log,) = (story / "data/raw/ci-log").glob("*/log.csv")
     run(story, "reskin", "predict", str(log), "--model", str(model), "--out", "contacts.csv")
-    found, readings = (pd.read_csv(file) for file in (story / "contacts.csv", log))
-    assert len(found) == len(readings)
-    contact = found["contact"].astype(bool)
-    assert 0.1 < contact.mean() < 0.9  # a walk: quiet, steps and swings
-    assert np.isfinite(found.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
+    estimates, readings = (pd.read_csv(file) for file in (story / "contacts.csv", log))
+    assert len(estimates) == len(readings)
+    contact = estimates["contact"].astype(bool)
+    assert 0.1 < contact.mean() < 0.9  # a walk: rest, steps and swings
+    assert np.isfinite(estimates.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
 
 
-def test_studies_of_the_physics_have_numbers_and_tables(story, numbers):
+def test_physics_studies_have_numbers_and_tables(story, numbers):
     assert {row["term"] for row in numbers["left_out"] if row["done"] == "left out"} >= {"ageing", "temperature"}
     costs = json.loads((story / "reports/ci/provenance.json").read_text())
     runtime = join(numbers, costs)["runtime"]
@@ -279,30 +281,32 @@ def test_studies_of_the_physics_have_numbers_and_tables(story, numbers):
     assert "<svg" in (story / "reports/ci/runtime/quadratures.svg").read_text()
 
 
-def test_every_capture_has_a_parquet_file_with_units(story):
+def test_captures_have_parquet_files_with_units(story):
     files = sorted((story / "data/indentations/ci").glob("*.parquet"))
     assert [file.stem for file in files] == ["b0_s0", "b0_s1", "b1_s0", "b1_s1", "b2_s0", "b2_s1"]
     assert pq.read_schema(files[0]).field("b_uT").metadata[b"unit"] == b"uT"
 
 
-def test_a_score_equals_that_of_a_naive_loop(story):
+def test_score_equals_a_naive_loop(story):
     card = json.loads((story / "data/models/ci/train_multi/lobo.paper.b1.seed0.json").read_text())
     predictions = pq.read_table(story / "data/models/ci/train_multi/predictions.parquet").to_pylist()
-    own = [row for row in predictions if (row["fold"], row["seed_i"]) == ("b1", 0)]
+    predicted = [row for row in predictions if (row["fold"], row["seed_i"]) == ("b1", 0)]
     truths = []
     for skin in ("b1_s0", "b1_s1"):
         for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():
-            if reading["pass_i"] >= 1 and reading["Fz_N"] >= 0:  # the first pass is the pool; the scene's selection
+            if (
+                reading["pass_i"] >= 1 and reading["Fz_N"] >= 0
+            ):  # the first pass is the pool; the selection of the scene
                 truths.append((skin, reading["x_mm"], reading["y_mm"], reading["Fz_N"]))
-    assert [(row["skin"], row["true_x_mm"], row["true_y_mm"], row["true_Fz_N"]) for row in own] == truths
+    assert [(row["skin"], row["true_x_mm"], row["true_y_mm"], row["true_Fz_N"]) for row in predicted] == truths
     hits = sum(
         abs(row["predicted_x_mm"] - x_mm) <= 1 and abs(row["predicted_y_mm"] - y_mm) <= 1
-        for row, (_, x_mm, y_mm, _) in zip(own, truths, strict=True)
+        for row, (_, x_mm, y_mm, _) in zip(predicted, truths, strict=True)
     )
     assert card["scores"]["all"]["accuracy_pct"] == pytest.approx(100 * hits / len(truths))
 
 
-def test_predictions_follow_from_the_saved_model_alone(story):
+def test_predictions_follow_from_the_saved_model(story):
     folder = story / "data/models/ci/train_multi"
     tensors, _ = io.read_tensors(folder / "lobo.paper.b1.seed0.safetensors")
     reading = pq.read_table(story / "data/indentations/ci/b1_s0.parquet").filter(pc.field("pass_i") == 1).slice(0, 1)
@@ -314,12 +318,12 @@ def test_predictions_follow_from_the_saved_model_alone(story):
         features = np.maximum(features, 0) if i in (1, 4, 5) else features  # ReLU where the paper has one
     expected = scaler.decode(features[None].astype(np.float32))[0]
     first = pq.read_table(folder / "predictions.parquet").filter(pc.field("fold") == "b1").slice(0, 1).to_pylist()[0]
-    # float32 sums in another order
+    # float32 sums in a different order
     assert [first[f"predicted_{name}"] for name in ("x_mm", "y_mm", "Fz_N")] == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.filterwarnings("ignore")  # MLflow warns about its own types when pyfunc is imported
-def test_a_model_loaded_by_mlflow_predicts_the_same(story, monkeypatch):
+def test_mlflow_model_predicts_the_same(story, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{story / 'mlflow.db'}")
     client = mlflow.MlflowClient()
     query = "tags.kind = 'training' and tags.question = 'lobo' and tags.current = 'true'"
@@ -330,16 +334,16 @@ def test_a_model_loaded_by_mlflow_predicts_the_same(story, monkeypatch):
     np.testing.assert_allclose(theirs.to_numpy(), ours.predict(db_uT), rtol=1e-6)
 
 
-def test_training_again_gives_the_same_lock_file(story, run_stages):
+def test_repeated_training_gives_the_same_lock_file(story, run_stages):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
-        file.unlink()  # else finished trainings would be reused
+        file.unlink()  # finished trainings are reused otherwise
     stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *RANDOM, "report")]
     run_stages(*stages)
     assert (story / "dvc.lock").read_text() == before
 
 
-def test_a_second_repro_runs_no_stage_and_restores_deleted_models(story):
+def test_second_repro_restores_deleted_models(story):
     models = sorted((story / "data/models/ci/train_multi").iterdir())
     content = models[0].read_bytes()
     for file in models:
@@ -353,7 +357,7 @@ def test_a_second_repro_runs_no_stage_and_restores_deleted_models(story):
     assert list((story / ".reskin/cells").glob("*.safetensors")) == []
 
 
-def test_dvc_notices_an_edited_report(story):
+def test_dvc_detects_an_edited_report(story):
     file = story / "reports/ci/numbers.json"
     content = file.read_text()
     file.write_text(content.replace("simulated", "recorded", 1))
@@ -362,17 +366,17 @@ def test_dvc_notices_an_edited_report(story):
     assert re.search(r"modified:\s+reports/ci/numbers.json", output)
 
 
-def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
+def test_killed_stage_keeps_finished_folds(story):
     models = story / "data/models/killed"
-    words = ["--scene", "ci", "--indentations", "data/indentations/ci",
+    arguments = ["--scene", "ci", "--indentations", "data/indentations/ci",
              "--folds", "data/models/ci/folds.json", "--models", str(models)]  # fmt: skip
-    command = [str(story / ".venv/bin/python"), "-m", "pipeline", "train_triplet", *words]
+    command = [str(story / ".venv/bin/python"), "-m", "pipeline", "train_triplet", *arguments]
     environment = {**os.environ, **ENVIRONMENT, "PYTHONPATH": str(story), "RESKIN_EXECUTOR": "processes:1"}
     trials = story / ".reskin/cells"
     for file in trials.glob("*.safetensors"):
         file.unlink()
 
-    def finished() -> int:  # three trainings run as one stack, which is finished with its last file
+    def finished() -> int:  # a stack of three trainings is finished with its last file
         stacks = Counter(file.stem.rpartition("-")[0] for file in trials.glob("*.safetensors"))
         return sum(written_n for written_n in stacks.values() if written_n == 3)
 
@@ -390,24 +394,24 @@ def test_a_stage_killed_in_the_middle_loses_no_finished_fold(story):
     assert len(list(models.glob("*.safetensors"))) == 6
 
 
-def test_a_missing_tracking_server_is_reported_and_costs_little_time(story):
+def test_missing_tracking_server_is_reported_quickly(story):
     start_s = time.monotonic()
-    words = ["--scene", "ci", "--models", "data/models/ci",
+    arguments = ["--scene", "ci", "--models", "data/models/ci",
              "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
-    done = run(story, "python", "-m", "pipeline", "publish", *words, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
+    done = run(story, "python", "-m", "pipeline", "publish", *arguments, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
     assert time.monotonic() - start_s < 100  # MLflow itself retries for minutes
 
 
-def test_a_removed_experiment_leaves_no_stage_no_file_and_no_cost(story, run_stages):
+def test_removed_experiment_leaves_nothing(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
-    own = YAML(typ="safe").load(scene.read_text())
-    own["experiments"].remove("sleeve")
-    own.pop("sleeve")
+    settings = YAML(typ="safe").load(scene.read_text())
+    settings["experiments"].remove("sleeve")
+    settings.pop("sleeve")
     for part in ("boards", "protocols"):
-        own["simulate"][part].pop("sleeve")
+        settings["simulate"][part].pop("sleeve")
     with scene.open("w") as stream:
-        YAML().dump(own, stream)
+        YAML().dump(settings, stream)
     assert "sleeve@ci" in run(story, "reskin", "scenes", "use", "ci").stdout
     assert "removed sleeve@ci: data/results/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
@@ -415,7 +419,7 @@ def test_a_removed_experiment_leaves_no_stage_no_file_and_no_cost(story, run_sta
     assert [
         *story.glob("data/[!c]*/**/*sleeve*"),
         *story.glob("reports/ci/**/*sleeve*"),
-    ] == []  # data/code has digests of every stage
+    ] == []  # data/code has the digests of all stages
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert "sleeve" not in numbers
     provenance = json.loads((story / "reports/ci/provenance.json").read_text())
@@ -423,7 +427,7 @@ def test_a_removed_experiment_leaves_no_stage_no_file_and_no_cost(story, run_sta
     assert not any("sleeve" in stage for stage in YAML(typ="safe").load((story / "dvc.lock").read_text())["stages"])
 
 
-def test_an_unknown_parameter_is_one_sentence(story, run_stages):
+def test_unknown_parameter_is_one_line(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     before = scene.read_text()
     scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))

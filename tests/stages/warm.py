@@ -22,7 +22,7 @@ LIBRARIES = (
     "torch", "pandas", "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats", "sklearn.ensemble", "numba",
     "matplotlib.figure", "magpylib", "pydantic", "jinja2",
 )  # fmt: skip
-DEEP_M = 1.3e-3  # past the deepest poke of scene ci
+DEEP_M = 1.3e-3  # deeper than all pokes of scene ci
 
 
 def run_stage(name: str, command: str) -> int:
@@ -48,7 +48,7 @@ def run_stage(name: str, command: str) -> int:
 
 def preload(protocols: set[tuple[str, str]]) -> None:
     """Import the modules of all stages, and compute the deformation tables of skins for (scene, protocol) pairs."""
-    importlib.import_module("pipeline")  # first, as it tells NumPy which instructions to use
+    importlib.import_module("pipeline")  # first: it selects the instructions of NumPy
     import numpy as np
 
     from pipeline.settings import read_settings
@@ -66,13 +66,13 @@ def preload(protocols: set[tuple[str, str]]) -> None:
         rule, name = kind.quadrature.in_si(), f"{kind.letter}0_s0"
         skin = draw_skin(of.skin, of.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m)
         list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # caches its tables
-    gc.freeze()  # else every fork would copy the pages of all these objects at its first garbage collection
+    gc.freeze()  # keeps forks from copying all pages in garbage collection
 
 
 def run_stages(names: list[str]) -> str:
     with Repo() as repo:
         planned = plan_repro(get_active_graph(repo.index.graph))
-        with_commands = [stage for stage in planned if stage.cmd]  # the others are added recordings
+        with_commands = [stage for stage in planned if stage.cmd]  # others are added recordings
         stages = {stage.addressing: stage for stage in with_commands if not names or stage.addressing in names}
         commands = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
         preload(
@@ -86,7 +86,7 @@ def run_stages(names: list[str]) -> str:
                 return FAILED
         with lock_repo(repo):
             for stage in stages.values():
-                stage.save(run_cache=False)  # no test needs earlier runs
+                stage.save(run_cache=False)  # no test uses earlier runs
                 stage.commit()
             next(iter(stages.values())).dvcfile.dump_stages([*stages.values()], update_pipeline=False)
     return DONE

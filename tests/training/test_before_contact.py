@@ -1,4 +1,4 @@
-"""Places without the contact: a repeated scan tells all of them, one in random order none."""
+"""Tests of places predicted from readings before contact: repeated scans reveal them, random orders do not."""
 
 from pathlib import Path
 
@@ -16,12 +16,12 @@ from tests.data.tables import readings
 
 ALL = Selection(force_min_N=0.0)
 PASSES_N, PLACES_N = 4, 64
-WORDS = {"seed": 0, "selection": {"force_min_N": 0.0}}
-BY_CHANCE_PCT = 15.0  # one of 64 places is right by chance, neighbours' means a little more often
+SCENE = {"seed": 0, "selection": {"force_min_N": 0.0}}
+CHANCE_MAX_PCT = 15.0  # 1 of 64 places by chance, a little more for means of neighbours
 
 
-def scored(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
-    """Score a scan of a 14 mm grid in four passes, the last tested; `memory` of each poke stays in the next field."""
+def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
+    """Score a scan of a 14 mm grid in four passes; the next field keeps a share `memory` of each poke."""
     rng = rng_for(0, "scan")
     order = [np.arange(PLACES_N) if snake else rng.permutation(PLACES_N) for _ in range(PASSES_N)]
     at = np.concatenate(order)
@@ -37,32 +37,32 @@ def scored(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
     rows = gather([one], Selection(force_min_N=0.0))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
     table = score_before_contact(
-        SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds), folder, ["c0"], {}
+        SceneData("test", Settings("test", "test.yaml", SCENE, {}), rows, folds), folder, ["c0"], {}
     )
     return dict(zip(table["told_by"].to_pylist(), table["accuracy_pct"].to_pylist(), strict=True))
 
 
-def test_a_snake_scan_tells_places_by_number_and_with_memory_by_the_no_load_field(tmp_path):
-    found = scored(tmp_path, snake=True, memory=0.1)
+def test_snake_scan_with_memory_reveals_places(tmp_path):
+    found = score_scan(tmp_path, snake=True, memory=0.1)
     assert found["scan"] == 100.0
     assert found["noload"] > 95.0
 
 
-def test_a_snake_scan_without_memory_tells_places_by_number_alone(tmp_path):
-    found = scored(tmp_path, snake=True, memory=0.0)
+def test_snake_scan_without_memory_reveals_places_by_number(tmp_path):
+    found = score_scan(tmp_path, snake=True, memory=0.0)
     assert found["scan"] == 100.0
-    assert found["noload"] < BY_CHANCE_PCT
+    assert found["noload"] < CHANCE_MAX_PCT
 
 
-def hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
-    """Score a tip that goes down on each place of a grid from above it, without force first; a magnet on it is read."""
-    at = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)  # above each place, then on it
+def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
+    """Score a tip that hovers above each place of a grid before it touches; a magnetic tip is read."""
+    at = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)  # above each place, then in contact
     touches = np.tile([False, True], PASSES_N * PLACES_N)
     place_mm = np.column_stack([2 * (at // 8), 2 * (at % 8)]).astype(np.float32)
     rng = rng_for(0, "hover")
     db_uT = np.column_stack([place_mm, place_mm[:, :1] * place_mm[:, 1:]]) * np.float32(10)
     db_uT = (db_uT * (touches | magnetic)[:, None] + rng.standard_normal(db_uT.shape)).astype(np.float32)
-    corner = np.arange(len(at)) % (2 * PLACES_N) == 0  # off the skin, before a pass
+    corner = np.arange(len(at)) % (2 * PLACES_N) == 0  # beside the skin before each pass
     one = readings(
         f=len(at), x_mm=np.where(touches, place_mm[:, 0], np.nan).astype(np.float32),
         y_mm=np.where(touches, place_mm[:, 1], np.nan).astype(np.float32),
@@ -71,27 +71,27 @@ def hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
     )  # fmt: skip
     hover = gather_hover([one])
     assert len(hover) == (~touches & ~corner).sum()
-    np.testing.assert_array_equal(hover.place_mm, place_mm[~touches & ~corner])  # the place that is touched next
+    np.testing.assert_array_equal(hover.place_mm, place_mm[~touches & ~corner])  # the next touched place
     io.write_readings(folder / "c0.parquet", [one], {})
     rows = gather([one], Selection(force_min_N=0.1))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
-    data = SceneData("test", Settings("test", "test.yaml", WORDS, {}), rows, folds)
+    data = SceneData("test", Settings("test", "test.yaml", SCENE, {}), rows, folds)
     table = score_before_contact(data, folder, ["c0"], {"s0": [lambda db_uT: np.zeros((len(db_uT), 3), np.float32)]})
     return {row["told_by"]: row for row in table.to_pylist()}
 
 
-def test_a_hovering_tip_is_located_only_if_it_is_a_magnet(tmp_path):
-    found = hovering(tmp_path, magnetic=True)
+def test_hovering_tip_is_located_only_if_magnetic(tmp_path):
+    found = score_hovering(tmp_path, magnetic=True)
     assert found["hover"]["accuracy_pct"] > 95
     assert found["hover"]["hover_uT"] > 0.9 * found["hover"]["touch_uT"]
-    assert found["hover_network"]["accuracy_pct"] < BY_CHANCE_PCT  # a network that always predicts one corner
-    found = hovering(tmp_path, magnetic=False)
-    assert found["hover"]["accuracy_pct"] < BY_CHANCE_PCT
+    assert found["hover_network"]["accuracy_pct"] < CHANCE_MAX_PCT  # this network always predicts one corner
+    found = score_hovering(tmp_path, magnetic=False)
+    assert found["hover"]["accuracy_pct"] < CHANCE_MAX_PCT
     assert found["hover"]["hover_uT"] < 0.1 * found["hover"]["touch_uT"]
 
 
-def test_a_random_order_tells_nothing_even_with_memory(tmp_path):
-    assert max(scored(tmp_path, snake=False, memory=0.1).values()) < BY_CHANCE_PCT
+def test_random_order_reveals_no_place(tmp_path):
+    assert max(score_scan(tmp_path, snake=False, memory=0.1).values()) < CHANCE_MAX_PCT
 
 
 def test_indentations_count_from_0_in_each_pass():

@@ -1,4 +1,4 @@
-"""What a few labels of a new board are tried on: equal tests for all, labels of its pool alone, none for scalers."""
+"""Tests of trainings with a few labels of a new board: folds, labels, scalers, adaptation and fine-tuning."""
 
 from collections import Counter
 from dataclasses import replace
@@ -25,7 +25,7 @@ from tests.scenes import RECIPE
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
 PLACES_N, PASSES_N, READINGS_N = 9, 2, 2
 SCHEDULE = {"steps_n": 1, "batch_n": 8, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
-ASKED = {
+SETTINGS = {
     "labels_n": [0, 2, 5],
     "recipes": {"plain": RECIPE, "triplet": RECIPE | {"inputs": "shape", "triplet_weight": 0.1}},
     "adapted": ["triplet"],
@@ -43,8 +43,8 @@ METHODS = [
 ]  # fmt: skip
 
 
-def poked() -> Rows:
-    """Two skins on the first board, one on each other; a grid of 3 x 3 places, two passes, two readings each."""
+def example_rows() -> Rows:
+    """Return rows of two skins on the first board, one on the others: 3 x 3 places, two passes, two readings each."""
     own_n = PLACES_N * PASSES_N * READINGS_N
     rng, f = rng_for(0, "few labels"), len(SKINS) * own_n
     place_i = np.tile(np.arange(PLACES_N).repeat(READINGS_N), len(SKINS) * PASSES_N)
@@ -58,21 +58,21 @@ def poked() -> Rows:
     )  # fmt: skip
 
 
-ROWS = poked()
+ROWS = example_rows()
 
 
 def study(seed: int = 5, rows: Rows = ROWS, **changes: object) -> few.Study:
     folds = draw_folds(ROWS, ["labels"], Split(labels_pool_n=8, labels_draws_n=2), seed)
-    return few.Study(rows, folds, seed, parse(Settings, ASKED | changes, "scene: few_labels"))
+    return few.Study(rows, folds, seed, parse(Settings, SETTINGS | changes, "scene: few_labels"))
 
 
-def of(rows: Rows) -> TrainingData:
+def training_data(rows: Rows) -> TrainingData:
     return TrainingData(rows.db_uT, rows.target, rows.skin)
 
 
-def as_drawn(job: TrainingJob) -> TrainingResult:
-    """A network that was not trained: what it starts from, scaled as it will be."""
-    prepared, scaler = prepare(job, of(ROWS))
+def untrained(job: TrainingJob) -> TrainingResult:
+    """Return a result with the initial weights and the fitted scaler of a job."""
+    prepared, scaler = prepare(job, training_data(ROWS))
     return TrainingResult(
         f"key of {job.name}",
         prepared.initial_weights,
@@ -87,10 +87,10 @@ def as_drawn(job: TrainingJob) -> TrainingResult:
 
 
 def networks_of(at: few.Study) -> list[few.Done]:
-    """Every network of the study, each step going on from those before, as the stage does."""
+    """Return all networks of the study, in the steps of the stage."""
     done: list[few.Done] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
-        done = [*done, *((tried, job, as_drawn(job)) for tried, job in step(at, done))]
+        done = [*done, *((entry, job, untrained(job)) for entry, job in step(at, done))]
     return done
 
 
@@ -98,31 +98,31 @@ STUDY = study()
 NETWORKS = networks_of(STUDY)
 TASKS = few.classical_jobs(STUDY)
 ADAPTED = [job for _, job, _ in NETWORKS if isinstance(job.tuning, Adaptation)]
-LABELLED = [(tried, job) for tried, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
+LABELLED = [(entry, job) for entry, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
 
 
 def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
-    return [*((tried, job) for tried, job, _ in networks), *few.classical_jobs(at)]
+    return [*((entry, job) for entry, job, _ in networks), *few.classical_jobs(at)]
 
 
-def test_every_method_is_tried_once_on_every_fold_with_every_number_of_labels():
+def test_every_method_fold_and_number_of_labels_has_one_entry():
     folds = [f"b{board}-draw{draw}" for board in range(3) for draw in range(2)]
     assert [fold.name for fold in STUDY.folds] == folds
-    tried = Counter((one.method, one.inputs, one.fold.name, one.labels_n) for one, _ in all_tried(STUDY, NETWORKS))
-    assert tried == Counter((*method, fold, n) for method in METHODS for fold in folds for n in (0, 2, 5))
+    entry = Counter((one.method, one.inputs, one.fold.name, one.labels_n) for one, _ in all_tried(STUDY, NETWORKS))
+    assert entry == Counter((*method, fold, n) for method in METHODS for fold in folds for n in (0, 2, 5))
 
 
-def test_no_two_trainings_share_a_name():
+def test_names_of_trainings_are_unique():
     names = [one.name for _, one in all_tried(STUDY, NETWORKS)]
     assert len(set(names)) == len(names) == 3 * 2 * 3 * len(METHODS)
 
 
-def test_all_methods_and_numbers_of_labels_are_tested_on_the_same_rows_and_train_on_the_same_boards():
-    for tried, one in all_tried(STUDY, NETWORKS):
-        assert (one.test == tried.fold.test).all()
-        assert (one.train == tried.fold.train).all()
-        assert {*ROWS.board[one.test]} == {tried.fold.name[:2]}
-        assert tried.fold.name[:2] not in {*ROWS.board[one.train]}
+def test_entries_of_a_fold_share_test_and_training_rows():
+    for entry, one in all_tried(STUDY, NETWORKS):
+        assert (one.test == entry.fold.test).all()
+        assert (one.train == entry.fold.train).all()
+        assert {*ROWS.board[one.test]} == {entry.fold.name[:2]}
+        assert entry.fold.name[:2] not in {*ROWS.board[one.train]}
 
 
 def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
@@ -130,57 +130,57 @@ def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
 
 
 def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
-    return [(tried, one) for tried, one in all_tried(at, networks) if tried.labels_n]
+    return [(entry, one) for entry, one in all_tried(at, networks) if entry.labels_n]
 
 
-def test_labels_are_whole_indentations_of_the_pool_as_many_as_asked():
-    for tried, one in with_labels(STUDY, NETWORKS):
-        own = labels_of(one)
-        assert {*own} <= {*tried.fold.pool}
-        labelled = np.unique(ROWS.indentation[own])
-        assert len(labelled) == tried.labels_n
-        assert {*own} == {*np.flatnonzero(np.isin(ROWS.indentation, labelled))}  # none of its readings left out
+def test_labels_are_whole_indentations_of_the_pool():
+    for entry, one in with_labels(STUDY, NETWORKS):
+        labelled_rows = labels_of(one)
+        assert {*labelled_rows} <= {*entry.fold.pool}
+        labelled = np.unique(ROWS.indentation[labelled_rows])
+        assert len(labelled) == entry.labels_n
+        assert {*labelled_rows} == {*np.flatnonzero(np.isin(ROWS.indentation, labelled))}  # all readings of them
         assert not {*labelled} & {*ROWS.indentation[one.test]}
 
 
-def test_without_labels_there_are_none():
-    for tried, one in all_tried(STUDY, NETWORKS):
-        if not tried.labels_n:
+def test_entries_without_labels_have_none():
+    for entry, one in all_tried(STUDY, NETWORKS):
+        if not entry.labels_n:
             assert len(one.few_labels) == 0 if isinstance(one, ClassicalJob) else not isinstance(one.tuning, FineTuning)
 
 
-def test_every_method_is_given_the_same_labels_and_every_fold_others():
+def test_methods_share_labels_and_folds_do_not():
     given_labels: dict[tuple[str, int], set[tuple[int, ...]]] = {}
-    for tried, one in with_labels(STUDY, NETWORKS):
-        given_labels.setdefault((tried.fold.name, tried.labels_n), set()).add(tuple(labels_of(one)))
+    for entry, one in with_labels(STUDY, NETWORKS):
+        given_labels.setdefault((entry.fold.name, entry.labels_n), set()).add(tuple(labels_of(one)))
     assert {len(labels) for labels in given_labels.values()} == {1}
     assert len(set.union(*given_labels.values())) == 3 * 2 * 2
 
 
-def test_which_pokes_of_a_pool_are_labelled_is_drawn_anew_in_every_fold():
+def test_labelled_pokes_are_drawn_for_each_fold():
     numbers = [
         tuple(np.flatnonzero(np.isin(np.unique(ROWS.indentation[fold.pool]), ROWS.indentation[labels_of(one)])))
         for fold in STUDY.folds
-        for tried, one in with_labels(STUDY, [])
-        if tried.fold is fold and tried.method == "ridge" and tried.labels_n == 5
+        for entry, one in with_labels(STUDY, [])
+        if entry.fold is fold and entry.method == "ridge" and entry.labels_n == 5
     ]
     assert len(set(numbers)) == len(numbers) == len(STUDY.folds)
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
-def test_the_fewer_labels_are_among_the_more(seed, labels_n):
+def test_fewer_labels_are_a_subset_of_more(seed, labels_n):
     at = study(seed, labels_n=labels_n)
     tasks = few.classical_jobs(at)
-    rows = {(tried.fold.name, tried.labels_n): {*task.few_labels} for tried, task in tasks if "ridge" in task.name}
+    rows = {(entry.fold.name, entry.labels_n): {*task.few_labels} for entry, task in tasks if "ridge" in task.name}
     for fold in at.folds:
         for less, more in pairwise(sorted(labels_n)):
             assert rows[fold.name, less] < rows[fold.name, more]
 
 
-def test_labels_are_drawn_by_the_seed_and_not_by_the_order_of_numbers():
+def test_labels_depend_on_the_seed_but_not_on_order():
     first, again, other, turned = (
-        [sorted(task.few_labels.tolist()) for tried, task in few.classical_jobs(at) if tried.labels_n == 5]
+        [sorted(task.few_labels.tolist()) for entry, task in few.classical_jobs(at) if entry.labels_n == 5]
         for at in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
     )
     assert first == again == turned
@@ -188,59 +188,60 @@ def test_labels_are_drawn_by_the_seed_and_not_by_the_order_of_numbers():
 
 
 def unknown(what: np.ndarray, rows: Rows = ROWS) -> Rows:
-    """The same scene, with places and forces of some rows unknown."""
+    """Return the rows with unknown places and forces for some of them."""
     target = rows.target.copy()
     target[what] = np.nan
     return replace(rows, target=target)
 
 
 def test_labels_of_a_new_board_change_no_scaler():
-    pooled = {(tried.method, tried.fold.name): one.scaler for tried, job, one in NETWORKS if job.tuning is None}
-    for tried, job in LABELLED:
-        changed = of(ROWS).db_uT.copy()
+    pooled = {(entry.method, entry.fold.name): one.scaler for entry, job, one in NETWORKS if job.tuning is None}
+    for entry, job in LABELLED:
+        changed = training_data(ROWS).db_uT.copy()
         changed[job.tuning.row] += 500
-        (prepared, scaler), (other, same) = (prepare(job, one) for one in (of(ROWS), replace(of(ROWS), db_uT=changed)))
-        for name, values in pooled[tried.method.removesuffix(", adapted"), tried.fold.name].arrays().items():
+        changed_data = replace(training_data(ROWS), db_uT=changed)
+        (prepared, scaler), (other, same) = (prepare(job, data) for data in (training_data(ROWS), changed_data))
+        for name, values in pooled[entry.method.removesuffix(", adapted"), entry.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
-        assert (other.few_labels.inputs != prepared.few_labels.inputs).any()  # learned from they are
-        assert len(prepared.few_labels.inputs) == READINGS_N * tried.labels_n
+        assert (other.few_labels.inputs != prepared.few_labels.inputs).any()  # but they are trained on
+        assert len(prepared.few_labels.inputs) == READINGS_N * entry.labels_n
 
 
-def test_labels_go_on_from_the_network_of_the_same_method_and_fold():
-    by_key = {one.key: tried for tried, _, one in NETWORKS}
-    for tried, job in LABELLED:
+def test_fine_tuning_starts_from_the_network_of_its_fold():
+    by_key = {one.key: entry for entry, _, one in NETWORKS}
+    for entry, job in LABELLED:
         base = by_key[job.tuning.start.key]
-        assert (base.method, base.inputs, base.fold, base.labels_n) == (tried.method, tried.inputs, tried.fold, 0)
+        assert (base.method, base.inputs, base.fold, base.labels_n) == (entry.method, entry.inputs, entry.fold, 0)
 
 
-def test_only_the_networks_named_are_adapted_by_all_pokes_of_their_pool():
+def test_only_listed_networks_are_adapted():
     assert [(job.recipe_name, job.fold) for job in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
     for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
-        assert {*job.tuning.lines.row} == {*fold.pool}  # no place of 8 pokes on a 3 x 3 grid is alone on its lines
-    assert few.adaptation_jobs(study(adapted=[]), few_done(study(adapted=[]))) == []
+        assert {*job.tuning.lines.row} == {*fold.pool}  # each of 8 places on a 3 x 3 grid has a neighbour on its lines
+    assert few.adaptation_jobs(study(adapted=[]), networks_of_no_labels(study(adapted=[]))) == []
 
 
-def few_done(at: few.Study) -> list[few.Done]:
-    return [(tried, job, as_drawn(job)) for tried, job in few.network_jobs(at, [])]
+def networks_of_no_labels(at: few.Study) -> list[few.Done]:
+    return [(entry, job, untrained(job)) for entry, job in few.network_jobs(at, [])]
 
 
-def test_adaptation_sees_no_label_of_the_new_board():
+def test_adaptation_uses_no_label_of_the_new_board():
     for job in ADAPTED:
-        blind = of(unknown(ROWS.board == job.fold[:2]))
-        prepared, other = prepare(job, of(ROWS))[0], prepare(job, blind)[0]
+        unlabelled_data = training_data(unknown(ROWS.board == job.fold[:2]))
+        prepared, other = prepare(job, training_data(ROWS))[0], prepare(job, unlabelled_data)[0]
         assert prepared.few_labels is other.few_labels is None
         assert (prepared.labelled.inputs == other.labelled.inputs).all()
         assert (prepared.labelled.targets == other.labelled.targets).all()
         assert (prepared.unlabelled.inputs == other.unlabelled.inputs).all()
         assert (prepared.unlabelled.row == other.unlabelled.row).all()
         assert prepared.rng.integers(2**63) == other.rng.integers(2**63)
-        assert JobKeys(of(ROWS)).key(job) == JobKeys(blind).key(job)
+        assert JobKeys(training_data(ROWS)).key(job) == JobKeys(unlabelled_data).key(job)
 
 
-def test_of_places_only_the_order_along_lines_reaches_adaptation():
+def test_adaptation_uses_only_the_order_along_lines():
     stretched = replace(ROWS, target=(ROWS.target * np.float32([3, 0.5, 0]) + np.float32([7, -2, 1])))
-    done = few_done(STUDY)
+    done = networks_of_no_labels(STUDY)
     pairs = zip(few.adaptation_jobs(STUDY, done), few.adaptation_jobs(study(rows=stretched), done), strict=True)
     for (_, job), (_, other) in pairs:
         for name, values in vars(job.tuning.lines).items():
@@ -257,7 +258,7 @@ def test_of_places_only_the_order_along_lines_reaches_adaptation():
         ({"methods": {"tree": {"method": "tree", "inputs": "raw"}}}, "methods.tree must"),
     ],
 )
-def test_a_wrong_setting_of_few_labels_is_one_sentence(changes, sentence):
+def test_invalid_few_labels_settings_are_an_error(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
         study(**changes)
 
@@ -266,9 +267,9 @@ def test_a_wrong_setting_of_few_labels_is_one_sentence(changes, sentence):
     ("changes", "sentence"),
     [
         ({"rows_max_n": 0}, "train_classical: rows_max_n must be greater than or equal to 1; got 0"),
-        ({"methods": {"a b": ASKED["methods"]["ridge"]}}, "methods.a b.* must"),
+        ({"methods": {"a b": SETTINGS["methods"]["ridge"]}}, "methods.a b.* must"),
     ],
 )
-def test_a_wrong_setting_of_the_baselines_is_one_sentence(changes, sentence):
+def test_invalid_classical_settings_are_an_error(changes, sentence):
     with pytest.raises(ParamsError, match=sentence):
-        parse(ClassicalMethods, {"rows_max_n": 5, "methods": ASKED["methods"]} | changes, "train_classical")
+        parse(ClassicalMethods, {"rows_max_n": 5, "methods": SETTINGS["methods"]} | changes, "train_classical")

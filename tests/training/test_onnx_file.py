@@ -1,4 +1,4 @@
-"""The ONNX file answers as the network does under torch."""
+"""Tests of the exported ONNX model against PyTorch."""
 
 import numpy as np
 import pytest
@@ -17,15 +17,15 @@ from tests.models.example_jobs import recipe
 
 STEPS_N = 300
 SCALING = {"paper": "standard", "released": "released"}
-PULLS_mm = np.array([[4.0, 4.0, 0.3], [12.0, 12.0, 1.5]])  # places and forces of the rows trained on: least, greatest
+TARGET_RANGE = np.array([[4.0, 4.0, 0.3], [12.0, 12.0, 1.5]])  # least and greatest x, y (mm), F (N)
 
 
 def trained(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:
-    """A network after some hundred steps of the project's own loop, and rows that it has not seen."""
+    """Return a network after a few hundred training steps, and held-out rows."""
     rng = rng_for(0, "onnx", architecture, inputs)
-    target = rng.uniform(*PULLS_mm, (600, 3)).astype(np.float32)  # x_mm, y_mm, F_N
-    field = 60 * rng.standard_normal((6, 15))  # uT a mm or N, and a mm^2 or N^2
-    centred = target - PULLS_mm.mean(axis=0)
+    target = rng.uniform(*TARGET_RANGE, (600, 3)).astype(np.float32)  # x_mm, y_mm, F_N
+    field = 60 * rng.standard_normal((6, 15))  # uT per mm or N, and per mm^2 or N^2
+    centred = target - TARGET_RANGE.mean(axis=0)
     db_uT = (np.hstack([centred, centred**2]) @ field + 3 * rng.standard_normal((600, 15))).astype(np.float32)
     settings, view = recipe(architecture=architecture, inputs=inputs, steps_n=STEPS_N, batch_n=64), VIEW[inputs]
     scaler = FIT[SCALING[architecture]](view(db_uT[:500]), target[:500])
@@ -33,27 +33,27 @@ def trained(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:
     start = draw_weights(LAYERS[architecture](labelled.inputs.shape[1]), rng)
     (outcome,) = train([PreparedJob(start, rng, labelled)], architecture, settings, LossWeights(0.0), "cpu")
     assert outcome.stopped_step is None
-    assert outcome.curve[-1] < 0.7 * outcome.curve[0]  # its weights are an optimiser's, and no longer the drawn ones
+    assert outcome.curve[-1] < 0.7 * outcome.curve[0]  # it has been trained
     card = {"recipe": {"architecture": architecture, "inputs": inputs}, "input": {"channels_n": 15}}
     return Network(card, dict(outcome.weights) | scaler.arrays()), db_uT[500:]
 
 
 @pytest.mark.parametrize("architecture", ["paper", "released"])
 @pytest.mark.parametrize("inputs", ["raw", "shape"])
-def test_onnxruntime_answers_as_a_trained_network_under_torch_within_1e_5(tmp_path, architecture, inputs):
+def test_onnx_model_equals_torch_within_1e_5(tmp_path, architecture, inputs):
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     runtime = pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
     network, db_uT = trained(architecture, inputs)
     reskin.Model(network).export_onnx(tmp_path / "model.onnx")
     session = runtime.InferenceSession(tmp_path / "model.onnx", providers=["CPUExecutionProvider"])
-    far_uT = (1000 * rng_for(1, "onnx").standard_normal((100, 15))).astype(np.float32)  # no row trained on is as long
+    far_uT = (1000 * rng_for(1, "onnx").standard_normal((100, 15))).astype(np.float32)  # far outside the training rows
     db_uT = np.concatenate([np.zeros((1, 15), np.float32), db_uT, far_uT])
     (found,) = session.run(None, {"db_uT": db_uT})
     expected = network(db_uT)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_without_the_package_it_says_what_to_install(monkeypatch):
+def test_missing_onnx_package_is_an_error(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     with pytest.raises(ParamsError, match=r"pip install.*\[onnx\]"):
         onnx_file.build_onnx(Network({}, {}))

@@ -1,4 +1,4 @@
-"""The shipped model estimates as the tested variant does, with the same standard deviations."""
+"""Tests of the shipped universal model against the tested variant."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def model() -> Universal:
 
 
 def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
-    """Skins about the nominal one, with presses on the lattice, each with an error in proportion to its field."""
+    """Return skins near the nominal one, with presses on the lattice and errors proportional to the field."""
     tables, rng = model.tables, rng_for(0, "shipping")
     at = rng.integers(2, len(tables.axis_mm) - 2, (2, skins_n, PRESSES_N))
     force_i = rng.integers(1, len(tables.force_N), (skins_n, PRESSES_N))
@@ -41,7 +41,7 @@ def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
 
 
 @pytest.mark.parametrize("labels_n", [0, 3, 10])
-def test_the_shipped_model_estimates_as_the_tested_variant(model, labels_n):
+def test_shipped_model_estimates_as_the_tested_variant(model, labels_n):
     skins = skins_of(model, 1)
     b_uT, _ = calibrate(model, skins, 0, (65, labels_n), even=True, seed=0)
     prior = PriorModel(new_map(model.tables), model.networks)
@@ -57,7 +57,7 @@ def test_the_shipped_model_estimates_as_the_tested_variant(model, labels_n):
 
 
 @pytest.mark.parametrize("presses_n", [12, 65])
-def test_a_larger_misfit_lowers_the_power_and_a_few_presses_have_none(model, presses_n):
+def test_larger_misfit_lowers_the_power(model, presses_n):
     misfits, powers = [], []
     for error in (0.1, 1.0):
         calibrate(model, skins_of(model, 1, error), 0, (presses_n, 0), even=False, seed=0)
@@ -69,7 +69,7 @@ def test_a_larger_misfit_lowers_the_power_and_a_few_presses_have_none(model, pre
     assert powers == pytest.approx([min(1, model.powers.of(presses_n, 0, even=False) / of) for of in misfits])
 
 
-def test_powers_are_calibrated_for_every_number_of_presses_and_labels(model, monkeypatch):
+def test_powers_are_calibrated_for_all_presses_and_labels(model, monkeypatch):
     monkeypatch.setattr(shipping, "CALIBRATION_SKINS_N", 1)
     monkeypatch.setattr(shipping, "draw_prior_skins", lambda *_: skins_of(model, 1))
     found = calibrate_powers(model, SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), (0, 10), seed=0)
@@ -78,7 +78,7 @@ def test_powers_are_calibrated_for_every_number_of_presses_and_labels(model, mon
     assert found == LikelihoodPowers.from_card(found.to_card())
 
 
-def test_the_shipped_model_is_made_from_the_nominal_skin_and_the_settings_of_scene_lab(model):
+def test_shipped_model_has_the_settings_of_scene_lab(model):
     inputs, card = read_inputs(), model.card
     assert inputs.prior.setup.design == DESIGN.model_copy(update={"tip_radius_mm": inputs.prior.setup.tip_radius_mm})
     assert inputs.training.model_dump() | {"seed": inputs.seed} == card["lessons"]

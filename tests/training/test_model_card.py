@@ -24,41 +24,41 @@ def card(job: TrainingJob, **changes: object) -> dict:
     return model_card(job, trained, rows(), scene="lab")
 
 
-def test_a_card_says_what_was_trained_on_what_and_tested_on_what():
-    words = card(pooled())
-    assert (words["scene"], words["key"], words["question"]) == ("lab", "k", "triplet")
-    assert (words["train_boards"], words["train_skins"]) == (["b0"], ["b0_s0", "b0_s1"])
-    assert (words["test_boards"], words["test_skins"]) == (["b1"], ["b1_s1"])
-    assert words["train_rows_n"] == len(TRAIN)
-    assert words["recipe"] == pooled().recipe.model_dump()
-    assert (words["fold"], words["seed"], words["seed_i"]) == ("b1", 7, 0)
-    assert "tuning" not in words
+def test_card_has_training_and_test_data():
+    result = card(pooled())
+    assert (result["scene"], result["key"], result["question"]) == ("lab", "k", "triplet")
+    assert (result["train_boards"], result["train_skins"]) == (["b0"], ["b0_s0", "b0_s1"])
+    assert (result["test_boards"], result["test_skins"]) == (["b1"], ["b1_s1"])
+    assert result["train_rows_n"] == len(TRAIN)
+    assert result["recipe"] == pooled().recipe.model_dump()
+    assert (result["fold"], result["seed"], result["seed_i"]) == ("b1", 7, 0)
+    assert "tuning" not in result
 
 
-def test_a_card_says_all_that_a_user_of_the_network_needs():
+def test_card_describes_the_network():
     (one,) = train_stack([pooled()], example_data())
-    words = card(pooled())
-    assert words["architecture"] == {name: list(values.shape) for name, values in one.weights.items()}
-    assert words["architecture"]["layer6.bias"] == [3]
-    assert words["input"] == {"quantity": "change of field", "unit": "uT", "channels_n": 15, "view": "raw"}
-    assert words["output"] == {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"}
+    result = card(pooled())
+    assert result["architecture"] == {name: list(values.shape) for name, values in one.weights.items()}
+    assert result["architecture"]["layer6.bias"] == [3]
+    assert result["input"] == {"quantity": "change of field", "unit": "uT", "channels_n": 15, "view": "raw"}
+    assert result["output"] == {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"}
     for name, values in one.scaler.arrays().items():
-        assert (np.array(words["scaler"][name], np.float32) == values).all()
+        assert (np.array(result["scaler"][name], np.float32) == values).all()
 
 
 @pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
-def test_a_card_is_json_that_reads_back_as_it_was(job):
-    words = card(job)
-    assert json.loads(json.dumps(words, allow_nan=False)) == words
+def test_card_is_json(job):
+    written = card(job)
+    assert json.loads(json.dumps(written, allow_nan=False)) == written
 
 
 @pytest.mark.parametrize(("explained", "collapsed"), [(None, False), (0.9, False), (0.049, True), (-3.0, True)])
-def test_a_card_says_whether_its_network_learnt_and_how_often_it_was_trained(explained, collapsed):
-    words = card(pooled(), explained_min=explained, collapsed_before_n=1)
-    assert (words["explained_min"], words["collapsed"], words["collapsed_before_n"]) == (explained, collapsed, 1)
+def test_card_has_collapse_and_attempts(explained, collapsed):
+    result = card(pooled(), explained_min=explained, collapsed_before_n=1)
+    assert (result["explained_min"], result["collapsed"], result["collapsed_before_n"]) == (explained, collapsed, 1)
 
 
-def test_an_early_stop_stands_on_the_card():
+def test_card_has_an_early_stop():
     assert card(pooled())["stopped_step"] is None
     assert card(pooled(), stopped_step=150)["stopped_step"] == 150
 
@@ -68,7 +68,7 @@ def test_an_early_stop_stands_on_the_card():
     [(adaptation(), "unlabelled", POKED), (fine_tuning(), "labelled", OWN)],
     ids=["unlabelled", "labelled"],
 )
-def test_a_tuned_network_says_from_what_by_what_and_on_how_many_indentations(job, kind, used):
+def test_card_of_a_tuned_network_has_its_tuning(job, kind, used):
     tuning = card(job)["tuning"]
     assert (tuning["from"], tuning["kind"], tuning["skins"]) == ("start", kind, ["b1_s1"])
     assert tuning["settings"] == job.tuning.settings.model_dump()
