@@ -1,4 +1,4 @@
-"""The audit stage on a tiny scene's files: honest ones pass, and each planted leak fails it by the leak's own name."""
+"""Tests of the audit stage on a tiny scene: clean files pass, and each planted leak is detected and named."""
 
 import shutil
 from collections.abc import Callable
@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = ("skin", "rig", "chip", "spreads")
 MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
-COPY = "b3_s0"  # b0_s0 again, under the name of another board's skin
+COPY = "b3_s0"  # a copy of b0_s0 as a skin of another board
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
 ADAPTATION = SHARED["adaptations"]["paper"]
 SCENE = recorded(
@@ -55,7 +55,7 @@ CHOICE = {
 
 
 def capture(skin: str) -> Readings:
-    """A grid poked twice: a field, strong against its noise, that is a skin's own function of the place."""
+    """Return a grid poked twice, with a field above the noise that is a function of place for each skin."""
     rng = rng_for(0, "skin", "b0_s0" if skin == COPY else skin)
     place_i = np.tile(np.arange(PLACES_N), PASSES_N)
     x, y = place_i // 4, place_i % 4
@@ -74,7 +74,7 @@ def capture(skin: str) -> Readings:
 
 
 def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
-    """Write a scene's files as its stages do, but that its networks stay as they were drawn."""
+    """Write the files of a scene as its stages do, with untrained networks."""
     for skin in skins:
         io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
     io.write_json(folder / "scene.json", SCENE)
@@ -84,7 +84,7 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     )
     drawn = draw_folds(rows, ("single_random", "lobo"), parsed.section(Split, "split"), parsed.seed)
     io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
-    data = scenery(folder)
+    data = load_scene_data(folder)
     for arm, section, experiment in (
         ("train_single", parsed.section(Training, "train_single"), "single_random"),
         ("train_multi", parsed.section(Training, "train_multi"), "lobo"),
@@ -108,15 +108,15 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     return folder
 
 
-def scenery(folder: Path) -> SceneData:
+def load_scene_data(folder: Path) -> SceneData:
     return read_data(settings(SCENE), folder / "indentations", folder / "folds.json")
 
 
 def write(folder: Path, arm: str, data: SceneData, jobs: list[TrainingJob]) -> None:
-    write_models(folder / "models" / arm, data, jobs, [as_drawn(job, data) for job in jobs], arm)
+    write_models(folder / "models" / arm, data, jobs, [untrained(job, data) for job in jobs], arm)
 
 
-def as_drawn(job: TrainingJob, data: SceneData) -> TrainingResult:
+def untrained(job: TrainingJob, data: SceneData) -> TrainingResult:
     prepared, scaler = prepare(job, TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin))
     predicted = np.zeros((len(job.test), 3), np.float32)
     weights = prepared.initial_weights
@@ -125,12 +125,12 @@ def as_drawn(job: TrainingJob, data: SceneData) -> TrainingResult:
 
 @pytest.fixture(autouse=True)
 def _at_home(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # seconds are noted in the working folder
+    monkeypatch.chdir(tmp_path)  # costs are written to the working folder
     monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
 
 @pytest.fixture(scope="module")
-def honest(tmp_path_factory) -> Path:
+def clean_scene(tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         folder = tmp_path_factory.mktemp("honest")
         patch.chdir(folder)
@@ -139,15 +139,15 @@ def honest(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def scene(honest, tmp_path) -> Path:
-    return shutil.copytree(honest, tmp_path / "scene")
+def scene(clean_scene, tmp_path) -> Path:
+    return shutil.copytree(clean_scene, tmp_path / "scene")
 
 
 def settings_of(folder: Path) -> Settings:
     return settings(io.read_json(folder / "scene.json"), **{name: SECTIONS[name] for name in PHYSICS})
 
 
-def audited(folder: Path) -> list[dict]:
+def run_audit(folder: Path) -> list[dict]:
     results = folder / "audit.json"
     of_scene = settings_of(folder)
     audit(
@@ -160,12 +160,12 @@ def audited(folder: Path) -> list[dict]:
 
 def assert_leak(folder: Path, sentence: str) -> None:
     with pytest.raises(LeakError, match=sentence):
-        audited(folder)
+        run_audit(folder)
     assert not (folder / "audit.json").exists()
 
 
-def test_honest_files_pass_and_every_fold_network_and_variant_is_checked(scene, capsys):
-    checks = audited(scene)
+def test_files_without_leaks_pass_all_checks(scene, capsys):
+    checks = run_audit(scene)
     assert {check["where"] for check in checks if check["what"] == "copies"} == {"lobo/b0", "lobo/b1", "lobo/b2"}
     assert {check["where"] for check in checks if check["what"] == "pool indentations"} == {
         "lobo/b0", "lobo/b1", "lobo/b2"
@@ -174,16 +174,16 @@ def test_honest_files_pass_and_every_fold_network_and_variant_is_checked(scene, 
     trained |= {f"{arm}.b{i}.seed0" for arm in ("lobo.paper", "lobo.shape", "triplet.paper") for i in range(3)}
     trained |= {f"adapt.paper.{skin}.8pokes.seed0" for skin in ("b0.b0_s0", "b0.b0_s1", "b1.b1_s0", "b2.b2_s0")}
     assert {check["where"] for check in checks if check["what"] == "scaler"} == trained
-    arms = {check["where"] for check in checks if check["what"] == "settings: recipe"}
-    assert arms == {"train_single", "train_multi", "train_triplet", "adapt"}
-    assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]  # the paper's way
+    variants = {check["where"] for check in checks if check["what"] == "settings: recipe"}
+    assert variants == {"train_single", "train_multi", "train_triplet", "adapt"}
+    assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]  # as in the paper
     assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
 
 
-def test_settings_for_speed_need_no_record_of_a_choice(scene):
+def test_settings_for_speed_need_no_choice(scene):
     io.write_json(scene / "scene.json", SCENE | {"audit": {"settings": "for speed"}})
     (scene / "choice.json").unlink()
-    assert not any(check["what"].startswith("settings") for check in audited(scene))
+    assert not any(check["what"].startswith("settings") for check in run_audit(scene))
 
 
 @pytest.mark.parametrize("seen_n", [1, 32])
@@ -195,8 +195,8 @@ def test_settings_for_speed_need_no_record_of_a_choice(scene):
         ("train_triplet", "triplet.paper.b1.seed0"),
     ],
 )
-def test_a_scaler_fitted_to_test_rows_too_is_a_leak(scene, arm, name, seen_n):
-    file, data = scene / f"models/{arm}/{name}.safetensors", scenery(scene)
+def test_scaler_fitted_to_test_rows_is_a_leak(scene, arm, name, seen_n):
+    file, data = scene / f"models/{arm}/{name}.safetensors", load_scene_data(scene)
     (fold,) = (one for one in data.folds_of("lobo") if one.name == "b1")
     seen = np.concatenate([fold.train, fold.test[:seen_n]])
     view = VIEW["shape" if ".shape." in name else "raw"](data.rows.db_uT[seen])
@@ -205,9 +205,9 @@ def test_a_scaler_fitted_to_test_rows_too_is_a_leak(scene, arm, name, seen_n):
     assert_leak(scene, f"audit of tiny, {name}: scaler must be that of the training rows, .*; got off by")
 
 
-def replant(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
-    """Change the fold of board b0 in folds.json, and leave the others."""
-    data = scenery(folder)
+def change_fold(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
+    """Change the fold of board b0 in folds.json."""
+    data = load_scene_data(folder)
     folds = [change(fold, data) if (fold.experiment, fold.name) == ("lobo", "b0") else fold for fold in data.folds]
     io.write_json(
         folder / "folds.json", render_folds(io.read_json(folder / "folds.json")["captures"], data.rows, folds)
@@ -215,44 +215,44 @@ def replant(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None:
     assert len(parse_folds(io.read_json(folder / "folds.json"), data.rows, "folds.json")) == len(data.folds)
 
 
-def a_skin_trained_on(fold: Fold, data: SceneData) -> Fold:
+def train_on_a_test_skin(fold: Fold, data: SceneData) -> Fold:
     own = data.rows.skin[fold.test] == "b0_s0"
     pool = fold.pool[data.rows.skin[fold.pool] != "b0_s0"]
     return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[own]), fold.test[~own], pool)
 
 
-def a_reading_on_both_sides(fold: Fold, data: SceneData) -> Fold:
+def train_on_a_test_reading(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[:1]), fold.test, fold.pool)
 
 
-def a_tested_reading_adapted_to(fold: Fold, data: SceneData) -> Fold:
+def adapt_to_a_test_reading(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.experiment, fold.name, fold.train, fold.test, np.union1d(fold.pool, fold.test[:1]))
 
 
-def a_tested_indentation_adapted_to(fold: Fold, data: SceneData) -> Fold:
+def adapt_to_a_test_indentation(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.experiment, fold.name, fold.train, fold.test[1:], np.union1d(fold.pool, fold.test[:1]))
 
 
-def a_stranger_adapted_to(fold: Fold, data: SceneData) -> Fold:
+def adapt_to_a_training_skin(fold: Fold, data: SceneData) -> Fold:
     return Fold(fold.experiment, fold.name, fold.train[1:], fold.test, np.union1d(fold.pool, fold.train[:1]))
 
 
 @pytest.mark.parametrize(
     ("leak", "sentence"),
     [
-        (a_skin_trained_on, "boards must be apart; got 1 of 1 on both sides: b0"),
-        (a_reading_on_both_sides, "readings must be on one side only; got 1 of 64 test readings"),
-        (a_tested_reading_adapted_to, "readings must be on one side only; got 1 of 64 test readings"),
-        (a_tested_indentation_adapted_to, "pool indentations must be apart from the test; got 1 of 33 unlabelled"),
-        (a_stranger_adapted_to, "pool skins must be skins of the test; got 1 of 3 are not held out: b1_s0"),
+        (train_on_a_test_skin, "boards must be apart; got 1 of 1 on both sides: b0"),
+        (train_on_a_test_reading, "readings must be on one side only; got 1 of 64 test readings"),
+        (adapt_to_a_test_reading, "readings must be on one side only; got 1 of 64 test readings"),
+        (adapt_to_a_test_indentation, "pool indentations must be apart from the test; got 1 of 33 unlabelled"),
+        (adapt_to_a_training_skin, "pool skins must be skins of the test; got 1 of 3 are not held out: b1_s0"),
     ],
 )
-def test_a_fold_that_trains_on_or_adapts_to_test_rows_is_a_leak(scene, leak, sentence):
-    replant(scene, leak)
+def test_fold_with_test_rows_is_a_leak(scene, leak, sentence):
+    change_fold(scene, leak)
     assert_leak(scene, f"audit of tiny, lobo/b0: {sentence}")
 
 
-def test_a_capture_copied_under_another_name_is_a_leak(tmp_path):
+def test_copied_capture_is_a_leak(tmp_path):
     assert_leak(
         build(tmp_path / "scene", (*SKINS, COPY)),
         r"audit of tiny, lobo/b0: copies must be .*; got 2 of 2 captures compared; b0_s0 like b3_s0: 100.0 %",
@@ -267,7 +267,7 @@ def test_a_capture_copied_under_another_name_is_a_leak(tmp_path):
     ],
     ids=["board", "skin"],
 )
-def test_settings_chosen_on_tested_boards_or_skins_are_a_leak(scene, changes, sentence):
+def test_settings_chosen_on_test_boards_or_skins_are_a_leak(scene, changes, sentence):
     io.write_json(scene / "choice.json", CHOICE | changes)
     assert_leak(scene, f"audit of tiny, {sentence}")
 
@@ -286,9 +286,9 @@ def test_settings_chosen_on_tested_boards_or_skins_are_a_leak(scene, changes, se
     ],
     ids=["another rate", "no choice"],
 )  # fmt: skip
-def test_a_setting_that_the_study_did_not_choose_is_a_stated_row_and_no_leak(scene, chosen, arm, found):
+def test_setting_that_was_not_chosen_is_reported(scene, chosen, arm, found):
     io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})
-    rows = {check["where"]: check for check in audited(scene) if check["what"] == "settings: recipe"}
+    rows = {check["where"]: check for check in run_audit(scene) if check["what"] == "settings: recipe"}
     assert (rows[arm]["found"], rows[arm]["holds"]) == (found, True)
     assert rows["train_multi"]["found"] == "equal"
 
@@ -302,10 +302,10 @@ def test_a_setting_that_the_study_did_not_choose_is_a_stated_row_and_no_leak(sce
     ],
     ids=["a network that saw the board", "pokes that are tested", "pokes of a training skin"],
 )
-def test_adaptation_from_a_wrong_network_or_with_wrong_pokes_is_a_leak(scene, change, sentence):
+def test_adaptation_from_a_wrong_network_or_pokes_is_a_leak(scene, change, sentence):
     file = next((scene / "models/adapt").glob("*.json"))
     card = io.read_json(file)
-    data = scenery(scene)
+    data = load_scene_data(scene)
     fold = next(fold for fold in data.folds_of("lobo") if fold.name == card["fold"])
     sides = {"tested": fold.test, "trained": fold.train}
     own = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}

@@ -1,4 +1,4 @@
-"""The audit passes honest skins and fails by name on planted leaks: split, copy, scaler, settings, pool."""
+"""Tests of the checks of the audit, with planted leaks of split, copy, scaler, settings and pool."""
 
 import doctest
 from dataclasses import replace
@@ -24,12 +24,12 @@ from reskin.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3
-NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # measured on the lab's recordings
+NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # measured in the lab recordings
 UNSEEN = ("lobo", "sensors", "transfer")
 
 
-def poked(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
-    """Two skins a board, poked at random places: a response all share, and a third as much of each skin's own."""
+def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
+    """Return presses of two skins per board: a shared response, and a third as much of each skin."""
     rng = rng_for(0, "audit")
     common, dbs_uT = rng.normal(0, 25, (9, 15)), []
     for _ in range(2 * boards_n):
@@ -50,7 +50,7 @@ def held_out(labels: Labels, experiment: str = "lobo", board: str = "b0") -> Sid
     return Sides(experiment, board, np.flatnonzero(~own), NONE, np.flatnonzero(own))
 
 
-def audited(fold: Sides, labels: Labels, db_uT: np.ndarray):
+def run_audit(fold: Sides, labels: Labels, db_uT: np.ndarray):
     return audit_fold(fold, labels, db_uT=db_uT, rng=rng_for(0, "sample"))
 
 
@@ -62,10 +62,10 @@ def passes(checks) -> bool:
     return all(check.holds or check.known for check in checks)
 
 
-LABELS, DB_uT = poked()
+LABELS, DB_uT = example_presses()
 
 
-def test_the_example_of_the_docstring_holds():
+def test_docstring_example_runs():
     outcome = doctest.testmod(audit, extraglobs={"rng": rng_for(0, "doctest")})
     assert outcome.attempted >= 4
     assert outcome.failed == 0
@@ -73,8 +73,8 @@ def test_the_example_of_the_docstring_holds():
 
 @pytest.mark.parametrize("experiment", UNSEEN)
 @pytest.mark.parametrize("board", ["b0", "b1", "b2"])
-def test_honest_folds_pass(experiment, board):
-    checks = audited(held_out(LABELS, experiment, board), LABELS, DB_uT)
+def test_folds_without_leaks_pass(experiment, board):
+    checks = run_audit(held_out(LABELS, experiment, board), LABELS, DB_uT)
     assert failing(checks) == []
     assert [check.what for check in checks] == ["readings", "boards", "skins", "indentations", "copies"]
 
@@ -96,23 +96,23 @@ FIRST_SKIN = LABELS.skin[LABELS.board == "b0"] == "b0_s0"
     ],
     ids=["a skin of the board", "five indentations of a skin", "one reading"],
 )
-def test_a_planted_split_leak_fails_and_is_named(leak, named):
-    checks = audited(moved_to_train(leak), LABELS, DB_uT)
+def test_split_leak_is_detected(leak, named):
+    checks = run_audit(moved_to_train(leak), LABELS, DB_uT)
     assert not passes(checks)
     assert failing(checks) == named
     assert checks[1].found == "1 of 1 on both sides: b0"
 
 
-def test_a_reading_trained_and_tested_on_fails_even_where_indentations_may_be_shared():
+def test_shared_reading_is_detected_within_a_skin():
     own = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides("single_random", "repeat0", own[:100], NONE, own[99:])
-    assert failing(audited(fold, LABELS, DB_uT)) == ["readings", "indentations"]
-    assert not passes(audited(fold, LABELS, DB_uT))
+    assert failing(run_audit(fold, LABELS, DB_uT)) == ["readings", "indentations"]
+    assert not passes(run_audit(fold, LABELS, DB_uT))
 
 
-def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_audit():
+def test_papers_random_readings_are_a_known_leak():
     own = np.flatnonzero(LABELS.skin == "b0_s0")
-    checks = audited(Sides("single_random", "repeat0", own[::2], NONE, own[1::2]), LABELS, DB_uT)
+    checks = run_audit(Sides("single_random", "repeat0", own[::2], NONE, own[1::2]), LABELS, DB_uT)
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
     assert leak.found.startswith("60 of 60 on both sides")  # 3 readings: one side has 2, the other 1
@@ -120,22 +120,22 @@ def test_the_papers_random_readings_are_a_known_leak_that_does_not_fail_the_audi
 
 
 @pytest.mark.parametrize("experiment", ["single_temporal", "single_indentation", "single_pass"])
-def test_within_one_skin_indentations_are_apart_or_the_audit_fails(experiment):
+def test_indentations_within_a_skin_must_be_separate(experiment):
     own = np.flatnonzero(LABELS.skin == "b0_s0")
     fold = Sides(experiment, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])
-    assert failing(audited(fold, LABELS, DB_uT)) == []
-    torn = replace(fold, train=own[:61], test=own[61:])
-    assert failing(audited(torn, LABELS, DB_uT)) == ["indentations"]
-    assert not passes(audited(torn, LABELS, DB_uT))
+    assert failing(run_audit(fold, LABELS, DB_uT)) == []
+    split_indentation = replace(fold, train=own[:61], test=own[61:])
+    assert failing(run_audit(split_indentation, LABELS, DB_uT)) == ["indentations"]
+    assert not passes(run_audit(split_indentation, LABELS, DB_uT))
 
 
-def test_unlabelled_pokes_are_of_the_held_out_skins_and_not_tested():
+def test_pool_must_be_untested_pokes_of_held_out_skins():
     fold = held_out(LABELS)
     pool, test = fold.test[: 10 * READINGS_N], fold.test[10 * READINGS_N :]
-    assert failing(audited(replace(fold, pool=pool, test=test), LABELS, DB_uT)) == []
-    tested = audited(replace(fold, pool=fold.test[:4], test=fold.test[4:]), LABELS, DB_uT)
+    assert failing(run_audit(replace(fold, pool=pool, test=test), LABELS, DB_uT)) == []
+    tested = run_audit(replace(fold, pool=fold.test[:4], test=fold.test[4:]), LABELS, DB_uT)
     assert failing(tested) == ["pool indentations"]
-    trained = audited(replace(fold, pool=fold.train[:3]), LABELS, DB_uT)
+    trained = run_audit(replace(fold, pool=fold.train[:3]), LABELS, DB_uT)
     assert failing(trained) == ["pool skins"]
     assert trained[-1].found == "1 of 1 are not held out: b1_s0"
 
@@ -148,72 +148,72 @@ def with_copy(db_uT: np.ndarray, labels: Labels, of: str, to: str, *, sd_uT: flo
 
 
 @pytest.mark.parametrize(("sd_uT", "factor"), [(0, 1), (3, 1), (5, 1), (5, 1.05), (3, 0.9), (0, 1.3)])
-def test_a_perturbed_copy_under_another_skins_name_fails_and_is_named(sd_uT, factor):
+def test_perturbed_copy_is_detected(sd_uT, factor):
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=sd_uT, factor=factor)
-    checks = audited(held_out(LABELS), LABELS, planted)
+    checks = run_audit(held_out(LABELS), LABELS, planted)
     assert failing(checks) == ["copies"]
     assert checks[-1].found.startswith("2 of 2 captures compared; c_b0_s1 like b2_s1:")
     assert not passes(checks)
 
 
-def test_a_copied_capture_is_found_among_a_skins_many_own():
+def test_copied_capture_is_detected_among_others():
     own, copied = (np.flatnonzero(LABELS.skin == skin) for skin in ("b0_s1", "b2_s1"))
     few = own[: 8 * READINGS_N]
     capture = LABELS.capture.astype("U20")
     capture[few] = "c_b0_s1_more"
     planted = DB_uT.copy()
     planted[few] = DB_uT[copied[: len(few)]] + rng_for(1, "copy").normal(0, 4, (len(few), 15))
-    check = audited(held_out(LABELS), replace(LABELS, capture=capture), planted)[-1]
+    check = run_audit(held_out(LABELS), replace(LABELS, capture=capture), planted)[-1]
     assert check.found.startswith("3 of 3 captures compared; c_b0_s1_more like b2_s1:")
     assert not check.holds
 
 
-def test_a_copy_is_found_in_a_sample_as_well(monkeypatch):
+def test_copy_is_detected_in_a_sample(monkeypatch):
     monkeypatch.setattr(audit, "PAIRS_MAX_N", 12_000)
     monkeypatch.setattr(audit, "SAMPLE_MIN_N", 1)
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=5, factor=1)
-    check = audited(held_out(LABELS), LABELS, planted)[-1]
+    check = run_audit(held_out(LABELS), LABELS, planted)[-1]
     assert check.found.endswith("of 25 indentations")  # 12,000 pairs over 240 training indentations and 2 captures
     assert not check.holds
-    assert audited(held_out(LABELS), LABELS, DB_uT)[-1].holds
+    assert run_audit(held_out(LABELS), LABELS, DB_uT)[-1].holds
 
 
-def test_the_same_directions_at_other_strengths_are_no_copy():
+def test_equal_directions_of_other_strengths_are_no_copy():
     planted, own = DB_uT.copy(), LABELS.skin == "b0_s1"
     factor = rng_for(4, "factor").uniform(1, 4, (own.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
     planted[own] = factor * DB_uT[LABELS.skin == "b2_s1"]
-    assert audited(held_out(LABELS), LABELS, planted)[-1].holds
+    assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_a_response_turned_by_ten_degrees_is_no_copy():
-    # Re-seating a skin turns it by more. Strengths stay; each row is off its ray by 0.17 |dB|, some 39 uT at the least.
+def test_response_rotated_by_ten_degrees_is_no_copy():
+    # Re-seating a skin rotates it by more. Each row is off its ray by 0.17 |dB|, at least 39 uT.
     planted, source = DB_uT.copy(), DB_uT[LABELS.skin == "b2_s1"]
     one, other = source[:, :14:2], source[:, 1:14:2]
     cos, sin = np.cos(np.radians(10)), np.sin(np.radians(10))
     source[:, :14:2], source[:, 1:14:2] = cos * one - sin * other, sin * one + cos * other
     planted[LABELS.skin == "b0_s1"] = source
-    assert audited(held_out(LABELS), LABELS, planted)[-1].holds
+    assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_skins_with_fields_within_the_noise_do_not_pass():
-    checks = audited(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
+def test_fields_within_the_noise_do_not_pass():
+    checks = run_audit(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
     assert failing(checks) == ["copies"]
     assert checks[-1].found == "cannot be told: fields within the noise: b0_s1"
 
 
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([*UNSEEN, "single_random"]))
 @settings(max_examples=30, deadline=None)
-def test_the_order_of_rows_does_not_change_what_is_found(draw, copied, experiment):
+def test_order_of_rows_does_not_matter(draw, copied, experiment):
     db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
     order = rng_for(draw, "order").permutation(len(DB_uT))
-    place = np.argsort(order)  # where a row went
+    place = np.argsort(order)  # the new index of each row
     fold = held_out(LABELS, experiment)
     shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
     moved = replace(fold, train=place[fold.train], test=place[fold.test])
-    assert audited(moved, shuffled, db_uT[order]) == audited(fold, LABELS, db_uT)
+    assert run_audit(moved, shuffled, db_uT[order]) == run_audit(fold, LABELS, db_uT)
 
 
-def test_the_nearest_ray_is_that_of_the_smallest_angle(monkeypatch):
+def test_nearest_ray_has_the_smallest_angle(monkeypatch):
     monkeypatch.setattr(audit, "CHUNK_PAIRS_N", 100)  # several chunks
     rng = rng_for(2, "rays")
     rows, others = (rng.normal(0, 100, (n, 6)).astype(np.float32) for n in (13, 40))
@@ -224,7 +224,7 @@ def test_the_nearest_ray_is_that_of_the_smallest_angle(monkeypatch):
         assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)  # float32 rays
 
 
-def test_two_recorded_skins_pass_and_a_copy_of_one_fails(shared_data):
+def test_recorded_skins_pass_and_a_copy_fails(shared_data):
     frames = {
         board: pd.concat([pd.read_csv(shared_data / f"lab/{board}_depth{i}.csv").assign(depth_i=i) for i in (1, 3)])
         for board in ("board1", "board2")
@@ -239,20 +239,20 @@ def test_two_recorded_skins_pass_and_a_copy_of_one_fails(shared_data):
     board = np.repeat(list(frames), [len(table) for table in tables])
     labels = Labels(board, board, np.arange(len(db_uT)), capture=board)
     fold = held_out(labels, board="board1")
-    assert failing(audited(fold, labels, db_uT)) == []
+    assert failing(run_audit(fold, labels, db_uT)) == []
     planted = with_copy(db_uT, labels, "board2", "board1", sd_uT=5, factor=0.95)
-    assert failing(audited(fold, labels, planted)) == ["copies"]
+    assert failing(run_audit(fold, labels, planted)) == ["copies"]
 
 
 @pytest.mark.parametrize("experiment", ["lobo", "by_weather"])
-def test_folds_that_cannot_be_judged_are_an_error(experiment):
+def test_unusable_folds_are_an_error(experiment):
     fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
         "lobo": "a side has no rows: 720 to train on, 0",
         "by_weather": "must be one of .*; got by_weath",
     }
     with pytest.raises(ParamsError, match=sentence[experiment]):
-        audited(fold, LABELS, DB_uT)
+        run_audit(fold, LABELS, DB_uT)
 
 
 TARGET = rng_for(3, "target").uniform(0.1, 16, (len(DB_uT), 3)).astype(np.float32)
@@ -268,7 +268,7 @@ def scaler_check(arrays, fold: Sides, db_uT: np.ndarray, scaling: str):
 @pytest.mark.parametrize("scaling", list(FIT))
 @given(st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
-def test_a_scaler_of_the_training_rows_passes_in_whatever_order_they_were_summed(scaling, draw):
+def test_scaler_of_training_rows_passes_in_any_order(scaling, draw):
     fold = held_out(LABELS)
     train = rng_for(draw, "order").permutation(fold.train)
     assert scaler_check(FIT[scaling](DB_uT[train], TARGET[train]).arrays(), fold, DB_uT, scaling).holds
@@ -276,7 +276,7 @@ def test_a_scaler_of_the_training_rows_passes_in_whatever_order_they_were_summed
 
 @pytest.mark.parametrize("scaling", list(FIT))
 @pytest.mark.parametrize("seen_n", [1, 20, 360])
-def test_a_planted_scaler_leak_fails_even_by_one_row(scaling, seen_n):
+def test_scaler_leak_of_a_single_row_is_detected(scaling, seen_n):
     fold = held_out(LABELS)
     seen = np.concatenate([fold.train, fold.test[:seen_n]])
     check = scaler_check(FIT[scaling](DB_uT[seen], TARGET[seen]).arrays(), fold, DB_uT, scaling)
@@ -285,7 +285,7 @@ def test_a_planted_scaler_leak_fails_even_by_one_row(scaling, seen_n):
 
 
 @pytest.mark.parametrize("scaling", list(FIT))
-def test_one_test_row_among_a_hundred_thousand_is_found_in_the_scaler(scaling):
+def test_one_test_row_in_100000_is_detected(scaling):
     copies_n = 100_000 // len(DB_uT)
     db_uT, target = np.tile(DB_uT, (copies_n, 1)), np.tile(TARGET, (copies_n, 1))
     train = np.arange(len(db_uT) - 2)
@@ -301,14 +301,14 @@ def test_one_test_row_among_a_hundred_thousand_is_found_in_the_scaler(scaling):
     assert [check.holds for check in checks] == [True, False]
 
 
-def test_the_last_bit_of_a_scaler_may_differ_between_machines():
+def test_last_bit_of_a_scaler_may_differ():
     fold = held_out(LABELS)
     arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
-    turned = {name: np.nextafter(value, np.float32(np.inf)) for name, value in arrays.items()}
-    assert scaler_check(turned, fold, DB_uT, "standard").holds
+    rounded = {name: np.nextafter(value, np.float32(np.inf)) for name, value in arrays.items()}
+    assert scaler_check(rounded, fold, DB_uT, "standard").holds
 
 
-def test_a_scaler_within_the_tolerance_but_nearer_to_both_sides_fails():
+def test_scaler_nearer_to_both_sides_fails():
     fold = held_out(LABELS)
 
     def fit(db_uT, target):
@@ -320,7 +320,7 @@ def test_a_scaler_within_the_tolerance_but_nearer_to_both_sides_fails():
     assert not check.holds
 
 
-def test_a_scaler_of_nan_does_not_pass_and_a_missing_array_is_an_error():
+def test_nan_scaler_fails_and_missing_array_is_an_error():
     fold = held_out(LABELS)
     arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
     assert not scaler_check(arrays | {"target_shift": np.full(3, np.nan, np.float32)}, fold, DB_uT, "standard").holds
@@ -342,13 +342,13 @@ def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
     return audit_choice(choice, recipes, source=source, seed=seed, **names)
 
 
-def test_settings_chosen_on_skins_of_another_seed_pass_though_names_are_alike():
+def test_settings_chosen_with_another_seed_pass():
     assert failing(choice_checks()) == []
     assert failing(choice_checks(source="recorded")) == []
 
 
 @pytest.mark.parametrize(("source", "seed"), [("simulated", 777), ("recorded", 5)])
-def test_a_planted_settings_leak_fails_and_is_named(source, seed):
+def test_settings_leak_is_detected(source, seed):
     checks = choice_checks(CHOICE | {"source": source}, source=source, seed=seed)
     assert failing(checks) == ["settings: boards", "settings: skins"]
     assert checks[1].found == "1 of 3 tested were chosen on: b0_s0"
@@ -363,13 +363,13 @@ def test_a_planted_settings_leak_fails_and_is_named(source, seed):
         ({"scaling": "standard", "rate_max": 0.003, "tau": 1}, "steps_n absent (study: 4000), tau 1 (study: absent)"),
     ],
 )  # fmt: skip
-def test_a_recipe_that_differs_from_the_chosen_one_is_stated_and_is_no_leak(recipe, found):
+def test_recipe_that_was_not_chosen_is_reported(recipe, found):
     checks = choice_checks(recipes={"train_multi": recipe})
     assert passes(checks)
     assert checks[-1].found == f"not chosen by the study: {found}"
 
 
-def test_a_variant_without_a_choice_is_stated_and_a_broken_record_is_an_error():
+def test_missing_choice_is_reported_and_broken_record_is_an_error():
     checks = choice_checks(recipes={"adapt": RECIPE})
     assert passes(checks)
     assert checks[-1].found == "not chosen by the study: it chose none for this"

@@ -1,4 +1,4 @@
-"""Departures of a capture from its scene: exchanged chips and mirrored labels are named."""
+"""Tests of departures of a capture from its scene."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from tests.recordings.test_recordings import ingest
 
 @pytest.fixture(scope="module")
 def real(shared_data, tmp_path_factory) -> Readings:
-    """A third of the pokes of a file of board 1, five readings each."""
+    """Return a third of the pokes of a file of board 1, five readings each."""
     readings, _ = ingest(lab, shared_data / "lab/board1_depth2.csv", tmp_path_factory.mktemp("lab"))
     return some(readings, (readings.indentation % 3 == 0) & (readings.reading_i < 5))
 
@@ -24,22 +24,22 @@ def some(readings: Readings, rows: np.ndarray) -> Readings:
     return replace(readings, **arrays)
 
 
-def test_a_recording_that_agrees_with_its_scene_has_no_departure(real):
+def test_agreeing_recording_has_no_departure(real):
     assert find_departure([real], SECTION, DESIGN) is None
 
 
-def test_exchanged_chips_of_a_recorded_file_are_named(real):
+def test_exchanged_chips_are_named(real):
     order = np.arange(15).reshape(5, 3)[[0, 2, 1, 3, 4]].ravel()
     swapped = replace(real, b_uT=real.b_uT[:, order], noload_uT=real.noload_uT[:, order])
     assert find_departure([swapped], SECTION, DESIGN) == "Against the scene, chips 1 and 2 are exchanged."
 
 
-def test_mirrored_labels_of_a_recorded_file_are_named(real):
+def test_mirrored_labels_are_named(real):
     mirrored = replace(real, y_mm=16 - real.y_mm)
     assert find_departure([mirrored], SECTION, DESIGN) == "Against the scene, the labels are mirrored along y."
 
 
-def test_captures_without_labels_enough_pokes_or_chips_have_no_departure(real):
+def test_incomplete_captures_have_no_departure(real):
     unknown = np.full(len(real), np.nan, np.float32)
     few = some(real, real.indentation < 30)
     fewer_chips = replace(real, b_uT=real.b_uT[:, :12], noload_uT=real.noload_uT[:, :12])

@@ -1,4 +1,4 @@
-"""Fits and frames of simulated recordings with known parameters, and of real ones."""
+"""Tests of fits and frames of simulated recordings with known parameters, and of real ones."""
 
 import itertools
 from dataclasses import asdict, replace
@@ -32,17 +32,17 @@ from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[3]
 SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"], "lab.yaml: compare")
-# One tip for the nominal skin too, as each tip's flow takes seconds.
+# The nominal skin has the same tip, as the flow of each tip takes seconds.
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
-# How near a fit comes with 3 uT of noise on 50 pokes; gap and amplitude trade against each other.
+# Errors of a fit to 50 pokes with 3 uT of noise; gap and amplitude are correlated.
 NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 TURN = chip_rotations(SECTION)
 
 
-def made(how: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
-    """Record 25 places under two forces, with a known law and noise, as labels and chips of scene lab read them."""
+def simulated_presses(how: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
+    """Return presses at 25 places and two forces with a known law and noise, in the frames of scene lab."""
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
@@ -58,29 +58,31 @@ def made(how: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
 
 @pytest.fixture(scope="module")
 def recorded() -> RecordedPresses:
-    return made()
+    return simulated_presses()
 
 
 def sentence(pokes: RecordedPresses) -> str:
     return check_frames(to_board_axes(pokes, SECTION), SETUP, SECTION)["sentence"]
 
 
-def test_a_fit_finds_the_true_parameters(recorded):
-    found, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(NEAR)
+def test_fit_recovers_the_true_parameters(recorded):
+    fitted, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(NEAR)
     assert {
-        name: (found[name], true) for name, true in asdict(TRUE).items() if abs(found[name] - true) > near[name]
+        name: (fitted[name], true) for name, true in asdict(TRUE).items() if abs(fitted[name] - true) > near[name]
     } == {}
 
 
-def test_refitting_finds_what_differs_between_boards_and_holds_the_law(recorded):
+def test_refit_changes_only_parameters_of_the_board(recorded):
     start = replace(fit.START, modulus_MPa=0.25, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
-    found = fit.fit(to_board_axes(made(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start)
-    assert found.rotation_deg == pytest.approx(2.0, abs=0.3)
-    assert (found.seat_x_mm, found.seat_y_mm) == pytest.approx((0.4, -0.3), abs=0.05)
-    assert [getattr(found, name) for name in fit.TEN[6:]] == [0.25, 6.0, 40.0, 10.0]
+    fitted = fit.fit(
+        to_board_axes(simulated_presses(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start
+    )
+    assert fitted.rotation_deg == pytest.approx(2.0, abs=0.3)
+    assert (fitted.seat_x_mm, fitted.seat_y_mm) == pytest.approx((0.4, -0.3), abs=0.05)
+    assert [getattr(fitted, name) for name in fit.TEN[6:]] == [0.25, 6.0, 40.0, 10.0]
 
 
-def test_a_recording_that_agrees_with_the_scene_departs_in_nothing(recorded):
+def test_agreeing_recording_has_no_departure(recorded):
     assert sentence(recorded) == "Labels, chips and skin lie as the scene says."
 
 
@@ -90,14 +92,14 @@ def test_exchanged_chips_are_named(recorded):
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_mirrored_axis_is_named(recorded, axis):
+def test_mirrored_axis_is_named(recorded, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     assert sentence(replace(recorded, db_uT=recorded.db_uT * signs)) == (
         f"Against the scene, all chips are mirrored along {'xyz'[axis]}."
     )
 
 
-def test_one_chip_turned_by_a_quarter_is_named(recorded):
+def test_rotated_chip_is_named(recorded):
     db_uT = recorded.db_uT.copy()
     db_uT[:, 3] = db_uT[:, 3] @ compare.quarter_turn(1)
     assert sentence(replace(recorded, db_uT=db_uT)) == (
@@ -114,19 +116,19 @@ def test_mirrored_labels_are_named(recorded, axis):
     )
 
 
-def test_a_flipped_skin_is_named(recorded):
+def test_flipped_skin_is_named(recorded):
     flipped = replace(recorded, db_uT=-recorded.db_uT)
     assert sentence(flipped) == "Against the scene, the skin is flipped: every field has the other sign."
 
 
-def test_the_sixteen_orientations_are_distinct():
+def test_sixteen_orientations_are_distinct():
     matrices = {tuple(turn.matrix.ravel().round().astype(int)) for turn in compare.TURNS}
     assert len(matrices) == len(compare.TURNS) == 16
     assert compare.TURNS[0].describe() == ""
     assert all(turn.matrix[2, 2] == (1 if i < 8 else -1) for i, turn in enumerate(compare.TURNS))
 
 
-def test_a_flipped_skin_is_a_checkerboard_turned_by_a_quarter():
+def test_flipped_skin_is_a_rotated_checkerboard():
     plain, flipped = (replace(SETUP, skin_flipped=way).rest for way in (False, True))
     turn = compare.quarter_turn(1)
     there = {
@@ -138,55 +140,55 @@ def test_a_flipped_skin_is_a_checkerboard_turned_by_a_quarter():
         np.testing.assert_allclose(turn @ before, moment, atol=1e-6 * np.abs(plain.moments_A_m2).max())
 
 
-def test_without_give_slide_and_offsets_the_law_is_the_nominal_skin_but_for_its_force():
+def test_law_without_slide_and_offsets_is_the_nominal_skin():
     plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
     nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
     lengths = [np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N))) for force_N in
-               np.geomspace(0.2, 8, 30)]  # some force goes as deep  # fmt: skip
+               np.geomspace(0.2, 8, 30)]  # one of the forces is as deep  # fmt: skip
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
-def test_pokes_beyond_the_deepest_that_a_law_follows_are_counted_and_held_there():
+def test_pokes_beyond_the_deepest_are_counted_and_clamped():
     deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
     of = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
     (deepest_N,) = layer.force(deepest_m, **of, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    still = replace(TRUE, away_um_mm=0.0)  # the slide goes on with force
+    still = replace(TRUE, away_um_mm=0.0)  # the slide would grow with force
     held_uT = law.simulate_uT(still, SETUP, np.zeros((4, 2)), force_N)
-    soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)  # reaches that depth under half the force
+    soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)  # reaches that depth at half the force
     assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
     np.testing.assert_allclose(held_uT[2], held_uT[3])
 
 
-def test_the_nominal_skin_counts_what_lies_beyond_its_own_curve():
+def test_nominal_skin_counts_pokes_beyond_its_curve():
     known_N, _ = law._nominal_curve(SETUP)
     assert law.beyond_n(None, SETUP, known_N[-1] * np.array([0.9, 1.1, 2.0])) == 2
 
 
-def test_direction_size_and_growth_of_fields_that_are_known():
+def test_direction_size_and_growth_of_known_fields():
     one_uT = np.array([[[3.0, 0.0, 0.0]], [[0.0, 4.0, 0.0]]])
     assert cosines(one_uT, 2 * one_uT).tolist() == [1.0, 1.0]
     assert cosines(one_uT, one_uT[:, :, [1, 0, 2]]).tolist() == [0.0, 0.0]
     assert explained(0.5 * one_uT, one_uT).tolist() == [0.75, 0.75]
-    pokes = made(noise_uT=0.0)
+    pokes = simulated_presses(noise_uT=0.0)
     power_uT = np.ones((50, 5, 3)) * pokes.force_N[:, None, None] ** 0.3
     assert growth(pokes, power_uT) == pytest.approx(0.3)
     assert growth(replace(pokes, force_N=np.ones(50)), power_uT) is None
 
 
-def test_memory_is_estimated_in_spite_of_drift():
-    pokes, rng = made(), rng_for(1, "compare")
+def test_memory_is_estimated_despite_drift():
+    pokes, rng = simulated_presses(), rng_for(1, "compare")
     for part in (0.0, 0.07):
         rest_uT = np.linspace(0, 60, 50)[:, None, None] ** 2 / 60 + 0.3 * rng.standard_normal((50, 5, 3))
         rest_uT[1:] += part * pokes.db_uT[:-1]
         assert memory(pokes, pokes.db_uT, rest_uT) == pytest.approx(part, abs=0.004)
-    assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None  # one no-load reading for all
+    assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None  # a single no-load reading
 
 
-def test_presses_are_means_of_their_readings_and_those_without_force_are_excluded():
+def test_presses_are_means_of_readings_with_force():
     one = readings(f=6, indentation=np.array([0, 0, 0, 1, 1, 2], np.int32), x_mm=np.zeros(6, np.float32),
                    Fz_N=np.array([1, 2, 3, 4, 4, np.nan], np.float32))  # fmt: skip
     pokes = pool([one])
@@ -202,7 +204,7 @@ def test_presses_are_means_of_their_readings_and_those_without_force_are_exclude
 
 @pytest.fixture(scope="module")
 def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
-    """The pokes of lab boards 1 and 2."""
+    """Return the presses of lab boards 1 and 2."""
     captures: dict[str, list] = {}
     for name in LAB:
         file = shared_data / "lab" / f"{name}.csv"
@@ -212,15 +214,15 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
     return {board: pool(own) for board, own in captures.items()}
 
 
-def test_laws_fitted_to_a_third_of_the_places_of_real_boards_agree_with_all_of_them(real):
-    # A third leaves 22 of 65 in each of three files; what is fitted on these must hold on all.
+def test_laws_fitted_to_a_third_of_the_places_agree_with_all(real):
+    # A third is 22 of 65 places in each of three files; the fitted laws must agree with all places.
     some = {board: _some(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
     numbers, drawn = compare_boards(some, SECTION, DESIGN, seed=2021)
     cosine_min = {"fitted": 0.89, "refitted": 0.85}
     for board, way in itertools.product(real, cosine_min):
-        words, seen = numbers["by_board"][board]["laws"][way], to_board_axes(real[board], SECTION)
-        found = law.Law(**{name: words[name] for name in law.Law.__dataclass_fields__})
-        agreed = agreement(seen, law.simulate_uT(found, SETUP, seen.place_mm, seen.recorded.force_N))
+        parameters, seen = numbers["by_board"][board]["laws"][way], to_board_axes(real[board], SECTION)
+        fitted = law.Law(**{name: parameters[name] for name in law.Law.__dataclass_fields__})
+        agreed = agreement(seen, law.simulate_uT(fitted, SETUP, seen.place_mm, seen.recorded.force_N))
         assert agreed["cosine_mean"] > cosine_min[way]
         assert agreed["explained_median"] > 0.78
         assert agreed["growth"]["simulated"] == pytest.approx(agreed["growth"]["recorded"], abs=0.12)
@@ -237,9 +239,9 @@ def _some(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 
 
-def test_memory_of_real_and_of_simulated_no_load_readings(real):
+def test_memory_of_real_and_simulated_no_load_readings(real):
     for pokes in real.values():
         seen = to_board_axes(pokes, SECTION)
-        found = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]
-        assert 0.05 < found["recorded"] < 0.08
-        assert found["simulated"] == pytest.approx(SECTION.memory, abs=0.005)
+        fitted = estimate_memory(seen, seen.db_uT, SECTION, seed=2021)["memory"]
+        assert 0.05 < fitted["recorded"] < 0.08
+        assert fitted["simulated"] == pytest.approx(SECTION.memory, abs=0.005)

@@ -1,4 +1,4 @@
-"""Tables and figures of experiment compare."""
+"""Tests of the tables and figures of experiment compare."""
 
 import copy
 
@@ -7,7 +7,7 @@ from reskin.universal.law import Law
 from tests.report.synthetic import texts_of
 
 LAW = dict.fromkeys(Law.__dataclass_fields__, 1.0)
-OWN = {
+AGREEMENT = {
     "cosine_mean": 0.91, "cosine_by_group": {"soft": 0.90, "hard": 0.92}, "explained_median": 0.82,
     "growth": {"recorded": 0.3, "simulated": 0.25}, "beyond_n": 0,
 }  # fmt: skip
@@ -16,9 +16,9 @@ GRIP = {
     "cosine_mean": 0.91, "explained_median": 0.82, "growth": {"recorded": 0.3, "simulated": 0.25}, "grip_N_mm": 8.75,
     "grip_N": 0.5, "light_uT": 3.0,
 }  # fmt: skip
-BOARD = OWN | {
-    "nominal": OWN | {"cosine_mean": 0.7, "beyond_n": 3},
-    "refitted": OWN | {"growth": {"recorded": 0.3, "simulated": 0.5}},
+BOARD = AGREEMENT | {
+    "nominal": AGREEMENT | {"cosine_mean": 0.7, "beyond_n": 3},
+    "refitted": AGREEMENT | {"growth": {"recorded": 0.3, "simulated": 0.5}},
     "memory": {"recorded": 0.07, "simulated": 0.065}, "laws": {"fitted": LAW, "refitted": LAW | {"law_of": "b2"}},
     "frames": {"sentence": "Against the scene, chips 1 and 2 are exchanged.", "chips": [CHIP]},
     "grips": [GRIP | {"grip_N_mm": 1e-6, "grip_N": 5e-8, "light_uT": 300.0}, GRIP],
@@ -42,7 +42,7 @@ DRAWN = {
 }  # fmt: skip
 
 
-def test_each_simulation_is_judged_by_its_bounds():
+def test_simulations_are_judged_by_bounds():
     table = tables(NUMBERS, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
@@ -54,7 +54,7 @@ def test_each_simulation_is_judged_by_its_bounds():
         assert words in table.attrs["meaning"]
 
 
-def test_a_single_board_with_equal_forces_has_no_growth_and_no_refitted_law():
+def test_single_board_of_equal_forces_has_no_growth_or_refit():
     alone = copy.deepcopy(BOARD)
     for own in (alone, alone["nominal"]):
         del own["growth"]
@@ -74,7 +74,7 @@ def test_tables_of_frames_and_parameters():
     assert {"gap, mm", "slide away, µm/mm", "Young's modulus, MPa"} <= set(found["compare_parameters"].columns)
 
 
-def test_figures_name_units_and_source_and_are_deterministic():
+def test_figure_labels():
     drawn = figures(NUMBERS, DRAWN, "recorded")
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
         assert word in texts_of(drawn["compare_arrows.svg"])
@@ -84,7 +84,7 @@ def test_figures_name_units_and_source_and_are_deterministic():
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
 
 
-def test_the_table_of_frictions_gives_the_field_of_a_light_touch():
+def test_friction_table_has_the_field_of_a_light_touch():
     table = tables(NUMBERS, "recorded")["compare_grip"]
     assert table["k / mu, N/mm"].tolist() == ["1e-06", "8.75"]
     assert table["|dB| of 1 mN, µT (median place)"].tolist() == ["300", "3"]

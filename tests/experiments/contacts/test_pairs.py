@@ -1,4 +1,4 @@
-"""Pairs of pokes, predictions against hand-made truths, and thresholds."""
+"""Tests of pairs of pokes, predictions for known contacts, and thresholds."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ SKINS = ("b0_s0", "b0_s1", "b1_s0")
 
 
 def grid_rows(force=True):
-    """Every place of the grid twice on each skin, at a force of its own."""
+    """Return rows with each place of the grid twice on each skin, at random forces."""
     skins = np.repeat(SKINS, 130)
     rows = tables.rows([name[:2] for name in skins], skins)
     target = np.column_stack([np.tile(points_mm(), (6, 1)), rng_for(0, "force").uniform(0, 3, len(skins))])
@@ -42,7 +42,7 @@ def pairs_at(separation_mm, rows=ROWS, own=OWN, pairs_n=80):
 
 
 @given(st.sampled_from([2.0, 4.2, 6.0, 8.5, 12.0, 16.0]))
-def test_pairs_lie_on_one_skin_at_the_given_distance(separation_mm):
+def test_pairs_are_on_one_skin_at_the_given_distance(separation_mm):
     pairs = pairs_at(separation_mm)
     assert (ROWS.skin[pairs.weaker] == ROWS.skin[pairs.stronger]).all()
     assert set(ROWS.board[pairs.weaker]) == {"b0"}
@@ -52,7 +52,7 @@ def test_pairs_lie_on_one_skin_at_the_given_distance(separation_mm):
     assert len(pairs.weaker) == 80
 
 
-def test_zero_is_one_place_twice_and_a_small_distance_is_two_places():
+def test_zero_distance_is_one_place_and_small_distances_are_two():
     same = pairs_at(0.0)
     np.testing.assert_array_equal(ROWS.target[same.weaker, :2], ROWS.target[same.stronger, :2])
     close = replace(ROWS, target=(ROWS.target * [0.2, 0.2, 1]).astype(np.float32))  # places 0.4 mm apart
@@ -60,7 +60,7 @@ def test_zero_is_one_place_twice_and_a_small_distance_is_two_places():
     assert (close.target[pairs.weaker, :2] != close.target[pairs.stronger, :2]).any(axis=1).all()
 
 
-def test_without_forces_the_weaker_one_is_that_of_the_smaller_field():
+def test_weaker_contact_without_forces_has_the_smaller_field():
     rows = grid_rows(force=False)
     pairs = pairs_at(4.0, rows=rows)
     length = [np.linalg.norm(rows.db_uT[side], axis=1) for side in (pairs.weaker, pairs.stronger)]
@@ -69,25 +69,25 @@ def test_without_forces_the_weaker_one_is_that_of_the_smaller_field():
     assert not {"force_over_sum", "force_over_larger"} & set(numbers)
 
 
-def test_readings_of_pairs_are_sums_row_by_row():
+def test_pair_readings_are_sums():
     pairs = pairs_at(6.0)
     for i in range(5):
         both = ROWS.db_uT[pairs.weaker[i]] + ROWS.db_uT[pairs.stronger[i]]
         np.testing.assert_array_equal(pairs.sum_uT(ROWS.db_uT)[i], both)
 
 
-def test_a_distance_without_places_is_an_error():
+def test_distance_without_places_is_an_error():
     with pytest.raises(ParamsError, match=r"31 mm apart, within 0.5 mm. Correct contacts.separations_mm"):
         pairs_at(31.0)
 
 
-def three(*rows):
+def contacts_of(*rows):
     return np.array(rows, np.float32)
 
 
-def test_a_prediction_between_two_known_contacts():
-    weaker, stronger = three([0, 0, 1], [0, 0, 1]), three([4, 0, 3], [0, 8, 3])
-    predicted = three([3, 0.5, 4], [0, 5, 2])
+def test_prediction_between_two_known_contacts():
+    weaker, stronger = contacts_of([0, 0, 1], [0, 0, 1]), contacts_of([4, 0, 3], [0, 8, 3])
+    predicted = contacts_of([3, 0.5, 4], [0, 5, 2])
     numbers = where_it_falls(weaker, stronger, predicted)
     assert numbers["near_either_pct"] == 50  # the first: 1 mm and 0.5 mm from the stronger
     assert numbers["nearest_mm"] == pytest.approx((np.hypot(1, 0.5) + 3) / 2)
@@ -98,10 +98,10 @@ def test_a_prediction_between_two_known_contacts():
 
 
 @given(st.floats(-1, 2), st.floats(-5, 5))
-def test_an_offset_across_the_line_does_not_move_the_projection(share, aside_mm):
-    weaker, stronger = three([2, 3, 1]), three([5, 7, 2])
+def test_perpendicular_offset_keeps_the_projection(share, aside_mm):
+    weaker, stronger = contacts_of([2, 3, 1]), contacts_of([5, 7, 2])
     foot = weaker[0] + share * (stronger - weaker)[0]
-    predicted = three(foot + aside_mm * np.array([-0.8, 0.6, 0]))
+    predicted = contacts_of(foot + aside_mm * np.array([-0.8, 0.6, 0]))
     assert along_the_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # float32
 
 
@@ -113,13 +113,13 @@ def test_an_offset_across_the_line_does_not_move_the_projection(share, aside_mm)
         (["b0", "b0", "b0"], ["s0", "s0", "s0"], [0, 1, 2], [2], "pass"),
     ],
 )
-def test_a_board_is_kept_aside_else_a_skin_else_a_pass(boards, skins, passes, aside, what):
-    fit, kept, said = keep_aside(tables.rows(boards, skins, passes), np.arange(3))
-    assert (kept.tolist(), said) == (aside, what)
+def test_board_skin_or_pass_is_held_out(boards, skins, passes, aside, what):
+    fit, kept, unit = keep_aside(tables.rows(boards, skins, passes), np.arange(3))
+    assert (kept.tolist(), unit) == (aside, what)
     assert sorted([*fit, *kept]) == [0, 1, 2]
 
 
-def test_one_pass_of_one_skin_cannot_be_split():
+def test_single_pass_of_one_skin_is_an_error():
     with pytest.raises(ParamsError, match="of a single board, skin and pass"):
         keep_aside(tables.rows(["b0"] * 2, ["s0"] * 2), np.arange(2))
 
@@ -128,7 +128,7 @@ def scores(name, shift=0.0, n=400):
     return {"odd": rng_for(0, "scores", name).normal(shift, 1, n)}
 
 
-def test_thresholds_depend_on_contacts_kept_aside_alone():
+def test_thresholds_depend_only_on_held_out_contacts():
     aside, double = scores("aside"), {0.0: scores("same"), 4.0: scores("four", 2)}
     one = detection_rates(aside, scores("single"), double, 0.1)
     other = detection_rates(aside, scores("single", 5), double, 0.1)
@@ -136,7 +136,7 @@ def test_thresholds_depend_on_contacts_kept_aside_alone():
     assert detection_rates(aside, aside, double, 0.1)["false_alarm_pct"]["odd"] == pytest.approx(10, abs=100 / 400)
 
 
-def test_the_area_over_all_pairs_leaves_out_those_at_one_place():
+def test_total_auc_excludes_pairs_at_one_place():
     single, apart = scores("single"), scores("four", 2)
     found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: apart}, 0.1)
     assert found["auc"] == found["by_separation"][4.0]["auc"]

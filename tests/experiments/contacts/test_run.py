@@ -18,12 +18,12 @@ SECTION = Contacts(pairs_n=40, separations_mm=(4.0, 8.0), false_alarm_fraction=0
 CI = Path(__file__).resolve().parents[3] / "pipeline/scenes/ci.yaml"
 
 
-def scenery():
+def scene_data():
     boards = np.repeat(["b0", "b1", "b2"], 260)
     rows = tables.rows(boards, [f"{board}_s0" for board in boards])
     force_N = rng_for(0, "forces").uniform(0.5, 3, len(boards))
     places_mm = np.tile(points_mm(), (12, 1))
-    # Field sources lie under the places: each of nine channels sees force fall with distance from a spot of its own.
+    # Each of nine channels reads the force, weighted by the distance from its own spot.
     spots_mm = np.array([[x, y] for x in (2, 8, 14) for y in (2, 8, 14)])
     near = np.exp(-((places_mm[:, None] - spots_mm) ** 2).sum(axis=2) / 50)
     db_uT = (200 * force_N[:, None] * near).astype(np.float32)
@@ -33,8 +33,8 @@ def scenery():
     )
 
 
-def nearest(data):
-    """An exact network, for single contacts: of the row that looks most alike."""
+def nearest_neighbour(data):
+    """Return a predictor that is exact for single contacts: the most similar row."""
 
     def predict(db_uT):
         known = data.rows.db_uT / np.linalg.norm(data.rows.db_uT, axis=1, keepdims=True)
@@ -45,31 +45,33 @@ def nearest(data):
     return predict
 
 
-AT = scenery()
-TEST = np.flatnonzero(AT.rows.board == "b0")
-FOLD = Fold("lobo", "b0", np.flatnonzero(AT.rows.board != "b0"), TEST, np.zeros(0, np.int64))
-NUMBERS, DRAWN = evaluate_board(AT, FOLD, SECTION, [nearest(AT)])
+DATA = scene_data()
+TEST = np.flatnonzero(DATA.rows.board == "b0")
+FOLD = Fold("lobo", "b0", np.flatnonzero(DATA.rows.board != "b0"), TEST, np.zeros(0, np.int64))
+NUMBERS, DRAWN = evaluate_board(DATA, FOLD, SECTION, [nearest_neighbour(DATA)])
 
 
-def test_two_contacts_are_detected_the_better_the_farther_apart():
+def test_distant_contacts_are_detected_better():
     found = NUMBERS["by_separation"]
     for detector in ("direction and length", "direction above noise", "residual"):
-        assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)  # 0.5 is guessing
-        assert NUMBERS["false_alarm_pct"][detector] < 25  # 10 asked, of as many again
+        assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)  # 0.5 is chance
+        assert NUMBERS["false_alarm_pct"][detector] < 25  # 10 is nominal
 
 
-def test_predictions_lie_between_the_two_and_nearer_the_stronger():
+def test_predictions_are_between_contacts_and_nearer_the_stronger():
     assert 0.5 < NUMBERS["falls"][8.0]["along"] < 1.0
     assert NUMBERS["falls"][4.0]["nearest_mm"] < NUMBERS["falls"][8.0]["nearest_mm"]
-    assert NUMBERS["falls"][0.0]["near_either_pct"] == 100  # twice one place is one contact, twice as strong
+    assert NUMBERS["falls"][0.0]["near_either_pct"] == 100  # the same place twice is one contact of twice the force
     assert [len(values) for values in DRAWN["along"].values()] == [40, 40]
 
 
 def test_disagreement_needs_two_networks():
     assert "networks disagree" not in NUMBERS["auc"]
-    numbers, _ = evaluate_board(AT, FOLD, SECTION, [nearest(AT), lambda db_uT: nearest(AT)(-db_uT)])
+    numbers, _ = evaluate_board(
+        DATA, FOLD, SECTION, [nearest_neighbour(DATA), lambda db_uT: nearest_neighbour(DATA)(-db_uT)]
+    )
     assert "networks disagree" in numbers["auc"]
 
 
-def test_the_same_board_gives_the_same_numbers():
-    assert evaluate_board(AT, FOLD, SECTION, [nearest(AT)]) == (NUMBERS, DRAWN)
+def test_evaluation_is_reproducible():
+    assert evaluate_board(DATA, FOLD, SECTION, [nearest_neighbour(DATA)]) == (NUMBERS, DRAWN)

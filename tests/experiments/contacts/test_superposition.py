@@ -1,4 +1,4 @@
-"""Two contacts on one skin: one alone is the simulator's, small and far contacts add, and neither is forgotten."""
+"""Tests of the superposition of two contacts on one skin."""
 
 import numpy as np
 import pytest
@@ -35,15 +35,15 @@ def rms(values):
     return np.sqrt((values**2).mean())
 
 
-def test_one_contact_is_that_of_the_simulator():
+def test_single_contact_equals_the_simulator():
     poke_m = np.array([[2e-3, -3e-3, DEPTH_M]])
     ((_, before, after),) = moved_dipoles(SKIN, poke_m - [0, 0, SKIN.depth_zero_m])
     theirs_T = change_of_field(before, after, BOARD.chips_m)
-    # Straight lines between five heights instead of the nodes' own: 1 % here, 0.3 % with the nine in use.
+    # Linear interpolation between five heights: an error of 1 %, or 0.3 % with the nine in use.
     assert rms(pressed_T(poke_m[0]) - theirs_T) < 0.02 * rms(theirs_T)
 
 
-def test_the_sum_is_the_better_the_less_deep_and_the_farther_apart():
+def test_error_of_the_sum_falls_with_distance_and_rises_with_depth():
     rows = {
         (row["depth_mm"], row["separation_mm"]): row["error_pct"] for row in superposition(SCENE, (4.0, 12.0), seed=1)
     }
@@ -51,13 +51,13 @@ def test_the_sum_is_the_better_the_less_deep_and_the_farther_apart():
     for separation_mm in (
         4,
         12,
-    ):  # what is missing is a product of two displacements, so half as deep is half the share
+    ):  # the error is a product of two displacements: half as deep is half the share
         assert rows[0.6, separation_mm] < 0.7 * rows[1.2, separation_mm]
     for depth_mm in (0.6, 1.2):
         assert 0 < rows[depth_mm, 12] < rows[depth_mm, 4]
 
 
-def test_of_two_contacts_neither_is_forgotten():
+def test_both_contacts_contribute():
     a_m, b_m = (-5e-3, 0, DEPTH_M), (5e-3, 1e-3, DEPTH_M)
     together_T = pressed_T(a_m, b_m)
     for one_m in (a_m, b_m):
@@ -65,8 +65,8 @@ def test_of_two_contacts_neither_is_forgotten():
     assert rms(together_T - pressed_T(a_m) - pressed_T(b_m)) < 0.1 * rms(together_T)
 
 
-def test_turned_moments_keep_their_length():
+def test_rotated_moments_keep_their_length():
     _, moments = press_on(SKIN, press_on(SKIN, REST, np.array([0, 0, DEPTH_M])), np.array([3e-3, 0, DEPTH_M]))
     length, before = (np.linalg.norm(of, axis=1) for of in (moments, SKIN.moments_A_m2))
-    # A straight line between turned vectors is a chord: it is shorter than the arc, by its angle squared over 8.
+    # Interpolation between rotated vectors gives a chord, shorter than the arc by its angle squared over 8.
     np.testing.assert_allclose(length, before, rtol=0.05)

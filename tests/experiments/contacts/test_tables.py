@@ -1,4 +1,4 @@
-"""What the report says of two contacts: every distance and detector, the false alarms, and the source of each row."""
+"""Tests of the tables and figure of two contacts."""
 
 from pipeline.experiments.contacts import figures, tables
 from tests.report.synthetic import texts_of
@@ -9,9 +9,9 @@ def stat(mean):
 
 
 def row(separation_mm, **more):
-    told = {name: stat(10.0 * separation_mm + i) for i, name in enumerate(("direction", "residual"))}
+    rates = {name: stat(10.0 * separation_mm + i) for i, name in enumerate(("direction", "residual"))}
     falls = {"near_either_pct": stat(42.0), "nearest_mm": stat(1.5)} | more
-    return {"separation_mm": separation_mm, "detected_pct": told, "auc": {"direction": stat(0.5)}} | falls
+    return {"separation_mm": separation_mm, "detected_pct": rates, "auc": {"direction": stat(0.5)}} | falls
 
 
 NUMBERS = {
@@ -25,7 +25,7 @@ SUPERPOSED = [{"depth_mm": 1.2, "separation_mm": 4.0, "pairs_n": 6, "error_pct":
 DRAWN = {"along": {"4": [0.5, 0.6, 1.1], "8": [0.2, 0.9, 0.7]}}
 
 
-def test_the_table_has_a_row_for_each_distance_and_one_of_single_contacts():
+def test_table_has_all_distances_and_single_contacts():
     table = tables(NUMBERS, "recorded")["contacts"]
     assert table["distance of the two, mm"].tolist() == ["0", "4", "8", "single contacts"]
     assert set(table["source"]) == {"recorded"}
@@ -36,17 +36,17 @@ def test_the_table_has_a_row_for_each_distance_and_one_of_single_contacts():
     assert "5 % false alarms" in table.attrs["meaning"]
 
 
-def test_superposition_has_a_table_in_simulated_scenes_alone():
+def test_superposition_table_is_only_in_simulated_scenes():
     assert set(tables(NUMBERS, "recorded")) == {"contacts"}
     table = tables(NUMBERS | {"superposition": SUPERPOSED}, "simulated")["superposition"]
     assert table["error of the sum, % of the change of field"].tolist() == ["13.2"]
 
 
-def test_the_figure_names_detectors_units_and_source_and_is_deterministic():
+def test_figure_labels():
     drawn = figures(NUMBERS, DRAWN, "recorded")
-    words = texts_of(drawn["contacts.svg"])
-    for word in ("direction", "residual", "stronger contact", "distance of the two / mm", "%", "(recorded)"):
-        assert word in words
+    labels = texts_of(drawn["contacts.svg"])
+    for label in ("direction", "residual", "stronger contact", "distance of the two / mm", "%", "(recorded)"):
+        assert label in labels
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
     nearer = figures(NUMBERS | {"same_place": row(2.0)}, DRAWN, "recorded")
-    assert nearer != drawn  # what two contacts at one place give is drawn too
+    assert nearer != drawn  # contacts at one place are drawn too

@@ -13,11 +13,11 @@ LATE = {
     "network_board": ["b0", "b1", "b2", "b3"],
 }  # fmt: skip
 CONTACTS_N = [5000, 10_000, 15_000, 20_000]
-BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # one network against another
+BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # relative differences between networks
 
 
 def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True) -> dict[str, np.ndarray]:
-    """Errors of a network a row, which grow by so much from one of four windows to the next."""
+    """Return errors of networks (rows) that grow by `per_window` over four windows."""
     places = np.array([[start * (1 + more) + i * per_window * (1 + more) for i in range(4)] for more in by_seed])
     return {"mse_xy_mm2": places} | ({"mse_f_N2": places / 100} if force else {})
 
@@ -25,7 +25,7 @@ def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True)
 PAPER = {"initial": errors(1.0, 0.5), "regular": errors(0.2, 0.01), "each": errors(0.3, 0.01)}
 
 
-def found(
+def judged(
     networks: dict, late: dict | None = LATE, boards: tuple[str, ...] = ("b0", "b1", "b2", "b3")
 ) -> dict[str, dict]:
     windows_n = next(iter(networks.values()))["mse_xy_mm2"].shape[1]
@@ -34,12 +34,12 @@ def found(
 
 
 def verdicts(networks: dict, late: dict | None = LATE) -> dict[str, str]:
-    return {name: one["verdict"] for name, one in found(networks, late).items()}
+    return {name: one["verdict"] for name, one in judged(networks, late).items()}
 
 
-def test_errors_as_in_the_paper_support_all_its_findings():
+def test_errors_as_in_the_paper_support_all_findings():
     assert verdicts(PAPER) == dict.fromkeys((HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE, OVERESTIMATES), SUPPORTED)
-    assert all(one["holds"] for one in found(PAPER).values())
+    assert all(one["holds"] for one in judged(PAPER).values())
 
 
 @pytest.mark.parametrize(
@@ -52,66 +52,66 @@ def test_errors_as_in_the_paper_support_all_its_findings():
         (OVERESTIMATES, {}, LATE | {"bias_N": -0.02, "network_bias_N": [-0.02, -0.021, -0.02, -0.019]}),
     ],
 )
-def test_a_finding_that_is_the_other_way_round_is_contradicted(finding, changed, late):
-    one = found(PAPER | changed, late)[finding]
+def test_opposite_finding_is_contradicted(finding, changed, late):
+    one = judged(PAPER | changed, late)[finding]
     assert (one["holds"], one["verdict"]) == (False, CONTRADICTED)
 
 
 @pytest.mark.parametrize("finding", [HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE])
-def test_a_difference_that_boards_disagree_on_is_undecided(finding):
-    signs = (-1.0, 1.2, 0.3, 0.1)  # of the difference, on each board: the mean is on the paper's side
+def test_disagreement_of_boards_is_undecided(finding):
+    signs = (-1.0, 1.2, 0.3, 0.1)  # of the difference by board; the mean agrees with the paper
     near = errors(0.2, 0.01)
     apart = {name: of + np.array(signs)[:, None] * 0.1 * np.arange(1, 5) * of for name, of in near.items()}
     changed = {"each": apart} if finding == EACH_IS_WORSE else {"initial": apart}
-    one = found(PAPER | {"regular": near} | changed)[finding]
+    one = judged(PAPER | {"regular": near} | changed)[finding]
     assert (one["holds"], one["verdict"]) == (False, UNDECIDED)
 
 
-def test_one_network_decides_nothing():
+def test_single_network_has_no_verdict():
     alone = {policy: {name: of[:1] for name, of in own.items()} for policy, own in PAPER.items()}
-    told = found(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
-    assert {one["verdict"] for one in told.values()} == {FEW_BOARDS}
-    assert {one["of_trainings"] for one in told.values()} == {UNDECIDED}
+    findings = judged(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
+    assert {one["verdict"] for one in findings.values()} == {FEW_BOARDS}
+    assert {one["of_trainings"] for one in findings.values()} == {UNDECIDED}
 
 
-def test_many_trainings_on_one_board_are_judged_as_trainings_only():
-    one_board = found(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
+def test_trainings_on_one_board_are_judged_only_as_trainings():
+    one_board = judged(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
     assert {one["verdict"] for one in one_board.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in one_board.values()} == {SUPPORTED}
 
 
-def test_more_trainings_with_equal_errors_do_not_narrow_the_interval_over_boards():
+def test_repeated_trainings_do_not_narrow_the_interval():
     twice = {policy: {name: np.repeat(of, 2, axis=0) for name, of in own.items()} for policy, own in PAPER.items()}
     late = LATE | {"network_bias_N": list(np.repeat(LATE["network_bias_N"], 2))}
     boards = ("b0", "b0", "b1", "b1", "b2", "b2", "b3", "b3")
-    again, once = found(twice, late | {"network_board": list(boards)}, boards), found(PAPER)
+    again, once = judged(twice, late | {"network_board": list(boards)}, boards), judged(PAPER)
     assert [one["verdict"] for one in again.values()] == [one["verdict"] for one in once.values()]
     assert again[OFFSET]["measured"] == once[OFFSET]["measured"]
 
 
-def test_one_contradicting_metric_contradicts_and_an_undecided_one_leaves_undecided():
+def test_one_contradicting_metric_contradicts():
     falls = PAPER["initial"] | {"mse_f_N2": 0.02 - 0.004 * np.arange(4) + np.array([[0.0], [1e-5], [2e-5], [3e-5]])}
     assert verdicts(PAPER | {"initial": falls})[HIGHER_AND_FASTER] == CONTRADICTED
     unclear = PAPER["initial"] | {"mse_f_N2": PAPER["regular"]["mse_f_N2"] + np.array([[-1.0], [1.0], [0.3], [0.1]])}
     assert verdicts(PAPER | {"initial": unclear})[OFFSET] == UNDECIDED
 
 
-def test_more_frequent_readings_are_judged_over_all_windows_and_not_by_the_last():
+def test_readings_policies_are_judged_over_all_windows():
     last_good = {name: of.copy() for name, of in errors(1.0, 0.5).items()}
     for of in last_good.values():
         of[:, -1] = 0
     assert verdicts(PAPER | {"initial": last_good})[OFFSET] == SUPPORTED
 
 
-def test_differences_are_of_pairs_so_that_a_shared_error_cancels():
-    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # one seed is far worse under both policies
+def test_paired_differences_cancel_shared_errors():
+    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # one seed is much worse under both policies
     regular = {name: of + shared for name, of in PAPER["regular"].items()}
     each = {name: of + shared for name, of in PAPER["each"].items()}
     assert verdicts(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE] == SUPPORTED
     own, other = (of["mse_xy_mm2"].mean(axis=1) for of in (each, regular))
     low, high = ttest_rel(own, other).confidence_interval(0.95)
     difference = f"difference {(own - other).mean():+.2g} [{low:+.2g}, {high:+.2g}] mm²"
-    assert difference in found(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE]["measured"]
+    assert difference in judged(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE]["measured"]
 
 
 @pytest.mark.parametrize(
@@ -124,32 +124,32 @@ def test_differences_are_of_pairs_so_that_a_shared_error_cancels():
         (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),  # trainings differ more
     ],
 )
-def test_a_bias_must_exceed_the_variation_of_indentations_and_of_trainings(bias_N, se_N, networks_N, verdict):
+def test_bias_must_exceed_both_variations(bias_N, se_N, networks_N, verdict):
     late = LATE | {"bias_N": bias_N, "bias_se_N": se_N, "network_bias_N": networks_N}
-    assert found(PAPER, late)[OVERESTIMATES]["of_trainings"] == verdict
+    assert judged(PAPER, late)[OVERESTIMATES]["of_trainings"] == verdict
 
 
 def test_without_forces_only_places_are_judged():
     two = {"initial": errors(1.0, 0.5, force=False), "each": errors(0.3, 0.01, force=False)}
     assert verdicts(two, None) == {HIGHER_AND_FASTER: SUPPORTED, OFFSET: SUPPORTED}
-    assert not any("MSE_F" in one["measured"] for one in found(two, None).values())
+    assert not any("MSE_F" in one["measured"] for one in judged(two, None).values())
 
 
-def test_a_single_policy_or_window_leaves_out_findings_it_cannot_test():
-    assert found({"initial": errors(1, 1)}, None) == {}
+def test_untestable_findings_are_omitted():
+    assert judged({"initial": errors(1, 1)}, None) == {}
     one_window = {policy: {name: of[:, :1] for name, of in own.items()} for policy, own in PAPER.items()}
-    assert set(found(one_window, None)) == {OFFSET, EACH_IS_WORSE}
+    assert set(judged(one_window, None)) == {OFFSET, EACH_IS_WORSE}
 
 
 @given(st.lists(st.floats(0, 10), min_size=2, max_size=9))
-def test_the_growth_is_the_slope_that_numpy_fits(values):
+def test_growth_equals_numpys_slope(values):
     contacts_n = [5000 * i for i in range(len(values))]
     slope = np.polyfit(np.array(contacts_n) / 10_000, values, 1)[0]
     assert growth(contacts_n, np.array([values, values])) == pytest.approx(slope, abs=1e-9)  # both in double precision
 
 
-def test_measured_gives_both_policies_the_difference_and_its_interval():
-    first, offset, third, late = (one["measured"] for one in found(PAPER).values())
+def test_measured_text_has_policies_difference_and_interval():
+    first, offset, third, late = (one["measured"] for one in judged(PAPER).values())
     assert first.startswith("MSE_xy, mean over windows: initial 1.75, regular 0.215, difference +1.5 [")
     assert "MSE_xy, growth in 10,000 contacts: initial 1, regular 0.02, difference +0.98 [" in first
     assert offset == "; ".join(first.split("; ")[:2])

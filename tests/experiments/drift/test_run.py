@@ -1,4 +1,4 @@
-"""Stages drift and variation on a skin whose field is known in closed form, with the settings of scene ci."""
+"""Tests of experiments drift and variation on a skin with a field in closed form, with the settings of scene ci."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,12 +21,12 @@ from reskin.seeds import rng_for
 from tests.data.tables import readings
 
 ROOT = Path(__file__).resolve().parents[3]
-DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3  # 390 contacts; drift of each channel a contact
+DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3  # 390 contacts; drift of each channel per contact
 EVERY_s, WARMING_K_PER_s = 0.5, 0.01
 
 
 def capture(name: str, board: str = "b0", skin: str = "s0", gain: float = 1.0, pokes_n: int | None = None) -> Readings:
-    """Two readings a contact; a field that is linear in place and force, and drifts at rest."""
+    """Return a capture with two readings per contact; its field is linear in place and force, and drifts at rest."""
     places = np.tile(points_mm(), (len(DEPTHS_MM) * PASSES_N, 1))[:pokes_n]
     depth_mm = np.tile(np.repeat(DEPTHS_MM, 65), PASSES_N)[:pokes_n]
     n = len(places)
@@ -68,7 +68,7 @@ def drift_section(scene: dict[str, Any]) -> Drift:
     return scene["settings"].section(Drift, "drift")
 
 
-def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(scene, tmp_path):
+def test_single_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     drift(section=drift_section(scene), indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
     results = io.read_json(scene["results"])
     numbers = results["numbers"]
@@ -77,7 +77,7 @@ def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(sc
     }  # fmt: skip
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers[policy]] == [100, 200, 300]
-    # As read nothing of the drift is left; a single reading is off by it, a regular one by up to 20 contacts of it.
+    # A reading before each contact removes the drift; the initial one misses all, a regular one up to 20 contacts.
     off_uT = {policy: numbers[policy][-1]["noload_off_uT"] for policy in ("initial", "regular", "each")}
     assert off_uT["each"] == 0
     assert off_uT["initial"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(np.arange(300, 330) ** 2.0)), rel=1e-3)
@@ -91,7 +91,7 @@ def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(sc
     assert all(row["spread"]["mse_xy_mm2"] > 0 for policy in off_uT for row in numbers[policy])
     assert all(numbers["last_window"][policy]["mse_xy_mm2"]["sd_seeds"] > 0 for policy in off_uT)
     assert {one["verdict"] for one in numbers["findings"]} == {"not judged (fewer than 4 boards)"}
-    # Whatever is subtracted under a policy, a contact changes the field by what a reading before it shows.
+    # The change of field by a contact does not depend on the policy.
     db_uT = capture("s0-wear").b_uT - capture("s0-wear").noload_uT
     assert numbers["field"]["contact_uT"] == pytest.approx(np.sqrt(np.mean(db_uT.astype(float) ** 2)), rel=1e-6)
     assert numbers["contact_every_s"] == pytest.approx(EVERY_s)
@@ -100,7 +100,7 @@ def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(sc
     assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings", "drift_wander"}
     drawn = drift_pages.figures(numbers, results["drawn"], "simulated")
     assert set(drawn) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
-    # A walk of no step is the last window itself; a reading before every contact sees any walk.
+    # A walk without steps is the last window; readings before every contact remove any walk.
     for policy, (still, _) in numbers["wander"].items():
         last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}
         assert {name: still[name] for name in last} == pytest.approx(last)
@@ -108,10 +108,10 @@ def test_on_a_drifting_skin_a_single_no_load_reading_is_worst_in_every_window(sc
     assert numbers["wander"]["each"][1]["mse_xy_mm2"] == pytest.approx(numbers["each"][-1]["mse_xy_mm2"], rel=1e-3)
 
 
-def test_no_walk_is_added_to_recordings(scene, tmp_path):
-    worn = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
+def test_recordings_have_no_added_walk(scene, tmp_path):
+    wear = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
     with pytest.raises(ParamsError, match="drift.wander_uT is .* but a recorded scene"):
-        drift(section=drift_section(scene), indentations=worn, **scene)
+        drift(section=drift_section(scene), indentations=wear, **scene)
 
 
 @pytest.mark.parametrize(
@@ -124,18 +124,18 @@ def test_no_walk_is_added_to_recordings(scene, tmp_path):
         ),
     ],
 )
-def test_captures_without_order_or_windows_are_an_error_before_training(scene, tmp_path, captures, sentence):
+def test_captures_without_order_or_windows_are_an_error(scene, tmp_path, captures, sentence):
     with pytest.raises(ParamsError, match=sentence):
         drift(section=drift_section(scene), indentations=write(tmp_path / "wear", *captures), **scene)
     assert not (tmp_path / ".reskin").exists()
 
 
-def test_variation_finds_the_drift_over_time_and_the_gain_between_skins(scene, tmp_path):
-    worn = write(tmp_path / "wear", capture("s0-wear"))
+def test_variation_recovers_drift_and_gain(scene, tmp_path):
+    wear = write(tmp_path / "wear", capture("s0-wear"))
     main = write(
         tmp_path / "main", capture("s0"), capture("s1", "b1", "s1", gain=1.5), capture("s2", "b0", "s2", gain=9)
     )
-    variation(section=scene["settings"].section(Variation, "variation"), main=main, indentations=worn, **scene)
+    variation(section=scene["settings"].section(Variation, "variation"), main=main, indentations=wear, **scene)
     results = io.read_json(scene["results"])
     assert results["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
     assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
@@ -145,7 +145,7 @@ def test_variation_finds_the_drift_over_time_and_the_gain_between_skins(scene, t
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
         assert place["time"]["db_change_uT"] < 1e-3  # float32 fields of 1000 uT
         assert place["skins"]["skins"] == ["s0", "s1"]  # the first of each board
-        # Two skins, one 1.5 times the other: half of the weaker's field, over the rms of both.
+        # The second skin has 1.5 times the field: a difference of half the weaker field, over the rms of both.
         assert place["skins"]["spread_pct"] == pytest.approx(100 * 0.5 / np.sqrt((1 + 1.5**2) / 2), rel=1e-4)
     assert set(variation_pages.figures(results["numbers"], results["drawn"], "simulated")) == {
         "variation_time.svg", "variation_skins.svg",
@@ -160,10 +160,10 @@ def walk_uT(step_uT: float, seed: int = 0) -> np.ndarray:
     line = capture("s0-wear")
     further = add_walk(line, step_uT, after_n=AFTER_N, seed=seed)
     np.testing.assert_allclose(further.b_uT - line.b_uT, further.noload_uT - line.noload_uT, atol=2e-3)
-    return (further.noload_uT - line.noload_uT)[::2].astype(float)  # two readings a contact
+    return (further.noload_uT - line.noload_uT)[::2].astype(float)  # two readings per contact
 
 
-def test_the_walk_begins_where_training_ends_and_grows_as_the_root_of_the_contacts():
+def test_walk_starts_after_training_and_grows_with_the_root_of_contacts():
     walk = np.concatenate([walk_uT(2.0, seed) for seed in range(20)], axis=1)
     assert np.abs(walk[:AFTER_N]).max() == 0
     for contacts_n in (1, 16, 256):
@@ -171,6 +171,6 @@ def test_the_walk_begins_where_training_ends_and_grows_as_the_root_of_the_contac
         assert rms_uT == pytest.approx(2.0 * np.sqrt(contacts_n), rel=0.15)  # 300 walks
 
 
-def test_twice_the_step_is_twice_the_same_walk():
+def test_walk_is_proportional_to_its_step():
     np.testing.assert_allclose(walk_uT(2.0), 2 * walk_uT(1.0), atol=2e-3)
     assert np.abs(walk_uT(0.0)).max() == 0

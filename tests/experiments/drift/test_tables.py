@@ -8,7 +8,7 @@ from pipeline.report.formatting import to_markdown
 
 
 def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
-    """Two windows of three policies, errors apart; two seeds if there is a spread."""
+    """Return numbers of two windows and three policies; of two seeds if there is a spread."""
     policies = {}
     for i, policy in enumerate(("initial", "regular", "each")):
         metrics = {"accuracy_pct": 50.0 + i, "mse_xy_mm2": 2.0 - i / 2} | (
@@ -42,7 +42,7 @@ DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_each_window_is_a_row_with_every_policy_and_its_source(source):
+def test_each_window_is_a_row_with_all_policies(source):
     table = tables(numbers(), source)["drift"]
     assert table["contacts"].tolist() == ["5,000", "10,000"]
     assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02 ± 0.0004"] * 2
@@ -50,7 +50,7 @@ def test_each_window_is_a_row_with_every_policy_and_its_source(source):
     assert set(table["source"]) == {source}
 
 
-def test_the_table_of_findings_has_verdicts_and_the_sizes_that_may_explain_them():
+def test_findings_table_has_verdicts_and_sizes():
     table = tables(numbers(), "simulated")["drift_findings"]
     assert table["holds"].tolist() == ["yes", "no", "not judged (fewer than 4 boards)"]
     assert table["of these trainings"].tolist() == ["yes", "no", "yes"]
@@ -65,60 +65,60 @@ def test_the_table_of_findings_has_verdicts_and_the_sizes_that_may_explain_them(
     )
 
 
-def test_the_note_states_the_protocol_and_what_was_left_out():
+def test_note_has_the_protocol_and_omitted_contacts():
     assert "first 5,000 indentations of each skin, tested on 1,000 indentations after every 5,000" in to_markdown(
         tables(numbers(), "simulated")["drift"]
     )
     assert "The last 90 indentations fill no whole test" in to_markdown(tables(numbers(), "simulated")["drift"])
     whole = numbers(unit="pass", train_n=1, test_n=1, every_n=1, left_out_units_n=0)
-    said = to_markdown(tables(whole, "recorded")["drift"])
-    assert "first 1 pass of each skin" in said
-    assert "left out" not in said
+    text = to_markdown(tables(whole, "recorded")["drift"])
+    assert "first 1 pass of each skin" in text
+    assert "left out" not in text
 
 
-def test_the_note_states_the_pace_and_that_a_simulated_one_is_faster_than_a_rig():
+def test_note_has_the_pace():
     simulated, recorded = (to_markdown(tables(numbers(), source)["drift"]) for source in ("simulated", "recorded"))
-    for said in (simulated, recorded):
-        assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in said
+    for text in (simulated, recorded):
+        assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in text
     assert "A real rig takes seconds a contact" in simulated
     assert "A real rig" not in recorded
     unknown = {name: value for name, value in numbers().items() if name not in ("contact_every_s", "lasts_s")}
     assert "When the contacts were is not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
-def test_the_note_states_whether_the_spread_is_over_seeds_or_over_skins_too():
-    said = to_markdown(tables(numbers(), "simulated")["drift"])
-    assert "± is the sd over 2 network seeds, all tested on the same contacts." in said
-    said = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])
-    assert "± is the sd over 4 skins with 2 network seeds each." in said
+def test_note_has_the_unit_of_the_spread():
+    text = to_markdown(tables(numbers(), "simulated")["drift"])
+    assert "± is the sd over 2 network seeds, all tested on the same contacts." in text
+    text = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])
+    assert "± is the sd over 4 skins with 2 network seeds each." in text
 
 
-def test_one_network_has_no_spread():
-    said = to_markdown(tables(numbers(spread=False), "simulated")["drift"])
-    assert "One network each" in said
-    assert "±" not in said
+def test_single_network_has_no_spread():
+    text = to_markdown(tables(numbers(spread=False), "simulated")["drift"])
+    assert "One network each" in text
+    assert "±" not in text
 
 
-def test_without_known_forces_places_are_shown_and_no_force_is_drawn():
+def test_unknown_forces_are_not_shown():
     unknown = numbers(force=False)
     assert "MSE_xy, mm² (before every contact)" in tables(unknown, "recorded")["drift"]
     assert list(drawn := figures(unknown, {}, "recorded")) == ["drift.svg"]
     assert "MSE_xy / mm²" in drawn["drift.svg"]
 
 
-def test_figures_are_svg_with_units_source_and_the_stated_bias():
+def test_figure_labels():
     drawn = figures(numbers(), DRAWN, "simulated")
     for text in drawn.values():
         ET.fromstring(text)
         assert "(simulated)" in text
-    for word in ("accuracy / %", "MSE_F / N²", "contacts the skin has felt", "every 390 indentations"):
-        assert word in drawn["drift.svg"]
+    for label in ("accuracy / %", "MSE_F / N²", "contacts the skin has felt", "every 390 indentations"):
+        assert label in drawn["drift.svg"]
     assert "bars: the sd over 2 network seeds" in drawn["drift.svg"]
-    for word in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
-        assert word in drawn["drift_force.svg"]
+    for label in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
+        assert label in drawn["drift_force.svg"]
 
 
-def test_an_added_walk_has_a_row_for_every_step_and_is_absent_where_it_was_not_run():
+def test_added_walk_has_a_row_for_each_step():
     steps = {
         policy: [
             {
@@ -142,7 +142,7 @@ def test_an_added_walk_has_a_row_for_every_step_and_is_absent_where_it_was_not_r
     assert "drift_wander.svg" not in figures(numbers(), DRAWN, "simulated")
 
 
-def test_a_policy_keeps_its_colour_whichever_others_there_are():
+def test_policies_keep_their_colours():
     both = numbers()
     del both["regular"], both["late"]
     colours = set(re.findall(r"stroke: (#\w{6})", figures(both, {}, "recorded")["drift.svg"]))
@@ -150,7 +150,7 @@ def test_a_policy_keeps_its_colour_whichever_others_there_are():
     assert "#0072b2" not in colours
 
 
-def test_equal_numbers_give_equal_bytes():
+def test_figures_are_reproducible():
     points = {"late": DRAWN["late"] | {"predicted_N": [0.1, 0.9, 2.1]}}
     first, again, other = (figures(numbers(), drawn, "simulated") for drawn in (DRAWN, DRAWN, points))
     assert first == again != other
