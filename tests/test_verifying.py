@@ -78,9 +78,9 @@ def test_rerun_starts_from_the_commit_and_is_kept(checkout, monkeypatch):
         (["quick", "--against", "data"], "data: no quick/numbers.json there"),
     ],
 )
-def test_missing_reports_are_an_error(checkout, arguments, sentence):
+def test_missing_reports_are_an_error(checkout, arguments, message):
     done = CliRunner().invoke(app, ["verify-reports", *arguments])
-    assert sentence in str(done.exception)
+    assert message in str(done.exception)
 
 
 def test_failed_command_is_named(tmp_path):
