@@ -135,7 +135,7 @@ def test_duplicates_are_refused_unless_allowed(root, lab_file):
     assert_refused(root, lambda: add_lab(root, lab_file), "the name .* is taken in this scene")
     assert_refused(root, lambda: add_lab(root, lab_file, name="again"), "It is in the scene already")
     assert_refused(root, lambda: add_lab(root, lab_file, board="board2", skin="skin2"), "--allow-copy")
-    assert_refused(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the readings of")
+    assert_refused(root, lambda: add_lab(root, lab_file, board="board2", name="x"), "the same readings as")
     add_lab(root, lab_file, board="board2", skin="skin2", allow_copy=True)
     assert len(plan.check(root).stages["ingest"]) == 2
 
