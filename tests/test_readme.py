@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from pipeline.report.numbers import split
+from pipeline.report.numbers import join, split
 from pipeline.report.readme import blocks_of
 from reskin import io
 from reskin.config import read_yaml
@@ -64,7 +64,8 @@ def test_rewritten_pages_and_scenes_are_printed(tmp_path):
 
 def test_readme_links_the_code_of_every_stage():
     stages = read_yaml(ROOT / "dvc.yaml")["stages"]
-    links = re.findall(r"\]\((\S+)\)", blocks_of([all_experiments()], [], stages, None)["stages"])
+    numbers, of_run = (io.read_json(ROOT / f"reports/quick/{name}.json") for name in ("numbers", "provenance"))
+    links = re.findall(r"\]\((\S+)\)", blocks_of([join(numbers, of_run)], [], stages, None)["stages"])
     assert len(links) == len(stages)
     assert [link for link in links if not (ROOT / "docs" / link).is_file()] == []
 
