@@ -102,7 +102,7 @@ def test_output_depends_on_forty_features():
     net, inputs = stack(2), batch(2)
     features = net.features(inputs)
     assert features.shape == (2, 16, 40)
-    assert (features < 0).any()  # no ReLU stands behind the bottleneck
+    assert (features < 0).any()  # no ReLU after the bottleneck
     assert torch.equal(net.head(features), net(inputs))
 
 

@@ -27,14 +27,14 @@ def relabelled(presses: Presses, way: str) -> Presses:
     return Presses(presses.place_mm @ np.array(WAYS[way]).T, presses.direction)
 
 
-def undone(way: str) -> str:
+def inverse_of(way: str) -> str:
     inverse = np.array(WAYS[way]).T.tolist()
     return next(name for name, matrix in WAYS.items() if matrix == inverse)
 
 
 @pytest.mark.parametrize("way", DEPARTURES)
 def test_changed_labels_are_named_with_their_inverse(way):
-    assert other_orientation(relabelled(board("one"), way), board("other")) == undone(way)
+    assert other_orientation(relabelled(board("one"), way), board("other")) == inverse_of(way)
 
 
 def test_no_false_alarm():
@@ -57,4 +57,4 @@ def test_every_change_is_found_on_recorded_boards(shared_data, tmp_path):
     for own, other in ((1, 2), (2, 1)):
         assert other_orientation(boards[own], boards[other]) is None
         for way in DEPARTURES:
-            assert other_orientation(relabelled(boards[own], way), boards[other]) == undone(way)
+            assert other_orientation(relabelled(boards[own], way), boards[other]) == inverse_of(way)

@@ -11,7 +11,7 @@ from reskin.recordings.readers.sd_card import column_names, read_log, render
 from reskin.seeds import rng_for
 
 
-def made(frames_n=60, chips_n=2):
+def random_log(frames_n=60, chips_n=2):
     rng = rng_for(0, "card", chips_n)
     step_uT = np.tile([0.2, 0.2, 0.32], chips_n)
     b_uT = (np.rint(rng.normal(0, 12, (frames_n, 3 * chips_n))) * step_uT + 500).astype(np.float32)
@@ -22,7 +22,7 @@ def made(frames_n=60, chips_n=2):
 @pytest.fixture
 def log(tmp_path):
     file = tmp_path / "log.csv"
-    file.write_text(render(*made()))
+    file.write_text(render(*random_log()))
     return file
 
 
@@ -32,7 +32,7 @@ def lines(file):
 
 @given(chips_n=st.integers(1, 8))
 def test_log_round_trip(tmp_path_factory, chips_n):
-    t_s, b_uT, temperature_degC = made(chips_n=chips_n)
+    t_s, b_uT, temperature_degC = random_log(chips_n=chips_n)
     file = tmp_path_factory.mktemp("card") / "log.csv"
     file.write_text(render(t_s, b_uT, temperature_degC))
     read_s, read_uT, read_degC, account = read_log(file)
@@ -84,7 +84,7 @@ def test_missing_frames_are_counted(log):
 
 
 def test_failed_reads_and_stuck_chips_are_dropped(log):
-    t_s, b_uT, temperature_degC = made()
+    t_s, b_uT, temperature_degC = random_log()
     b_uT[3, :3], temperature_degC[3, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     b_uT[30:, 3:] = b_uT[30, 3:]  # 30 equal frames: the last 11 are certainly stuck
     log.write_text(render(t_s, b_uT, temperature_degC))
@@ -96,7 +96,7 @@ def test_failed_reads_and_stuck_chips_are_dropped(log):
 
 
 def test_reset_chip_is_refused(log):
-    t_s, b_uT, temperature_degC = made(frames_n=400, chips_n=3)
+    t_s, b_uT, temperature_degC = random_log(frames_n=400, chips_n=3)
     b_uT[:, 3:6] = (500 + (b_uT[:, 3:6] - 500) / [0.2, 0.2, 0.32] * [0.98, 0.98, 1.58]).astype(np.float32)
     log.write_text(render(t_s, b_uT, temperature_degC))
     with pytest.raises(CaptureError, match="from row 2 on, the step of chip 1 differs from that of the other chips"):
@@ -125,23 +125,23 @@ def test_byte_order_mark_changes_nothing(log):
     assert plain[3] == marked[3]
 
 
-def failing(failed_n, stuck_n, frames_n=60):
-    t_s, b_uT, temperature_degC = made(frames_n)
+def log_with_faults(failed_n, stuck_n, frames_n=60):
+    t_s, b_uT, temperature_degC = random_log(frames_n)
     b_uT[:failed_n, :3], temperature_degC[:failed_n, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     b_uT[frames_n - stuck_n :, 3:] = b_uT[-1, 3:]
     return t_s, b_uT, temperature_degC
 
 
 def test_log_with_too_many_faults_is_refused(log):
-    log.write_text(render(*failing(40, 0)))
+    log.write_text(render(*log_with_faults(40, 0)))
     with pytest.raises(
         CaptureError, match="only 20 of 60 lines are whole: 40 had failed I2C reads, 0 stuck chips. At least 50 % must"
     ):
         read_log(log)
-    log.write_text(render(*failing(5, 50)))
+    log.write_text(render(*log_with_faults(5, 50)))
     with pytest.raises(
         CaptureError, match=r"\d+ of 60 lines are whole: 5 had failed I2C reads, \d+ stuck chips. .*heck the wiring"
     ):
         read_log(log)
-    log.write_text(render(*failing(30, 0)))
+    log.write_text(render(*log_with_faults(30, 0)))
     assert read_log(log)[3]["rows_n"] == 30

@@ -1,4 +1,4 @@
-"""The fingerprint of the simulated skin: equal for equal presses, another for every setting that a capture shows."""
+"""The fingerprint of the simulated skin identifies all settings that change a capture."""
 
 from copy import deepcopy
 from pathlib import Path
@@ -15,7 +15,7 @@ PARAMS = read_yaml(NOMINAL)
 TODAY = fingerprint(PARAMS)
 
 
-def test_the_same_settings_in_another_order_have_the_same_fingerprint():
+def test_order_of_settings_does_not_matter():
     turned = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
     assert fingerprint(turned) == TODAY
     assert len(TODAY) == 16
@@ -28,13 +28,13 @@ def test_the_same_settings_in_another_order_have_the_same_fingerprint():
         ("rig", "force_noise_N", 0.0063), ("chip", "noise_z_uT", 5.1),
     ],
 )  # fmt: skip
-def test_another_setting_has_another_fingerprint(section, name, value):
+def test_every_setting_changes_the_fingerprint(section, name, value):
     changed = deepcopy({name: dict(PARAMS[name]) for name in ("skin", "rig", "chip", "spreads")})
     changed[section][name] = value
     assert fingerprint(changed) != TODAY
 
 
-def test_another_law_has_another_fingerprint_and_rounding_has_not(monkeypatch):
+def test_fingerprint_depends_on_physics_but_not_rounding(monkeypatch):
     rigid = slide.press_displacement_m
     monkeypatch.setattr(slide, "press_displacement_m", lambda *of, **how: rigid(*of, **how) * (1 + 1e-12))
     assert fingerprint(PARAMS) == TODAY
@@ -42,6 +42,6 @@ def test_another_law_has_another_fingerprint_and_rounding_has_not(monkeypatch):
     assert fingerprint(PARAMS) != TODAY
 
 
-def test_settings_were_chosen_on_the_skin_of_today():
+def test_tuned_settings_match_the_current_skin():
     record = read_yaml(ROOT / "reports/tuning/choice.json")
     assert record["physics"] == TODAY, "run scene tuning again and commit reports/tuning/choice.json"
