@@ -153,7 +153,7 @@ def test_recording_added_by_hand_is_not_added_again(root, world, tmp_path):
     assert sorted(read_registry(root).captures["small"]) == ["board2_skin-board2_board2", "mine"]
 
 
-@pytest.mark.usefixtures("not_added")
+@pytest.mark.usefixtures("only_fetched")
 def test_mirror_or_folder_replaces_the_home(root, world, tmp_path):
     write_source(root, source_of(world.files, (tmp_path / "away").as_uri(), world.commit))
     assert_refused(root, "cannot read the repository")
@@ -185,7 +185,7 @@ def test_truncated_or_missing_file_is_an_error(root, world, tmp_path):
     assert_refused(root, "no file data/board2.csv or board2.csv", tmp_path)
 
 
-@pytest.mark.usefixtures("not_added")
+@pytest.mark.usefixtures("only_fetched")
 def test_changed_file_is_fetched_again(root, world):
     fetch(root)
     (root / fetching.FETCHED / "rig/board2.csv").write_bytes(b"changed")
@@ -193,7 +193,7 @@ def test_changed_file_is_fetched_again(root, world):
     assert fetched(root) == world.files
 
 
-@pytest.mark.usefixtures("not_added")
+@pytest.mark.usefixtures("only_fetched")
 def test_unlicensed_data_need_consent(root, world):
     write_source(root, source_of(world.files, world.url, world.commit, licence=None))
     assert_refused(root, "use without a licence was not consent to. Nothing was fetched.*--yes")
@@ -232,7 +232,7 @@ def test_archives_are_checked_as_converted_tables(root, tmp_path):
     assert list(read_registry(root).captures["small"]) == ["board1_skin-board1_board1"]
 
 
-@pytest.mark.usefixtures("not_added")
+@pytest.mark.usefixtures("only_fetched")
 def test_interrupted_fetch_leaves_no_files(root, world, monkeypatch):
     opened, reads = fetching.open_origin, []
 
