@@ -196,7 +196,7 @@ def test_changed_file_is_fetched_again(root, world):
 @pytest.mark.usefixtures("only_fetched")
 def test_unlicensed_data_need_consent(root, world):
     write_source(root, source_of(world.files, world.url, world.commit, licence=None))
-    assert_refused(root, "use without a licence was not consent to. Nothing was fetched.*--yes")
+    assert_refused(root, "use without a licence was not agreed to. Nothing was fetched.*--yes")
     output = fetch(root, consent=True)
     assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in output
     assert f"home: {world.url}, commit {world.commit}" in output
