@@ -2,8 +2,8 @@
 
 import pytest
 
-from pipeline.stages import MODULES, module_name
-from pipeline.stages.code import experiment_stages
+from pipeline.stages import module_name
+from pipeline.stages.code import all_stages
 from reskin import code
 
 SOURCE = '''"""A module."""
@@ -69,7 +69,7 @@ def test_edit_of_the_library_reruns_its_stages():
 DISPLAY = {"pipeline.report", *(f"pipeline.report.{name}" for name in ("drawing", "formatting", "paper"))}
 
 
-@pytest.mark.parametrize("stage", sorted({*MODULES, *experiment_stages()} - {"table2", "report", "publish"}))
+@pytest.mark.parametrize("stage", sorted({*all_stages()} - {"table2", "report", "publish"}))
 def test_computing_stages_import_only_display_modules_of_the_report(stage):
     imported = {name for name in code.imported(module_name(stage)) if name.startswith("pipeline.report")}
     assert imported <= DISPLAY

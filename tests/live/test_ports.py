@@ -69,7 +69,7 @@ def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
     script = make_script(pokes_n=1)
     with plugged_in(script, loop=True) as name, plugged_in(script, "tcp", loop=True) as other:
         assert find.find_board([name, "/dev/none"]).port == name
-        with pytest.raises(CaptureError, match=r"the board must be one, .*; got .*5 chips.*; .*5 chips"):
+        with pytest.raises(CaptureError, match=r"2 boards are connected: .*5 chips.*; .*5 chips.*--port"):
             find.find_board([name, other])
         assert [found.port for found in find.find_boards([name, "/dev/none", other])] == [name, other]
     with pytest.raises(CaptureError, match="no serial port at all"):
