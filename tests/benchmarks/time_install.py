@@ -58,7 +58,10 @@ def seconds_to_page(reskin: Path, folder: Path) -> float:
 
 def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, object]:
     """Build, install and run in an empty folder."""
-    shutil.copytree(ROOT, folder / "source", ignore=shutil.ignore_patterns(".venv", ".git", "data", "reports", "build"))
+    bytecode = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "reskin", folder / "source/reskin", ignore=bytecode)
+    for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff"):
+        shutil.copy(ROOT / name, folder / "source")
     made = run([python, "-m", "venv", str(folder / "venv")], folder)
     new_python = str(folder / "venv/bin/python")
     built = run([new_python, *PIP, "wheel", "--no-deps", "--wheel-dir", "dist", "./source"], folder)
