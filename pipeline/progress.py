@@ -27,7 +27,7 @@ def announce() -> str | None:
 def stages_in_order() -> list[str]:
     """Return the names of all stages in the order in which DVC runs them.
 
-    DVC is asked once; the answer is cached until `dvc.yaml` or the plan changes.
+    The list is computed by DVC, and cached until `dvc.yaml` or the plan changes.
     """
     made_of = hashlib.sha256(Path(FLOW).read_bytes() + Path(PLAN).read_bytes()).hexdigest()
     file = home() / ORDER

@@ -161,7 +161,7 @@ class Publisher:
         """
         if time.monotonic() > self.end_s:
             raise TrackingAway(
-                f"MLflow took longer than {self.limit_s:.0f} s. Results are kept; `reskin publish` goes on from there."
+                f"MLflow took longer than {self.limit_s:.0f} s. Results are kept; `reskin publish` sends the rest."
             )
         self.current.add(key)
         found = self.find(stage, run_key=key)

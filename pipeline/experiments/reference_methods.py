@@ -504,15 +504,15 @@ def flag_by_universal(
 DASH = "–"
 # What each method can do and what it cannot, by its mechanism; whether it helps is in the columns beside it.
 WHY = {
-    "channels matched": "undoes a gain of each channel; a seat or a turn mixes channels, and where forces differ so do "
-    "deviations",
-    "CORAL": "also undoes what mixes channels, as far as the pokes tell all their covariances; many maps have the same "
-    "covariances, and it knows not which keeps places",
-    "direct standardisation": "knows which places belong together, but has as many unknowns as channels squared, and a "
-    "linear map is not how a seat changes a field",
-    "labels as rows": "says where this skin's fields lie, at the labelled places alone",
-    "network, domain-adversarial": "makes features of both boards alike as a whole; nothing says that like features "
-    "have like places",
+    "channels matched": "corrects the gain of each channel; a seat or a rotation mixes channels, and standard "
+    "deviations also differ where forces do",
+    "CORAL": "also corrects mixed channels, as far as the presses determine all covariances; many linear maps give "
+    "the same covariances, and only one of them preserves places",
+    "direct standardisation": "is given which places correspond, but has as many unknowns as channels squared, and a "
+    "seat does not change the field linearly",
+    "labels as rows": "adds fields of this skin, at the labelled places only",
+    "network, domain-adversarial": "makes the distributions of features equal on both boards; equal features need not "
+    "have equal places",
 }
 BASELINES = (
     "Regressors and networks of the known boards on the held-out one; aligned by all its unlabelled pokes, or by so "
@@ -534,7 +534,7 @@ ALARM = (
     "above the limit that {asked:g} % of readings of boards not held out exceed; limit {limit}. Area under the ROC "
     "curve: 0.5 is chance, 1 is perfect. Strangers are recorded readings of the same board with changed chips; the law "
     "is that of the right skin, or fitted anew to the stranger's own pokes and field at rest. n boards; "
-    "[low, high]: 95 % interval over them (Student's t, which knows no bounds)."
+    "[low, high]: 95 % interval over them (Student's t; it may leave the possible range)."
 )
 FLAGGED = (
     "Each receives the right skin's own unlabelled pokes and no label. Flagged: above the limit that {asked:g} % of "

@@ -182,7 +182,7 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
             done_n += 1
     except BaseException:
         all_n = len(source.recordings)
-        say(f"{done_n} of {all_n} recordings are in scene {scene}; the same command goes on from there")
+        say(f"{done_n} of {all_n} recordings are in scene {scene}; run the same command again to add the rest")
         raise
 
 

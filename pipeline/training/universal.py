@@ -83,7 +83,7 @@ class PoolCalibration:
         return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
     def nominal_powers(self, powers: Powers) -> Powers:
-        """Lower the powers of a model that knows no board by the misfit."""
+        """Lower the powers of the model of simulated skins alone, by the misfit of the unlabelled presses."""
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
     def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":

@@ -76,7 +76,7 @@ class Variant:
 
 
 class Variants(NamedTuple):
-    """The variant that knows no board, and by held-out board the variant that knows the others."""
+    """The variant of simulated skins alone; by held-out board, the variant that also saw the other boards."""
 
     nominal: Variant
     rig: Mapping[str, Variant]
