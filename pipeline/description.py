@@ -97,7 +97,7 @@ def _steps(readings: Readings) -> dict[str, float]:
 
 
 def _rate(readings: Readings) -> dict[str, float]:
-    """Give the rate at which readings of one stop followed each other, where a clock tells."""
+    """Return the rate of readings within one stop, if the capture has a clock."""
     between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
     known_s = between_s[between_s > 0]  # NaN, no clock, is not
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}

@@ -1,6 +1,6 @@
 """The universal model before calibration to a held-out board: train it on other boards and simulated skins, or read it.
 
-Two variants: `rig` knows the recorded boards that are not held out, `nominal` simulated skins alone.
+Two variants: `rig` is made from the recorded boards that are not held out, `nominal` from simulated skins alone.
 """
 
 from collections.abc import Mapping
@@ -118,7 +118,7 @@ def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
 
 
 def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
-    """Return the prior that knows all boards but one: their laws, the laws' errors, and their readings."""
+    """Return the prior that is made from all boards but one: their laws, the laws' errors, and their readings."""
     others = {other: own for other, own in known.presses.items() if other != board}
     rows, frame = known.data.rows, known.frame
     recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]

@@ -31,7 +31,7 @@ Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and tes
 
 
 class Split(Strict):
-    """How folds are drawn; each part is there if, and only if, its experiment is asked."""
+    """How folds are drawn; each part is given if, and only if, the scene runs its experiment."""
 
     random_test_fraction: Fraction | None = None
     random_repeats_n: Count | None = None
@@ -79,7 +79,7 @@ NO_POOL = np.zeros(0, np.int64)
 
 
 def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) -> list[Fold]:
-    """Draw the folds of every experiment that a scene asks.
+    """Draw the folds of every experiment that a scene runs.
 
     >>> rows = Rows.of_labels(boards=["b1", "b1", "b2"], skins=["s1", "s2", "s3"])
     >>> [(fold.name, fold.train.tolist(), fold.test.tolist()) for fold in draw_folds(rows, ["lobo"], Split(), 0)]
@@ -260,7 +260,7 @@ def draw_sides(
 ) -> list[Sides]:
     """Draw test groups, repeatedly: rows of equal `group` stay together; one group at least is tested.
 
-    `what` the groups are and `where` they are asked for stand in errors.
+    `what` names the groups and `where` their setting, for error messages.
     """
     from sklearn.model_selection import GroupShuffleSplit  # late: it takes a second, and most stages draw nothing
 

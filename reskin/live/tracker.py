@@ -43,13 +43,15 @@ from reskin.universal.model import Universal
 NOLOAD_S = 1.0  # without contact, over which the no-load reading is averaged
 NOLOAD_FRAMES_MAX_N = 10_000
 HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # from which the wire format is detected
-SILENT_S = 0.3  # without data, after which a controller is told
+SILENT_S = 0.3  # without data, after which a controller receives a contact of NaN
 OPENING_S = 10.0
 ENDS_KEPT_N = 256  # chunks, to time frames that are decoded late
 FRAME_BYTES_MIN_N = 16  # per chip, in any wire format
 SPACING_MM = 5.0  # at which chips are drawn whose places are unknown
 UNKNOWN_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
-MISFIT_MAX = 4.0  # assumed, chi^2 per channel: about 1 where the universal model knows the skin
+MISFIT_MAX = (
+    4.0  # assumed, chi^2 per channel: about 1 where the skin is like those that the universal model was made from
+)
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"

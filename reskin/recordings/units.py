@@ -18,7 +18,7 @@ NANO_STEP_MIN = 100.0  # the finest step is 150 nT, the coarsest 9.68 uT
 # Forces on skins a few mm thick; a touch of 1 N read as grams would be 102.
 FORCE_MAX_N = 100.0
 FORCE_MIN_N = 0.05  # the strongest touch of any recording is above it; a touch of 0.4 N in kg is not
-SAME_PLACE_mm = 0.002  # a robot that stands still says so to a few um
+SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
 EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 
