@@ -200,7 +200,7 @@ def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"
 
 
 def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count the frames that are missing before each, by the board's clock; without a clock they cannot be counted."""
+    """Count the frames missing before each, by the board's clock; zeros without a clock."""
     usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
     if not usual_s > 0:
         return np.zeros(len(device_step_s), np.int64)
@@ -215,7 +215,7 @@ def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
 
 
 def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
-    """Count the bytes before each frame that are none; text frames have no fixed length: they are compared with the usual line."""
+    """Count the stray bytes before each frame; text frames, of no fixed length, are compared with the usual line."""
     length_n = np.diff(end_byte, prepend=first_byte)
     if frame_bytes_n is not None:
         return length_n - frame_bytes_n

@@ -104,7 +104,7 @@ class Health:
         return np.asarray(mask.any(axis=1)) & (getattr(self.policy, fault) != "flag")
 
     def _measure_rate(self, frames_n: int, now_s: float) -> None:
-        """Measure the frame rate over a second; a rate below the usual one means missing frames: no wire format numbers them."""
+        """Measure the frame rate over a second: below the usual rate, frames are missing (they carry no number)."""
         self._arrivals.append((now_s, frames_n))
         self._arrived_n += frames_n
         while now_s - self._arrivals[0][0] > RATE_WINDOW_S:

@@ -1,6 +1,6 @@
 """Domain-adversarial training (Ganin et al., JMLR 2016), a reference method for adaptation.
 
-A second network, the discriminator, predicts from the features whether a reading is of the known skins or of the new one,
+A second network, the discriminator, infers from features whether a reading is of the known skins or of the new one,
 and the features are trained to mislead it. With a weight of 0 it is the control. It has a loop of its own, because its
 batches and its second network are no term of the loss in `train`.
 """
