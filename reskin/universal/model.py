@@ -270,7 +270,7 @@ class Universal:
         return self._power
 
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
-        """Take the mean of readings without contact as the no-load field, which also fixes seat and gap.
+        """Take the mean of readings without contact as the no-load field, and condition the map on it.
 
         Earlier presses are forgotten; with `keep` they stay, for the same skin after drift.
 
