@@ -421,23 +421,23 @@ MEANING = (
     "place and recorded force. Bounds stand in brackets. Cosine: over all channels, the mean over pokes. Explained: 1 "
     "- |simulated - recorded|² / |recorded|², the median. Growth: d log|dB| / d log F within a place, the median over "
     "places, simulated / recorded. A board is within bounds, yes or no, by its own numbers; four boards or more are "
-    "also judged together, by the 95 % interval over them (Student's t). The form of the law, its tip radius (2 mm), "
-    "stiffening (power 3/2) and force at which the slide is gone (8 N) were chosen with both boards of scene lab in "
-    "view: only a new board tests them. Why a skin slides away from its middle is not explained. Memory, simulated / "
+    "also judged together, by the 95 % interval over them (Student's t). The form of the law, its tip radius, its "
+    "exponent of stiffening and the force at which the slide is gone were chosen with both boards of scene lab in "
+    "view: only a new board tests them. Why a skin slides towards its middle is not explained. Memory, simulated / "
     "recorded: of a poke's change in the next no-load reading; it is put in by hand, {:g} %, so that its estimator is "
     "tested and nothing predicted. Held: pokes whose force lies beyond the deepest that the law follows (0.72 of the "
     "thickness); they are simulated at that depth, and count like all others."
 )
 ABOUT_PARAMETERS = (
-    "Seat: the skin's middle seen from the board's. Label offset: from where a label says to where the tip is. Slide "
-    "away: how far the material under the tip goes from the skin's middle at no force, per distance from it; give: of "
+    "Seat: the skin's middle seen from the board's. Label offset: from where a label says to where the tip is. Slide: "
+    "how far the material under the tip moves towards the skin's middle at no force, per distance from it; give: of "
     "the rig's arm. Gap and amplitude trade against each other: neither is a measured size."
 )
 ABOUT_GRIP = (
     "A tip slides the skin no further than its friction on the skin allows: k |u| <= mu F. k / mu = {grip_N_mm:g} N/mm "
-    "is used (springs of 7 N/mm from a recorded sideways force, friction of 0.8: params.yaml); all else is fitted anew "
-    "for each. Recordings begin above half a newton and see only the end of it: what is assumed decides the field of a "
-    "light touch. Without friction the skin would jump at contact."
+    "is used (the springs are from a recorded sideways force, friction assumed: `skin.hold` in nominal.yaml); all "
+    "else is fitted anew for each. Recordings begin above half a newton, where the skin hardly slides any further: the "
+    "assumption decides the field of a light touch. Without friction the skin would jump at contact."
 )
 ABOUT_FRAMES = (
     "Cosines over all pokes together, with the nominal skin: read as the scene says, and in the best of all ways. A "
@@ -446,7 +446,7 @@ ABOUT_FRAMES = (
 TITLES = {
     "seat_x_mm": "seat x, mm", "seat_y_mm": "seat y, mm", "rotation_deg": "rotation, degrees", "gap_mm": "gap, mm",
     "amplitude": "amplitude", "label_x_mm": "label offset x, mm", "label_y_mm": "label offset y, mm",
-    "modulus_MPa": "Young's modulus, MPa", "away_um_mm": "slide away, µm/mm", "give_x_um": "give x, µm",
+    "modulus_MPa": "Young's modulus, MPa", "away_um_mm": "slide to the middle, µm/mm", "give_x_um": "give x, µm",
     "give_y_um": "give y, µm",
 }  # fmt: skip
 ARROW_MM = 6.0  # the longest of a board

@@ -212,12 +212,13 @@ MEANING = (
     "One line of a controller closes a gripper until the estimated force is the aimed one, "
     "`closed_mm += {gain_mm_N:g} * (aim_N - estimate_N)`, {rate_hz:g} times a second, while the object stiffens "
     "threefold, gives way ninefold and stiffens again: {objects_n} objects of {soft:g} to {hard:g} N/mm on each of "
-    "{skins_n} skins, one a board, pressed at its middle. Networks never saw the board; the map comes with the project "
-    "and predicts forces from 0.55 N on. The known press is one of the aimed force where the object is then held: "
-    "as a factor it scales all estimates, as a label the map learns from it. Judged is the true force from one second "
-    "on: held is a run whose mean force lies within {within_pct:g} % of the aim, always one that never leaves that "
-    "band; an error is the mean of a run's. [low, high]: 95 % interval over boards. Each of {seeds_n} networks a board "
-    "holds by itself; ± (seeds): standard deviation over {seeds_n} network seeds on one board, mean over boards."
+    "{skins_n} skins, one a board, pressed at its middle. Networks never saw the board; `map` is the universal model "
+    "that comes with the project. The known press is one of the aimed force where the object is then held: "
+    "as a factor it scales all estimates, as a label it calibrates the universal model. Judged is the true "
+    "force from one second on: held is a run whose mean force lies within {within_pct:g} % of the aim, always one that "
+    "never leaves that band; an error is the mean of a run's. [low, high]: 95 % interval over boards. Each of "
+    "{seeds_n} networks a board holds by itself; ± (seeds): standard deviation over {seeds_n} network seeds on one "
+    "board, mean over boards."
 )
 PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
 

@@ -117,7 +117,7 @@ def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, 
     """Return skins about a design, on boards as designed, with the law's parameters and the slide of the design."""
     if design.hold is None:
         what = "hold of section skin is null, but this experiment needs a skin that slides"
-        raise ParamsError(f"params.yaml: {what}. Run it in a scene whose skin has hold.")
+        raise ParamsError(f"nominal.yaml: {what}. Run it in a scene whose skin has hold.")
     modulus_MPa = design.modulus_kPa * 1e-3
     law = Law(
         0.0, 0.0, 0.0, kind.design.gap_mm, 1.0, 0.0, 0.0, modulus_MPa, design.hold.away_um_mm,

@@ -51,7 +51,7 @@ def analyse_levels(
     fitted, held = np.split(db_uT.astype(np.float64), [len(db_uT) // 2])
     along_uT = held @ direction(fitted)
     response_uT, step_N = along_uT.mean(axis=(0, 2)), float(weight_N[1] - weight_N[0])
-    told = {
+    by_direction = {
         "one_reading": ordered_share(along_uT),
         "five_readings": ordered_share(along_uT.mean(axis=2, keepdims=True)),
     }
@@ -59,7 +59,7 @@ def analyse_levels(
         "one_reading": ordered_share(np.linalg.norm(held, axis=3)),
         "five_readings": ordered_share(np.linalg.norm(held.mean(axis=2, keepdims=True), axis=3)),
     }
-    steps_N = _known({name: smallest_step_N(share, step_N) for name, share in told.items()})
+    steps_N = _known({name: smallest_step_N(share, step_N) for name, share in by_direction.items()})
     numbers = {
         "levels_n": len(weight_N),
         "fillings_n": len(db_uT),
@@ -80,7 +80,7 @@ def analyse_levels(
         "response_uT": np.round(response_uT, 2).tolist(),
         "sd_uT": np.round(along_uT.std(axis=(0, 2), ddof=1), 2).tolist(),
     }
-    drawn["told"] = {name: np.round(share, 4).tolist() for name, share in told.items()}
+    drawn["by_direction"] = {name: np.round(share, 4).tolist() for name, share in by_direction.items()}
     drawn["told_by_length"] = {name: np.round(share, 4).tolist() for name, share in by_length.items()}
     return numbers, drawn
 
@@ -203,7 +203,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         left.set(xlabel="weight / N", ylabel="response / µT (mean, sd of a reading)")
         difference_N = numbers["step_N"] * np.arange(1, len(weight_N))
         for colour, (name, words) in zip(COLOURS[1:], READINGS.items(), strict=False):
-            share_pct = 100 * np.array(drawn["told"][name])
+            share_pct = 100 * np.array(drawn["by_direction"][name])
             right.plot(difference_N, share_pct, "o-", color=colour, markersize=3, linewidth=1.2, label=words)
         told_pct = numbers["told_pct"]
         right.axhline(told_pct, color="0.3", linestyle="--", linewidth=1, label=f"{told_pct:g} %")

@@ -102,7 +102,7 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
     _, blocks, _ = open_capture(folder, policy)
     section = config.parse(Compare, (scene.model_extra or {})["compare"], "section compare")
     try:
-        sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "params.yaml: skin"))
+        sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "nominal.yaml: skin"))
     except ReskinError as error:
         sentence = f"Whether labels, chips and skin lie as the scene says was not checked: {error}"
     if sentence:

@@ -78,7 +78,7 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
         pass_i.append(readings.pass_i[keep] + np.int32(before_n))
         passes_n[readings.skin] = before_n + int(readings.pass_i.max()) + 1
     kept_n = [int(keep.sum()) for keep in kept]
-    places_unknown_n = sum(int(np.isnan(readings.x_mm).sum()) for readings in captures)
+    places_unknown_n = sum(int((np.isnan(readings.x_mm) | np.isnan(readings.y_mm)).sum()) for readings in captures)
     weak_n = sum(map(len, captures)) - sum(kept_n) - places_unknown_n
     columns = [np.stack([getattr(readings, name) for name in targets], axis=1)[keep] for readings, keep in pairs]
     return Rows(

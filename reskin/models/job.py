@@ -177,7 +177,8 @@ class JobKeys:
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()[:32]
 
     def data_digest(self) -> str:
-        return _digest(self.data.db_uT, self.data.target)
+        """Return a digest of all rows: fields, targets, and which rows are of one skin."""
+        return _digest(self.data.db_uT, self.data.target, np.unique(self.data.skin, return_inverse=True)[1])
 
     def _train_digest(self, train: np.ndarray) -> str:
         if id(train) not in self._train_digests:  # the array is kept, so that its id is not reused

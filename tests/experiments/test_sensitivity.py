@@ -47,7 +47,7 @@ def test_shares_equal_a_loop_over_pairs():
 
 
 def test_shares_equal_the_normal_distribution():
-    shares = analyse_levels(fillings(), WEIGHT_N)[1]["told"]
+    shares = analyse_levels(fillings(), WEIGHT_N)[1]["by_direction"]
     z = GAIN_uT_PER_N * STEP_N * np.arange(1, 4) / (np.sqrt(2) * NOISE_uT)
     np.testing.assert_allclose(shares["one_reading"][:3], norm.cdf(z), atol=0.015)  # 12,500 dependent pairs
     np.testing.assert_allclose(shares["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)  # 500 pairs

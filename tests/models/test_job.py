@@ -310,6 +310,12 @@ def test_key_ignores_unused_rows():
     assert key(moved, fewer) == key(replace(pooled(), train=TRAIN[6:]))
 
 
+def test_data_digest_distinguishes_rows_of_other_skins():
+    rows = example_data()
+    other = replace(rows, skin=np.roll(rows.skin, 1))
+    assert JobKeys(rows).data_digest() != JobKeys(other).data_digest()
+
+
 def test_keys_do_not_depend_on_their_cache():
     book, jobs = JobKeys(example_data()), [pooled(), replace(pooled(), train=TRAIN[1:]), pooled(), adaptation()]
     assert [book.key(job) for job in jobs] == [key(job) for job in jobs]

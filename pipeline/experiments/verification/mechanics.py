@@ -409,7 +409,7 @@ def quadrature(
     few = f"{len(np.unique(pokes_m[:, :2], axis=0))} places of the protocol"
     return [
         Check("dB of pokes", f"quadrature, {few}, all depths", narrower, norm_error(found_T, cells_T), "1", 0.02,
-              "2 % is what an indentation may be wrong by in all (DESIGN 6)"),
+              "2 % is what an indentation may be wrong by in all"),
         Check("dB of pokes", f"quadrature, {few}, each channel of each poke", narrower,
               float((np.abs(found_T - cells_T) / allowed_T).max()), "of the allowed", 1.0,
               f"2 % of the poke's dB, or {unseen_uT:g} uT where that is more: a third of a chip's noise"),
@@ -429,7 +429,7 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
     return Check("dB of pokes", f"table, steps and kernel, {kind} depth ({depth_m / milli:g} mm)",
                  f"each node followed in {REFERENCE_STEPS_N} steps, F = R U by SVD, magpylib's dipoles",
                  norm_error(found_T, truth_T), "1", 0.02,
-                 "2 % is what an indentation may be wrong by in all (steps, table, kernel; DESIGN 6)")  # fmt: skip
+                 "2 % is what an indentation may be wrong by in all (steps, table, kernel)")  # fmt: skip
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
