@@ -77,7 +77,7 @@ def add(
         header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro (or: report@{scene})")
     if scene not in running:
-        typer.echo(f"switched scene {scene} on in {PLAN}, beside {', '.join(running) or 'no other'}")
+        typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(running) or 'none'})")
 
 
 @app.command()

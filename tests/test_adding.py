@@ -352,7 +352,7 @@ def output_of(arguments: list[str]) -> str:
 def test_command_line_reports_a_switched_on_scene(root, lab_file, monkeypatch):
     monkeypatch.chdir(root)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
-    assert "switched scene small on in pipeline/plan.yaml" in run(root, "reskin", *arguments).stdout
+    assert "added scene small to pipeline/plan.yaml" in run(root, "reskin", *arguments).stdout
     again = output_of([*arguments, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
     assert "added small/again" in again
     assert "switched" not in again

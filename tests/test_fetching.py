@@ -116,7 +116,7 @@ def test_recordings_are_fetched_and_added_once(root, world):
         raw = root / adding.RAW / "small" / f"{board}_skin-{board}_{board}"
         assert (raw / lab.READINGS).read_bytes() == world.files[f"{board}.csv"]
     assert list(plan.check(root).scenes) == ["small"]
-    assert "switched scene small on in pipeline/plan.yaml, beside no other" in output
+    assert "added scene small to pipeline/plan.yaml (already there: none)" in output
     assert "now: dvc repro" in output
     before = contents(root)
     output = fetch(root)
@@ -189,7 +189,7 @@ def test_truncated_or_missing_file_is_an_error(root, world, tmp_path):
 def test_changed_file_is_fetched_again(root, world):
     fetch(root)
     (root / fetching.FETCHED / "rig/board2.csv").write_bytes(b"changed")
-    assert "every checksum is right" in fetch(root)
+    assert "all checksums match" in fetch(root)
     assert fetched(root) == world.files
 
 
@@ -318,8 +318,8 @@ def test_real_boards_join_their_scene(shared_data, tmp_path, monkeypatch):
     assert {(entry.board, entry.skin) for entry in captures.values()} == {("board1", "skin1"), ("board2", "skin2")}
     assert len(captures) == 6
     assert list(read_plan(root / PLAN).scenes) == ["quick", "lab"]
-    assert "switched scene lab on in pipeline/plan.yaml, beside quick" in done.stdout
-    assert "now: dvc repro (runs quick, lab; only this one: reskin scenes use lab)" in done.stdout
+    assert "added scene lab to pipeline/plan.yaml (already there: quick)" in done.stdout
+    assert "next: dvc repro (runs quick, lab; to run this scene alone first: reskin scenes use lab)" in done.stdout
     again = CliRunner().invoke(app, ["fetch", "lab"])
     assert again.stdout.count("added already") == 6
 

@@ -110,7 +110,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
     if all(_is_unchanged(folder / file.path, file) for file in source.files):
         say(f"{folder}: {source.size}, there already and unchanged")
     else:
-        commit = f"commit {source.commit}" if source.commit else "newest commit (none is pinned: checksums alone tell)"
+        commit = f"commit {source.commit}" if source.commit else "newest commit (no commit is pinned; files are verified by checksum)"
         say(f"{name}: {source.size}; licence: {source.terms}\nhome: {source.home}, {commit}")
         if where is not None:
             say(f"taken from: {where}")
@@ -118,7 +118,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
             remedy = "Nothing was fetched. Answer y on a terminal, or add --yes."
             raise ParamsError(f"reskin fetch {name}: use without a licence was not agreed to. {remedy}")
         download(source, where or source.home, folder)
-        say(f"{folder}: {source.size}, every checksum is right")
+        say(f"{folder}: {source.size}, all checksums match")
     if source.scene is None:
         return say(source.note or "no layout reads it, so nothing is added")
     _add_all(root, source.scene, source, folder, say)
@@ -208,9 +208,9 @@ def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Sa
     if scene not in running:
         return say(f"scene {scene} is switched off; now: reskin scenes use {' '.join([*running, scene])}; dvc repro")
     if scene not in before:
-        say(f"switched scene {scene} on in {PLAN}, beside {', '.join(before) or 'no other'}")
-    say(f"now: dvc repro (runs {', '.join(running)}; only this one: reskin scenes use {scene})")
-    say(f"then: reports/{scene}/index.html, and beside the other scenes in reports/index.html")
+        say(f"added scene {scene} to {PLAN} (already there: {', '.join(before) or 'none'})")
+    say(f"next: dvc repro (runs {', '.join(running)}; to run this scene alone first: reskin scenes use {scene})")
+    say(f"report: reports/{scene}/index.html; all scenes: reports/index.html")
 
 
 @dataclass(frozen=True)
