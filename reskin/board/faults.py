@@ -311,6 +311,7 @@ class FaultDetector:
     chips_n : chips of a frame.
     frame_bytes_n : length of a binary frame; None for text, whose lines vary.
     expected_lsb_uT : LSB along x, y and along z that the header promises, if it does.
+    steps_min_n : how many equal gaps between neighbouring values show a chip's LSB.
     """
 
     def __init__(
@@ -319,8 +320,9 @@ class FaultDetector:
         *,
         frame_bytes_n: int | None = None,
         expected_lsb_uT: tuple[float, float] | None = None,
+        steps_min_n: int = SURE_STEPS_MIN_N,
     ) -> None:
-        self._expected_lsb_uT = expected_lsb_uT
+        self._expected_lsb_uT, self._steps_min_n = expected_lsb_uT, steps_min_n
         self._frame_bytes_n = frame_bytes_n
         self._stuck, self._constant = StuckChips(chips_n), ConstantChannels(chips_n)
         self._window_uT, self._window_s = np.zeros((0, 3 * chips_n), np.float32), np.zeros(0)
@@ -359,7 +361,7 @@ class FaultDetector:
         complete_n = len(held_uT) // SCALE_FRAMES_N * SCALE_FRAMES_N
         for first in range(0, complete_n, SCALE_FRAMES_N):
             rows = slice(first, first + SCALE_FRAMES_N)
-            lsb_uT = find_lsb(held_uT[rows], steps_min_n=SURE_STEPS_MIN_N)
+            lsb_uT = find_lsb(held_uT[rows], steps_min_n=self._steps_min_n)
             changed = np.any(np.abs(lsb_uT / self._lsb_uT - 1) > LSB_TOLERANCE, axis=1)
             unusual = unusual_lsb(lsb_uT, self._expected_lsb_uT)
             first_frame = self._windowed_n + 1

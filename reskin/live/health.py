@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from reskin.board.faults import FaultDetector, Faults, find_reading_faults
+from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults, find_reading_faults
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
@@ -45,7 +45,7 @@ class Health:
         self.alarms: dict[str, Alarm] = {}
         self.rate_hz = self._usual_hz = np.nan
         self._chips_n = chips_n
-        self._detector = FaultDetector(chips_n)  # an alarm may be less sure than a refusal
+        self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)  # an alarm needs less evidence than a refusal
         self._batch: list[Frames] = []
         self._stuck = False  # a chip is stuck since the last batch, and the policy does not let it pass
         self._arrivals: deque[tuple[float, int]] = deque()
@@ -73,7 +73,7 @@ class Health:
         faulty |= self._note_chips("temperature out of range", readings.too_hot, now_s, "too_hot")
         faulty |= self._note_chips("field at the end of the range", readings.saturated, now_s, "saturated")
         self._measure_rate(len(frames), now_s)
-        self._batch.append(frames)
+        self._batch.append(frames.where(~readings.faulty_rows))  # one failed read must not hide what spans frames
         if sum(map(len, self._batch)) >= BATCH_FRAMES_N:
             batch, self._batch = concatenate(self._batch, self._chips_n), []
             self._note_batch(self._detector.feed(batch, np.full(len(batch), now_s)), now_s)

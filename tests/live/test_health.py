@@ -1,8 +1,11 @@
 """Every fault raises an alarm with its chip; a healthy board raises none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from reskin.board.faults import FAILED_B_uT, FAILED_TEMPERATURE_degC, RESET_LSB_XY_uT, RESET_LSB_Z_uT
 from reskin.board.wire import Frames
 from reskin.live.emulator import inject, parse_fault
 from reskin.live.health import BATCH_FRAMES_N, LIVE_POLICY, Health
@@ -58,6 +61,41 @@ def test_fault_is_named_and_counted(name):
     assert alarm.count_n >= 100
     assert health.active(alarm.last_s + 1.0) == [alarm]
     assert health.active(alarm.last_s + 3.0) == []
+
+
+def fail_reads_of_chip_0(script, every_n):
+    """The script, with a failed read of chip 0 in every `every_n`-th frame."""
+    b_uT, temperature_degC = script.frames.b_uT.copy(), script.frames.temperature_degC.copy()
+    b_uT[every_n - 1 :: every_n, :3], temperature_degC[every_n - 1 :: every_n, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
+    return replace(script, frames=replace(script.frames, b_uT=b_uT, temperature_degC=temperature_degC))
+
+
+@pytest.mark.parametrize("every_n", [30, BATCH_FRAMES_N])
+@pytest.mark.parametrize("name", ["stuck", "chip-reset", "int16-wrap", "repeated"])
+def test_failed_reads_of_another_chip_hide_no_fault(name, every_n):
+    alarms = feed(fail_reads_of_chip_0(inject_fault(name), every_n)).alarms
+    assert {"chip 0: failed I2C reads", ALARMS.get(name, "frames repeat")} == set(alarms)
+
+
+@pytest.mark.parametrize("every_n", [3, 30, BATCH_FRAMES_N])
+def test_stuck_chip_stays_invalid_beside_failed_reads(every_n):
+    script = fail_reads_of_chip_0(inject_fault("stuck"), every_n)  # stuck from 1.5 to 3.0 s
+    health, used = Health(5), np.zeros(len(script), bool)
+    for i in range(len(script)):
+        used[i : i + 1] = health.feed(script.frames.where(np.arange(len(script)) == i), float(script.t_s[i]))
+    found_s = 1.5 + 2 * BATCH_FRAMES_N * 1.5 / 400  # two batches of sound frames, of which up to a third fail
+    assert not used[(script.t_s > found_s) & (script.t_s < 2.95)].any()
+    assert used[script.t_s < 1.5].any()
+
+
+def test_reset_is_found_on_a_quiet_board():
+    rng, step_uT = np.random.default_rng(0), np.tile([0.15, 0.15, 0.242], 5)
+    step_uT[3:6] = RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT  # chip 1 is back at its power-on settings
+    b_uT = np.round(rng.normal(0, 1.0, (1200, 15)) / step_uT) * step_uT
+    script = make_script(pokes_n=2)
+    frames = replace(script.frames.where(np.arange(len(script)) < 1200), b_uT=b_uT.astype(np.float32))
+    alarms = feed(replace(script, frames=frames, pieces=script.pieces[:1200], t_s=script.t_s[:1200])).alarms
+    assert ALARMS["chip-reset"] in alarms
 
 
 def test_zeros_are_named_on_every_chip():
