@@ -1,5 +1,6 @@
 """`python -m pipeline STAGE --scene NAME ...` runs a stage, as dvc.yaml does; other words are commands of `reskin`."""
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -16,7 +17,9 @@ def main() -> None:
         if name == "code":
             from pipeline.stages.code import write_digests
 
-            write_digests(Path(sys.argv[sys.argv.index("--digests") + 1]))
+            parser = argparse.ArgumentParser(prog="python -m pipeline code", description=write_digests.__doc__)
+            parser.add_argument("--digests", type=Path, required=True)
+            write_digests(parser.parse_args(sys.argv[2:]).digests)
             return
         from pipeline.stage import run
         from pipeline.stages import is_stage, module_of

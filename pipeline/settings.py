@@ -126,7 +126,7 @@ class Settings:
     def row(self, section: str, name: Any) -> dict[str, Any]:
         """Return a named row of a shared section, such as a recipe; raise `ParamsError` if there is none."""
         rows = self.shared[section]
-        if name not in rows:
+        if not isinstance(name, str) or name not in rows:
             raise ParamsError(
                 self.where, f"a row of {section}", f"one of {sorted(rows)}", repr(name), "Correct it there."
             )
@@ -178,6 +178,11 @@ def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where
     section = dict(section)
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}
     variants = take(section, "variants", where)
+    if "recipes" in section:
+        raise ParamsError(f"{where}: unknown key recipes. Remove it: recipes are made of recipe, steps_n and variants.")
+    if not isinstance(variants, dict) or not all(isinstance(own, dict) for own in variants.values()):
+        rule = "a mapping of names to the settings that a variant changes, {} for none"
+        raise ParamsError(f"{where}.variants", "the variants", rule, variants, "Correct it there.")
     if HEADLINE in variants:
         rule = f"other than {HEADLINE}, the name of the section's own recipe in tables"
         raise ParamsError(f"{where}.variants", "a variant's name", rule, HEADLINE, "Choose another name.")

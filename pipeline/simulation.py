@@ -9,9 +9,10 @@ from reskin.simulation.settings import MAIN, SimulationSettings, parse_simulatio
 # Protocols that experiments read, and the kind that each can read.
 KINDS = {
     "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter", "glass": "load",
-    "press": "press", "log": "walk",
+    "grip": "load", "press": "press", "log": "walk",
 }  # fmt: skip
-ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "press", "log")  # compared with, or read by networks of, these
+# Compared with the boards of the main protocol, or read by networks of these.
+ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "grip", "press", "log")
 ON_OTHER_BOARDS = ("flexible",)
 OF_ONE_SKIN = ("wear", "glass", "press", "log")  # their experiments read one capture
 

@@ -28,9 +28,9 @@ def digest(name: str, *, data: bool = True) -> str:
 
 
 def files_of(name: str) -> list[Path]:
-    """Return the files of a module: its own, and data files of the same name beside it."""
-    file = file_of(name)
-    return [file, *sorted(one for one in file.parent.glob(f"{file.stem}.*") if one.suffix in DATA)]
+    """Return the files of a module or package: its own, and data files of the same name beside it."""
+    file, path = file_of(name), ROOT / name.replace(".", "/")
+    return [file, *sorted(one for one in path.parent.glob(f"{path.name}.*") if one.suffix in DATA)]
 
 
 def normalised(file: str, content: bytes) -> bytes:

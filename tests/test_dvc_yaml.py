@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from pipeline.scenes import ANALYSES
 from pipeline.stages.code import all_stages, digests_of
 from reskin import code
-from reskin.code import file_of
+from reskin.code import file_of, files_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = YAML(typ="safe").load((ROOT / "dvc.yaml").read_text())["stages"]
@@ -38,6 +38,12 @@ def test_digests_contain_the_modules_of_a_stage():
     assert "reskin.models.train" in digests_of("train_multi")
     assert "reskin.models.train" not in digests_of("simulate")
     assert {f"pipeline.experiments.{name}" for name in ANALYSES} <= digests_of("report").keys()
+
+
+def test_report_depends_on_every_data_file_of_tables_pages_and_experiments():
+    data = {file for name in ("report", "experiments") for file in (ROOT / "pipeline" / name).rglob("*.*")}
+    read = {file for name in digests_of("report") for file in files_of(name)}
+    assert {file for file in data if file.suffix in code.DATA} <= read
 
 
 def test_caption_reruns_only_the_report(monkeypatch):

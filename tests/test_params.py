@@ -45,6 +45,13 @@ def test_params_and_plan_are_valid():
             "recipes.fast.rate_max must be greater than 0",
         ),
         ({"train_multi": TRAINING | {"variants": {"paper": {}}}}, "a variant's name must be other than paper"),
+        (
+            {"train_multi": TRAINING | {"variants": None}},
+            "train_multi.variants: the variants must be a mapping.*got None",
+        ),
+        ({"train_multi": TRAINING | {"variants": {"fast": 3}}}, "train_multi.variants: the variants must be a mapping"),
+        ({"train_multi": TRAINING | {"recipes": {"a": {}}}}, "train_multi: unknown key recipes"),
+        ({"train_multi": TRAINING | {"recipe": ["paper"]}}, "a row of recipes must be one of"),
     ],
 )
 def test_invalid_scene_names_the_parameter(changes, message):

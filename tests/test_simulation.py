@@ -14,7 +14,7 @@ FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
     ("name", "kind"),
     [
         ("wear", "grid"), ("flexible", "grid"), ("drag", "drag"), ("hand", "hand"), ("sleeve", "scatter"),
-        ("glass", "load"), ("press", "press"), ("log", "walk"),
+        ("glass", "load"), ("grip", "load"), ("press", "press"), ("log", "walk"),
     ],
 )  # fmt: skip
 def test_wrong_kind_of_protocol(name, kind):
@@ -31,6 +31,7 @@ def test_wrong_kind_of_protocol(name, kind):
         ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n is 1, .*, not 2"),
         ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n is 1, .*, not 2"),
         ("glass", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol glass: boards is rigid, .* flexible"),
+        ("grip", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol grip: boards is rigid, .* flexible"),
         ("hand", HAND | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol hand: boards is rigid, .* flexible"),
         ("drag", DRAG | {"boards": "flexible"}, FRICTION, "protocol drag: boards is rigid, as of grid, not flexible"),
         ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards is another kind .*, not rigid too"),

@@ -58,7 +58,7 @@ def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factor
 def test_rerun_starts_from_the_commit_and_is_kept(checkout, monkeypatch):
     def run(clone, environment, *arguments, quiet=False):
         if arguments[0] == "dvc":
-            assert not (clone / "reports/quick").exists()
+            assert not list((clone / "reports/quick").glob("*"))
             assert arguments[-1] == "report@quick"
             write(clone / "reports/quick", 90.0)
 

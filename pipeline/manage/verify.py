@@ -41,12 +41,21 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
-            shutil.rmtree(clone / "reports" / name, ignore_errors=True)  # so that a scene that does not run cannot pass
+            _clear(clone / "reports" / name)  # so that a scene that does not run cannot pass
         # Forced: no cache of this machine replaces a stage. Stage publish does not run.
         _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
         for name in names:
             with io.replacing(root / VERIFIED / name) as folder:
                 shutil.copytree(clone / "reports" / name, folder)
+
+
+def _clear(reports: Path) -> None:
+    """Remove the reports of a scene; the choice of settings stays, as audits of other scenes read it."""
+    for path in reports.glob("*"):
+        if path.is_dir():
+            shutil.rmtree(path)
+        elif path.name != "choice.json":
+            path.unlink()
 
 
 def _bring_recordings(root: Path, clone: Path, names: Sequence[str]) -> None:

@@ -119,7 +119,8 @@ QUANTITIES = {
 PAIRED = (
     "Differences on the same test rows, skin by skin, each side the mean of its networks on a skin and a board the "
     "mean of its skins; [low, high] is the 95 % interval over n boards (Student's t). One skin on others: on the "
-    "boards that it was tested on, and the interval is over its training skins too. Verdicts on them: table claims."
+    "boards that it was tested on, and the interval is over its training skins too. With fewer than 4 boards there "
+    "is no interval: (a; b) are the values of the boards. Verdicts on them: table claims."
 )
 SKINS_MEANING = (
     "Mean over skins [least … most] (number of skins); a change of field is the length of the vector of all channels, "
@@ -134,7 +135,7 @@ CHECKS = {
 CASES = {
     "area": "area", "case": "case", "should": "should", "happened": "happened", "error": "error", "limit": "allowed",
 }  # fmt: skip
-TABLE_1 = Path(__file__).with_name("table1.yaml")
+TABLE_1 = Path(__file__).with_suffix(".yaml")  # the table of the paper
 LOCALISATION = "Localisation (within 1 mm, new skin)"  # our row: the paper's table has none
 OURS = "ours, measured"
 NOT_GIVEN = "–"

@@ -7,7 +7,7 @@ in its module of `pipeline.experiments`.
 from importlib import import_module
 from types import ModuleType
 
-from pipeline.catalogue import FOLDER
+from pipeline.catalogue import experiment_files
 
 STAGES = {
     "simulate": ("simulate",),
@@ -23,7 +23,7 @@ EXPERIMENTS = "pipeline.experiments"
 
 def is_stage(name: str) -> bool:
     """Tell whether a stage or an experiment has this name."""
-    return name in MODULES or (FOLDER / f"{name}.py").is_file() or (FOLDER / name / "__init__.py").is_file()
+    return name in MODULES or name in experiment_files()
 
 
 def module_name(stage: str) -> str:

@@ -31,7 +31,7 @@ def digests_of(stage: str) -> dict[str, str]:
 
 
 def write_digests(digests: Path) -> None:
-    """Write for each stage one line a module: its digest and its name."""
+    """Write a file per stage, with one line per module: its digest and its name."""
     for stage in all_stages():
         lines = [f"{found}  {name}\n" for name, found in digests_of(stage).items()]
         io.write_text(digests / stage, "".join(lines))

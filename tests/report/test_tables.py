@@ -300,7 +300,7 @@ def test_unknown_property_is_an_error():
 
 @pytest.mark.parametrize(("rows", "fault"), [("{Type: [Magnetic]}", "2 cells, not 1"), ("{Type: [1, 2]}", "string")])
 def test_invalid_table_1_is_an_error(tmp_path, rows, fault):
-    file = tmp_path / "table1.yaml"
+    file = tmp_path / "tables.yaml"
     file.write_text(f"columns: {{a: x, b: y}}\nrows: {rows}\n")
     with pytest.raises(ParamsError, match=fault):
         read_table1(file)
