@@ -117,7 +117,7 @@ def test_recordings_are_fetched_and_added_once(root, world):
         assert (raw / lab.READINGS).read_bytes() == world.files[f"{board}.csv"]
     assert list(plan.check(root).scenes) == ["small"]
     assert "added scene small to pipeline/plan.yaml (already there: none)" in output
-    assert "now: dvc repro" in output
+    assert "next: dvc repro" in output
     before = contents(root)
     output = fetch(root)
     assert "there already and unchanged" in output
