@@ -75,22 +75,18 @@ def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 INTRODUCTION = """\
-# Faults, and what becomes of them
+# Faults and recovery
 
-Written by `make faults` (`python -m tests.faults`), which injects each fault for real into a copy of a checkout whose
-stages have finished, and then runs `dvc repro` once more. Green: the message is one sentence without a traceback,
-within ten minutes; finished stages and trainings are not computed again, and the hashes of all outputs in dvc.lock
-are those of the undisturbed run. The scene is a part of scene `ci`, with the stages that `kill -9` names below; every
-other stage is an experiment, which starts, writes and fails through the same code (`pipeline/stage.py` and
-`reskin/io.py`).
+This page lists what happens when a process, disk, file or server fails while `dvc repro` runs, and what is lost.
+`make faults` injects each fault into a finished run of a part of scene `ci`, and then runs `dvc repro` again. A row
+is green if a command that fails prints a message and no traceback, no command takes more than ten minutes, no finished
+stage or training is computed again, and all outputs are those of the undisturbed run.
 
-DVC restores outputs from its cache without reading them: a read-only object counts as intact. So arrays (safetensors)
-and tables (Parquet) carry checksums, and a stage, a controller or a page that reads a damaged one stops with a message.
-`reskin check-cache` compares every object with its name, JSON and CSV too; it sets damaged objects aside and removes
-their copies among the outputs, and the next `dvc repro` makes these again. Run it if you doubt a disk, or if a stage
-says so.
+If you doubt a disk, or a message asks for it, run `reskin check-cache`, then `dvc repro`. DVC restores outputs from its
+cache without reading them; `reskin check-cache` reads every object, sets damaged ones aside and removes their copies.
+Arrays (safetensors) and tables (Parquet) also carry checksums, so that reading a damaged one is an error.
 
-{green_n} of {faults_n} green, {not_run_n} not run yet. Code (`git rev-parse HEAD:pipeline`) {code};
+{green_n} of {faults_n} green, {not_run_n} not run. Code (`git rev-parse HEAD:pipeline`) {code};
 {cores_n} cores, load {load:.0f} at the end, Python {python}; {minutes:.0f} min.
 
 """
