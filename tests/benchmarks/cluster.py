@@ -132,7 +132,7 @@ def locally(steps: Steps, folder: Path) -> dict[str, Sweep]:
 
 def whole(steps: Steps, cluster: Cluster, nodes: Mapping[str, Node], folder: Path, expected: str) -> Sweep:
     """The sweep on three workers: same bytes; what came to each."""
-    with steps.step("three workers: the same bytes") as see:
+    with steps.step("three workers") as see:
         before = {name: nodes[name].received_bytes() for name in WORKERS}
         sweep = ended(cluster.sweep(folder / "whole", "--empty"), folder / "whole")
         require(sweep.found["sha256"] == expected, "bytes differ")
@@ -141,7 +141,7 @@ def whole(steps: Steps, cluster: Cluster, nodes: Mapping[str, Node], folder: Pat
         sweep.found["received_bytes"] = sum(came.values())
         require(len(sweep.lines("begun")) == TASKS_N, f"begun {len(sweep.lines('begun'))}")
         see(f"{TASKS_N} tasks, by worker {sorted(ran.values())}; received kB by worker "
-            f"{sorted(round(n / 1e3) for n in came.values())}")  # fmt: skip
+            f"{sorted(round(n / 1e3) for n in came.values())}; equal bytes")  # fmt: skip
         reads = Counter(line[1] for line in sweep.lines("read"))
         require(set(reads.values()) <= {1}, f"rows read {reads}")
         see(f"rows ({sweep.found['rows_bytes'] / 1e6:.1f} MB) read once by each of {len(reads)} workers")
@@ -149,7 +149,7 @@ def whole(steps: Steps, cluster: Cluster, nodes: Mapping[str, Node], folder: Pat
 
 
 def killed_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> Sweep:
-    with steps.step("a worker's machine is switched off in mid-sweep (SIGKILL)") as see:
+    with steps.step("a worker is killed during the sweep (SIGKILL)") as see:
         process, at = cluster.sweep(folder / "killed"), Sweep(folder / "killed")
         wait_until(lambda: len(at.lines("ended")) >= 3, SWEEP_MAX_s, "three tasks")
         cluster.end("w1")
@@ -158,7 +158,7 @@ def killed_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -
         begun_n = len(sweep.lines("begun"))
         require(sweep.found["sha256"] == expected, "bytes differ")
         require(begun_n <= TASKS_N + 1, f"{begun_n} tasks begun")
-        see(f"after {ended_n} of {TASKS_N} tasks; {begun_n} begun in all: {begun_n - TASKS_N} twice; the same bytes")
+        see(f"after {ended_n} of {TASKS_N} tasks; {begun_n - TASKS_N} tasks ran twice; equal bytes")
     cluster.start("w1")
     cluster.wait_for(len(WORKERS))
     return sweep
@@ -166,17 +166,17 @@ def killed_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -
 
 def restarted_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
     place = folder / "restarted"
-    with steps.step("the scheduler is killed in mid-sweep") as see:
+    with steps.step("the scheduler is killed during the sweep") as see:
         process, at = cluster.sweep(place), Sweep(place)
         wait_until(lambda: len(at.lines("ended")) >= 4, SWEEP_MAX_s, "four tasks")
         cluster.end("scheduler")
         start_s = time.monotonic()
         process.wait(120)
         said = (place / "said.txt").read_text().splitlines()[-1]
-        require(process.returncode == 1 and "what was finished is kept" in said, said)
+        require(process.returncode == 1 and "Finished trainings are cached" in said, said)
         see(f"after {time.monotonic() - start_s:.1f} s: `{said}`")
         cluster.end_all()
-    with steps.step("scheduler and workers started again, the same command again") as see:
+    with steps.step("restart scheduler and workers, repeat the command") as see:
         finished = {line[1] for line in at.lines("ended")}
         before_n = len(at.lines("begun"))
         cluster.start_all()
@@ -184,7 +184,7 @@ def restarted_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: 
         again = [line[1] for line in sweep.lines("begun")[before_n:]]
         require(not finished & {*again}, "a finished training ran again")
         require(sweep.found["sha256"] == expected, "bytes differ")
-        see(f"{len(finished)} tasks were finished, {len(again)} of {TASKS_N} ran; the same bytes")
+        see(f"{len(finished)} tasks were finished, {len(again)} of {TASKS_N} ran; equal bytes")
 
 
 @contextmanager
@@ -212,7 +212,7 @@ def slow_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> 
         sweep = ended(cluster.sweep(folder / "slow"), folder / "slow")
         require(sweep.found["sha256"] == expected, "bytes differ")
         by_worker = sorted(sweep.per_worker().values())
-        see(f"sweep {sweep.found['sweep_s']:.1f} s, tasks by worker {by_worker}; the same bytes")
+        see(f"sweep {sweep.found['sweep_s']:.1f} s, tasks by worker {by_worker}; equal bytes")
 
 
 SRUN = """#!/bin/sh
@@ -231,7 +231,7 @@ def slurm_script(steps: Steps, folder: Path, expected: str) -> None:
     srun.chmod(0o755)
     job = {"SLURM_SUBMIT_DIR": str(ROOT), "SLURM_JOB_ID": str(os.getpid()), "SLURM_NTASKS": "3"}
     environment = {**os.environ, **job, "PATH": f"{srun.parent}:{os.environ['PATH']}"}
-    with steps.step("`deploy/slurm/reskin.sbatch` on this machine, `srun` by a stand-in: two workers") as see:
+    with steps.step("`deploy/slurm/reskin.sbatch` with a substitute for `srun`, two workers") as see:
         words = ["bash", str(ROOT / "deploy/slurm/reskin.sbatch"), *SWEEP, str(place)]
         with (folder / "slurm.log").open("wb") as said:
             process = subprocess.Popen(words, env=environment, stdout=said, stderr=said, start_new_session=True)
@@ -242,7 +242,7 @@ def slurm_script(steps: Steps, folder: Path, expected: str) -> None:
         require(code == 0, (folder / "slurm.log").read_text()[-600:])
         sweep = Sweep(place).read()
         require(sweep.found["sha256"] == expected, "bytes differ")
-        see(f"tasks by worker {sorted(sweep.per_worker().values())}; the same bytes")
+        see(f"tasks by worker {sorted(sweep.per_worker().values())}; equal bytes")
 
 
 def play(steps: Steps, folder: Path) -> Measurements:
@@ -282,7 +282,7 @@ def main() -> None:
     with ExitStack() as kept:
         folder = asked.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
         measurements = play(steps, folder.resolve())
-    steps.write(asked.out / "cluster.md", f"`make cluster-test`: {TASKS_N} stacks of three trainings, {STEPS_N} steps.")
+    steps.write(asked.out / "cluster.md", f"`make cluster-test`: {TASKS_N} tasks of three trainings, {STEPS_N} steps.")
     write_scaling(measurements, asked.out)
 
 

@@ -109,7 +109,7 @@ def write_scaling(of: Measurements, folder: Path) -> None:
         f"| {n} | " + " | ".join(f"{faster[name][i]:.1f}" for name in cases) + " |" for i, n in enumerate(WORKERS_N)
     ]
     text = [
-        "`make cluster-test`: speed-up over one worker, simulated from measured times and sizes.", "",
+        "Speed-up over one worker, simulated from times and sizes measured by `make cluster-test`.", "",
         "| workers | " + " | ".join(cases) + " |", "|---" * (len(cases) + 1) + "|", *rows, "",
         *explain(of, paper, rest_s, largest, cost), "", "![Speed-up against workers](scaling.svg)", "",
     ]  # fmt: skip
@@ -120,25 +120,23 @@ def write_scaling(of: Measurements, folder: Path) -> None:
 def explain(
     of: Measurements, paper: Sequence[Sweep], rest_s: float, largest: Sweep, cost: dict[str, float]
 ) -> list[str]:
-    """Say what was measured, and what bounds the speed-up."""
+    """Describe the measurements and the limits of the speed-up."""
     one_s, two_s = of.processes_s
     work_s = sum(sweep.tasks_n * sweep.task_s for sweep in paper)
     counts = ", ".join(str(sweep.tasks_n) for sweep in sorted(paper, key=lambda sweep: -sweep.tasks_n))
     mean_s, sd_s = np.mean(of.task_s), np.std(of.task_s)
     lines = [
-        f"Measured, sweep of {len(of.task_s) + 1} tasks: one process {one_s:.1f} s, two {two_s:.1f} s, "
-        f"{one_s / two_s:.2f} times as fast, at a load of {os.getloadavg()[0]:.0f} on "
-        f"{os.cpu_count()} cores; a task {mean_s:.2f} s of CPU (sd {100 * sd_s / mean_s:.0f} %).",
-        f"Measured, engine: {1e3 * of.call_s:.1f} ms a task, {of.connect_s:.1f} s for a stage to connect, "
-        f"{of.task_bytes / 1e3:.1f} kB to a worker for a task, {of.rows_bytes / 1e6:.1f} MB of rows once a worker. "
-        "Assumed: 1 Gbit/s for all.",
-        f"The number of tasks bounds it: stages of `paper` have {counts} (three trainings each) and run one after "
-        "another; workers beyond a stage's tasks have nothing to do, and its last round is seldom full.",
-        f"Then what is no training: {rest_s:.0f} s of `paper`'s {rest_s + work_s:.0f} s, counted here as the work of "
-        f"one process, allow at most {(rest_s + work_s) / rest_s:.0f} times.",
-        f"The engine does not: with 256 workers it costs {cost['`paper` in full']:.1f} % of the time of `paper`. "
-        f"Handing out a task in {1e3 * of.call_s:.1f} ms feeds about {largest.task_s / of.call_s:,.0f} workers with "
-        f"tasks of {largest.task_s:.0f} s.",
+        f"Measured: a sweep of {len(of.task_s) + 1} tasks takes {one_s:.1f} s in one process and {two_s:.1f} s in two "
+        f"({one_s / two_s:.2f} times as fast), at a load of {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores; "
+        f"a task takes {mean_s:.2f} s of CPU (sd {100 * sd_s / mean_s:.0f} %).",
+        f"Measured for Dask: {1e3 * of.call_s:.1f} ms per task, {of.connect_s:.1f} s to connect a stage, "
+        f"{of.task_bytes / 1e3:.1f} kB per task and {of.rows_bytes / 1e6:.1f} MB of rows per worker. Assumed: "
+        "a network of 1 Gbit/s, shared by all workers.",
+        f"The number of tasks limits the speed-up: stages of `paper` have {counts} tasks and run one after another.",
+        f"The remaining work is counted as one process: {rest_s:.0f} s of {rest_s + work_s:.0f} s, which limits the "
+        f"speed-up of `paper` to {(rest_s + work_s) / rest_s:.0f}.",
+        f"Dask is no limit: with 256 workers it costs {cost['`paper` in full']:.1f} % of the time of `paper`. One "
+        f"scheduler can serve about {largest.task_s / of.call_s:,.0f} workers with tasks of {largest.task_s:.0f} s.",
     ]
     return [f"- {line}" for line in lines]
 
@@ -147,7 +145,7 @@ def draw(faster: dict[str, list[float]], file: Path) -> None:
     with rc_context({"svg.hashsalt": "reskin", "svg.fonttype": "none"}):
         figure = Figure(figsize=(6.5, 4.2), layout="constrained")
         axes = figure.subplots()
-        axes.plot(WORKERS_N, WORKERS_N, color="0.7", linestyle=":", label="as many times as workers")
+        axes.plot(WORKERS_N, WORKERS_N, color="0.7", linestyle=":", label="ideal")
         for (name, values), marker in zip(faster.items(), "osd^v", strict=True):
             axes.plot(WORKERS_N, values, marker=marker, markersize=4, label=name.replace("`", ""))
         axes.set(xscale="log", yscale="log", xlabel="workers", ylabel="speed-up", xticks=WORKERS_N)

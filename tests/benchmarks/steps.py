@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-HEAD = "| step | seconds | seen |\n|---|---|---|\n"
+HEAD = "| step | seconds | result |\n|---|---|---|\n"
 
 
 class Steps:
@@ -39,7 +39,7 @@ class Steps:
         """Write the table, under what made it and where."""
         machine = f"{platform.machine()}, {os.cpu_count()} shared cores, Python {platform.python_version()}"
         file.parent.mkdir(parents=True, exist_ok=True)
-        words = f"{title} Commit {self._commit}, {machine}, load {os.getloadavg()[0]:.1f} at its end.\n\n"
+        words = f"{title} Commit {self._commit}, {machine}, load {os.getloadavg()[0]:.1f} at the end.\n\n"
         file.write_text(words + HEAD + "\n".join(self.rows) + "\n")
 
 

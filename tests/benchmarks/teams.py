@@ -115,7 +115,7 @@ def make_origin(folder: Path, address: str) -> Path:
 def transferred(said: str) -> str:
     """What DVC says of a push or a pull, in a few words."""
     found = re.search(r"(\d+ files? (?:pushed|fetched)[^\n]*)|Everything is up to date", said)
-    return found[0] if found else "nothing said"
+    return found[0] if found else "no message of DVC"
 
 
 def words(ran: Counter[str]) -> str:
@@ -142,7 +142,7 @@ def with_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) -> tup
         with steps.step(f"fresh clone, `dvc pull -r {remote}`") as see:
             fresh.append(Clone(folder / f"fresh-{remote}", origin, at))
             see(transferred(fresh[-1].dvc("pull", "-r", remote)))
-        with steps.step("there: `dvc repro`") as see:
+        with steps.step("`dvc repro` in this clone") as see:
             before = fresh[-1].git("status", "--porcelain")
             ran = fresh[-1].repro()
             see(f"{sum(ran.values())} stages ran")
@@ -198,25 +198,25 @@ def runs_of(tracking: str) -> pd.DataFrame:
 
 def with_mlflow(steps: Steps, ana: Clone, ben: Clone, tracking: str, database: str) -> int:
     """Runs are in PostgreSQL, once each; a model comes back through the server; give how many runs there are."""
-    with steps.step("MLflow: what both published, and again from both clones at once") as see:
+    with steps.step("publish again from both clones at once") as see:
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(lambda clone: clone.reskin("publish"), (ana, ben)))
         runs = runs_of(tracking)
         current = runs[(runs["tags.kind"] == "training") & (runs["tags.current"] == "true")]
         require(runs["tags.run_key"].is_unique, "a result stands there twice")
         require(len(current) == 4, f"{len(current)} current trainings")
-        see(f"{len(runs)} runs, none twice, {len(current)} current trainings")
-    with steps.step("PostgreSQL: asked by SQL") as see:
+        see(f"{len(runs)} MLflow runs, no duplicates, {len(current)} current trainings")
+    with steps.step("query PostgreSQL") as see:
         rows_n = count_rows(database)
         require(rows_n == len(runs), f"{rows_n} rows, {len(runs)} runs")
         see(f"{rows_n} rows in table runs")
-    with steps.step("a model through the server, beside its file") as see:
+    with steps.step("load a model from the server and from its file") as see:
         run_id, name = current.iloc[0][["run_id", "tags.mlflow.runName"]]
         pokes = np.random.default_rng(0).normal(0, 50, (5, 15)).astype(np.float32)
         theirs = np.asarray(mlflow.pyfunc.load_model(f"runs:/{run_id}/model").predict(pokes))
         ours = reskin.load_model(ben.folder / f"data/models/{SCENE}/train_multi/{name}.safetensors")
         require(np.array_equal(theirs, ours.zero(np.zeros(15)).predict(pokes)), "answers differ")
-        see("same answers")
+        see("same predictions")
     return rows_n
 
 
@@ -236,7 +236,7 @@ def play(steps: Steps, folder: Path) -> None:
     at, ports = [], [servers.free_port() for _ in range(3)]
     try:
         with ExitStack() as up:
-            with steps.step("start PostgreSQL (made anew), MLflow on it, an S3-compatible server"):
+            with steps.step("start PostgreSQL (new database), MLflow and an S3-compatible server"):
                 database = up.enter_context(servers.postgres(folder / "postgres", ports[0]))
                 at.append(database)
                 down = up.enter_context(ExitStack())
@@ -247,16 +247,16 @@ def play(steps: Steps, folder: Path) -> None:
             ana, ben = with_remotes(steps, folder, make_origin(folder, store), tracking)
             merge_two(steps, ana, ben)
             rows_n = with_mlflow(steps, ana, ben, tracking, database)
-            with steps.step("MLflow ended and started again on the same database") as see:
+            with steps.step("restart MLflow on the same database") as see:
                 down.close()
                 up.enter_context(servers.mlflow(folder / "mlflow", database, ports[1]))
                 require(len(runs_of(tracking)) == rows_n, "runs are gone")
                 see(f"{rows_n} runs, as before")
     finally:
-        with steps.step("all servers ended") as see:
+        with steps.step("stop all servers") as see:
             left = [address.split("@")[-1] for address in at if servers.listens(address)]
             require(not left, f"still there: {left}")
-            see(f"nobody listens at their {len(at)} ports")
+            see(f"{len(at)} ports are closed")
 
 
 def main() -> None:
@@ -270,7 +270,7 @@ def main() -> None:
         folder = asked.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
         folder.chmod(0o755)  # PostgreSQL's user comes through
         play(steps, folder.resolve())
-    steps.write(asked.out, "`make teams`, servers of its own on loopback, simulated recordings.")
+    steps.write(asked.out, "`make teams`: two people share runs and simulated recordings, on one machine.")
 
 
 if __name__ == "__main__":
