@@ -42,11 +42,11 @@ EQUIVALENT = "equivalent to none within half of the paper's"
 NOT_POOLED = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")  # need several skins
 DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules about differences, which are shown with their sign
 FAMILY = (
-    "The claims of section 5 about accuracy, the primary score, are one family, listed before any run (checklist.yaml, "
-    "family): their p-values (t over boards) are adjusted by Holm's method, and a claim is supported or contradicted "
-    f"only if its adjusted p is {SIGNIFICANT:g} or less. All other verdicts are unadjusted: exploratory. "
-    f"Sizeable: at least {100 * SIZEABLE:g} % of the paper's own difference; equivalent to none: the whole interval is "
-    "nearer to 0 than that."
+    "The claims of section 5 about accuracy are one family, listed before any run (checklist.yaml, family): their "
+    "p-values (t over boards) are adjusted by Holm's method, and a claim is supported or contradicted only if its "
+    f"adjusted p is {SIGNIFICANT:g} or less. All other verdicts are unadjusted and exploratory. Sizeable: at least "
+    f"{100 * SIZEABLE:g} % of the paper's own difference; equivalent to none: the whole interval is nearer to 0 than "
+    "that."
 )
 MEANING = (
     f"Verdicts are on claims. {VERDICTS} {FAMILY} Other numbers have no verdict. Met: whether our mean meets the "

@@ -50,10 +50,10 @@ BEFORE_TOUCH = {
     "scan": "the number of the poke in its pass alone",
 }
 BEFORE_TOUCH_MEANING = (
-    "Place from ... alone: predicted by the 2 nearest training rows, on the rows and folds above, without any change "
-    "of field. The number in the pass shows how far the rig repeats its order; no network receives it. The no-load "
-    "reading shows what a skin that remembers its pokes reveals of that order; it is part of every change of field, so "
-    "a network that is tested on its training skin may have used it."
+    "Place from ... alone: predicted from the 2 nearest training rows, without any change of field. The number in the "
+    "pass measures how far the rig repeats its order; no network receives it. The no-load reading measures what the "
+    "skin's memory of earlier indentations reveals of that order; a network may use it, because it is part of the "
+    "change of field."
 )
 SEEN_TIP = (
     "Not comparable with the paper's numbers: a tip that only hovers is placed too, so the indenter itself is magnetic "
@@ -70,8 +70,8 @@ TABLE_2_SPREAD = (
     f"on others. {INTERVAL} (for one skin on others: over its training skins and the boards that it was tested on)."
 )
 TARGET = (
-    "The row of one skin on others was a calibration target of an earlier simulated skin: spreads that were set with "
-    "it in view remain, so agreement there is no evidence."
+    "An earlier simulated skin was tuned to the paper's row of one skin on others, and some of its spreads remain, so "
+    "agreement in this row is no evidence."
 )
 CONSTANT = "a constant force, the mean of the tested presses"
 COLLAPSED_MEANING = (
@@ -80,8 +80,8 @@ COLLAPSED_MEANING = (
     "kept in all means; those of train_* and adapt are also named in the audit. Very short trainings are not judged."
 )
 PLACES = (
-    "Registered: after one offset a board (uses its labels: a diagnosis). Labels and unlabelled pokes are indentations "
-    "of the new board at places where it is also tested, at other depths."
+    "Registered: places corrected by one offset per board, estimated from its labels, as a diagnosis. Labelled and "
+    "unlabelled indentations are at tested places of the new board, at other depths."
 )
 TRAINING_ROWS = (
     "Training rows of the first fold; a classical method is given at most so many, drawn at random. Settings of "
