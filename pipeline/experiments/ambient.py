@@ -296,13 +296,14 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     table = pd.DataFrame(rows)
     meanings = "; ".join(f"{method}: {text}" for method, text in numbers["arms"].items())
     table.attrs["meaning"] = (
-        "The field comes up after the no-load reading, so it stays in the change of field. The direction of a uniform "
-        f"field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, "
-        f"lies right above the skin's middle, in the earth's field ({numbers['earth_uT']:g} µT, dipping "
-        f"{numbers['earth_dip_deg']:g}°) and the skin's own. {meanings}. The last method is trained for board "
-        f"{last['board']} alone: compare methods there. [low, high] is the 95 % interval over held-out boards "
-        f"(Student's t); ± (seeds) the standard deviation over {numbers['seeds_n']} network seeds on one board, mean "
-        "over boards. The paper gives no number (section 7: future work)."
+        "The field appears after the no-load reading, so subtracting that reading does not remove it. The direction of "
+        f"a uniform field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, "
+        "is directly above the skin's middle; it is magnetised by the earth's field "
+        f"({numbers['earth_uT']:g} µT, dipping {numbers['earth_dip_deg']:g}°) and by the skin's. Methods: {meanings}. "
+        f"The last method has networks for board {last['board']} only, so compare all methods on that board. "
+        "[low, high] is the 95 % confidence interval over held-out boards (Student's t); ± (seeds) is the standard "
+        f"deviation over {numbers['seeds_n']} network seeds on one board, averaged over boards. The paper gives no "
+        "number (section 7: future work)."
     )
     return {"ambient": table}
 
@@ -319,13 +320,13 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             "earth", (numbers["earth_uT"], 98), xytext=(3, 0), textcoords="offset points", va="top", fontsize=9
         )
         left.set(xlabel="uniform field / µT", ylabel="accuracy / %", ylim=(0, 100))
-        right.set(xscale="log", xlabel="iron ball above the skin / mm")
+        right.set(xscale="log", xlabel="distance of the iron ball from the skin / mm")
         ticks_mm = [row["distance_mm"] for row in last["iron"]]
         right.set_xticks(ticks_mm, [f"{mm:g}" for mm in ticks_mm])
         right.minorticks_off()
         handles, labels = left.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", frameon=False, fontsize=9, ncols=2)
-        title = f"Fields from outside, board {last['board']} never seen ({source})"
+        title = f"External fields, held-out board {last['board']} ({source})"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"ambient.svg": svg(figure)}
 

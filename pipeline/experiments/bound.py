@@ -173,7 +173,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the bound by depth, and in all beside the network, which is scored on all depths together."""
     lines = [_line(f"{row['depth_mm']:g}", row, {}, source) for row in numbers["by_depth"]]
     lines.append(_line("all", numbers["all"], numbers["network"], source))
-    return {"bound": tabulate(lines, meaning=_meaning(numbers), spread="± is the sd over n folds of the network.")}
+    spread = "± is the standard deviation of the network's scores over n folds."
+    return {"bound": tabulate(lines, meaning=_meaning(numbers), spread=spread)}
 
 
 def _line(depth: str, row: Mapping[str, Any], network: Mapping[str, Any], source: str) -> dict[str, str]:
@@ -189,12 +190,13 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
     labels, above_n = numbers["labels"], numbers["above_the_skin_n"]
     above = f" {above_n} pokes that do not touch the skin are left out." if above_n else ""
     return (
-        f"Bound (Cramér-Rao): the least error of an unbiased estimate from the change of field of one row, "
-        f"{numbers['readings_n']} reading less the mean of {numbers['noload_frames_n']} no-load ones, at the "
-        f"{numbers['places_n']} places of skin {numbers['skin']}; its accuracy is that of normal errors. Only the "
-        "chips' noise and steps count: the skin, its board and what earlier pokes left are taken as known. Labels' "
-        f"errors: the robot's place, {labels['place_sd_mm']:g} mm an axis, and the force sensor, "
-        f"{labels['force_sd_N']:.2g} N, which reads the true depth's force.{above} Network: random passes of the "
-        "same skin held out. Places lie on a grid; a network that learns the grid is biased towards it and may have "
-        "less error than the bound."
+        "Bound (Cramér-Rao): the smallest error of an unbiased estimate from the change of field of one row "
+        f"({numbers['readings_n']} reading less the mean of {numbers['noload_frames_n']} no-load readings), averaged "
+        f"over the {numbers['places_n']} places of skin {numbers['skin']}; its accuracy assumes normally distributed "
+        "errors. The only sources of error are the chips' noise and rounding: the skin, its board and the "
+        "after-effects of earlier pokes are taken as known. Labels' errors, as standard deviations: "
+        f"{labels['place_sd_mm']:g} mm per axis for the robot's place, and {labels['force_sd_N']:.2g} N for the force "
+        f"sensor, which measures the force at the true depth.{above} Network: random passes of the same skin are held "
+        "out. All places are on a grid; a network that learns the grid is biased towards it and may have a smaller "
+        "error than the bound."
     )

@@ -417,31 +417,36 @@ HELD = "held at the deepest"
 MEMORY = "memory, % ({:g} to {:g})".format(*MEMORY_PCT)
 NONE = "–"
 MEANING = (
-    "dB of each recorded poke, the mean in contact less the mean before, beside the simulated one at its labelled "
-    "place and recorded force. Bounds stand in brackets. Cosine: over all channels, the mean over pokes. Explained: 1 "
-    "- |simulated - recorded|² / |recorded|², the median. Growth: d log|dB| / d log F within a place, the median over "
-    "places, simulated / recorded. A board is within bounds, yes or no, by its own numbers; four boards or more are "
-    "also judged together, by the 95 % interval over them (Student's t). The form of the law, its tip radius, its "
-    "exponent of stiffening and the force at which the slide is gone were chosen with both boards of scene lab in "
-    "view: only a new board tests them. Why a skin slides towards its middle is not explained. Memory, simulated / "
-    "recorded: of a poke's change in the next no-load reading; it is put in by hand, {:g} %, so that its estimator is "
-    "tested and nothing predicted. Held: pokes whose force lies beyond the deepest that the law follows (0.72 of the "
-    "thickness); they are simulated at that depth, and count like all others."
+    "Compares dB of each recorded poke (mean in contact less mean before contact) with dB simulated at the labelled "
+    "place and the recorded force. Bounds are in brackets. Cosine: between recorded and simulated dB over all "
+    "channels, mean over pokes. Explained: 1 - |simulated - recorded|² / |recorded|², median over pokes. Growth: d "
+    "log|dB| / d log F at one place, median over places, simulated / recorded. Whether one board is within the bounds "
+    "is judged by its own numbers; four or more boards are also judged together, by the 95 % confidence interval over "
+    "boards (Student's t). Law: the physical model of a skin. The form of the law, its tip radius, its exponent of "
+    "stiffening and the force at which the slide is gone were chosen with data of both boards of scene lab: only a new "
+    "board tests them. Why a skin slides towards its middle is not explained. Memory, simulated / recorded: the share "
+    "of a poke's change of field that remains in the next no-load reading. The simulated memory is set to {:g} %, so "
+    "it tests the estimator and is not a prediction. Held at the deepest: number of pokes whose force is larger than "
+    "at the deepest indentation that the law can follow (0.72 of the thickness); they are simulated at that depth, and "
+    "count like all others."
 )
 ABOUT_PARAMETERS = (
-    "Seat: the skin's middle seen from the board's. Label offset: from where a label says to where the tip is. Slide: "
-    "how far the material under the tip moves towards the skin's middle at no force, per distance from it; give: of "
-    "the rig's arm. Gap and amplitude trade against each other: neither is a measured size."
+    "Seat: position of the skin's middle relative to the board's. Label offset: from the labelled place to the tip. "
+    "Slide: displacement of the material under the tip towards the skin's middle at vanishing force, per distance from "
+    "the middle. Give: compliance of the rig's arm. Gap and amplitude compensate each other in the fit: neither is a "
+    "measurement."
 )
 ABOUT_GRIP = (
-    "A tip slides the skin no further than its friction on the skin allows: k |u| <= mu F. k / mu = {grip_N_mm:g} N/mm "
-    "is used (the springs are from a recorded sideways force, friction assumed: `skin.hold` in nominal.yaml); all "
-    "else is fitted anew for each. Recordings begin above half a newton, where the skin hardly slides any further: the "
-    "assumption decides the field of a light touch. Without friction the skin would jump at contact."
+    "A tip slides the skin no further than the friction under the tip allows: k |u| <= mu F, with springs k, slide u, "
+    "friction mu and force F. k / mu = {grip_N_mm:g} N/mm is used (k is from a recorded sideways force, mu is assumed: "
+    "`skin.hold` in nominal.yaml). For each value of k / mu all other parameters are fitted again. Recordings begin "
+    "above half a newton, where the skin hardly slides any further: the field of a light touch therefore depends on "
+    "the assumed friction. Without a limit by friction, the skin would jump at contact."
 )
 ABOUT_FRAMES = (
-    "Cosines over all pokes together, with the nominal skin: read as the scene says, and in the best of all ways. A "
-    "way that departs from the scene is named if it raises the sum over chips by 0.1 and more for each departure."
+    "Cosines between recorded and simulated dB over all pokes together, with the nominal skin: in the orientations "
+    "that the scene states (as written), and in those that agree best (best). A departure from the scene is reported "
+    "if it raises the sum of the cosines over chips by 0.1 or more."
 )
 TITLES = {
     "seat_x_mm": "seat x, mm", "seat_y_mm": "seat y, mm", "rotation_deg": "rotation, degrees", "gap_mm": "gap, mm",
@@ -560,14 +565,14 @@ def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: st
             styles = iter(("-.", ":", "--", (0, (1, 3))))
             for grip, length_uT in own["curve_uT"].items():
                 line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
-                friction = "any force slides it" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
+                friction = "no limit by friction" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
                 label = f"simulated, {friction}" + (" (used)" if grip == used else "")
                 axes.plot(drawn["curve_N"], length_uT, color=COLOURS[1], label=label, **line)
             axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
             axes.set_ylim(bottom=0.1)
             axes.grid(alpha=0.25)
             axes.legend(frameon=False, fontsize=8)
-        title = f"From the lightest touch on: change of field against force ({source}; simulated: median over places)"
+        title = f"Change of field against force, from the lightest touch ({source}; simulated: median over places)"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return svg(figure)
 

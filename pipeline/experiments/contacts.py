@@ -370,15 +370,16 @@ def _errors(changes_T: Float[np.ndarray, "p 4 k 3"]) -> dict[str, float]:
 # --- Tables and figures ---
 
 MEANING = (
-    "Two contacts are the sum of two changes of field that were read of one held-out skin, so their noise is that of "
-    "two readings. A network of single contacts predicts one place and one force. Detected: the score of a detector is "
-    "above a threshold, which a set share of single contacts of training skins exceeds; the share of the held-out "
-    "boards' single contacts above it is the false alarm. The networks behind residual and networks disagree were "
-    "trained on the contacts that thresholds are set on, so their thresholds may be too low. At 0 mm both pokes are at "
-    "one place: the effect of strength and noise alone. [low, high] is the 95 % interval over "
-    "held-out boards (Student's t). The paper gives no number (section 7: future work)."
+    "Two contacts at once are modelled as the sum of two changes of field that were recorded on one held-out skin, so "
+    "their noise is that of two readings. Networks trained on single contacts predict one place and one force (columns "
+    "`answer` and `along the line`). Detected: the score of a detector is above its threshold. Thresholds are set so "
+    "that a given share of single contacts of training skins exceeds them; row `single contacts` gives the share of "
+    "the held-out boards' single contacts above them, the false alarms. The networks behind residual and networks "
+    "disagree were trained on the contacts that set the thresholds, so these two thresholds may be too low. At 0 mm "
+    "both pokes are at one place: this shows the effect of strength and noise alone. [low, high] is the 95 % "
+    "confidence interval over held-out boards (Student's t). The paper gives no number (section 7: future work)."
 )
-TWO_TIPS = "Two tips cannot stand nearer than they are wide; smaller distances are sums all the same."
+TWO_TIPS = "Two real tips cannot be closer than their width; smaller distances are sums of two readings all the same."
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -389,7 +390,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     }
     table = pd.DataFrame([*rows, false_alarm]).fillna("–").assign(source=source)
     asked = next(iter(numbers["false_alarm_pct"].values()))["asked"]
-    table.attrs["meaning"] = f"{MEANING} Thresholds ask for {asked:g} % false alarms. {TWO_TIPS}"
+    table.attrs["meaning"] = f"{MEANING} Thresholds are set for {asked:g} % false alarms. {TWO_TIPS}"
     made = {"contacts": table}
     if "superposition" in numbers:
         made["superposition"] = _superposition(numbers["superposition"], source)
@@ -402,7 +403,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         left, right = figure.subplots(1, 2)
         _draw_places(left, drawn["along"])
         _draw_detection(right, numbers)
-        figure.suptitle(f"Two contacts at once on skins never seen ({source})", x=0.01, ha="left", fontsize=11)
+        figure.suptitle(f"Two contacts at once on held-out skins ({source})", x=0.01, ha="left", fontsize=11)
         return {"contacts.svg": svg(figure)}
 
 
@@ -415,8 +416,8 @@ def _draw_places(axes: Any, along: Mapping[str, Sequence[float]]) -> None:
     ends_mm = [separations_mm[0] - width_mm, separations_mm[-1] + width_mm]
     axes.plot(ends_mm, ends_mm, color=COLOURS[2], label="stronger contact")
     axes.plot(ends_mm, [0, 0], color=COLOURS[1], linestyle="--", label="weaker contact")
-    axes.set(xlabel="distance of the two / mm", ylabel="answer, along their line / mm")
-    axes.set_title("One answer (box: half; whiskers: 90 %)", loc="left", fontsize=10)
+    axes.set(xlabel="distance of the two / mm", ylabel="predicted place along their line / mm")
+    axes.set_title("Predicted place (box: middle half; whiskers: 90 %)", loc="left", fontsize=10)
     axes.set_ylim(top=1.45 * ends_mm[1])
     axes.legend(frameon=False, loc="upper left", fontsize=9)
 
@@ -433,8 +434,8 @@ def _draw_detection(axes: Any, numbers: Mapping[str, Any]) -> None:
             together["separation_mm"], at_one, color=colour, marker=marker, markerfacecolor="white", clip_on=False
         )
         axes.axhline(alarm["realised"]["mean"], color=colour, linestyle=":", linewidth=1)
-    axes.set(xlabel="distance of the two / mm", ylabel="called two contacts / %", ylim=(0, 100))
-    axes.set_title("Told as two (dotted: one called two;\nhollow: both at one place)", loc="left", fontsize=10)
+    axes.set(xlabel="distance of the two / mm", ylabel="detected as two contacts / %", ylim=(0, 100))
+    axes.set_title("Detected as two (dotted: false alarms;\nhollow: both at one place)", loc="left", fontsize=10)
     axes.legend(frameon=False, loc="upper left", fontsize=9)
 
 
@@ -468,8 +469,8 @@ def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFra
         for row in rows
     )
     table.attrs["meaning"] = (
-        "The sum of two changes of field against both contacts on one skin, the second displacing what the first has "
-        "moved (mean of both orders; rms over chips and pairs). How one contact lowers the surface under the other is "
-        "left out."
+        "Compares the sum of the changes of field of two single contacts with the change of field of both contacts on "
+        "one skin, where the second contact displaces material that the first has already displaced (mean of both "
+        "orders; rms over chips and pairs). That one contact lowers the surface under the other is neglected."
     )
     return table

@@ -412,12 +412,15 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
 def describe_pace(numbers: Mapping[str, Any], source: str) -> str:
     """Describe `pace` in a sentence, with what it means in a simulated capture."""
     if "lasts_s" not in numbers:
-        return "When the contacts were is not known."
-    every = f"A contact follows the one before after {numbers['contact_every_s']:.3g} s (median)"
+        return "The times of the contacts are not known."
+    every = f"The median time from one contact to the next is {numbers['contact_every_s']:.3g} s"
     text = f"{every}; the whole capture lasts {numbers['lasts_s']:,.0f} s."
     if source != "simulated":
         return text
-    return f"{text} A real rig takes seconds a contact: temperature wanders here over many more contacts than there."
+    return (
+        f"{text} A real rig takes seconds per contact, so in the simulation a change of temperature is spread over "
+        "many more contacts than on a rig."
+    )
 
 
 def _first_rows(readings: Readings) -> Int64[np.ndarray, " n"]:
@@ -600,16 +603,18 @@ def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[
 
 POLICIES = ("initial", "regular", "each", "free")
 WANDER_MEANING = (
-    "The networks of figure 5a on their last window again, of captures to which a random walk was added: one normal "
-    "step a contact and channel, from the end of training on, in contact and no-load readings alike. The first row is "
-    "that of figure 5a. How far fields at rest really go is in the table of skins: rms change over 1 to 1,000 contacts."
+    "The networks of figure 5a, tested again on their last window after a random walk was added to the captures: one "
+    "normally distributed step per contact and channel after the end of training, the same in contact readings and "
+    "no-load readings. The row without an added walk is the last window of figure 5a. For the drift of recorded fields "
+    "at rest see the table of skins: rms change over 1 to 1,000 contacts."
 )
 FINDINGS_MEANING = (
-    f"{VERDICTS} A finding of several parts: no, if one part is no; yes, if all are. Of these trainings: judged in the "
-    "same words by the 95 % interval over pairs of networks (policies trained from the same seed on the same skin), "
-    "each network's value the mean over its windows; for the bias of the force also by two standard errors over "
-    "indentations. Several trainings on one skin say how much trainings vary, not how much boards do. Measured: "
-    "values by no-load policy; brackets are the interval over boards, or over these trainings where boards are too few."
+    f"{VERDICTS} A finding with several parts is contradicted if one part is, and supported if all are. Of these "
+    "trainings: the same verdicts, but from the 95 % interval over pairs of networks (policies trained from the same "
+    "seed on the same skin); for the force bias this interval is widened to two standard errors over indentations "
+    "where these are larger. Several training runs on one skin show how much training runs vary, not how much boards "
+    "do. Measured: values by no-load policy; brackets are the 95 % interval over boards, or over these training runs "
+    "where there are too few boards."
 )
 
 
@@ -657,14 +662,15 @@ def _possible_reasons(numbers: Mapping[str, Any]) -> str:
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
     )
     text = (
-        f"A contact changes the field by {field['contact_uT']:.3g} µT rms over channels, a no-load reading has a noise "
-        f"of {field['noload_noise_uT']:.2g} µT; in the last window it is off by {off}."
+        f"A contact changes the field by {field['contact_uT']:.3g} µT rms over channels; the noise of a no-load "
+        f"reading is {field['noload_noise_uT']:.2g} µT. In the last window, the no-load reading in use differs from "
+        f"one taken just before the contact by {off}."
     )
     if "force_left_pct" in late:
         left_pct = late["force_left_pct"]
         text += (
-            f" At equal places and depths the skin gives {left_pct:.4g} % of its early force after "
-            f"{late['contacts_n']:,} contacts, so softening explains {100 - left_pct:+.2g} % of the force bias."
+            f" After {late['contacts_n']:,} contacts, the force at equal places and depths is {left_pct:.4g} % of the "
+            f"early force, so softening explains a force bias of {100 - left_pct:+.2g} %."
         )
     return text
 
@@ -695,10 +701,10 @@ def _spread(numbers: Mapping[str, Any]) -> str:
     [(_, rows), *_] = _policies(numbers).values()
     seeds_n, skins_n = numbers["seeds_n"], numbers["skins_n"]
     if not rows[0]["spread"]:
-        return "One network each."
+        return "Each value is of one network."
     if skins_n == 1:
-        return f"± is the sd over {seeds_n} network seeds, all tested on the same contacts."
-    return f"± is the sd over {skins_n} skins with {seeds_n} network seeds each."
+        return f"± is the standard deviation over {seeds_n} network seeds, all tested on the same contacts."
+    return f"± is the standard deviation over {skins_n} skins with {seeds_n} network seeds each."
 
 
 def _protocol(numbers: Mapping[str, Any]) -> str:
@@ -709,9 +715,11 @@ def _protocol(numbers: Mapping[str, Any]) -> str:
     )
     text = (
         f"Trained on the first {train} of each skin, tested on {test} after every {every}; each policy of "
-        "the no-load reading has networks of its own. Contacts: what the skin had felt before the test."
+        "the no-load reading has networks of its own. Contacts: number of contacts of the skin before the test."
     )
-    return text + (f" The last {left} fill no whole test, and are left out." if numbers["left_out_units_n"] else "")
+    return text + (
+        f" The last {left} do not fill a test window, and are not used." if numbers["left_out_units_n"] else ""
+    )
 
 
 # --- Figures ---
@@ -722,11 +730,11 @@ MARGIN = 0.05  # of the largest force
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw scores against contacts (figure 5a) and against an added walk; late forces where known (figure 5b)."""
     windows = {policy: rows for policy, (_, rows) in _policies(numbers).items()}
-    title = f"Trained on first contacts, tested on later ones ({source})"
+    title = f"Trained on the first contacts, tested on later ones ({source})"
     texts = {"drift.svg": _draw_scores(numbers, windows, "contacts_n", title)}
     if "wander" in numbers:
         last_n = next(iter(windows.values()))[-1]["contacts_n"]
-        title = f"After {last_n:,} contacts, if the field at rest wandered more ({source})"
+        title = f"After {last_n:,} contacts, with an added random walk of the field at rest ({source})"
         texts["drift_wander.svg"] = _draw_scores(numbers, numbers["wander"], "step_uT", title)
     if "late" in numbers:
         texts["drift_force.svg"] = _draw_forces(numbers["late"], drawn["late"], source)
@@ -747,12 +755,12 @@ def _draw_scores(
                 axes.errorbar([row[x] for row in rows], [row[metric] for row in rows], bars, label=name, **look)
             axes.set_ylabel(COLUMNS[metric].replace(", ", " / "))
             if x == "contacts_n":
-                axes.set_xlabel("contacts the skin has felt")
+                axes.set_xlabel("contacts of the skin before the test")
                 axes.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
             else:
                 steps_uT = [row[x] for row in next(iter(lines.values())) if row[x] > 0]
                 axes.set_xscale("symlog", linthresh=min(steps_uT, default=1.0))
-                axes.set_xlabel("further random walk / µT a contact")
+                axes.set_xlabel("added random walk / µT per contact")
             axes.set_xlim(left=0)
             axes.grid(alpha=0.25)
         axes.set_yscale("log")

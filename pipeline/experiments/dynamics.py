@@ -151,12 +151,13 @@ def lag_ms(
 
 
 MEANING = (
-    "Half-sine presses at random places of the grid, every frame read. The model is the paper's network, trained on "
-    "readings at rest of other boards. Scored are readings with four before them in the press and some force. The mean "
-    "of the last five readings is the paper's protocol at rest; in a press the five see different depths. Against the "
-    "force of its middle reading the same mean shows how much of its error is lag: a prediction two frames late. "
-    "Presses of one duration differ from those of another in depth and place too: compare the ways, at each duration. "
-    f"± is the sd over network seeds; all presses are on one board. {VERDICTS}"
+    "Half-sine presses at random places of the grid, recorded at the full rate. The model is the paper's network, "
+    "trained on readings at rest of other boards. A reading is scored if four readings of the same press come before "
+    f"it and its force is at least {FORCE_MIN_N:g} N. The mean of the last five readings is the paper's protocol at "
+    "rest; during a press, these five readings are taken at different depths. The third method compares the same mean "
+    "with place and force at its middle reading, two frames earlier: the difference in error is due to lag. Presses "
+    "of different durations also differ in depth and place, so compare methods at the same duration. "
+    f"± is the standard deviation over network seeds; all presses are on one board. {VERDICTS}"
 )
 TITLES = {
     "one": "each reading alone",
@@ -211,7 +212,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.set_ylim(bottom=0)
         handles, labels = panels[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-        figure.suptitle(f"Presses read at {numbers['rate_hz']:.0f} Hz ({source})", x=0.01, ha="left", fontsize=11)
+        title = f"Errors during presses recorded at {numbers['rate_hz']:.0f} Hz ({source})"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"dynamics.svg": svg(figure)}
 
 

@@ -143,9 +143,10 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         own = numbers[SHAPE]
         lines += [_line(OF_SHAPE + title, own, name, source) for name, title in VARIANTS.items() if name in own]
     spread = (
-        f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks. One "
-        "fold's networks predict all these boards, so it does not include the choice of training boards. ± (seeds) is "
-        f"the standard deviation over {numbers['seeds_n']} network seeds on one skin, mean over skins."
+        "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
+        f"{numbers['seeds_n']} networks. The networks of one fold predict all these boards, so the interval does not "
+        "include the variation between choices of training boards. ± (seeds) is the standard deviation over "
+        f"{numbers['seeds_n']} network seeds on one skin, averaged over skins."
     )
     return {"flexible": tabulate(lines, meaning=_meaning(numbers), spread=spread)}
 
@@ -164,8 +165,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.set(xlabel="true force / N")
         panels[0].set_ylabel("predicted force / N")
         title = (
-            f"Networks of rigid boards on flexible boards ({source})\n"
-            f"bias over {numbers['seeds_n']} network seeds, points of the first"
+            f"Networks trained on rigid boards, tested on flexible boards ({source})\n"
+            f"bias: mean over {numbers['seeds_n']} network seeds; points: first seed"
         )
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         return {"flexible.svg": svg(figure)}
@@ -174,13 +175,14 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _meaning(numbers: Mapping[str, Any]) -> str:
     gap_mm = numbers["gap_mm"]
     return (
-        f"Networks of fold {numbers['fold']}, trained on {numbers['trained_on_skins_n']} skins of rigid boards, on "
-        f"{numbers['skins_n']} skins of {numbers['boards_n']} flexible boards; adapted by {numbers['pokes_n']} pokes. "
-        "Bias: mean of predicted less true force, and as a part of the mean force; the paper names "
-        f"{FLEXIBLE_BIAS} after adaptation, without a number. Ours: |dB| is {show(numbers['strength_ratio'])} times as "
-        f"strong at equal depth (± over depths). Skins lie {gap_mm['flexible']:g} mm over the chips instead of "
-        f"{gap_mm['rigid']:g} mm, {numbers['gap_less_pct']:.0f} % less; the paper's {FLEXIBLE_GAP_LESS_PCT:g} % less. "
-        "The paper's numbers are after adaptation, its accuracy about."
+        f"Networks of fold {numbers['fold']}, trained on {numbers['trained_on_skins_n']} skins of rigid boards and "
+        f"tested on {numbers['skins_n']} skins of {numbers['boards_n']} flexible boards; adapted with "
+        f"{numbers['pokes_n']} pokes of each skin. Bias: mean of predicted less true force, also as a percentage of "
+        f"the mean force; the paper reports {FLEXIBLE_BIAS} after adaptation, without a number. In our simulation, "
+        f"|dB| at equal depth is {show(numbers['strength_ratio'])} times that on rigid boards (± over depths). The gap "
+        f"between chips and skin is {gap_mm['flexible']:g} mm instead of {gap_mm['rigid']:g} mm, "
+        f"{numbers['gap_less_pct']:.0f} % less; in the paper it is {FLEXIBLE_GAP_LESS_PCT:g} % less. "
+        "The paper's numbers are after adaptation; its accuracy is approximate."
     )
 
 

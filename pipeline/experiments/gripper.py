@@ -209,16 +209,16 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
 
 
 MEANING = (
-    "One line of a controller closes a gripper until the estimated force is the aimed one, "
-    "`closed_mm += {gain_mm_N:g} * (aim_N - estimate_N)`, {rate_hz:g} times a second, while the object stiffens "
-    "threefold, gives way ninefold and stiffens again: {objects_n} objects of {soft:g} to {hard:g} N/mm on each of "
-    "{skins_n} skins, one a board, pressed at its middle. Networks never saw the board; `map` is the universal model "
-    "that comes with the project. The known press is one of the aimed force where the object is then held: "
-    "as a factor it scales all estimates, as a label it calibrates the universal model. Judged is the true "
-    "force from one second on: held is a run whose mean force lies within {within_pct:g} % of the aim, always one that "
-    "never leaves that band; an error is the mean of a run's. [low, high]: 95 % interval over boards. Each of "
-    "{seeds_n} networks a board holds by itself; ± (seeds): standard deviation over {seeds_n} network seeds on one "
-    "board, mean over boards."
+    "A one-line controller closes a gripper until the estimated force equals the intended force (the aim), "
+    "`closed_mm += {gain_mm_N:g} * (aim_N - estimate_N)`, {rate_hz:g} times per second, while the object stiffens "
+    "threefold, softens ninefold and stiffens again: {objects_n} objects of {soft:g} to {hard:g} N/mm on each of "
+    "{skins_n} skins, one per board, pressed at the skin's middle. The networks were trained without the board; `map` "
+    "is the universal model that comes with the project. The known press has the aimed force, at the place where the "
+    "object is then held: as a factor, it scales all estimates; as a label, it calibrates the universal model. The "
+    "true force from one second on is judged. Held: the run's mean force is within {within_pct:g} % of the aim. "
+    "Always: the force never leaves that band. Error: mean absolute deviation from the aim over a run. [low, high]: 95 "
+    "% confidence interval over boards. Each of the {seeds_n} networks of a board controls runs of its own; ± (seeds): "
+    "standard deviation over {seeds_n} network seeds on one board, averaged over boards."
 )
 PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
 
@@ -261,8 +261,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             labels = [f"{row['feedback']}\n{PRESSES[row['press']]}" for row in rows]
             axes.set_xticks(range(len(rows)), labels, fontsize=8, rotation=45)
             axes.set_title(f"{aim_N:g} N", fontsize=10)
-        panels[0].set_ylabel("mean force off the aim / %")
-        title = f"A force is held by its estimate; below, who estimates, and the known press ({source})"
+        panels[0].set_ylabel("mean force less the aim / %")
+        title = f"Force control by estimated force; labels: model, and use of a known press ({source})"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"gripper.svg": svg(figure)}
 

@@ -139,20 +139,20 @@ def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Est
 # --- Tables and figures ---
 
 MEANING = (  # {rate_hz} comes from the numbers
-    "A log at {rate_hz:.0f} Hz with nothing but times and readings, as a board writes it to an SD card: a quiet start, "
-    "then footfalls at random places. The quiet start is the no-load reading; contact is a change of field well above "
-    "its noise; places and forces are predicted by networks that never saw the board, each scored by itself: ± is the "
-    "standard deviation over {networks_n} network seeds. Errors are over the readings "
-    "found in contact, against the truth that the simulator keeps. The board keeps its place: the earth's field is "
-    "part of the no-load reading and stays as it is, which it does not in a dog's shoe or on a hand."
+    "A log at {rate_hz:.0f} Hz with only times and readings, as a board writes it to an SD card: a quiet start, "
+    "then footfalls at random places. The quiet start is the no-load reading; a contact is a change of field well "
+    "above its noise. Places and forces are predicted by networks trained without the board, each scored separately: ± "
+    "is the standard deviation over {networks_n} network seeds. Errors are over the readings detected as contact, "
+    "against the true values of the simulation. The board does not rotate: the earth's field is part of the no-load "
+    "reading and remains constant, which is not so in a dog's shoe or on a hand."
 )
 TURNING = (
-    "The same log, as if the board pitched to either side by so much, as a sine once a step ({turning_period_s:.2g} s) "
-    "in the earth's field of {earth_uT:.0f} µT, walking north (the worst way); the angles are assumed. What changes "
-    "of that field passes for contacts. As a remedy, one chip more, aside and of the same make and noise, is read with "
-    "every frame, and its reading is taken off all others, turned as the board's design turns each chip. Errors are "
-    "over the readings found in contact that are: where more weak ones are found, the mean error of force falls. ± is "
-    "the standard deviation over network seeds."
+    "The same log, as if the board pitched to either side by the given angle, as a sine once per step "
+    "({turning_period_s:.2g} s) in the earth's field of {earth_uT:.0f} µT, walking north (the worst direction); the "
+    "angles are assumed. Changes of that field are mistaken for contacts. As a remedy, one additional chip of the same "
+    "type and noise, placed aside, is read with every frame; its reading, rotated to each chip's axes by the board's "
+    "design, is subtracted from all others. Errors are over the readings in contact that were detected as contact: "
+    "where more weak ones are detected, the mean error of force falls. ± is the standard deviation over network seeds."
 )
 VARIANTS = {"as logged": None, "a chip's aside taken off": "reference_chip"}
 

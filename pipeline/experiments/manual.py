@@ -149,14 +149,15 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             cells = {metric: judge(difference.get(metric), metric) for metric in COLUMNS}
             lines.append(_line(title, difference, cells, PAPER_DIFFERENCES.get(name, {}), source))
     meaning = (
-        f"{numbers['pokes_n']} pokes by hand a skin, along {numbers['lines_n']} lines of which only the order is known "
-        f"(paper: {MANUAL_POKES_N}); tested on the robot's grid of the same skin, by networks that never saw its "
-        f"board. Differences: whether by hand is better. {VERDICTS}"
+        f"{numbers['pokes_n']} hand pokes per skin (paper: {MANUAL_POKES_N}), along {numbers['lines_n']} lines; only "
+        "the order of the pokes along a line is known, not their places. Networks of folds that hold out the skin's "
+        "board are adapted with these pokes and tested on the robot's grid of the same skin. Differences: is "
+        f"adaptation with hand pokes better than the alternative? {VERDICTS}"
     )
     spread = (
-        f"[low, high] is the 95 % interval over n boards, each skin the mean of {numbers['seeds_n']} networks. "
-        f"± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds on one skin, mean over skins; of "
-        "a difference, that of the differences of equal seeds."
+        "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
+        f"{numbers['seeds_n']} networks. ± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds "
+        "on one skin, averaged over skins; for a difference, it is that of the differences between networks of equal seed."
     )
     return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
 

@@ -296,9 +296,10 @@ def neglected_effects(settings: Settings, results: Path) -> None:
 
 
 MEANING = (
-    "Error of neglecting each effect, measured on this scene's first skin under the main protocol, whichever protocols "
-    "neglect it: root mean square of all changes of field, relative; the largest of the no-load field, before it is "
-    "subtracted; the force. Always neglected and not quantified: the skin's corner tabs, and its screws one by one."
+    "Error caused by neglecting each effect, measured on this scene's first skin under the main protocol, whichever "
+    "protocols neglect it. Change of field: root mean square error over all changes of field, relative to their root "
+    "mean square. Field at rest: largest error of the no-load field, before it is subtracted. Force: relative error of "
+    "the force. Always neglected and not quantified: the skin's corner tabs, and each single screw that holds it."
 )
 
 

@@ -443,15 +443,15 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         "population": tabulate([_line(row, source) for row in numbers["told"]], meaning=_meaning(numbers)),
         "population_scaling": tabulate(
             [first | _line(row, source) for first, row in zip(scaling, numbers["scaling"], strict=True)],
-            meaning=f"Networks of {numbers['steps_n']} steps each, from equal initial weights, on the first so many "
-            "skins of one population. The map beside them is the same, and so are the likelihood powers, chosen with "
-            "the network of most skins.",
+            meaning=f"Networks trained for {numbers['steps_n']} steps each, from the same initial weights, on the first "
+            "skins of one population (column `skins taught`: how many). All rows use the same map and the same "
+            "likelihood powers, which were chosen with the network of most skins.",
         ),
     }
     if "fresh" in numbers:  # absent from results of earlier versions
         meaning = (
-            "Fresh skins of the population: neither those of the training nor those that likelihood powers were chosen "
-            "on. [low, high]: 95 % interval over n skins. The population is drawn wider than the scene's "
+            "Newly drawn skins of the population, used neither for training nor for choosing likelihood powers. "
+            "[low, high]: 95 % confidence interval over n skins. The population has wider spreads than the scene's "
             f"{numbers['skins_asked_n']} skins."
         )
         shown["population_fresh"] = tabulate(_fresh(numbers["fresh"], source), meaning=meaning)
@@ -470,7 +470,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             style = {"color": COLOURS[i], "marker": MARKERS[i], "capsize": 3}
             axes.errorbar(own["skins_n"], wrong_pct, sd, label=NAMES[way], **style)
         axes.set(xscale="log", xlabel="simulated skins that the network was trained on", ylim=(0, None))
-        axes.set_ylabel("error above 1 mm / %")
+        axes.set_ylabel("readings with an error above 1 mm / %")
         axes.legend(frameon=False)
         boards_n = rows["accuracy_pct"].iloc[0]["n"]
         axes.set_title(f"{numbers['steps_n']} steps each, skins of {boards_n} boards ({source})", fontsize=9)
@@ -496,11 +496,12 @@ def _fresh(rows: Sequence[Mapping[str, Any]], source: str) -> list[dict[str, str
 def _meaning(numbers: Mapping[str, Any]) -> str:
     coverage = ", ".join(f"{NAMES[way]} {pct:.3g} %" for way, pct in numbers["coverage_further_pct"].items())
     return (
-        f"Models of simulated skins about the skin as designed, of none of the scene's {numbers['skins_asked_n']}; "
-        f"tested on {numbers['rows_asked_n']:,} rows of later passes. Unlabelled pokes: one at each of the "
-        f"{numbers['pool_n']} places of the grid under any depth, or the first of these; labels are among them. Known "
-        f"weight: of one press in the middle, the first passes' nearest to {numbers['weight_N']:g} N, the force is "
-        f"known to {100 * numbers['weight_sd']:g} %. The factor uses all forces: no weight that scales them alike does "
-        "better. Likelihood powers, and the share of the weight's error that corrects all forces, were chosen on "
-        f"further skins of the population; there 90 % intervals cover {coverage}."
+        "Models built from simulated skins that are drawn around the skin as designed and include none of the scene's "
+        f"{numbers['skins_asked_n']} skins; tested on {numbers['rows_asked_n']:,} rows of later passes. Unlabelled "
+        f"pokes: one at each of the {numbers['pool_n']} places of the grid, at any of its depths, or the first of "
+        "these; the labelled pokes are among them. One known weight: of the first passes' presses in the middle, the "
+        f"one nearest to {numbers['weight_N']:g} N is used, and its force is known to {100 * numbers['weight_sd']:g} "
+        "%. One factor a skin: the best factor, computed from all true forces; no weight that scales all forces alike "
+        "can do better. Likelihood powers, and the share of the weight's error by which all forces are corrected, were "
+        f"chosen on further skins of the population; on those, 90 % intervals cover: {coverage}."
     )

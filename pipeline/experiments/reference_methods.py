@@ -515,32 +515,35 @@ WHY = {
     "have equal places",
 }
 BASELINES = (
-    "Regressors and networks of the known boards on the held-out one; aligned by all its unlabelled pokes, or by so "
-    "many labelled ones, each paired with what known boards read at its place and force. Paired: difference to the row "
-    "without it (the same regressor, no label; the network, trained as long), board by board. Ridge of direct "
-    "standardisation: by leaving out these pairs one by one, as one training board has no second to be validated on. "
-    "Nothing else was searched."
+    "Regressors and networks of the known boards, tested on the held-out board. They are aligned with all its "
+    "unlabelled pokes, or with the given number of labelled ones; direct standardisation pairs each of these with what "
+    "known boards read at its place and force. Paired: difference to the same method without alignment (the regressor "
+    "without labels; the network trained as long without it), board by board. The ridge penalty of direct "
+    "standardisation is chosen by leave-one-out over these pairs, because with a single training board there is no "
+    "second one to validate on. No other setting was tuned."
 )
 UNLABELLED = (
-    "No label of the held-out board. Paired: difference to the same method with the skin's own pokes, board by board. "
-    "Physics inversion: a law's eight numbers, and place and force of each poke, by least squares from nominal "
-    "numbers, whose stiffness and slide are the middle of recorded boards, these included; then each reading is "
-    "searched in that law. Centred: places shifted so that the pokes' mean is the middle, as maps and networks assume "
-    "too. Its stiffness is nominal, so its forces are in nominal units. Another skin's: the pokes of "
-    "the next board, beside the held-out board's own field at rest."
+    "No label of the held-out board is used. Paired: difference to the same method with the skin's own pokes, board by "
+    "board. Physics inversion: eight parameters of the physical model (the law), and place and force of each poke, are "
+    "fitted by least squares, starting from nominal parameters; the nominal stiffness and slide are the middle of "
+    "recorded boards, these boards included. Each tested reading is then looked up in the fitted model. Centred: "
+    "places are shifted so that the mean of the pokes is the middle, which maps and networks assume too. The stiffness "
+    "of the model is nominal, so its forces are in nominal units. Another skin's: the pokes of the next board, "
+    "together with the held-out board's own field at rest."
 )
 ALARM = (
-    "Left over: |dB - simulated| / |dB| of the best place in the law, the median over readings. The alarm is raised "
-    "above the limit that {asked:g} % of readings of boards not held out exceed; limit {limit}. Area under the ROC "
-    "curve: 0.5 is chance, 1 is perfect. Strangers are recorded readings of the same board with changed chips; the law "
-    "is that of the right skin, or fitted anew to the stranger's own pokes and field at rest. n boards; "
-    "[low, high]: 95 % interval over them (Student's t; it may leave the possible range)."
+    "Left over: the residual |dB - simulated| / |dB| at the best place in the physical model (the law), median over "
+    "readings. A reading raises the alarm if its residual is above the limit that {asked:g} % of the readings of the "
+    "other boards exceed; limit {limit}. Area under the ROC curve: 0.5 is chance, 1 is perfect. Strangers: recorded "
+    "readings of another board, or of the same board with its chips changed in software. The law is that of the right "
+    "skin, or is fitted again to the stranger's own pokes and field at rest. n boards; [low, high]: 95 % confidence "
+    "interval over them (Student's t; it may extend beyond the possible range)."
 )
 FLAGGED = (
-    "Each receives the right skin's own unlabelled pokes and no label. Flagged: above the limit that {asked:g} % of "
-    "readings of boards not held out exceed. n boards; an error is of those that flag any reading. A large "
-    "misfit means that dB is unlike that of such a skin, a large standard deviation that several places read alike: "
-    "only the latter is about the place."
+    "Each method receives the right skin's own unlabelled pokes and no label. Flagged: readings above the limit that "
+    "{asked:g} % of the readings of the other boards exceed. n boards; errors of flagged readings are over the boards "
+    "that flag any. A large misfit means that dB is unlike any that such a skin produces; a large standard deviation "
+    "means that several places give similar readings. Only the latter says something about the error of the place."
 )
 
 

@@ -157,11 +157,12 @@ def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
 
 
 MEANING = (  # {told_pct} comes from the numbers
-    "The weight on the skin's centre increases step by step; the glass's flat foot is taken as the rig's round tip. A "
-    "difference is resolved if at least {told_pct:g} % of the pairs of readings within a held-out filling are in the "
-    "order of the weights, for it and all larger differences. The response is the change of field along its mean "
-    "direction in the other half of the fillings. Monotonicity is tested at the smallest step whose mean rise exceeds "
-    "the noise of a stop's readings in {told_pct:g} % of cases: at finer steps noise alone makes it fall."
+    "The weight on the skin's centre increases step by step; the flat foot of the glass is simulated as the rig's "
+    "round tip. A difference of weight is resolved if, for this and all larger differences, at least {told_pct:g} % of "
+    "the pairs of readings within a held-out filling are in the order of their weights. The response is the component "
+    "of the change of field along its mean direction in the other half of the fillings. Monotonicity is tested at the "
+    "smallest step whose mean rise exceeds the noise of one filling (mean of a stop's readings) in {told_pct:g} % of "
+    "cases: at finer steps, noise alone can make the response fall."
 )
 READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's readings"}
 
@@ -200,7 +201,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         weight_N, response_uT, sd_uT = (np.array(drawn[name]) for name in ("weight_N", "response_uT", "sd_uT"))
         left.fill_between(weight_N, response_uT - sd_uT, response_uT + sd_uT, color=COLOURS[6], linewidth=0)
         left.plot(weight_N, response_uT, color=COLOURS[1])
-        left.set(xlabel="weight / N", ylabel="response / µT (mean, sd of a reading)")
+        left.set(xlabel="weight / N", ylabel="response / µT (mean, standard deviation)")
         difference_N = numbers["step_N"] * np.arange(1, len(weight_N))
         for colour, (name, words) in zip(COLOURS[1:], READINGS.items(), strict=False):
             share_pct = 100 * np.array(drawn["by_direction"][name])
@@ -211,7 +212,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         right.set(xscale="log", xlabel="difference of weight / N", ylabel="pairs in the right order / %")
         right.set_ylim(48, 102)  # half is chance
         right.legend(frameon=True, framealpha=1, edgecolor="none", fontsize=9, loc="lower right")
-        figure.suptitle(f"A glass is filled on the skin ({source})", x=0.01, ha="left", fontsize=11)
+        figure.suptitle(f"Response while a glass on the skin is filled ({source})", x=0.01, ha="left", fontsize=11)
         return {"sensitivity.svg": svg(figure)}
 
 

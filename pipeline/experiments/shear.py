@@ -148,14 +148,16 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         lines.append(line | {"n": str(own["accuracy_pct"]["n"])})
     rms_N = ", ".join(f"{numbers[f'{axis}_rms_N']:.2g} N (F{axis[1]})" for axis in ("fx", "fy", "fz"))
     meaning = (
-        f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: a "
-        f"line that is held out is dragged along in {numbers['passes_n'] - 1} others. Our forces are {rms_N} rms. The "
-        "paper's are not stated, and an MSE grows with the square of the force: explained variance, 1 - MSE / "
-        "variance, does not. MSE_Fxy is a mean over two axes too; the paper does not say whether it sums or averages."
+        f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: the "
+        f"path of a held-out line is also dragged along in {numbers['passes_n'] - 1} other passes. Our forces are "
+        f"{rms_N} rms. The paper does not state its forces, and an MSE grows with the square of the force; explained "
+        "variance, 1 - MSE / variance, does not. MSE_Fxy, too, is a mean over two axes; the paper does not say whether "
+        "it sums or averages."
     )
     spread = (
-        f"± is the sd over n random splits, each the mean of {numbers['seeds_n']} networks; ± (seeds) is the sd over "
-        f"{numbers['seeds_n']} network seeds on one split, mean over splits."
+        "± is the standard deviation over n random splits; the score of a split is the mean over "
+        f"{numbers['seeds_n']} networks. ± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds "
+        "on one split, averaged over splits."
     )
     return {"shear": tabulate(lines, meaning=meaning, spread=spread)}
 
@@ -172,7 +174,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             axes.locator_params(nbins=4)
         explained = {part: _show_explained(numbers["by_line"][f"explained_{part}"]) for part in ("fxy", "fz")}
         title = (
-            f"Forces of dragged lines held out whole ({source}); points of the first of {numbers['seeds_n']} networks\n"
+            f"Forces on held-out dragged lines ({source}); points: first of {numbers['seeds_n']} networks\n"
             f"explained variance: {explained['fxy']} sideways, {explained['fz']} normal"
         )
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)

@@ -213,7 +213,7 @@ def draw_errors(
 PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % within, mm"}
 PARTS = {"near_seam": "median near a border of boards, mm", "inside": "median elsewhere, mm"}
 NO_NUMBER = "none: a demonstration"
-SPREAD = "± is the standard deviation over the network seeds that column `seeds` counts."
+SPREAD = "± is the standard deviation over the network seeds; column `seeds` gives their number."
 NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}
 
 
@@ -226,7 +226,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     near_n, inside_n = (numbers[part]["pokes_n"] if part in numbers else 0 for part in PARTS)
     meaning = (
         f"Trained on the first {numbers['trained_n']} pokes of one skin, tested on its last {numbers['tested_n']}: "
-        f"{near_n} of them less than {numbers['near_mm']:g} mm from a border of two boards, {inside_n} elsewhere. "
+        f"{near_n} of them less than {numbers['near_mm']:g} mm from a border between two boards, {inside_n} elsewhere. "
         f"The paper prints no number here: {SLEEVE_WORDS}."
     )
     return {"sleeve": tabulate(lines, meaning=meaning, spread=SPREAD), "sleeve_set_up": _set_up(numbers, source)}
@@ -249,7 +249,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         axes.set(xlabel="y / mm", ylabel="x / mm", aspect="equal")
         median = show(numbers["median_error_mm"])
         over = f"over {numbers['median_error_mm']['n']} network seeds"
-        title = f"Held-out pokes over {numbers['chips_n']} chips ({source})\nmedian error {median} mm {over}"
+        title = f"Place errors of held-out pokes over {numbers['chips_n']} chips ({source})\nmedian {median} mm {over}"
         figure.suptitle(title, x=0.01, ha="left", fontsize=10)
         figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
         return {"sleeve.svg": svg(figure)}

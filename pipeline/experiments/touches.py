@@ -359,11 +359,11 @@ def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: floa
 
 BY_TIME = "later in the same recordings"
 ONCE = (
-    "Each place was recorded once, so later readings of the same recording may be recognised by the recording as well "
-    "as by the place: only a recording of another day, or a place left out, excludes that."
+    "Each place was recorded once, so later readings may be recognised by their recording as well as by their place; "
+    "only a recording from another day, or a place left out of training, rules this out."
 )
-APART = "Single touches and two at once are in different recordings; data/README.md says of which days."
-NO_MM = "The pitch of the 3 x 3 places is stated nowhere, so nothing is given in mm."
+APART = "Single touches and two touches at once are in different recordings; data/README.md gives their dates."
+NO_MM = "The spacing of the 3 x 3 places is not documented, so nothing is given in mm."
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -392,8 +392,9 @@ def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
     single, double = numbers["single"], numbers["double"]
     table.attrs["meaning"] = (
         f"{single['rows_n']} rows of {single['recordings_n']} recordings of one touch, {double['rows_n']} rows of "
-        f"{double['recordings_n']} of two, with {numbers['force_min_N']:g} N or more. Place: the nearest directions of "
-        f"the change of field; force: ridge regression on it. Means and ± sd over n recordings. {ONCE} {APART} {NO_MM}"
+        f"{double['recordings_n']} of two, with {numbers['force_min_N']:g} N or more. Place: majority of the nearest "
+        "known directions of the change of field. Force: ridge regression on the change of field. Mean ± standard "
+        f"deviation over n recordings. {ONCE} {APART} {NO_MM}"
         f"{_left_out(numbers)}"
     )
     return table
@@ -439,11 +440,11 @@ def _superposition(numbers: Mapping[str, Any]) -> pd.DataFrame:
     rows.append({"places": "mean"} | {title: show_digits(numbers[name], 0) for title, name in means.items()})
     table = pd.DataFrame(rows).fillna("–")
     table.attrs["meaning"] = (
-        "What is left of a recorded change of field of two touches, as a share of it (median over rows), when it is "
-        "fitted by the mean directions of single touches at these places, each times an amplitude of 0 or more: how "
-        "hard each was pressed is not recorded. A direction that changes with force counts as left over: of single "
-        f"touches themselves it is {show_digits(numbers['single_touches_pct'], 0)} %. Two amplitudes fit better than "
-        f"one of themselves; the other pairs have two as well. {APART}"
+        "Residual of the recorded change of field of two touches, as a percentage of its size (median over rows), "
+        "after a fit by the mean directions of single touches at these places, each with an amplitude of 0 or more, "
+        "because how hard each place was pressed is not recorded. A direction that changes with force adds to the "
+        f"residual: for single touches the residual is {show_digits(numbers['single_touches_pct'], 0)} %. Two "
+        f"amplitudes always fit better than one; the other pairs have two amplitudes as well. {APART}"
     )
     return table
 
@@ -463,9 +464,9 @@ def _detection(numbers: Mapping[str, Any]) -> pd.DataFrame:
     ]
     table = pd.DataFrame(rows)
     table.attrs["meaning"] = (
-        f"Thresholds ask for {numbers['false_alarm_asked_pct']:g} % false alarms, as in `contacts`, and are set "
-        "on single touches between those that are known and those that are tested. A detector that calls a single "
-        "touch at a place it does not know two has found what is new, not what is two: then the first column is no "
-        f"evidence for more. {APART}"
+        f"Thresholds are set for {numbers['false_alarm_asked_pct']:g} % false alarms, as in `contacts`, on single "
+        "touches recorded after the known and before the tested ones. A detector that also calls a single touch at an "
+        "unknown place `two` responds to what is new, not to two touches; then the first column is no evidence that it "
+        f"detects two touches. {APART}"
     )
     return table

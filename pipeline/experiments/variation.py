@@ -168,8 +168,9 @@ def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
 
 
 MEANING = (
-    "By how much equal pokes differ: rms over the channels, and as a part of the change of field that the poke makes. "
-    "As read: the field itself. Change: less the no-load reading of the same indentation, which is what a model sees."
+    "Difference between equal pokes: rms over the channels, and as a percentage of the change of field that the poke "
+    "causes. Field as read: nothing is subtracted. Change of field: the no-load reading of the same indentation is "
+    "subtracted, as in the inputs of a model."
 )
 
 
@@ -194,7 +195,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     if "shown_s" in numbers and "warmer_K" in numbers:
         meaning += (
             f" The contacts compared over time take {numbers['shown_s']:,.0f} s, in which the chips' temperature "
-            f"changes by {numbers['warmer_K']:+.2g} K: the field shows that too, beside the skin's own wear."
+            f"changes by {numbers['warmer_K']:+.2g} K: the field changes with temperature as well as with wear."
         )
     return {"variation": tabulate(lines, meaning=f"{meaning} Paper: {FIGURE_4}.")}
 
@@ -212,7 +213,7 @@ def _draw_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], 
 
     most_n = max(place["time"]["contacts_n"][-1] for place in places)
     title = f"Field over time at {numbers['depth_mm']:g} mm depth, first visit subtracted ({source})"
-    with _panels(places, title, "field less the first / µT") as (figure, panels):
+    with _panels(places, title, "field less that of the first visit / µT") as (figure, panels):
         # Without the upper end of the colour map: its yellow is pale on white.
         colours = mpl.colors.ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.85, 256)))
         scale = mpl.colors.Normalize(0, most_n)

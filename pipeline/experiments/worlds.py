@@ -263,9 +263,10 @@ FACTORS = {
 DRAWN = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
 MEANING = (
     "Each world differs from the default in one factor; skins, indentations, noise and folds are the same. Error "
-    "of the simulation: the largest is that on recorded boards (scene lab, 1 - explained), correlated over "
-    "{residual_length_mm:g} mm, {residual_own_share:.0%} of its variance specific to a skin; simulated skins of all "
-    "other scenes have none. {folds_n} boards held out in turn, {steps_n} steps, one network each."
+    "of the simulation: a smooth random error that is added to the fields, relative to |dB|. Its largest size is the "
+    "error on recorded boards (scene lab, 1 - explained); it is correlated over {residual_length_mm:g} mm, and "
+    "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
+    "error. {folds_n} boards are held out in turn; networks are trained for {steps_n} steps, one per row, fold and world."
 )
 DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # those of the other factors are in the numbers
 

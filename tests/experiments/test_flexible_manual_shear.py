@@ -289,7 +289,7 @@ def test_shear_table_has_both_splits():
         assert f"{mean:g} ± {sd:g}" in text
     table = shear.tables(SHEAR_NUMBERS, "simulated")["shear"]
     assert table["accuracy, % (ours)"].tolist() == ["96 ± 0.1 ± 0.02 (seeds)", "58 ± 0.1 ± 0.02 (seeds)"]
-    assert "± (seeds) is the sd over 3 network seeds" in text
+    assert "± (seeds) is the standard deviation over 3 network seeds" in text
     assert table["split"].tolist()[0] == "random readings held out (ours; the paper names no split)"
     assert "4590 readings of 54 dragged lines in 1 passes" in text
     text = texts_of(shear.figures(SHEAR_NUMBERS, CURVES, "simulated")["shear.svg"])
@@ -314,7 +314,7 @@ def test_manual_table_has_variants_and_differences():
 def test_flexible_table_has_bias_and_differences():
     text = to_markdown(flexible.tables(FLEXIBLE_NUMBERS, "simulated")["flexible"])
     assert f"{FLEXIBLE['mse_xy_mm2']:g}" in text
-    assert "30 % less; the paper's 80 % less" in text
+    assert "30 % less; in the paper it is 80 % less" in text
     table = flexible.tables(FLEXIBLE_NUMBERS, "simulated")["flexible"]
     assert table["bias of F, N"].tolist() == [f"{mean} ± 0.1 ± 0.02 (seeds)" for mean in ("+0.96", "-0.83", "+0.97")]
     assert "over 3 network seeds" in text

@@ -237,14 +237,14 @@ def test_pitched_log_has_its_own_table():
     assert list(table["contacts made"]) == ["3", "3"]
     assert list(table["accuracy / %"]) == ["50", "unknown"]
     assert set(table["source"]) == {"simulated"}
-    assert "once a step (0.7 s) in the earth's field of 50 µT" in table.attrs["meaning"]
+    assert "once per step (0.7 s) in the earth's field of 50 µT" in table.attrs["meaning"]
     assert "logs_turning" not in tables(NUMBERS, "recorded")
 
 
 def test_text_has_the_rate_of_the_log():
     table = tables(NUMBERS | {"rate_hz": 133.0}, "recorded")["logs"]
     assert "A log at 133 Hz with" in table.attrs["meaning"]
-    assert "The board keeps its place" in table.attrs["meaning"]
+    assert "The board does not rotate" in table.attrs["meaning"]
 
 
 def test_spread_over_networks_is_shown():

@@ -176,7 +176,7 @@ def test_table_lists_methods_with_source_and_no_paper_number():
     assert set(table["paper"]) == {"none: a demonstration"}
     assert table["seeds"].tolist() == ["1", "2", "1"]
     assert "±" in table["accuracy, %"][1]
-    assert "network seeds that column `seeds` counts" in table.attrs["spread"]
+    assert "column `seeds` gives their number" in table.attrs["spread"]
     assert float(table["median error, mm"][0]) == pytest.approx(
         numbers["median_error_mm"]["mean"], rel=5e-3
     )  # 3 digits

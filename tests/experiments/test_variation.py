@@ -147,8 +147,8 @@ def test_places_have_changes_and_spread():
 
 def test_pace_and_temperature_are_in_the_notes():
     text = to_markdown(tables(numbers(), "simulated")["variation"])
-    assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in text
-    assert "A real rig takes seconds a contact" in text
+    assert "to the next is 0.0575 s; the whole capture lasts 1,166 s." in text
+    assert "A real rig takes seconds per contact" in text
     assert "take 575 s, in which the chips' temperature changes by +1.9 K" in text
     cold = {name: value for name, value in numbers().items() if name != "warmer_K"}
     assert "temperature changes" not in to_markdown(tables(cold, "recorded")["variation"])

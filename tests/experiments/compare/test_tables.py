@@ -50,7 +50,7 @@ def test_simulations_are_judged_by_bounds():
     assert table["memory, % (5 to 8)"].tolist()[1] == "6.5 / 7.0"
     assert table["held at the deepest"].tolist() == ["3", "0", "0", "–"]
     assert set(table["source"]) == {"recorded"}
-    for words in ("put in by hand, 6.5 %", "both boards of scene lab in view", "not explained"):
+    for words in ("memory is set to 6.5 %", "both boards of scene lab", "not explained"):
         assert words in table.attrs["meaning"]
 
 
@@ -79,7 +79,7 @@ def test_figure_labels():
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
         assert word in texts_of(drawn["compare_arrows.svg"])
     assert "recorded: power 0.30" in texts_of(drawn["compare_growth.svg"])
-    for word in ("k / μ 8.75 N/mm (used)", "any force slides it", "recorded"):
+    for word in ("k / μ 8.75 N/mm (used)", "no limit by friction", "recorded"):
         assert word in texts_of(drawn["compare_touch.svg"])
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
 

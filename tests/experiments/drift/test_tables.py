@@ -58,8 +58,8 @@ def test_findings_table_has_verdicts_and_sizes():
     text = to_markdown(table)
     assert "95 % interval over pairs of networks" in text
     assert "A contact changes the field by 140 µT rms" in text
-    assert "off by 3 µT (once at the start), 2 µT (every 390 indentations), 0 µT (before every contact)" in text
-    assert "98.1 % of its early force after 45,000 contacts, so softening explains +1.9 % of the force bias" in text
+    assert "by 3 µT (once at the start), 2 µT (every 390 indentations), 0 µT (before every contact)" in text
+    assert "is 98.1 % of the early force, so softening explains a force bias of +1.9 %" in text
     assert (
         "softening" not in to_markdown(tables(numbers(force=False), "recorded")["drift_findings"]).split("Measured")[1]
     )
@@ -69,33 +69,33 @@ def test_note_has_the_protocol_and_omitted_contacts():
     assert "first 5,000 indentations of each skin, tested on 1,000 indentations after every 5,000" in to_markdown(
         tables(numbers(), "simulated")["drift"]
     )
-    assert "The last 90 indentations fill no whole test" in to_markdown(tables(numbers(), "simulated")["drift"])
+    assert "The last 90 indentations do not fill" in to_markdown(tables(numbers(), "simulated")["drift"])
     whole = numbers(unit="pass", train_n=1, test_n=1, every_n=1, left_out_units_n=0)
     text = to_markdown(tables(whole, "recorded")["drift"])
     assert "first 1 pass of each skin" in text
-    assert "left out" not in text
+    assert "not used" not in text
 
 
 def test_note_has_the_pace():
     simulated, recorded = (to_markdown(tables(numbers(), source)["drift"]) for source in ("simulated", "recorded"))
     for text in (simulated, recorded):
-        assert "after 0.0575 s (median); the whole capture lasts 1,166 s." in text
-    assert "A real rig takes seconds a contact" in simulated
+        assert "to the next is 0.0575 s; the whole capture lasts 1,166 s." in text
+    assert "A real rig takes seconds per contact" in simulated
     assert "A real rig" not in recorded
     unknown = {name: value for name, value in numbers().items() if name not in ("contact_every_s", "lasts_s")}
-    assert "When the contacts were is not known." in to_markdown(tables(unknown, "recorded")["drift"])
+    assert "The times of the contacts are not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
 def test_note_has_the_unit_of_the_spread():
     text = to_markdown(tables(numbers(), "simulated")["drift"])
-    assert "± is the sd over 2 network seeds, all tested on the same contacts." in text
+    assert "± is the standard deviation over 2 network seeds, all tested on the same contacts." in text
     text = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])
-    assert "± is the sd over 4 skins with 2 network seeds each." in text
+    assert "± is the standard deviation over 4 skins with 2 network seeds each." in text
 
 
 def test_single_network_has_no_spread():
     text = to_markdown(tables(numbers(spread=False), "simulated")["drift"])
-    assert "One network each" in text
+    assert "of one network" in text
     assert "±" not in text
 
 
@@ -111,9 +111,9 @@ def test_figure_labels():
     for text in drawn.values():
         ET.fromstring(text)
         assert "(simulated)" in text
-    for label in ("accuracy / %", "MSE_F / N²", "contacts the skin has felt", "every 390 indentations"):
+    for label in ("accuracy / %", "MSE_F / N²", "contacts of the skin before the test", "every 390 indentations"):
         assert label in drawn["drift.svg"]
-    assert "bars: the sd over 2 network seeds" in drawn["drift.svg"]
+    assert "bars: the standard deviation over 2 network seeds" in drawn["drift.svg"]
     for label in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
         assert label in drawn["drift_force.svg"]
 
@@ -136,8 +136,8 @@ def test_added_walk_has_a_row_for_each_step():
     table = tables(numbers(wander=steps), "simulated")["drift_wander"]
     assert table["further walk, µT a contact"].tolist() == ["0", "0.5", "5"]
     assert table["accuracy, % (once at the start)"].tolist() == ["90 ± 1.5", "89.5 ± 1.5", "85 ± 1.5"]
-    assert "± is the sd over 2 network seeds" in to_markdown(table)
-    assert "After 10,000 contacts, if" in figures(numbers(wander=steps), DRAWN, "simulated")["drift_wander.svg"]
+    assert "± is the standard deviation over 2 network seeds" in to_markdown(table)
+    assert "After 10,000 contacts, with" in figures(numbers(wander=steps), DRAWN, "simulated")["drift_wander.svg"]
     assert "drift_wander" not in tables(numbers(), "simulated")
     assert "drift_wander.svg" not in figures(numbers(), DRAWN, "simulated")
 
