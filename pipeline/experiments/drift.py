@@ -605,8 +605,8 @@ POLICIES = ("initial", "regular", "each", "free")
 WANDER_MEANING = (
     "The networks of figure 5a, tested again on their last window after a random walk was added to the captures: one "
     "normally distributed step per contact and channel after the end of training, the same in contact readings and "
-    "no-load readings. The row without an added walk is the last window of figure 5a. For the drift of recorded fields "
-    "at rest see the table of skins: rms change over 1 to 1,000 contacts."
+    "no-load readings. The row without an added walk is the last window of figure 5a. The table of skins gives the "
+    "drift of the field at rest without an added walk: rms change over 1 to 1,000 contacts."
 )
 FINDINGS_MEANING = (
     f"{VERDICTS} A finding with several parts is contradicted if one part is, and supported if all are. Of these "

@@ -443,8 +443,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         "population": tabulate([_line(row, source) for row in numbers["told"]], meaning=_meaning(numbers)),
         "population_scaling": tabulate(
             [first | _line(row, source) for first, row in zip(scaling, numbers["scaling"], strict=True)],
-            meaning=f"Networks trained for {numbers['steps_n']} steps each, from the same initial weights, on the first "
-            "skins of one population (column `skins taught`: how many). All rows use the same map and the same "
+            meaning=f"Networks trained for {numbers['steps_n']} steps each, from the same initial weights, on the "
+            "first skins of one population (column `skins taught`: how many). All rows use the same map and the same "
             "likelihood powers, which were chosen with the network of most skins.",
         ),
     }

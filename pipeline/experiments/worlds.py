@@ -266,7 +266,7 @@ MEANING = (
     "of the simulation: a smooth random error that is added to the fields, relative to |dB|. Its largest size is the "
     "error on recorded boards (scene lab, 1 - explained); it is correlated over {residual_length_mm:g} mm, and "
     "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
-    "error. {folds_n} boards are held out in turn; networks are trained for {steps_n} steps, one per row, fold and world."
+    "error. {folds_n} boards are held out in turn; one network per row, fold and world; {steps_n} steps."
 )
 DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # those of the other factors are in the numbers
 

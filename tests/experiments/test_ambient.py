@@ -189,6 +189,7 @@ def test_single_board_variant_is_compared_on_that_board():
 def test_figure_labels():
     texts = figures(NUMBERS, {}, "simulated")
     keys = texts_of(texts["ambient.svg"])
-    for label in ("a", "b", "c", "uniform field / µT", "iron ball above the skin / mm", "earth", "b2", "(simulated)"):
+    axes = ("uniform field / µT", "distance of the iron ball from the skin / mm")
+    for label in ("a", "b", "c", *axes, "earth", "b2", "(simulated)"):
         assert label in keys.split() or label in keys
     assert figures(NUMBERS, {}, "simulated") == texts
