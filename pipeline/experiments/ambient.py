@@ -1,7 +1,7 @@
-"""Ambient fields and iron nearby that come up after the no-load reading (paper section 7, future work).
+"""Ambient fields and iron nearby that appear after the no-load reading (paper section 7, future work).
 
-What they cost on held-out boards, and what is recovered by subtracting the reading of a reference chip, or the common
-part of the board's own chips.
+Measures how much they degrade the scores on held-out boards, and how much is recovered by subtracting the reading of a
+reference chip, or the common part of the readings of the board's own chips.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,14 +34,14 @@ from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation.settings import SimulationSettings
 
-REFERENCE_ASIDE_MM = 30.0  # the lone chip, from the board's middle along x: assumed far enough to read no poke
+REFERENCE_ASIDE_MM = 30.0  # reference chip, from the board's middle along x: assumed too far away to sense a poke
 AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
 
 Networks = Mapping[str, Sequence[Network]]  # by method
 
 
 class Iron(Strict):
-    """A ball of soft iron right above the middle of the skin."""
+    """A ball of soft iron directly above the middle of the skin."""
 
     radius_mm: Annotated[float, Field(gt=0, le=100)]
     distances_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]  # from the skin's top
@@ -94,12 +94,15 @@ def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Pat
 
 @dataclass(frozen=True)
 class Instrument:
-    """A board and a reference chip aside as manufactured, and the rotations of the design, which are what is known."""
+    """A board and a separate reference chip as manufactured, and the chip rotations of the design.
+
+    Only the design is known to the methods that subtract a field.
+    """
 
     board: Board
     aside: Board
     turn: Float[np.ndarray, "k 3 3"]
-    noise_uT: Float[np.ndarray, " 3"]  # of the change that the chip aside reads
+    noise_uT: Float[np.ndarray, " 3"]  # of the reference chip's change of field
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ class Disturbance:
 def train_without_common_part(
     data: SceneData, fold: Fold, training: Training, instrument: Instrument
 ) -> tuple[list[Network], dict[str, int]]:
-    """Train the headline recipe on inputs without their common part; also count collapsed trainings."""
+    """Train the headline recipe on inputs without their common part; also count collapsed training runs."""
     without = project(data.rows.db_uT, remove_common_part(instrument.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
     jobs = make_jobs(data, headline, [fold], experiment="ambient")
@@ -134,7 +137,7 @@ def score_board(
     instrument: Instrument,
     networks: Networks,
 ) -> Iterator[dict[str, Any]]:
-    """Score every network of every method in every field, on one reading of each of the board's held-out pokes."""
+    """Score every network of every method in every field, on one reading of each held-out poke of the board."""
     rows, seed = data.rows, data.settings.seed
     test = one_row_per_poke(rows.indentation, fold.test, rng_for(seed, "ambient", fold.name, "pokes"))
     db_uT, true = rows.db_uT[test], rows.target[test]
@@ -167,9 +170,10 @@ def one_row_per_poke(
 
 
 def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequence[str]) -> list[dict[str, Any]]:
-    """Summarise scores over boards: a row for each value of the axis, with each method tested on these boards.
+    """Summarise scores over boards: one row per value of the axis, with each method that was tested on these boards.
 
-    Each point is one network's; `sd_seeds` is the standard deviation over the networks of one board, mean over boards.
+    Each point is the scores of one network. `sd_seeds` is the standard deviation over the networks of one board,
+    averaged over boards.
     """
     of_axis = [point for point in points if axis in point and point["board"] in boards]
     rows = []
@@ -189,7 +193,7 @@ def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequenc
 
 
 def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
-    """Give the root of the mean square of fields' sizes."""
+    """Return the root mean square of the fields' magnitudes."""
     return float(np.sqrt((b_T**2).sum(axis=-1).mean())) / micro
 
 
@@ -197,7 +201,7 @@ def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
 
 
 def draw_instrument(of: SimulationSettings, name: str, *, seed: int) -> Instrument:
-    """Draw the board of this name as in its captures, and a reference chip with as large manufacturing errors."""
+    """Draw the board of this name as in its captures, and a reference chip with equally large manufacturing errors."""
     design, rig, chip = of.main_boards.design, of.rig, of.chip
     lone = BoardDesign(chips_xy_mm=((REFERENCE_ASIDE_MM, 0.0),), chips_turn_deg=(0.0,), gap_mm=design.gap_mm)
     noise = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
@@ -210,7 +214,7 @@ def draw_instrument(of: SimulationSettings, name: str, *, seed: int) -> Instrume
 
 
 def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarray, "f ch"]:
-    """Give the change of the board's readings by a field in tesla at its chips, without noise."""
+    """Return the change of the board's readings that a field in tesla at its chips causes, without noise."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     return np.einsum("kij,fkj->fki", to_chip, b_T).reshape(len(b_T), -1) / micro
 
@@ -218,13 +222,13 @@ def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarr
 def reference_uT(
     own: Instrument, aside_T: Float[np.ndarray, "f 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "f ch"]:
-    """Give what is subtracted: the noisy reading of the reference chip, rotated as the design rotates each chip."""
+    """Return the field to subtract: the noisy reading of the reference chip, in each chip's axes by the design."""
     read_uT = readings_uT(own.aside, aside_T[:, None]) + own.noise_uT * rng.standard_normal((len(aside_T), 3))
     return np.einsum("kji,fj->fki", own.turn, read_uT).reshape(len(read_uT), -1)
 
 
 def remove_common_part(turn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "ch ch"]:
-    """Give the matrix that removes the best uniform field (least squares) from a reading, by the design's rotations."""
+    """Return the matrix that removes the least-squares uniform field from a reading, given the design's rotations."""
     uniform = turn.transpose(0, 2, 1).reshape(-1, 3)  # readings of unit fields along x, y, z
     return np.eye(len(uniform)) - uniform @ np.linalg.pinv(uniform)
 
@@ -237,7 +241,7 @@ def project(db_uT: Float32[np.ndarray, "f ch"], matrix: Float[np.ndarray, "ch ch
 def uniform_fields(
     own: Instrument, fields_uT: Sequence[float], *, rows_n: int, rng: np.random.Generator
 ) -> Iterator[Disturbance]:
-    """Give no field and uniform ones; each row has a random direction, the same at all strengths."""
+    """Yield no field, then uniform fields; each row has a random direction, the same at all strengths."""
     along = random_directions(rows_n, rng)
     for field_uT in sorted({0.0, *fields_uT}):
         b_T = field_uT * micro * along
@@ -248,7 +252,7 @@ def uniform_fields(
 def iron_balls(
     own: Instrument, skins: Sequence[Skin], which: Int64[np.ndarray, " f"], iron: Iron, *, rng: np.random.Generator
 ) -> Iterator[Disturbance]:
-    """Give a ball at every distance over the skin of each row; `which` is the number of a row's skin."""
+    """Yield the disturbance by a ball at every distance above each row's skin; `which` is the index of that skin."""
     for distance_mm in sorted(iron.distances_mm):
         both = [iron_fields(own, skin, radius_mm=iron.radius_mm, distance_mm=distance_mm) for skin in skins]
         chips_T, aside_T = np.stack([chips for chips, _ in both]), np.concatenate([aside for _, aside in both])
@@ -260,9 +264,9 @@ def iron_balls(
 def iron_fields(
     own: Instrument, skin: Skin, *, radius_mm: float, distance_mm: float
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "1 3"]]:
-    """Give the field that a ball right above the skin's middle adds at the chips, and at the reference chip, in tesla.
+    """Return the field in tesla that a ball directly above the skin's middle adds at the chips and the reference chip.
 
-    It is magnetised by the earth and the skin at rest; `distance_mm` is from the skin's top to the ball's surface.
+    The ball is magnetised by the earth and the skin at rest; `distance_mm` is from the skin's top to its surface.
     """
     above_m = skin.thickness_m + (distance_mm + radius_mm) * milli
     centre_m = np.append(skin.seat_m, above_m)
@@ -281,7 +285,7 @@ DASHES = ("-", "--", "-.")  # two lines coincide where nothing is recovered
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate every method in every field, over held-out boards and on the last one, which has all methods."""
+    """Tabulate every method in every field, over all held-out boards, and on the last board, which has all methods."""
     last = numbers["last_board"]
     parts = (("all held out", numbers), (str(last["board"]), last))
     rows = [

@@ -1,6 +1,7 @@
-"""Audit: check that nothing of the test rows leaked into training, by folds, copies, scalers, adaptation and settings.
+"""Audit: check that no information about test rows leaked into training.
 
-A leak fails the stage. Known leaks (the paper's own protocol) and collapsed networks are stated in the results.
+Checks folds, copied captures, scalers, adaptation and settings. A leak fails the stage. Known leaks (the paper's own
+protocol) and collapsed networks are reported in the results.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,21 +24,21 @@ from reskin.models.inputs import FIT, VIEW
 from reskin.models.recipe import HEADLINE
 from reskin.seeds import rng_for
 
-NOT_CHOSEN = "not chosen by the study"  # first words of what is found of such a setting
+NOT_CHOSEN = "not chosen by the study"  # `Check.found` begins with this for such a setting
 COLLAPSE = "collapse"
 
 
 class AuditSettings(Strict):
-    """Section audit: whether the settings were chosen by a study, which must then be on other boards, or for speed."""
+    """Section audit: were the settings chosen by a study, which must have used other boards, or for speed?"""
 
     settings: Literal["chosen", "for speed"]
 
 
 @dataclass(frozen=True)
 class Check:
-    """A rule that keeps training apart from testing, and what was found.
+    """A rule that separates training from testing, and what was found.
 
-    `known` marks a violation that is stated in the results and does not fail the stage.
+    `known` marks a violation that is reported in the results and does not fail the stage.
     """
 
     what: str
@@ -94,7 +95,7 @@ PAPERS_SPLIT = "single_random"  # readings of one indentation on both sides, as 
 
 @dataclass(frozen=True)
 class Sides:
-    """Rows of a fold: trained on, adapted to without labels, tested on."""
+    """Row numbers of a fold: training rows, unlabelled rows for adaptation (`pool`), and test rows."""
 
     experiment: str
     name: str
@@ -110,7 +111,7 @@ class Sides:
 
 @dataclass(frozen=True)
 class Labels:
-    """What each row of the scene belongs to; `indentation` is unique over the scene."""
+    """Board, skin, indentation and capture of each row of the scene; `indentation` is unique over the scene."""
 
     board: np.ndarray
     skin: np.ndarray
@@ -121,7 +122,7 @@ class Labels:
 def audit_fold(
     sides: Sides, labels: Labels, *, db_uT: Float[np.ndarray, "f ch"], rng: np.random.Generator
 ) -> list[Check]:
-    """Check that no test row, nor a copy of one, was trained on or adapted to.
+    """Check that no test row, and no copy of one, was used for training or adaptation.
 
     >>> skin = np.array(["s1", "s1", "s2"])
     >>> labels = Labels(np.array(["b1", "b1", "b2"]), skin, np.array([0, 0, 1]), capture=skin)
@@ -158,7 +159,7 @@ def _check_experiment(sides: Sides) -> None:
             )  # fmt: skip
     if not (len(sides.train) and len(sides.test)):
         got = f"{len(sides.train)} to train on, {len(sides.test)} to test on"
-        raise ParamsError(f"fold {sides.where}: a side has no rows: {got}. Split again.")
+        raise ParamsError(f"fold {sides.where}: one side of the fold has no rows: {got}. Split again.")
 
 
 def _readings(sides: Sides) -> Check:
@@ -168,7 +169,7 @@ def _readings(sides: Sides) -> Check:
 
 
 def _apart(what: str, label: np.ndarray, sides: Sides, *, rule: str = "apart", known: bool = False) -> Check:
-    """Check that no label is on both sides; `known` marks shared ones as known."""
+    """Check that no label is on both sides; with `known`, shared labels count as a known leak."""
     own = np.unique(label[sides.test])
     shared = own[np.isin(own, np.unique(label[sides.train]))]
     found = f"{len(shared)} of {len(own)} on both sides{_some(shared)}"
@@ -185,28 +186,28 @@ def _copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Gene
     captures, skins = labels.capture[sides.test], labels.skin[sides.test]
     weak = np.setdiff1d(skins, skins[np.isin(captures, test.name)])
     if len(weak) or not len(train.name):
-        found = f"cannot be told: fields within the noise{_some(weak)}"
+        found = f"undecidable: fields within the noise{_some(weak)}"
         return Check("copies", sides.where, rule, found, holds=False)
-    likest = most_alike(test, train, rng=rng)
-    most = max(likest, key=lambda one: one.share)
+    closest = most_alike(test, train, rng=rng)
+    most = max(closest, key=lambda one: one.share)
     found = (
-        f"{len(likest)} of {len(np.unique(captures))} captures compared; "
+        f"{len(closest)} of {len(np.unique(captures))} captures compared; "
         f"{most.capture} like {most.train_skin}: {100 * most.share:.1f} % of {most.compared_n} indentations"
     )
     return Check("copies", sides.where, rule, found, holds=most.share < COPIED_SHARE_MAX)
 
 
 def _pool(sides: Sides, labels: Labels) -> list[Check]:
-    """Check that unlabelled pokes are of the skins held out, and none of those tested on."""
+    """Check that the unlabelled pokes are of held-out skins, and that none of them is a test indentation."""
     pokes, tested = (np.unique(labels.indentation[side]) for side in (sides.pool, sides.test))
     shared = pokes[np.isin(pokes, tested)]
     skins = np.unique(labels.skin[sides.pool])
     foreign = np.setdiff1d(skins, labels.skin[sides.test])
-    apart = f"{len(shared)} of {len(pokes)} unlabelled also tested{_some(shared)}"
-    strangers = f"{len(foreign)} of {len(skins)} are not held out{_some(foreign)}"
+    overlap = f"{len(shared)} of {len(pokes)} unlabelled also tested{_some(shared)}"
+    not_held_out = f"{len(foreign)} of {len(skins)} are not held out{_some(foreign)}"
     return [
-        Check("pool indentations", sides.where, "apart from the test", apart, holds=len(shared) == 0),
-        Check("pool skins", sides.where, "skins of the test", strangers, holds=len(foreign) == 0),
+        Check("pool indentations", sides.where, "apart from the test", overlap, holds=len(shared) == 0),
+        Check("pool skins", sides.where, "skins of the test", not_held_out, holds=len(foreign) == 0),
     ]
 
 
@@ -221,16 +222,17 @@ def _some(names: np.ndarray) -> str:
 
 # One reading's noise by axis of a chip (x, y, z), measured on the lab's recordings: 3.0-3.3 and 4.4-5.0 uT.
 NOISE_uT = np.array([3.3, 3.3, 5.0])
-STRONG_NOISES = 10.0  # below, the direction of dB is more noise than skin
-# Two readings of one state are 1.4 noises apart (22 uT over 15 channels), a copy with 5 uT added to each channel 1.3.
+STRONG_NOISES = 10.0  # in noises of a reading; below, noise dominates the direction of dB
+# Two readings of one state differ by 1.4 noises (22 uT over 15 channels); a copy with 5 uT more in each channel by 1.3.
 ALIKE_NOISES = 2.0
-FACTOR_TOLERANCE = 0.1  # a copy was multiplied by one factor, while honest look-alikes differ in depth
-# Alike are, measured: between four recorded skins 0 %, between honest simulated ones at most 11 % (60 skins, 4 draws);
-# in a copy with up to 8 uT added to single readings 55 % or more, and with 5 % of random gain a channel 42 %.
+FACTOR_TOLERANCE = 0.1  # a copy was multiplied by one factor; genuine look-alikes differ in depth, so in the factor
+# Measured shares of similar indentations: 0 % between four recorded skins, at most 11 % between independent simulated
+# skins (60 skins, 4 draws); at least 55 % in a copy with up to 8 uT added to single readings, and 42 % in a copy with
+# 5 % random gain per channel.
 COPIED_SHARE_MAX = 0.3
-PAIRS_MAX_N = 100_000_000  # indentations compared in a fold: a second at most, unless samples became too small to judge
-SAMPLE_MIN_N = 100  # of a capture
-CHUNK_PAIRS_N = 4_000_000  # of these at once: 16 MB
+PAIRS_MAX_N = 100_000_000  # pairs of indentations compared per fold: a second at most, unless SAMPLE_MIN_N needs more
+SAMPLE_MIN_N = 100  # indentations of a capture
+CHUNK_PAIRS_N = 4_000_000  # pairs compared at once: 16 MB
 
 
 @dataclass(frozen=True)
@@ -254,7 +256,7 @@ class Likeness:
 def strong_indentations(
     name: np.ndarray, indentation: Int[np.ndarray, " f"], db_uT: Float[np.ndarray, "f ch"]
 ) -> MeanFields:
-    """Average the readings of each indentation, and keep those with |dB| above ten noises of a reading."""
+    """Average the readings of each indentation, and keep indentations whose |dB| is above ten noises of a reading."""
     _, first, group = np.unique(indentation, return_index=True, return_inverse=True)
     sums = np.stack([np.bincount(group, weights=channel) for channel in db_uT.T], axis=1)
     mean_uT = (sums / np.bincount(group)[:, None]).astype(np.float32)
@@ -263,22 +265,22 @@ def strong_indentations(
 
 
 def noise_uT(ch_n: int) -> float:
-    """Give the norm of one reading's noise over all channels."""
+    """Return the norm of one reading's noise over all channels."""
     return float(np.sqrt(ch_n / len(NOISE_uT) * (NOISE_uT**2).sum()))
 
 
 def most_alike(test: MeanFields, train: MeanFields, *, rng: np.random.Generator) -> list[Likeness]:
-    """Find the training skin most like each test capture, from a sample of its indentations and all of theirs."""
+    """Find the training skin most like each test capture; a sample of the capture is compared with all of the skin."""
     captures = np.unique(test.name)
     sample_n = max(SAMPLE_MIN_N, PAIRS_MAX_N // len(train.name) // len(captures))
-    likest = []
+    closest = []
     for capture in captures:
         own_uT = test.db_uT[test.name == capture]
         own_uT = own_uT[rng.permutation(len(own_uT))[:sample_n]]
         shares = _copied_shares(own_uT, train)
         most = max(shares, key=lambda skin: shares[skin])
-        likest.append(Likeness(str(capture), most, shares[most], len(own_uT)))
-    return likest
+        closest.append(Likeness(str(capture), most, shares[most], len(own_uT)))
+    return closest
 
 
 def nearest_rays(
@@ -308,8 +310,8 @@ def _copied_shares(own_uT: Float32[np.ndarray, "n ch"], train: MeanFields) -> di
 
 # --- Networks ---
 
-# The same rows give the same scaler but for the order of float64 sums, and that turns the last bit of a float32 at
-# most; 4 of them are 5e-7. One foreign row in 100,000 moves a mean by some 1e-5 of its deviation.
+# The same rows give the same scaler except for the order of float64 sums, which changes a float32 by its last bit at
+# most; 4 such bits are 5e-7. One foreign row in 100,000 moves a mean by about 1e-5 of its standard deviation.
 SCALER_TOLERANCE = 4 * float(np.finfo(np.float32).eps)
 
 Arrays = Mapping[str, np.ndarray]
@@ -317,10 +319,10 @@ Fits = dict[tuple[str, str, str, str, int], Arrays]  # by fold, view, scaling an
 
 
 def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
-    """Check the scaler of every network, whether it collapsed, and what it was adapted with."""
+    """Check of every network: its scaler, whether it collapsed, and the data it was adapted with."""
     views = {name: view(data.rows.db_uT) for name, view in VIEW.items()}
     fits: Fits = {}
-    keys: dict[tuple[str, int], set[str]] = {}  # of the networks that may be adapted, by fold and seed
+    keys: dict[tuple[str, int], set[str]] = {}  # keys of the networks that may be adapted, by fold and seed
     for variant in data.settings.models:
         cards = {file: io.read_json(file) for file in sorted((models / variant).glob("*.json"))}
         yield audit_collapse(variant, list(cards.values()))
@@ -343,7 +345,7 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
 
 
 def _fit_once(fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray) -> Arrays:
-    of = (*key, len(db_uT))  # a fold's training rows are fewer than those of both sides
+    of = (*key, len(db_uT))  # the number of rows distinguishes the training rows from both sides together
     if of not in fits:
         fits[of] = FIT[key[-1]](db_uT, target).arrays()
     return fits[of]
@@ -358,7 +360,7 @@ def audit_scaler(
     sides: Sides,
     fit: Callable[[np.ndarray, np.ndarray], Arrays],
 ) -> Check:
-    """Check that a model's scaler is that of its training rows, and not of training and test rows together."""
+    """Check that a model's scaler was fitted to its training rows, and not to training and test rows together."""
     both = np.concatenate([sides.train, sides.test])
     honest, leaky = (_relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both))
     found = f"off by {honest:.2g} from training rows alone, by {leaky:.2g} from both sides"
@@ -367,7 +369,7 @@ def audit_scaler(
 
 
 def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
-    """Give the largest difference relative to the fitted value (absolute where that is 0); NaN if any is."""
+    """Return the largest difference relative to the fitted value (absolute where that is 0); NaN if any one is."""
     gaps = []
     for name, value in fitted.items():
         if name not in arrays or arrays[name].shape != value.shape:
@@ -380,7 +382,7 @@ def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
 def audit_tuning(
     where: str, tuning: Mapping[str, Any], *, bases: set[str], sides: Sides, indentation: Int[np.ndarray, " f"]
 ) -> list[Check]:
-    """Check section `tuning` of a model card; `bases` are the keys of the networks of its fold and seed."""
+    """Check section `tuning` of a model card; `bases` are the keys of the pretrained networks of its fold and seed."""
     own = np.array(tuning["indentations"], np.int64)
     tested = np.intersect1d(own, indentation[sides.test])
     foreign = np.setdiff1d(own, indentation[sides.pool])
@@ -394,7 +396,7 @@ def audit_tuning(
 
 
 def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
-    """Count the networks of a variant that predict nearly the same for any input, and repeated trainings."""
+    """Count the networks of a variant that predict nearly the same for any input, and the repeated training runs."""
     kept = [
         f"{one['question']}.{one['recipe_name']}.{one['fold']}.seed{one['seed_i']}" for one in cards if one["collapsed"]
     ]
@@ -406,7 +408,7 @@ def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
 
 # --- Settings ---
 
-SAME_AS = {"train_single": "train_multi"}  # one recipe for networks of one skin and of many
+SAME_AS = {"train_single": "train_multi"}  # networks of one skin and of many share a recipe
 
 
 class Choice(Strict, extra="allow"):
@@ -449,9 +451,9 @@ def audit_choice(
     test_skins: Sequence[str],
     physics: str,
 ) -> list[Check]:
-    """Check that settings were chosen on other boards and skins, and state which headline recipes differ from them.
+    """Check that settings were chosen on other boards and skins, and report headline recipes that differ from them.
 
-    Simulated skins of another seed are different skins, whatever their names; recorded ones are known by name.
+    Simulated skins of another seed are different skins, whatever their names; recorded skins are identified by name.
     """
     record = parse(Choice, dict(choice), "record of the study of settings")
     same_draw = record.source == source and (source == "recorded" or record.seed == seed)
@@ -468,7 +470,7 @@ def audit_choice(
 
 
 def audit_recipe(variant: str, recipe: Mapping[str, Any], record: Choice) -> Check:
-    """State how a recipe differs from the chosen one, which is no leak."""
+    """Report how a recipe differs from the chosen one; a difference is not a leak."""
     rule = f"the recipe chosen on scene {record.scene}, or one that is stated here"
     studied = SAME_AS.get(variant, variant)
     chosen = record.chosen.get(studied)

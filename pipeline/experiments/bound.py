@@ -1,6 +1,6 @@
-"""Bound: how well the chips' noise allows a contact to be estimated, beside a network's scores (paper section 4).
+"""Bound: smallest error that the chips' noise allows, compared with a network's scores (paper section 4).
 
-Cramér-Rao bound of place and force from one row of a simulated skin that is known.
+Cramér-Rao bound for place and force, estimated from one row of a simulated skin whose properties are known.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,15 +31,15 @@ from reskin.physics.skin import Skin, changes_of_field, draw_skin, forces
 from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-ROW_READINGS_N = 1  # of a row that a network sees (dataset.rows)
-STEP_MM = 0.01  # of the differences; 0.002 to 0.05 mm give the same bound within 2 %
-NETWORK = "single_pass"  # the experiment whose networks never saw a reading of the presses that they are tested on
+ROW_READINGS_N = 1  # readings in one input row of a network (dataset.rows)
+STEP_MM = 0.01  # of the finite differences; 0.002 to 0.05 mm give the same bound within 2 %
+NETWORK = "single_pass"  # the experiment that holds out all readings of the tested presses
 
 Measure = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # of x, y and depth in mm
 
 
 def bound(settings: Settings, models: Path, results: Path) -> None:
-    """Bound the errors of estimates from one row, and compare with those of the paper's network."""
+    """Bound the errors of estimates from one row, and compare them with those of the paper's network."""
     numbers = bound_errors(simulation_settings(settings), seed=settings.seed)
     write_results(results, numbers | {"network": score_network(models, numbers["skin"])}, {})
     least = numbers["all"]["with_label_errors"]
@@ -47,7 +47,10 @@ def bound(settings: Settings, models: Path, results: Path) -> None:
 
 
 def bound_errors(of: SimulationSettings, *, seed: int) -> dict[str, Any]:
-    """Bound the errors at every place and depth of the main protocol, on its first skin; count those above the skin."""
+    """Bound the errors at every place and depth of the main protocol, on its first skin.
+
+    Pokes that do not reach the skin are excluded and counted.
+    """
     kind, (board_name, skin_name) = of.main_boards, list_captures(of, MAIN)[0]
     board = draw_board(kind.design, of.spreads, seed=seed, name=board_name)
     rule = kind.quadrature.in_si()
@@ -74,7 +77,7 @@ def bound_errors(of: SimulationSettings, *, seed: int) -> dict[str, Any]:
 
 
 def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Mark commanded depths that press a skin by more than a step of the differences; raise if none does."""
+    """Mark commanded depths that indent the skin by more than the finite-difference step; raise if none does."""
     touched = depths_mm - STEP_MM + skin.depth_zero_m / milli > 0
     if not touched.any():
         what = (
@@ -85,14 +88,14 @@ def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarra
 
 
 def noise_var_uT2(chip: ChipDesign, chips_n: int, *, readings_n: int, noload_frames_n: int) -> Float[np.ndarray, " ch"]:
-    """Give the variance of one row's change of field: the mean of its readings minus that of its no-load frames."""
+    """Return the noise variance of one row's change of field: mean of its readings minus mean of its no-load frames."""
     noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
-    frame_uT2 = noise_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12  # rounding, spread by noise of more than a step
+    frame_uT2 = noise_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12  # rounding: uniform, as the noise exceeds a step
     return np.tile(frame_uT2 * (1 / readings_n + 1 / noload_frames_n), chips_n)
 
 
 def slopes(measure: Measure, pokes_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n ch 3"]:
-    """Differentiate a measurement by x, y and depth, per mm, by central differences."""
+    """Differentiate a measurement with respect to x, y and depth, per mm, by central differences."""
     steps_mm = STEP_MM * np.concatenate([np.eye(3), -np.eye(3)])
     values = measure((pokes_mm + steps_mm[:, None]).reshape(-1, 3)).reshape(2, 3, len(pokes_mm), -1)
     return np.moveaxis((values[0] - values[1]) / (2 * STEP_MM), 0, -1)
@@ -103,7 +106,8 @@ def least_covariance(
 ) -> Float[np.ndarray, "n 3 3"]:
     """Bound the covariance of x, y (mm) and force (N) by the inverse of the Fisher information of x, y and depth.
 
-    Slopes are by x, y and depth, in uT/mm and N/mm; those of the force transform the bound to it.
+    Slopes are derivatives with respect to x, y and depth, in uT/mm and N/mm; `force_slopes` transform the bound from
+    depth to force.
     """
     information = np.einsum("nci,c,ncj->nij", db_slopes, 1 / var_uT2, db_slopes)
     to_force = np.broadcast_to(np.eye(3), information.shape).copy()
@@ -114,7 +118,7 @@ def least_covariance(
 def expected_scores(
     covariance: Float[np.ndarray, "n 3 3"], *, place_sd_mm: float, force_sd_N: float
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Give the expected scores of normal errors of this covariance, with independent errors of the labels added."""
+    """Return the expected scores for normal errors with this covariance plus independent errors of the labels."""
     variance = np.diagonal(covariance, axis1=1, axis2=2) + np.array([place_sd_mm, place_sd_mm, force_sd_N]) ** 2
     correlation = covariance[:, 0, 1] / np.sqrt(variance[:, 0] * variance[:, 1])
     within = probability_within(ACCURACY_LIMIT_MM / np.sqrt(variance[:, :2]), correlation)
@@ -124,9 +128,9 @@ def expected_scores(
 def probability_within(
     limits: Float[np.ndarray, "n 2"], correlation: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Give P(|x| <= h, |y| <= k) of standard normals; limits are h and k, above 0.
+    """Return P(|x| <= h, |y| <= k) for standard normal x and y with a correlation; `limits` are h and k, above 0.
 
-    By Owen's function (Owen 1956, equation 2.1), the four corners added up: exact, unlike an integral by sampling.
+    Adds up the four corners by Owen's function (Owen 1956, equation 2.1): exact, unlike integration by sampling.
     """
     h, k = limits.T
     outside = np.zeros(len(h))
@@ -139,7 +143,7 @@ def probability_within(
 def by_depth(
     depth_mm: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n 3 3"], labels: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Average expected scores over places, by depth and in all, without and with errors of the labels."""
+    """Average expected scores over places, by depth and over all depths, without and with errors of the labels."""
     no_errors = dict.fromkeys(labels, 0.0)
     scores = {
         name: pd.DataFrame(expected_scores(covariance, **sds))
@@ -153,7 +157,7 @@ def by_depth(
 
 
 def score_network(models: Path, skin: str) -> dict[str, Any]:
-    """Summarise the scores of the paper's network on a skin, over its folds; raise if it was trained on another."""
+    """Summarise the scores of the paper's network on a skin over its folds; raise if it was trained on another skin."""
     cards = [io.read_json(file) for file in sorted(models.glob("*.json"))]
     cards = [card for card in cards if (card["question"], card["recipe_name"]) == (NETWORK, HEADLINE)]
     skins = sorted({name for card in cards for name in card["train_skins"]})
@@ -170,7 +174,7 @@ NONE = "–"
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the bound by depth, and in all beside the network, which is scored on all depths together."""
+    """Tabulate the bound by depth, and over all depths together with the network, which has no score by depth."""
     lines = [_line(f"{row['depth_mm']:g}", row, {}, source) for row in numbers["by_depth"]]
     lines.append(_line("all", numbers["all"], numbers["network"], source))
     spread = "± is the standard deviation of the network's scores over n folds."
@@ -180,7 +184,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 def _line(depth: str, row: Mapping[str, Any], network: Mapping[str, Any], source: str) -> dict[str, str]:
     line = {"depth, mm": depth, "source": source}
     for metric, title in COLUMNS.items():
-        if metric in row[next(iter(SIDES))]:  # R^2 is bounded by nothing here
+        if metric in row[next(iter(SIDES))]:  # there is no bound for R^2
             line |= {f"{title} ({name})": f"{row[side][metric]:.3g}" for side, name in SIDES.items()}
         line[f"{title} (network)"] = show(network.get(metric)) if network else NONE
     return line | {"n": n_of(network) if network else NONE}

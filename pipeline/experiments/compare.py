@@ -1,8 +1,9 @@
 """Compare recorded changes of field with simulated ones, poke by poke (ours; boards with known forces).
 
-Three simulations of each board: the nominal skin, a physical model (law) fitted to the board, and the law of another
-board with what may differ between boards fitted. Beside agreement: what the recordings tell of friction under the tip,
-what a poke leaves in the next no-load reading (memory), and whether labels, chips and skin lie as the scene says.
+Each board is simulated in three ways: with the nominal skin, with a physical model (law) fitted to the board, and with
+the law of another board after fitting only the parameters that may differ between boards. Besides agreement, the
+experiment examines the friction under the tip, the part of a poke's change that remains in the next no-load reading
+(memory), and whether labels, chips and skin are oriented as the scene states.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,12 +35,12 @@ from reskin.universal.law import SEVEN, START, TEN, AlignedPresses, Law, Setup, 
 from reskin.universal.presses import RecordedPresses, cosines, explained, growth, lengths_uT, memory, pool
 
 ARROWS_N = 4  # places that the figure shows
-WALK_uT = 0.5  # of the no-load field from poke to poke, assumed, where memory is simulated
+WALK_uT = 0.5  # random-walk step of the simulated no-load field from poke to poke, assumed
 NOLOAD_READINGS_N = 10
 CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve from the lightest touch to a firm press
 LIGHT_N = 1e-3
-EVERY = 5  # of a board's places, one is on that curve
-# Friction under the tip bounds the slide: k / mu in N/mm, of none (the whole slide at any force) to a slippery tip.
+EVERY = 5  # the curve uses every fifth place of a board
+# Friction under the tip limits the slide: k / mu in N/mm, from no limit (full slide at any force) to a slippery tip.
 GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 Fields = Float[np.ndarray, "n k 3"]
@@ -47,17 +48,17 @@ Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class Compare(Strict):
-    """Section compare: how the recorded board lies under its labels and its skin, and the memory that is simulated."""
+    """Section compare: geometry and orientation of the recorded board, its labels and skin, and simulated memory."""
 
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
-    skin_flipped: bool  # every field has the other sign: a checkerboard skin that lies turned by a quarter
+    skin_flipped: bool  # every field has the other sign: a checkerboard skin that is rotated by a quarter turn
     labels_middle_mm: tuple[float, float]  # the label of the board's middle
     labels_mirrored: bool  # y labels run against the board's y
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     memory: Annotated[
         float, Field(ge=0, lt=1)
-    ]  # part of a poke's change that stays in the next no-load reading, assumed
+    ]  # part of a poke's change that remains in the next no-load reading, assumed
 
 
 def compare(settings: Settings, section: Compare, indentations: Path, results: Path) -> None:
@@ -70,7 +71,7 @@ def compare(settings: Settings, section: Compare, indentations: Path, results: P
 def compare_boards(
     boards: Mapping[str, RecordedPresses], section: Compare, design: SkinDesign, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Compare every board; return the numbers, and what the figures draw."""
+    """Compare every board; return the numbers, and the data for the figures."""
     setup = make_setup(section, design)
     seen = {board: to_board_axes(pokes, section) for board, pokes in boards.items()}
     fitted = {board: fit(own, setup, TEN) for board, own in seen.items()}
@@ -128,13 +129,13 @@ def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
 
 
 def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
-    """Return the agreement of a simulation; that of the fitted law stands in the board's own mapping."""
+    """Return the agreement of a simulation; for the fitted law it is the board's own mapping."""
     own: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
     return own
 
 
 def _drawn(seen: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
-    """Choose what figures show: changes of field at some places of the middle group, and sizes against force."""
+    """Choose the data for the figures: changes of field at some places of the middle group, and |dB| against force."""
     own = np.flatnonzero(seen.recorded.group_i == len(seen.recorded.groups) // 2)
     order = own[np.argsort(np.hypot(*seen.place_mm[own].T), kind="stable")]
     chosen = order[np.unique(np.linspace(0, len(order) - 1, ARROWS_N).round().astype(int))]
@@ -162,12 +163,12 @@ def pool_skins(captures: Sequence[Readings]) -> dict[str, RecordedPresses]:
 
 
 def chip_rotations(section: Compare) -> Float[np.ndarray, "k 3 3"]:
-    """Give the rotations from the chips' axes to the board's, as the scene has them."""
+    """Return the rotations from the chips' axes to the board's, as the scene states them."""
     return Rotation.from_euler("z", np.array(section.design.turns_deg)[:, None], degrees=True).as_matrix()
 
 
 def make_setup(section: Compare, design: SkinDesign) -> Setup:
-    """Put the designed skin over the scene's chips."""
+    """Place the designed skin over the scene's chips."""
     chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
     return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
 
@@ -198,12 +199,12 @@ def agreement(seen: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
 
 
 def estimate_memory(seen: AlignedPresses, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
-    """Estimate the memory of the recordings, and of simulated no-load readings that have that of the section."""
+    """Estimate the memory of the recordings, and of simulated no-load readings with the memory of the section."""
     pokes = seen.recorded  # memory does not depend on the axes of the chips
     rng = rng_for(seed, "compare", pokes.board)
     walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
     noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
-    before_uT = np.roll(simulated_uT, 1, axis=0)  # the first of a capture follows none, and is not used
+    before_uT = np.roll(simulated_uT, 1, axis=0)  # the first poke of a capture has no predecessor, and is not used
     found = {
         "recorded": memory(pokes, pokes.db_uT, pokes.noload_uT),
         "simulated": memory(pokes, simulated_uT, walk_uT + noise_uT + section.memory * before_uT),
@@ -212,7 +213,7 @@ def estimate_memory(seen: AlignedPresses, simulated_uT: Fields, section: Compare
 
 
 def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
-    """Give |dB| in uT of presses with the forces of `CURVE_N`, the median over some places."""
+    """Return |dB| in uT of presses with the forces `CURVE_N`, as the median over some places."""
     places_mm = np.unique(place_mm.round(2), axis=0)[::EVERY]
     at_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
     length_uT = lengths_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
@@ -220,9 +221,9 @@ def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"
 
 
 def fit_frictions(seen: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
-    """Fit the law anew with other frictions under the tip; give agreement, and the field of a light touch.
+    """Refit the law with other frictions under the tip; return agreement, and the field of a light touch.
 
-    `grip_N` is the force that takes two thirds of the slide in the skin's middle.
+    `grip_N` is the force at which two thirds of the slide are reached in the skin's middle.
     """
     rows = []
     for grip_N_mm in GRIPS_N_MM:
@@ -239,10 +240,10 @@ def fit_frictions(seen: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[
     return rows
 
 
-# --- Frames: do labels, chips and skin lie as the scene says? ---
+# --- Frames: are labels, chips and skin oriented as the scene states? ---
 
-# By how much a departure from the scene must raise the sum over chips of the cosines. Assumed: chips that are read
-# wrongly lose 0.5 and more each, and a skin that sits 0.5 mm aside changes no cosine by as much.
+# A departure from the scene must raise the sum of the cosines over chips by this much. Assumed: each chip with wrong
+# axes loses 0.5 or more, and a skin that is displaced by 0.5 mm changes no cosine by as much.
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin lie as the scene says."
@@ -250,7 +251,7 @@ AS_SAID = "Labels, chips and skin lie as the scene says."
 
 @dataclass(frozen=True)
 class Turn:
-    """A quarter turn about z, after axes of a chip changed sign."""
+    """A rotation by quarter turns about z, applied after axes of a chip changed sign."""
 
     quarters: int
     signs: tuple[int, int, int]
@@ -266,21 +267,21 @@ class Turn:
         return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))
 
 
-# Each of 16 orientations once: a mirrored x turned by a half is a mirrored y. The first is the scene's own; the first
-# eight leave z alone, as labels do.
+# Each of 16 orientations once: a mirrored x rotated by a half turn is a mirrored y. The first is the scene's own; the
+# first eight leave z unchanged, as labels do.
 PLAIN = [(quarters, 1, 1) for quarters in range(4)] + [(0, -1, 1), (0, 1, -1), (1, -1, 1), (1, 1, -1)]
 TURNS = [Turn(quarters, (x, y, z)) for z in (1, -1) for quarters, x, y in PLAIN]
 
 
 def quarter_turn(quarters: int) -> Float[np.ndarray, "3 3"]:
-    """Rotate by so many quarters about z."""
+    """Return the rotation by this number of quarter turns about z."""
     cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The orientations that agree best; `chips` is where each recorded chip sits, by the scene's numbers."""
+    """The orientations that agree best; `chips` is the position of each recorded chip, in the scene's numbering."""
 
     labels: Turn
     flipped: bool
@@ -320,7 +321,7 @@ def _describe_exchanges(at: Int[np.ndarray, " k"]) -> list[str]:
 
 
 def check_frames(seen: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
-    """Check whether labels, chips and skin lie as the scene says."""
+    """Check whether labels, chips and skin are oriented as the scene states."""
     found = find_frames(
         seen.place_mm, seen.recorded.db_uT, chip_rotations(section),
         lambda at_mm: nominal_uT(setup, at_mm, seen.recorded.force_N),
@@ -342,7 +343,7 @@ def find_frames(
     """Find the orientations of labels, skin and chips that agree best with the nominal skin.
 
     `read_uT` is in the chips' axes, `chips_turn` the scene's rotations of the chips; `nominal` simulates places in the
-    board's axes. A chip that sits at another's place is taken to be turned as that one.
+    board's axes. A chip at another chip's position is assumed to have that chip's rotation.
     """
     turns = np.stack([turn.matrix for turn in TURNS])
     as_written, found = np.empty(0), []
@@ -365,7 +366,8 @@ def _best_chips(
 ) -> Frames:
     """Find the best places and turns of the chips, given the labels, the skin and the turn most chips share.
 
-    A turn that all chips share counts as one departure, a little larger: a flipped skin reads as such a turn, too.
+    A turn that all chips share counts as one departure with a larger penalty, because a flipped skin looks like such a
+    turn, too.
     """
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
@@ -377,13 +379,13 @@ def _best_chips(
     return Frames(labels, flipped, at, turns, signed[own, at, turn_i], as_written, float(total))
 
 
-CHIPS_N = 5  # frames are found by chips on all sides of the middle
-# Fewer pokes are not reliable; more take seconds and add nothing: on lab every third of 65 places is enough.
+CHIPS_N = 5  # orientations are determined only for boards with chips on all sides of the middle
+# Fewer pokes are not reliable; more take seconds and add nothing: in scene lab, every third of 65 places is enough.
 POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
 def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
-    """Describe how a capture departs from the scene; None if it does not, or if the capture cannot tell."""
+    """Describe how a capture departs from the scene; None if it does not, or if it has too little data to decide."""
     if blocks[0].chips_n != CHIPS_N or not any(_pressed_rows(block).any() for block in blocks):
         return None
     pokes = _thin(pool(blocks))
@@ -398,7 +400,7 @@ def _pressed_rows(readings: Readings) -> np.ndarray:
 
 
 def _thin(pokes: RecordedPresses) -> RecordedPresses:
-    """Keep at most `POKES_MAX_N` pokes, evenly over the recording."""
+    """Keep at most `POKES_MAX_N` pokes, evenly distributed over the recording."""
     kept = np.unique(np.linspace(0, len(pokes) - 1, POKES_MAX_N).round().astype(int))
     names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
     return replace(pokes, **{name: getattr(pokes, name)[kept] for name in names})
@@ -459,7 +461,7 @@ BOARDS_MAX_N = 4  # of which arrows are drawn
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate agreement beside its bounds, what was fitted, and how labels, chips and skin lie."""
+    """Tabulate agreement with its bounds, the fitted parameters, and the orientation of labels, chips and skin."""
     by_board = numbers["by_board"]
     rows = [
         _board_row(board, name, _of_simulation(own, name), own["laws"].get(name, {}))
@@ -545,7 +547,7 @@ def _frames_row(board: str, own: Mapping[str, Any]) -> dict[str, str]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the field's change at the chips for a few places, and its growth with force, recorded and simulated."""
+    """Draw recorded and simulated changes of field at the chips for a few places, and their growth with force."""
     boards = dict(list(drawn["boards"].items())[:BOARDS_MAX_N])
     return {
         "compare_arrows.svg": _draw_arrows(boards, np.array(drawn["chips_mm"]), source),
@@ -555,7 +557,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 
 def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
-    """Draw |dB| against force from the lightest touch on: recorded presses, and the law with some frictions."""
+    """Draw |dB| against force from the lightest touch on: recorded presses, and the law with several frictions."""
     boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
     with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]

@@ -1,6 +1,7 @@
 """Two contacts at once, as sums of two pokes of a held-out skin (paper section 7, future work).
 
-What networks of single contacts predict for two, whether two can be detected, and how far fields of two contacts add.
+Tests what networks trained on single contacts predict for two, whether two contacts can be detected, and how well the
+fields of two contacts add.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -47,18 +48,18 @@ from reskin.seeds import rng_for
 from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-KNOWN_ROWS_N = 6000  # in which detectors search neighbours, drawn
-SINGLES_N = 1000  # single contacts that a threshold is set on, and as many that are tested
-DRAWN_N = 60  # pairs of each board and separation in the figure
-SAME_PLACE = 0.0  # mm: the effect of strength and noise of two readings, without two places
-TOLERANCE_MM = 0.5  # assumed: of a pair's distance, as places lie on a grid
-PLACE_DECIMALS = 2  # places nearer than 0.01 mm are one
+KNOWN_ROWS_N = 6000  # rows, drawn at random, in which detectors search for neighbours
+SINGLES_N = 1000  # single contacts for setting a threshold, and as many for testing
+DRAWN_N = 60  # pairs per board and separation in the figure
+SAME_PLACE = 0.0  # mm: shows the effect of strength and noise of two readings, without two places
+TOLERANCE_MM = 0.5  # of a pair's distance, assumed, as places are on a grid
+PLACE_DECIMALS = 2  # places closer than 0.01 mm count as one
 
 Predict = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and y in mm, F in N
 
 
 class Contacts(Strict):
-    """Section contacts: the pairs that are drawn, and the share of false alarms of detectors."""
+    """Section contacts: the pairs to draw, and the share of false alarms of detectors."""
 
     pairs_n: Annotated[int, Field(ge=1)]
     separations_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
@@ -68,7 +69,7 @@ class Contacts(Strict):
 def contacts(
     settings: Settings, section: Contacts, folds: Path, indentations: Path, models: Path, results: Path
 ) -> None:
-    """Add pokes of every held-out board in pairs, and test networks that never saw it on the sums."""
+    """Add the pokes of every held-out board in pairs, and test networks trained without the board on the sums."""
     data = read_data(settings, indentations, folds)
     boards, drawn = zip(
         *(evaluate_board(data, fold, section, networks_held_out(models, fold.name)) for fold in data.folds_of("lobo")),
@@ -83,7 +84,7 @@ def contacts(
     numbers: dict[str, Any] = {
         "pairs_n": section.pairs_n,
         "boards_n": len(boards),
-        # The networks behind two of the detectors were trained on all other boards, this part included.
+        # The networks behind two of the detectors were trained on all other boards, including these contacts.
         "threshold_set_on": (
             f"training contacts of a {drawn[0]['kept_aside']} among which detectors look no neighbours up; the "
             "networks behind `residual` and `networks disagree` were trained on them"
@@ -108,7 +109,7 @@ def contacts(
 def evaluate_board(
     data: SceneData, fold: Fold, section: Contacts, networks: Sequence[Predict]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Predict pairs of one held-out board: its numbers, and where predictions fall for the figure."""
+    """Evaluate pairs of one held-out board; return its numbers, and the predicted places for the figure."""
     rows = data.rows
     rng = rng_for(data.settings.seed, "contacts", fold.name)
     fit, aside, what = keep_aside(rows, fold.train)
@@ -154,7 +155,7 @@ def evaluate_board(
 
 @dataclass(frozen=True)
 class Pairs:
-    """Rows of two pokes of one skin: the weaker one has less force, or less |dB| where a force is unknown."""
+    """Row numbers of two pokes of one skin; the weaker one has less force, or less |dB| where a force is unknown."""
 
     weaker: Int64[np.ndarray, " p"]
     stronger: Int64[np.ndarray, " p"]
@@ -167,11 +168,11 @@ class Pairs:
 def draw_pairs(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
 ) -> Pairs:
-    """Draw pairs of rows: two places of a skin at this distance, then a row at each; at 0 mm, one place twice."""
+    """Draw pairs of rows: two places of a skin at this distance, then one row at each; at 0 mm, one place twice."""
     found = [_places_apart(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])]
     sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in found for i, j in pairs]
     if not sides:
-        what = f"no two held-out places of one skin lie {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
+        what = f"no two held-out places of one skin are {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
         raise ParamsError(f"contacts: {what}. Correct contacts.separations_mm of the scene.")
     drawn = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
     one, other = (np.array([rng.choice(side) for side in both]) for both in zip(*drawn, strict=True))
@@ -184,34 +185,35 @@ def draw_pairs(
 def _places_apart(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float
 ) -> tuple[list[Int64[np.ndarray, " b"]], Int64[np.ndarray, "p 2"]]:
-    """Give the rows at each place of a skin, and the pairs of places (by number) at this distance."""
+    """Return the rows at each place of a skin, and the pairs of places (by index) at this distance."""
     places_mm, at = np.unique(rows.target[own, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
     order = np.argsort(at.ravel(), kind="stable")
     rows_at = np.split(own[order], np.cumsum(np.bincount(at.ravel()))[:-1])
     distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
     near = np.abs(distance_mm - separation_mm) <= TOLERANCE_MM
-    # One place twice only at 0 mm, which is within the tolerance of small separations too.
+    # A place is paired with itself only at 0 mm, although 0 mm is also within the tolerance of small separations.
     return rows_at, np.argwhere(np.triu(near, k=1) if separation_mm else np.eye(len(places_mm), dtype=bool))
 
 
 def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Split training rows into those that detectors know, those that thresholds are set on, and what these are.
+    """Split training rows into those that detectors know and those that set the thresholds.
 
-    The latter are the last board, or the last skin of one board, or the last pass of one skin.
+    The latter are the last board, or the last skin of a single board, or the last pass of a single skin; the third
+    return value names which.
     """
     for what, labels in (("board", rows.board), ("skin", rows.skin), ("pass", rows.pass_i)):
         kinds = np.unique(labels[train])
         if len(kinds) > 1:
             last = labels[train] == kinds[-1]
             return train[~last], train[last], what
-    what = "the training rows are of a single board, skin and pass, and two of one of these are needed"
-    raise ParamsError(f"contacts: {what}. Record more, or remove the experiment from the scene's.")
+    what = "the training rows are of a single board, skin and pass; two boards, skins or passes are needed"
+    raise ParamsError(f"contacts: {what}. Record more, or remove the experiment from the scene.")
 
 
 def where_it_falls(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> dict[str, float]:
-    """Compare a single predicted contact (x_mm, y_mm, F_N) with two true ones; ratios of force need known forces."""
+    """Compare a single predicted contact (x_mm, y_mm, F_N) with two true ones; force ratios need known forces."""
     off_mm = np.stack([predicted[:, :2] - side[:, :2] for side in (weaker, stronger)])
     numbers = {
         "near_either_pct": 100 * float((np.abs(off_mm) <= ACCURACY_LIMIT_MM).all(axis=2).any(axis=0).mean()),
@@ -232,7 +234,7 @@ def where_it_falls(
 def along_the_line(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Project predictions on the line through both contacts: 0 at the weaker one, 1 at the stronger."""
+    """Project predictions onto the line through both contacts: 0 at the weaker one, 1 at the stronger one."""
     line_mm = (stronger - weaker)[:, :2].astype(np.float64)
     return ((predicted - weaker)[:, :2] * line_mm).sum(axis=1) / (line_mm**2).sum(axis=1)
 
@@ -243,9 +245,9 @@ def along_the_line(
 def detection_rates(
     aside: Scores, single: Scores, double: Mapping[float, Scores], false_alarm_fraction: float
 ) -> dict[str, Any]:
-    """Give the share of single and double contacts above thresholds that are set on contacts kept `aside`.
+    """Return, by detector, the percentage of single and double contacts above its threshold.
 
-    By detector, and for double contacts by separation.
+    Thresholds are set on the contacts kept `aside`. The rates for double contacts are by separation.
     """
     limits = thresholds(aside, false_alarm_fraction)
     apart = {
@@ -266,11 +268,12 @@ def residual(
     predicted: Float[np.ndarray, "f 3"],
     db_uT: Float[np.ndarray, "f ch"],
 ) -> Float[np.ndarray, " f"]:
-    """Give what a single contact at the prediction leaves of the change of field, as a share of it and its noise.
+    """Return the residual of a single contact at the prediction, relative to |dB| plus noise.
 
-    Its field is that of the `known` contacts (x_mm, y_mm, F_N; uT) nearest to the prediction; forces count if known.
+    The field of that contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; uT) nearest to the
+    prediction; forces count if they are known.
     """
-    from sklearn.neighbors import KNeighborsRegressor  # late: it takes a second
+    from sklearn.neighbors import KNeighborsRegressor  # imported late: it takes a second
 
     target, known_uT = known
     columns = ~np.isnan(target).any(axis=0)
@@ -281,13 +284,13 @@ def residual(
 
 
 def disagreement(predicted: Float[np.ndarray, "m f 3"]) -> Float[np.ndarray, " f"]:
-    """Give how far apart networks of several seeds place a contact: rms distance from their mean place, in mm."""
+    """Return the disagreement of networks of several seeds on a contact's place: rms distance from the mean, in mm."""
     place_mm = predicted[:, :, :2]
     return np.sqrt(((place_mm - place_mm.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
 
 
 def summarise_nested(boards: Sequence[Any]) -> Any:
-    """Summarise each number of nested mappings over boards; there is one mapping for each board."""
+    """Summarise each number of nested mappings over boards; there is one mapping per board."""
     first = boards[0]
     if isinstance(first, Mapping):
         return {key: summarise_nested([board[key] for board in boards if key in board]) for key in first}
@@ -296,13 +299,13 @@ def summarise_nested(boards: Sequence[Any]) -> Any:
 
 # --- Superposition of simulated fields ---
 
-PAIRS_N = 6  # of each distance, drawn
-MIDDLE_MM = 2.0  # largest distance of a pair's middle from the skin's, each axis
-HEIGHTS_N = 9  # of the table of displacements, which is interpolated linearly for the second contact
+PAIRS_N = 6  # drawn for each distance
+MIDDLE_MM = 2.0  # largest distance along each axis of a pair's middle from the skin's
+HEIGHTS_N = 9  # in the table of displacements, which is interpolated linearly for the second contact
 
 
 def superposition(of: SimulationSettings, separations_mm: Sequence[float], *, seed: int) -> list[dict[str, Any]]:
-    """Give the rms error of adding the fields of two contacts of the scene's first skin, at two depths."""
+    """Return the rms error of adding the fields of two contacts of the scene's first skin, at two depths."""
     board_name, skin_name = list_captures(of, MAIN)[0]
     board = draw_board(of.main_boards.design, of.spreads, seed=seed, name=board_name)
     rule = of.main_boards.quadrature.in_si()
@@ -325,7 +328,7 @@ def superposition(of: SimulationSettings, separations_mm: Sequence[float], *, se
 
 
 def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Dipoles:
-    """Displace and turn dipoles, at rest or moved before, by a poke (x, y, true depth) at their present places."""
+    """Displace and rotate dipoles, at rest or already moved, by a poke (x, y, true depth)."""
     nodes_m, moments_A_m2 = dipoles
     heights = np.linspace(0, 1, HEIGHTS_N)
     at = nodes_m[:, 2] / skin.thickness_m * (HEIGHTS_N - 1)
@@ -350,7 +353,7 @@ def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Di
 def _changes_of_pair(
     board: Board, skin: Skin, a_m: Float[np.ndarray, "3"], b_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 k 3"]:
-    """Give the change of field of contact a alone, of b alone, of a before b, and of b before a."""
+    """Return four changes of field: of contact a alone, of b alone, of a before b, and of b before a."""
     rest = skin.nodes_m, skin.moments_A_m2
     only_a, only_b = press_on(skin, rest, a_m), press_on(skin, rest, b_m)
     pressed = (only_a, only_b, press_on(skin, only_a, b_m), press_on(skin, only_b, a_m))
@@ -383,7 +386,7 @@ TWO_TIPS = "Two real tips cannot be closer than their width; smaller distances a
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate predictions and detections by distance, and how far fields are from adding."""
+    """Tabulate predictions and detections by distance, and the error of superposition."""
     rows = [_table_row(numbers["same_place"], numbers), *(_table_row(one, numbers) for one in numbers["by_separation"])]
     false_alarm = {"distance of the two, mm": "single contacts"} | {
         f"detected by {name}, %": show_digits(one["realised"], 1) for name, one in numbers["false_alarm_pct"].items()

@@ -1,4 +1,4 @@
-"""Detection of readings that are unlike known ones: scores, thresholds and ROC areas, for several experiments."""
+"""Detection of readings that are unlike known ones: scores, thresholds and areas under ROC curves."""
 
 from collections.abc import Mapping
 
@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 NEIGHBOURS_N = 5  # assumed
-NOISE_uT = 15.0  # of all channels of a reading together (a channel's is 3 to 5 uT on recorded boards)
+NOISE_uT = 15.0  # norm over all channels of a reading (3 to 5 uT per channel on recorded boards)
 
-Scores = Mapping[str, Float[np.ndarray, "_"]]  # by detector: the larger, the less like known readings
+Scores = Mapping[str, Float[np.ndarray, "_"]]  # by detector; larger means less like known readings
 
 
 def neighbour_distance(known: Float[np.ndarray, "a c"], tested: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
-    """Give the mean distance to the nearest known rows, each column in units of its standard deviation among these."""
+    """Return the mean distance to the nearest known rows; columns are scaled by their standard deviation in `known`."""
     scale = np.maximum(known.std(axis=0), 1e-12)
     return _neighbour_distance(known / scale, tested / scale)
 
@@ -20,7 +20,7 @@ def neighbour_distance(known: Float[np.ndarray, "a c"], tested: Float[np.ndarray
 def direction_distance(
     known_uT: Float[np.ndarray, "a ch"], tested_uT: Float[np.ndarray, "f ch"]
 ) -> Float[np.ndarray, " f"]:
-    """Give the mean distance to the nearest known directions dB / (|dB| + noise), which are short for weak readings."""
+    """Return the mean distance to the nearest known directions dB / (|dB| + noise), which are short for weak fields."""
     known, tested = (
         db_uT / (np.linalg.norm(db_uT, axis=1, keepdims=True) + NOISE_uT) for db_uT in (known_uT, tested_uT)
     )
@@ -28,29 +28,29 @@ def direction_distance(
 
 
 def _neighbour_distance(known: Float[np.ndarray, "a c"], tested: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
-    from sklearn.neighbors import NearestNeighbors  # late: it takes a second, and scenes are checked without it
+    from sklearn.neighbors import NearestNeighbors  # imported late: it takes a second, and checking scenes needs none
 
     neighbours = NearestNeighbors(n_neighbors=min(NEIGHBOURS_N, len(known))).fit(known)
     return neighbours.kneighbors(tested)[0].mean(axis=1)
 
 
 def thresholds(scores: Scores, false_alarm_fraction: float) -> dict[str, float]:
-    """Give the threshold of each detector that this fraction of the scores exceeds."""
+    """Return for each detector the threshold that this fraction of its scores exceeds."""
     return {name: float(np.quantile(own, 1 - false_alarm_fraction)) for name, own in scores.items()}
 
 
 def above_pct(scores: Scores, limits: Mapping[str, float]) -> dict[str, float]:
-    """Give the share of rows above each detector's threshold, in percent."""
+    """Return the percentage of rows above each detector's threshold."""
     return {name: 100 * float((scores[name] > limit).mean()) for name, limit in limits.items()}
 
 
 def roc_areas(negative: Scores, positive: Scores) -> dict[str, float]:
-    """Give each detector's area under the ROC curve."""
+    """Return each detector's area under the ROC curve."""
     return {name: roc_area(negative[name], positive[name]) for name in negative}
 
 
 def roc_area(negative: Float[np.ndarray, " a"], positive: Float[np.ndarray, " b"]) -> float:
-    """Give the area under the ROC curve: the share of pairs whose positive has the larger score; ties count half."""
+    """Return the area under the ROC curve: the share of pairs whose positive has the larger score; ties count half."""
     ordered = np.sort(negative)
     below = np.searchsorted(ordered, positive, side="left")
     not_above = np.searchsorted(ordered, positive, side="right")

@@ -1,7 +1,7 @@
 """Drift: networks trained on a skin's first contacts and tested on later ones (paper section 4, figure 5).
 
-Each no-load policy (how often the no-load reading is renewed) has networks of its own. The paper's statements about
-the policies and about the force bias of late contacts are tested over boards.
+Separate networks are trained for each no-load policy (how often the no-load reading is renewed). The paper's statements
+about the policies and about the force bias of late contacts are tested over boards.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -58,16 +58,17 @@ POINTS_MAX_N = 2000  # of the scatter plot
 DECIMALS = 3  # of a newton or millimetre
 
 Count = Annotated[int, Field(ge=1)]
-# No-load reading: once, every so often, before each contact, or whenever a reading is judged free of contact.
+# When the no-load reading is renewed: never, every few contacts, before each contact, or whenever a reading is judged
+# free of contact.
 PolicyName = Literal["initial", "regular", "each", "free"]
 UNIT_COLUMN = {"indentation": "indentation", "pass": "pass_i"}
-Errors = Mapping[str, Float[np.ndarray, "u w"]]  # by metric; rows: networks (skin and seed); columns: windows
+Errors = Mapping[str, Float[np.ndarray, "u w"]]  # by metric; rows are networks (skin and seed), columns are windows
 
 
 class Drift(SectionWithTraining):
-    """Section drift: windows of contacts that are trained on and tested, and the no-load policies."""
+    """Section drift: windows of contacts for training and testing, and the no-load policies."""
 
-    unit: Literal["indentation", "pass"]  # what the numbers below count
+    unit: Literal["indentation", "pass"]  # of the numbers below
     train_n: Count
     test_n: Count
     every_n: Count
@@ -84,7 +85,7 @@ class Drift(SectionWithTraining):
         if self.train_n > self.every_n:
             raise ValueError(f"train_n is at most every_n, {self.every_n}, after which the first test follows")
         if ("regular" in self.policies) != (self.regular_n is not None):
-            raise ValueError("regular_n stands there if and only if policies holds regular")
+            raise ValueError("regular_n is required if policies contains regular, and not allowed otherwise")
         if len(set(self.policies)) < len(self.policies):
             raise ValueError(f"policies names each policy once, not {list(self.policies)}")
         return self
@@ -110,7 +111,7 @@ class WindowPredictions:
 
 
 def drift(settings: Settings, section: Drift, indentations: Path, results: Path) -> None:
-    """Train and test networks under every no-load policy, on every capture of a folder."""
+    """Train and test networks under every no-load policy, on every capture of the scene."""
     preload_training()
     selection = settings.section(Selection, "selection")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
@@ -148,7 +149,7 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
 
 
 def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
-    """Cut the windows that all captures have, and gather their rows under every policy."""
+    """Cut the captures into windows that all of them have, and gather the rows of each under every policy."""
     check_one_each(captures)
     units = [rank(getattr(one, UNIT_COLUMN[section.unit])) for one in captures]
     units_n = [1 + int(own.max()) for own in units]
@@ -159,7 +160,7 @@ def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selecti
 
 
 def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.ndarray:
-    """Give the no-load field of each reading under a policy."""
+    """Return the no-load field of each reading under a policy."""
     fields = readings.noload_uT, readings.indentation
     if policy == "regular":
         assert section.regular_n is not None
@@ -172,7 +173,7 @@ def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.n
 
 
 def make_jobs(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[TrainingJob, list[Part]]]:
-    """Make a job of every recipe, skin, policy and seed, with its test windows."""
+    """Make one job per recipe, skin, policy and seed, with its test windows."""
     starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
     for start, end in pairwise([*starts, len(parts)]):
         train, tests = parts[start], list(parts[start + 1 : end])
@@ -197,7 +198,7 @@ def summarise_headline(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Summarise the networks of the headline recipe: numbers, and the points of figure 5b.
 
-    The paper does not say which policy figure 5b is of; `regular` is used where it was run.
+    The paper does not say which policy figure 5b shows; `regular` is used if it was run.
     """
     scores = score_windows(predictions)
     windows = {policy: window_means(scores, policy) for policy in section.policies}
@@ -223,7 +224,7 @@ def summarise_headline(
 
 
 def score_windows(predictions: Sequence[WindowPredictions]) -> pd.DataFrame:
-    """Score every window of every network: one row each, `bias_f_N` (mean of predicted less true force) included.
+    """Score every window of every network: one row each, including `bias_f_N` (mean of predicted less true force).
 
     Metrics of force are absent where no force is known.
     """
@@ -244,7 +245,7 @@ def _metrics_in(scores: pd.DataFrame, *names: str) -> list[str]:
 
 
 def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
-    """Give a row for each window: means over skins and seeds, and under `spread` their standard deviations."""
+    """Return one row per window: means over skins and seeds, and under `spread` their standard deviations."""
     rows = []
     for _, own in scores[scores["policy"] == policy].groupby("window_i"):
         values = {name: own[name].to_numpy() for name in _metrics_in(own, *METRICS, "bias_f_N")}
@@ -257,7 +258,10 @@ def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
 
 
 def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndarray, "u w"]]:
-    """Give each metric of each network (row: skin and seed) in each window (column); rows of two policies are pairs."""
+    """Return, by metric, the errors of each network (rows) in each window (columns).
+
+    Equal rows of two policies are the same skin and seed, so they form a pair.
+    """
     own = scores[scores["policy"] == policy]
     return {
         name: np.ascontiguousarray(own.pivot_table(name, index=["skin", "seed_i"], columns="window_i"))
@@ -274,7 +278,7 @@ def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
 
 
 def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
-    """Find the first window after the paper's 45,000 contacts, or else the last one."""
+    """Find the first window after the paper's 45,000 contacts, or the last window if there is none."""
     late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
     return late[0] if late else len(rows) - 1
 
@@ -284,7 +288,7 @@ def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
 
 @dataclass(frozen=True)
 class ContactForces:
-    """Forces of one window, a point per indentation: the means of its readings, where the true force is known."""
+    """Forces of one window: one point per indentation with a known force, the mean of its readings."""
 
     skin: Shaped[np.ndarray, " n"]
     true_N: Float[np.ndarray, " n"]
@@ -292,9 +296,9 @@ class ContactForces:
 
 
 def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
-    """Average the readings of each indentation, which are not independent.
+    """Average the readings of each indentation, because they are not independent.
 
-    All predictions are of one window, each of one skin and one network.
+    All predictions are for one window, each for one skin by one network.
     """
     skin = np.concatenate([np.full(len(one.indentation), one.skin) for one in predictions])
     indentation = np.concatenate([one.indentation for one in predictions])
@@ -311,7 +315,7 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
 
 
 def force_bias(contacts: ContactForces) -> dict[str, Any]:
-    """Give the mean of predicted less true force, its standard error over contacts, and the least-squares slope."""
+    """Return the mean of predicted less true force, its standard error over contacts, and the least-squares slope."""
     error_N = contacts.predicted_N - contacts.true_N
     away_N = contacts.true_N - contacts.true_N.mean()
     return {
@@ -326,7 +330,7 @@ def force_bias(contacts: ContactForces) -> dict[str, Any]:
 def late_force(
     predictions: Sequence[WindowPredictions], policy: str, window_i: int
 ) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
-    """Give the force bias of one window, mean over seeds, that of each network, and the first seed's points to draw.
+    """Return the force bias of one window (mean over seeds, and of each network), and the first seed's points to draw.
 
     None if fewer than two contacts have a known force.
     """
@@ -344,21 +348,21 @@ def late_force(
 
 
 def points(contacts: ContactForces) -> dict[str, list[float]]:
-    """Give true and predicted forces to draw, to 1 mN; every second, third, ... if there are very many."""
+    """Return true and predicted forces for the figure, to 1 mN; every second, third, ... if there are very many."""
     every_n = ceil(len(contacts.true_N) / POINTS_MAX_N)
     sides = {"true_N": contacts.true_N, "predicted_N": contacts.predicted_N}
     return {name: np.round(values[::every_n], DECIMALS).tolist() for name, values in sides.items()}
 
 
 def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float | None:
-    """Give `force_left` of a window relative to training, mean over skins; None if unknown for a skin."""
+    """Return `force_left` of a window relative to training, mean over skins; None if unknown for any skin."""
     own = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
     left = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
     return None if None in left else float(np.mean([one for one in left if one is not None]))
 
 
 def force_left(early: Readings, late: Readings) -> float | None:
-    """Give late force over early force at equal places and depths, in %: below 100 where the skin softened.
+    """Return the ratio of late to early force at equal places and depths, in %; below 100 if the skin softened.
 
     None if no place and depth with a known force was visited both early and late.
     """
@@ -382,10 +386,10 @@ def force_left(early: Readings, late: Readings) -> float | None:
 
 
 def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
-    """Give, rms over channels, the change of field that a contact makes, and the noise of a no-load reading.
+    """Return the rms over channels of the change of field by a contact, and of the noise of a no-load reading.
 
-    The change is against the no-load reading before that contact, whatever the policy. Noise is taken from each
-    no-load reading to the next, where drift is small.
+    The change is relative to the no-load reading before that contact, whatever the policy. The noise is estimated from
+    differences between successive no-load readings, where drift is small.
     """
     changes_uT = [subtract(one.b_uT, one.noload_uT)[~np.isnan(one.x_mm)] for one in captures]
     steps_uT = [np.diff(one.noload_uT[_first_rows(one)].astype(float), axis=0) for one in captures]
@@ -395,9 +399,9 @@ def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
 
 
 def pace(captures: Sequence[Readings]) -> dict[str, float]:
-    """Give the median time from one indentation to the next, and how long the longest capture lasts.
+    """Return the median time from one indentation to the next, and the duration of the longest capture.
 
-    Empty where recordings have no times, or one indentation.
+    Empty if the recordings have no times, or only one indentation.
     """
     timed = [one for one in captures if np.isfinite(one.t_s).all()]
     steps_s = [step_s for one in timed for step_s in np.diff(one.t_s[_first_rows(one)])]
@@ -410,7 +414,7 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
 
 
 def describe_pace(numbers: Mapping[str, Any], source: str) -> str:
-    """Describe `pace` in a sentence, with what it means in a simulated capture."""
+    """Describe the result of `pace` in words, with a remark on temperature for simulated captures."""
     if "lasts_s" not in numbers:
         return "The times of the contacts are not known."
     every = f"The median time from one contact to the next is {numbers['contact_every_s']:.3g} s"
@@ -428,11 +432,11 @@ def _first_rows(readings: Readings) -> Int64[np.ndarray, " n"]:
 
 
 def rms(values: Float[np.ndarray, "..."]) -> float:
-    """Give the root of the mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values.astype(float) ** 2)))
 
 
-# --- A field at rest that wanders more than the simulated one ---
+# --- A field at rest that drifts more than the simulated one ---
 
 
 def score_wandering(
@@ -444,7 +448,8 @@ def score_wandering(
 ) -> dict[str, list[dict[str, Any]]]:
     """Test the networks on their last window again, after a random walk was added to the captures.
 
-    Gives for each policy a row for each step size: mean scores over skins and seeds, and their sd under `spread`.
+    Returns, by policy, one row per step size: mean scores over skins and seeds, and their standard deviations under
+    `spread`.
     """
     from reskin.models.network import Predictor  # torch, late
 
@@ -472,7 +477,7 @@ def score_wandering(
 
 
 def add_walk(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Readings:
-    """Add a random walk of so many uT per contact and channel (sd) to all readings after `after_n` contacts."""
+    """Add a random walk to all readings after `after_n` contacts; `step_uT` is its sd per contact and channel."""
     since_n = np.maximum(rank(readings.indentation) + 1 - after_n, 0)
     rng = rng_for(seed, "drift", "wander", readings.skin)  # the same walk at every step size, scaled
     walk_T = baseline_walk(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
@@ -491,12 +496,12 @@ OVERESTIMATES = (
     '"the model, on average, overestimates the applied force"; "attributed to the softening of the elastomer"'
 )
 INDENTATION_SES = 2.0  # standard errors: about 95 % confidence for the many indentations of a window
-ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # force is absent where it is unknown
+ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # MSE_F is absent if forces are unknown
 PER_CONTACTS_N = 10_000
 
 
 class Comparison(NamedTuple):
-    """A quantity of networks compared in pairs; the difference is positive where the paper is right."""
+    """A quantity compared between pairs of networks; the difference is positive if the paper is right."""
 
     text: str
     over_boards: Stat
@@ -506,7 +511,7 @@ class Comparison(NamedTuple):
 def compare_networks(
     quantity: str, unit: str, values: Mapping[str, Float[np.ndarray, " u"]], boards: Sequence[str]
 ) -> Comparison:
-    """Compare the networks of two policies, values by policy, in pairs that each belong to a board."""
+    """Compare the networks of two policies in pairs; `values` are by policy, `boards` gives the board of each pair."""
     (policy, own), (other_policy, other) = values.items()
     over_boards, over_trainings = mean_over_boards(own - other, boards)
     text = (
@@ -524,7 +529,7 @@ def _show_ends(over_boards: Stat, over_trainings: list[float] | None) -> str:
 def mean_over_boards(
     values: Float[np.ndarray, " u"], boards: Sequence[str]
 ) -> tuple[dict[str, Any], list[float] | None]:
-    """Give the statistic of values over boards, and their 95 % interval over networks."""
+    """Return the statistic of the board means of values, and the 95 % interval of the values over networks."""
     by_board = pd.Series(values, dtype=float).groupby(list(boards)).mean()
     return statistic(by_board, boards=True), interval(values.astype(float))
 
@@ -532,10 +537,10 @@ def mean_over_boards(
 def judge_findings(
     networks: Mapping[str, Errors], *, boards: Sequence[str], contacts_n: Sequence[int], late: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
-    """Test each finding of the paper that the policies and the known quantities allow.
+    """Test each finding of the paper for which the required policies and quantities are available.
 
-    `networks` are the errors of the networks of each policy: equal rows of two policies are a pair, on `boards`.
-    `contacts_n` counts the contacts before each window.
+    `networks` are the errors of the networks by policy; equal rows of two policies are a pair, whose board is in
+    `boards`. `contacts_n` is the number of contacts before each window.
     """
     frequent = [policy for policy in ("regular", "each") if policy in networks]
     findings = []
@@ -568,14 +573,17 @@ def judge_findings(
 
 
 def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
-    """Give the least-squares slope of each network's errors against contacts, per 10,000 contacts."""
+    """Return the least-squares slope of each network's errors against contacts, per 10,000 contacts."""
     tens = np.array(contacts_n, float) / PER_CONTACTS_N
     away = tens - tens.mean()
     return errors @ away / (away @ away)
 
 
 def late_bias(late: Mapping[str, Any]) -> Comparison:
-    """Judge the bias of late forces against the variation of indentations and of trainings: one network cannot tell."""
+    """Judge the bias of late forces against the variation over indentations and over training runs.
+
+    With a single network there is no interval over training runs.
+    """
     over_boards, ends_N = mean_over_boards(np.array(late["network_bias_N"]), late["network_board"])
     reach_N = INDENTATION_SES * late["bias_se_N"]
     if ends_N is not None:
@@ -585,7 +593,7 @@ def late_bias(late: Mapping[str, Any]) -> Comparison:
 
 
 def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[str, Any]:
-    """Judge a finding by all of its comparisons, over boards and over trainings on these boards."""
+    """Judge a finding by all of its comparisons, over boards and over training runs on these boards."""
     judged = combine_verdicts([verdict(part.over_boards) for part in parts])
     trainings = [part.over_trainings for part in parts]
     of_trainings = combine_verdicts([UNDECIDED if ends is None else verdict({"ci95": ends}) for ends in trainings])
@@ -619,7 +627,7 @@ FINDINGS_MEANING = (
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate scores against contacts, the paper's findings, and scores with a walk that was added."""
+    """Tabulate scores against contacts, the paper's findings, and scores with an added random walk."""
     policies, error, spread = _policies(numbers), _error(numbers), _spread(numbers)
     lines = []
     for i, first in enumerate(next(iter(policies.values()))[1]):
@@ -656,7 +664,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _possible_reasons(numbers: Mapping[str, Any]) -> str:
-    """Give the sizes that bound what a no-load reading can change, and what softening explains of the force bias."""
+    """Describe how large no-load errors are beside a contact's field, and how much force bias softening explains."""
     field, late = numbers["field"], numbers.get("late", {})
     off = ", ".join(
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
@@ -676,7 +684,7 @@ def _possible_reasons(numbers: Mapping[str, Any]) -> str:
 
 
 def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mapping[str, Any]]]]:
-    """Give the title and the windows of each policy that was tested."""
+    """Return the title and the windows of each policy that was tested."""
     titles = {
         "initial": "once at the start",
         "regular": f"every {numbers.get('regular_n')} indentations",
@@ -687,7 +695,7 @@ def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mappi
 
 
 def _error(numbers: Mapping[str, Any]) -> str:
-    """Choose the error to show beside accuracy: that of places where no force is known."""
+    """Choose the error to show beside accuracy: that of the force, or of places if no force is known."""
     [(_, rows), *_] = _policies(numbers).values()
     return "mse_f_N2" if "mse_f_N2" in rows[0] else "mse_xy_mm2"
 
@@ -728,7 +736,7 @@ MARGIN = 0.05  # of the largest force
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw scores against contacts (figure 5a) and against an added walk; late forces where known (figure 5b)."""
+    """Draw scores against contacts (figure 5a) and against an added walk; late forces if known (figure 5b)."""
     windows = {policy: rows for policy, (_, rows) in _policies(numbers).items()}
     title = f"Trained on the first contacts, tested on later ones ({source})"
     texts = {"drift.svg": _draw_scores(numbers, windows, "contacts_n", title)}
@@ -744,7 +752,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _draw_scores(
     numbers: Mapping[str, Any], lines: Mapping[str, Sequence[Mapping[str, Any]]], x: str, title: str
 ) -> str:
-    """Draw accuracy and an error against `contacts_n` or `step_uT`, a line for each policy."""
+    """Draw accuracy and an error against `contacts_n` or `step_uT`, one line per policy."""
     policies, spread = _policies(numbers), _spread(numbers)
     with drawing(7.6, 4.0) as figure:
         for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", _error(numbers)), strict=True):

@@ -1,6 +1,7 @@
 """Dynamic presses: readings of presses that never rest, at the full rate (paper section 7, future work).
 
-Each reading is estimated alone, and as the mean of the last five, which is the paper's protocol at rest.
+Place and force are estimated from each reading alone, and from the mean of the last five readings, which is the paper's
+protocol at rest.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +27,7 @@ from reskin.metrics import score
 from reskin.models.trained import networks_held_out
 
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
-FORCE_MIN_N = 0.2  # assumed: the first and last readings of a press are below, with little contact to place
+FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, whose contact is hard to locate
 BINS_N = 5
 LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # candidates
 METHODS = ("one", "mean5", "mean5_of_middle")
@@ -36,21 +37,21 @@ Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 
 @dataclass(frozen=True)
 class Presses:
-    """Readings of presses in order of time; `press_i` counts from 0, `duration_s` is that of the row's press."""
+    """Readings of presses in order of time; `press_i` counts from 0, `duration_s` is the duration of a row's press."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     true: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
     t_s: Float64[np.ndarray, " f"]
     press_i: Int64[np.ndarray, " f"]
     duration_s: Float64[np.ndarray, " f"]
-    scored: Bool[np.ndarray, " f"]  # enough force, and four readings of the press before it
+    scored: Bool[np.ndarray, " f"]  # enough force, and four earlier readings of the same press
 
     def __len__(self) -> int:
         return len(self.t_s)
 
 
 def dynamics(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
-    """Score the networks of train_multi that never saw the board of the pressed skin."""
+    """Score the networks of train_multi that were trained without the board of the pressed skin."""
     one = only(read_captures(indentations), indentations)
     true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
     presses = find_presses(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
@@ -75,12 +76,12 @@ def find_presses(
 
 
 def rate_of(t_s: Float64[np.ndarray, " f"], press_i: Int64[np.ndarray, " f"]) -> float:
-    """Measure the rate in Hz at which readings of a press follow each other."""
+    """Measure the rate in Hz of the readings within presses."""
     return float(1 / np.median(np.diff(t_s)[np.diff(press_i) == 0]))
 
 
 def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]:
-    """Average each row with the four before it; the first four with as many as there are."""
+    """Average each row with the four rows before it; the first four rows with as many as there are."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0, dtype=np.float64)])
     end = np.arange(1, len(values) + 1)
     start = np.maximum(end - WINDOW_N, 0)
@@ -88,9 +89,10 @@ def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]
 
 
 def score_presses(of: Presses, networks: Sequence[Predict], *, board: str) -> dict[str, Any]:
-    """Score each reading alone, the mean of the last five, and that mean against the truth of the middle one.
+    """Score estimates from each reading alone and from the mean of the last five readings.
 
-    All presses are on one skin of this `board`, so `paired`, which compares the first two, has no interval.
+    The mean is also compared with the truth at its middle reading. All presses are on one skin of this `board`, so
+    `paired`, which compares the first two methods, has no interval.
     """
     mean_uT = running_mean(of.db_uT).astype(np.float32)
     alone, meant = ([network(one) for network in networks] for one in (of.db_uT, mean_uT))
@@ -144,7 +146,7 @@ def lag_ms(
     true_t_s: Float64[np.ndarray, " g"],
     true_N: Float64[np.ndarray, " g"],
 ) -> float:
-    """Give the delay at which the true force, times any factor, is nearest to the predictions (least squares)."""
+    """Return the delay at which the true force, times the best factor, fits the predictions best (least squares)."""
     delayed_N = np.interp(t_s[None] - LAGS_MS[:, None] / 1e3, true_t_s, true_N)
     explained = (delayed_N @ predicted_N) ** 2 / (delayed_N**2).sum(axis=1)
     return float(LAGS_MS[int(np.argmax(explained))])
@@ -170,7 +172,7 @@ METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the errors of each method by duration of the press, and over all presses; the paper has none."""
+    """Tabulate the errors of each method by duration of the press, and over all presses; the paper gives none."""
     rows = [(f"{one['duration_s']:.2g}", one) for one in numbers["by_duration"]]
     rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
     table = pd.DataFrame(
@@ -196,7 +198,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     """Draw errors of force and place against the press's duration."""
     with drawing(7.6, 3.8) as figure:
         panels = figure.subplots(1, 2)
-        # A press stays where it is: against the middle's place the mean is as good as against the last one's.
+        # The place does not change during a press, so the third method has the same place error as the second.
         for axes, name, methods_n in zip(panels, ("mse_f_N2", "mse_xy_mm2"), (3, 2), strict=True):
             for i, (method, title) in enumerate(list(TITLES.items())[:methods_n]):
                 known = [one for one in numbers["by_duration"] if name in one[method]]

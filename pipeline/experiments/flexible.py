@@ -1,4 +1,4 @@
-"""Flexible boards: networks of rigid boards, adapted to flexible ones (paper section 5)."""
+"""Flexible boards: networks trained on rigid boards, adapted to flexible ones (paper section 5)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -37,12 +37,12 @@ from reskin.seeds import rng_for
 
 DEPTH_DECIMALS = 2  # of a commanded depth in mm
 DRAWN_N = 400  # points in a panel
-FORCE_DECIMALS = 3  # of a newton that is drawn
-SHAPE = "shape"  # recipe on directions, if the scene has one: it should depend less on the gap
+FORCE_DECIMALS = 3  # of a force in N in the figure
+SHAPE = "shape"  # recipe with direction and length as inputs, if the scene has one: should depend less on the gap
 
 
 def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
-    """Adapt the networks of the first fold of lobo to every flexible skin, and test on its later passes."""
+    """Adapt the networks of the first fold of lobo to every flexible skin, and test them on its later passes."""
     preload_training()
     data = read_data(settings, main, folds)
     starts, captures = read_pretrained(pretrained), read_captures(indentations)
@@ -93,7 +93,7 @@ def sizes_by_depth(readings: Readings) -> dict[float, np.ndarray]:
 
 
 def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
-    """Give the median |dB| of flexible boards over that of rigid ones, at each common depth, over depths."""
+    """Return the ratio of the median |dB| of flexible boards to that of rigid ones, summarised over common depths."""
 
     def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
         return float(np.median(np.concatenate([one[depth_mm] for one in captures if depth_mm in one])))
@@ -103,7 +103,7 @@ def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dic
 
 
 def gaps(data: SceneData) -> dict[str, Any]:
-    """Give the gap between skin and chips of both kinds of boards, and by how many percent one is smaller."""
+    """Return the gap between skin and chips on rigid and flexible boards, and by how many percent the latter is less."""
     of = simulation_settings(data.settings)
     protocols = {"rigid": "grid", "flexible": "flexible"}
     gap_mm = {kind: of.boards[of.protocols[name].boards].design.gap_mm for kind, name in protocols.items()}
@@ -119,7 +119,7 @@ def summarise_flexible(predictions: Sequence[VariantPrediction]) -> dict[str, An
 def draw_forces(
     predictions: Sequence[VariantPrediction], rng: np.random.Generator
 ) -> dict[str, dict[str, list[float]]]:
-    """Draw equal readings of the first networks before and after: true and predicted force, in newtons."""
+    """Choose the same random readings before and after adaptation, first networks: true and predicted force in N."""
     first = {name: [one for one in predictions if one.variant == name and one.seed_i == 0] for name in (BEFORE, AFTER)}
     shown = rng.permutation(sum(len(one.true) for one in first[BEFORE]))[:DRAWN_N]
     return {
@@ -137,7 +137,7 @@ OF_SHAPE = "direction and length of the change of field (ours): "
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the variants of the paper's recipe, and those of ours on directions if there is one."""
+    """Tabulate the variants of the paper's recipe, and those of recipe `shape` if the scene has it."""
     lines = [_line(title, numbers, name, source) for name, title in VARIANTS.items() if name in numbers]
     if SHAPE in numbers:
         own = numbers[SHAPE]

@@ -1,4 +1,4 @@
-"""Gripper: hold a force by the estimate of networks or of the universal model (paper section 6).
+"""Gripper: force control by the force estimates of networks or of the universal model (paper section 6).
 
 A simulated gripper squeezes objects of several stiffnesses; the true force is judged, without and with one press whose
 force is known.
@@ -32,17 +32,17 @@ from reskin.simulation.protocols import load_steps_N
 from reskin.universal.model import Universal, load_universal
 
 RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; from SETTLED_S on the force is judged
-SWING = 3.0  # factor by which an object becomes stiffer, and softer, than its own stiffness
-DEPTH_OF_1_N_MM = 0.8  # assumed, of a round tip (Hertz); it sets how fast a force is reached, not which
+SWING = 3.0  # factor by which an object becomes stiffer and softer than its nominal stiffness
+DEPTH_OF_1_N_MM = 0.8  # assumed, for a round tip (Hertz); affects how fast a force is reached, not its value
 READINGS_N = 5  # of the known press, as of each indentation (paper section 3)
-WITHIN = 0.1  # of the aim (paper section 6 lets a gripper hold a blueberry; the share is ours)
+WITHIN = 0.1  # tolerance relative to the aim (in paper section 6 a gripper holds a blueberry; the tolerance is ours)
 Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
 Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # of changes of field: x, y in mm, F in N
 Positive = Annotated[float, Field(gt=0, le=100)]
 
 
 class Gripper(Strict):
-    """Section gripper: forces to hold, stiffness of objects, and the gain of the controller."""
+    """Section gripper: forces to hold, stiffnesses of the objects, and the gain of the controller."""
 
     aims_N: tuple[Positive, ...]
     stiffness_N_mm: tuple[Positive, ...]
@@ -61,14 +61,14 @@ class Finger:
     noise_uT: float
 
     def read(self, force_N: Float64[np.ndarray, " r"], rng: np.random.Generator) -> Float64[np.ndarray, "r ch"]:
-        """Read the skin under some forces, with noise."""
+        """Simulate readings of the skin under these forces, with noise."""
         clean_uT = np.stack([np.interp(force_N, self.force_N, column) for column in self.change_uT.T], axis=1)
         return self.noload_uT + clean_uT + self.noise_uT * rng.standard_normal(clean_uT.shape)
 
     def squeezed_N(
         self, closed_mm: Float64[np.ndarray, " r"], stiffness_N_mm: Float64[np.ndarray, " r"]
     ) -> Float64[np.ndarray, " r"]:
-        """Find the force of skin and object in series, when the gripper has closed by `closed_mm`."""
+        """Return the force on skin and object, which are in series, when the gripper has closed by `closed_mm`."""
         return np.array([
             np.interp(closed, self.depth_mm + self.force_N / stiffness, self.force_N)
             for closed, stiffness in zip(closed_mm, stiffness_N_mm, strict=True)
@@ -83,7 +83,7 @@ class Press(NamedTuple):
 
 
 def gripper(settings: Settings, section: Gripper, indentations: Path, models: Path, results: Path) -> None:
-    """Hold objects by the estimated force on the skin of a gripper's finger."""
+    """Hold objects by force control, with the force estimated from the skin of a gripper's finger."""
     load = load_protocol(settings, "grip")
     weight_N = load_steps_N(load.force_max_N, load.step_N)
     fingers = [make_finger(capture, weight_N) for capture in read_captures(indentations)]
@@ -98,7 +98,7 @@ def gripper(settings: Settings, section: Gripper, indentations: Path, models: Pa
 
 
 def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finger:
-    """Average a capture's readings under each weight; the noise is the standard deviation about these averages."""
+    """Average a capture's readings under each weight; the noise is their standard deviation from these averages."""
     change_uT = subtract(capture.b_uT, capture.noload_uT)
     levels_uT = group_by_level(
         change_uT, capture.indentation, capture.Fz_N, levels_n=len(weight_N), where=capture.capture
@@ -111,8 +111,8 @@ def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finge
 
 
 def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Iterator[tuple[str, str, Estimate]]:
-    """Give every estimate of force: the model's name, how the known press is used, and the function."""
-    nothing = load_universal().zero(finger.noload_uT[None])
+    """Yield every force estimator: the model's name, how the known press is used, and the function."""
+    unlabelled = load_universal().zero(finger.noload_uT[None])
     labelled = load_universal().zero(finger.noload_uT[None])
     labelled.label(np.full((1, 2), CENTRE_MM), np.array([press.force_N]), press.b_uT[None])
 
@@ -124,7 +124,7 @@ def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Ite
 
     for name, estimate in (
         *(("networks", by_network(network)) for network in networks),
-        ("map", by_universal(nothing)),
+        ("map", by_universal(unlabelled)),
     ):
         yield name, "none", estimate
         yield name, "factor", scale_to_press(estimate, press)
@@ -140,7 +140,7 @@ def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
 def hold(
     finger: Finger, estimate: Estimate, aim_N: float, how: Gripper, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f r"]:
-    """Hold objects of all stiffnesses, each by itself; give the true force of each step."""
+    """Hold objects of all stiffnesses, each in a run of its own; return the true force at each step."""
     own_N_mm = np.array(how.stiffness_N_mm)
     closed_mm, force_N = np.zeros(len(own_N_mm)), np.zeros(len(own_N_mm))
     touch_uT = finger.noise_uT * (np.sqrt(len(finger.noload_uT)) + CONTACT_SDS)
@@ -159,7 +159,7 @@ def hold(
 def hold_all(
     fingers: Sequence[Finger], networks: Mapping[str, Sequence[Predict]], how: Gripper, *, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Hold each force by every estimate, on every skin; return the numbers, and what the figure draws."""
+    """Hold each force with every estimator on every skin; return the numbers, and the data of the figure."""
     rows, drawn = [], []
     for aim_N in how.aims_N:
         runs: dict[tuple[str, str], dict[str, list[Float64[np.ndarray, "f r"]]]] = {}
@@ -187,10 +187,10 @@ def hold_all(
 
 
 def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float) -> dict[str, Any]:
-    """Score how far true forces are from the aim once settled, over the runs of all boards and estimators.
+    """Score how far true forces are from the aim after settling, over the runs of all boards and estimators.
 
-    `runs` are those of each estimator (network seed) on each board; `sd_seeds` is the standard deviation over the
-    estimators of one board, mean over boards.
+    `runs` are by board, one array per estimator (network seed); `sd_seeds` is the standard deviation over the
+    estimators of one board, averaged over boards.
     """
     off = {board: [one[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for one in own] for board, own in runs.items()}
     every = np.concatenate([one for own in off.values() for one in own], axis=1)
@@ -224,7 +224,7 @@ PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate how often, and how nearly, each force was held by each estimate."""
+    """Tabulate how often and how accurately each force was held with each estimator."""
     table = pd.DataFrame(
         {
             "aim, N": f"{row['aim_N']:g}",
@@ -247,7 +247,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw by how much each run's mean force missed the aim."""
+    """Draw the deviation of each run's mean force from the aim."""
     aims_N = list(numbers["aims_N"])
     with drawing(7.6, 3.8) as figure:
         panels = figure.subplots(1, len(aims_N), sharey=True, squeeze=False)[0]

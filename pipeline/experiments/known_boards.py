@@ -1,4 +1,4 @@
-"""The recorded boards of a scene in the board's axes, as the universal model and its reference methods know them."""
+"""The recorded boards of a scene, in the axes that the universal model and its reference methods use."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from reskin.physics.skin import SkinDesign
 
 
 def read_known_boards(settings: Settings, indentations: Path, folds: Path) -> KnownBoards:
-    """Read the recorded boards of a scene, two or more; they lie as section compare says."""
+    """Read the recorded boards of a scene (two or more), in the orientation that section compare states."""
     data, section = read_data(settings, indentations, folds), settings.section(Compare, "compare")
     skins = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
     if len(skins) < 2:

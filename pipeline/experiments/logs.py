@@ -1,7 +1,7 @@
-"""Logs: force and place over time from the log of an SD card, as of a dog shoe or a glove (paper section 6).
+"""Logs: force and place over time from a log on an SD card, as recorded in a dog shoe or a glove (paper section 6).
 
-Networks that never saw the board read the log; a simulated one is scored, also as if its board turned in the earth's
-field.
+Networks trained without the board estimate contacts from the log. A simulated log is also scored, once as it is and
+once as if its board rotated in the earth's field.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +46,7 @@ SCORES = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "
 
 
 def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
-    """Estimate contacts of a log with networks that never saw its board; score them where their truth is known."""
+    """Estimate contacts of a log with networks trained without its board; score them if the true contacts are known."""
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board
@@ -65,7 +65,7 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
     say(f"{settings.scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
 
 
-# --- A board that turns in the earth's field ---
+# --- A board that rotates in the earth's field ---
 
 
 @dataclass(frozen=True)
@@ -79,9 +79,9 @@ class Log:
 
 
 def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
-    """Score the networks on the log as if its board turned in the earth's field, with a reference chip and without."""
+    """Score the networks on the log as if its board rotated in the earth's field, with and without a reference chip."""
     of, seed = simulation_settings(settings), settings.seed
-    noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # a log's readings are single
+    noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # single readings, no averages
     own = replace(draw_instrument(of, board, seed=seed), noise_uT=noise_uT)
     return {
         "turning": score_pitches(log, own, networks, rng_for(seed, "logs", board, "aside")),
@@ -93,9 +93,9 @@ def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[E
 def score_pitches(
     log: Log, own: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
 ) -> list[dict[str, Any]]:
-    """Score the log with the board pitching after its quiet start, as it is and less the reading of a reference chip.
+    """Score the log with the board pitching after its quiet start, without and with a reference chip's reading subtracted.
 
-    `own.noise_uT` is that of one reading of the reference chip.
+    `own.noise_uT` is the noise of one reading of the reference chip.
     """
     period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
     rows = []
@@ -112,20 +112,20 @@ def score_pitches(
 
 
 def step_period_s(t_s: Float64[np.ndarray, " f"], touched: Bool[np.ndarray, " f"]) -> float:
-    """Give the median time from the start of one contact to that of the next."""
+    """Return the median time from the start of one contact to the start of the next."""
     starts_s = t_s[np.flatnonzero(np.diff(touched.astype(int), prepend=0) == 1)]
     return float(np.median(np.diff(starts_s))) if len(starts_s) > 1 else PERIOD_S
 
 
 def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) -> Float64[np.ndarray, " f"]:
-    """Give a sine that begins at `start_s`, and is 0 before."""
+    """Return a sine that begins at `start_s` and is 0 before."""
     return np.sin(2 * np.pi * np.maximum(t_s - start_s, 0) / period_s)
 
 
 def earth_in_board_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
-    """Give the earth's field in the axes of a board that pitches about its y axis; at rest its x axis points north.
+    """Return the earth's field in the axes of a board that pitches about its y axis; at rest its x axis points north.
 
-    Assumed: walking north, so that the whole field lies in the plane of the pitch, which is the worst direction.
+    Assumed: walking north, so that the whole field is in the plane of the pitch, which is the worst direction.
     """
     return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
 
@@ -158,7 +158,7 @@ VARIANTS = {"as logged": None, "a chip's aside taken off": "reference_chip"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate contacts of the log, with their scores where the truth is known; the paper shows its logs as videos."""
+    """Tabulate contacts of the log, with scores if the truth is known; the paper shows its logs as videos."""
     account = numbers["account"]
     rows = [
         ("rate, Hz", f"{numbers['rate_hz']:.0f}", f"{paper.LOG_RATE_HZ:.0f}"),
@@ -186,7 +186,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """Tabulate the scores of a board that turns, by its largest pitch."""
+    """Tabulate the scores of a board that rotates, by its largest pitch."""
     rows = []
     for row in numbers["turning"]:
         for title, name in VARIANTS.items():

@@ -1,6 +1,7 @@
-"""Manual: networks adapted by pokes by hand, whose places are unknown (paper section 5).
+"""Manual: networks adapted with hand pokes, whose places are unknown (paper section 5).
 
-Tested on the robot's grid of the same skin, beside adaptation by as many pokes of the robot and a control.
+They are tested on the robot's grid of the same skin, and compared with networks adapted with as many pokes by the
+robot, and with a control.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -44,11 +45,11 @@ from reskin.errors import SchemaError
 from reskin.models.job import TrainingJob
 from reskin.models.recipe import HEADLINE
 
-GRID = "grid"  # as many pokes, by the robot
+GRID = "grid"  # adapted with as many pokes by the robot
 
 
 def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
-    """Adapt to every skin that was poked by hand, and by as many pokes of the robot; test on the robot's grid."""
+    """Adapt to every skin with its hand pokes, and with as many pokes by the robot; test on the robot's grid."""
     preload_training()
     data = read_data(settings, main, folds)
     starts = read_pretrained(pretrained)
@@ -72,7 +73,7 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pret
 def make_jobs(
     data: SceneData, fold: Fold, adapting: Adaptations, starts: PretrainedNetworks, skin: str, by_hand: Lines
 ) -> Iterator[tuple[str, TrainingJob]]:
-    """Make the adaptations of one skin: by hand, by the robot, and the control if the scene has such a recipe."""
+    """Make the adaptation jobs of one skin: hand pokes, robot pokes, and the control if the scene has its recipe."""
     headline = HEADLINE, adapting.recipes[HEADLINE]
     for seed_i in select_pretrained(starts, headline[1].base, fold):
         by_robot = pool_lines(data, fold, skin, pokes_n=count_pokes(data, by_hand), seed_i=seed_i)
@@ -84,7 +85,7 @@ def make_jobs(
 
 
 def count_pokes(data: SceneData, lines: Lines) -> int:
-    """Count the pokes of lines."""
+    """Count the pokes along these lines."""
     return len(np.unique(data.rows.indentation[lines.row]))
 
 
@@ -100,7 +101,7 @@ def fold_without(data: SceneData, board: str) -> Fold:
 def summarise_manual(
     predictions: Sequence[VariantPrediction], *, pokes_n: Sequence[int], lines_n: Sequence[int]
 ) -> dict[str, Any]:
-    """Summarise predictions over boards; `pokes_n` and `lines_n` are those of each skin, and averaged."""
+    """Summarise predictions over boards; `pokes_n` and `lines_n` are given by skin, and averaged."""
     variants = summarise_variants(predictions)
     counts = {
         "pokes_n": round(np.mean(pokes_n)),
@@ -132,10 +133,10 @@ PAPER_DIFFERENCES = {"after_minus_before": GAINS["by_hand"]}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the variants, then their differences on equal skins."""
+    """Tabulate the variants, then their differences on the same skins."""
 
     def judge(difference: Stat | None, metric: str) -> str:
-        """Show whether a difference is a gain, and its size."""
+        """Return the verdict whether a difference is a gain, and its size."""
         return "–" if difference is None else f"{verdict(gain(difference, metric))}: {show_difference(difference)}"
 
     lines = []
@@ -157,7 +158,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     spread = (
         "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
         f"{numbers['seeds_n']} networks. ± (seeds) is the standard deviation over {numbers['seeds_n']} network seeds "
-        "on one skin, averaged over skins; for a difference, it is that of the differences between networks of equal seed."
+        "on one skin, averaged over skins; for a difference, that of the differences between networks of equal seed."
     )
     return {"manual": tabulate(lines, meaning=meaning, spread=spread)}
 

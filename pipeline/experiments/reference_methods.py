@@ -122,19 +122,19 @@ def reference_methods(
 
 
 def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
-    """Give the fold of the board after this one, of the same draw: its pool is another skin's pokes."""
+    """Return the fold of the board after this one, of the same draw: its pool is another skin's pokes."""
     same = [one for one in folds if one.draw_i == fold.draw_i]
     names = [one.name for one in same]
     return same[(names.index(fold.name) + 1) % len(same)]
 
 
 def first_folds(folds: Sequence[Fold]) -> dict[str, Fold]:
-    """Give the first fold of each board."""
+    """Return the first fold of each board."""
     return dict(sorted({fold.board: fold for fold in reversed(folds)}.items()))
 
 
 def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float[np.ndarray, "m ch"]:
-    """Give the mean change of field of each poke, in the chips' axes."""
+    """Return the mean change of field of each poke, in the chips' axes."""
     return np.array([data.rows.db_uT[row].mean(axis=0, dtype=np.float64) for row in pokes])
 
 
@@ -400,7 +400,7 @@ class Board:
     tested_uT: Float[np.ndarray, "b ch"]
 
     def alter(self, change: Callable[[Chips], Chips]) -> "Board":
-        """Give the board as it would read if its chips were changed."""
+        """Return the board as it would read if its chips were changed."""
         parts = self.rest_uT, self.pool_uT, self.tested_uT
         return Board(*(change(part.reshape(len(part), -1, 3)).reshape(part.shape) for part in parts))
 

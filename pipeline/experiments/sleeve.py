@@ -156,7 +156,7 @@ def rate_hz(captures: Sequence[Readings]) -> float:
 
 
 def errors_mm(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
-    """Give the distance between true and predicted place of each reading."""
+    """Return the distance between true and predicted place of each reading."""
     return np.linalg.norm(predicted[:, :2].astype(float) - true[:, :2], axis=1)
 
 

@@ -211,7 +211,7 @@ def name_places(
 def directions(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"]
 ) -> dict[int, Float64[np.ndarray, " ch"]]:
-    """Give the mean direction of each place's rows."""
+    """Return the mean direction of each place's rows."""
     units = unit(known_uT)
     return {int(place): units[places == place].mean(axis=0) for place in np.unique(places)}
 
@@ -291,7 +291,7 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
 
 
 def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
-    """Give the residual of two touches by their two places, beside that of one place and of all other pairs."""
+    """Return the residual of two touches by their two places, beside that of one place and of all other pairs."""
     left = {of: float(np.median(left_over(known, of, db_uT))) for of in combinations(sorted(known), 2)}
     alone = {place: float(np.median(left_over(known, (place,), db_uT))) for place in known}
     least = min(alone, key=lambda place: alone[place])
@@ -343,7 +343,7 @@ def sums_of(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[n
 
 
 def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: float) -> dict[str, float]:
-    """Give the share of single touches that detectors which know all other places call two; mean over places."""
+    """Return the share of single touches that detectors which know all other places call two; mean over places."""
     called = []
     for one in blocks:
         others = [other for other in blocks if other is not one]

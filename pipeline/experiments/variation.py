@@ -114,7 +114,7 @@ def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
 def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the visits within a skin's first contacts with the first visit: field as read, and change of field.
 
-    Gives rms values over channels at the last visit, and the lines to draw: each visit's field less the first's.
+    Returns rms values over channels at the last visit, and the lines to draw: each visit's field less the first's.
     """
     early = visits.contacts_n - visits.contacts_n[0] < contacts_n
     before_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]

@@ -198,7 +198,7 @@ def test_response_rotated_by_ten_degrees_is_no_copy():
 def test_fields_within_the_noise_do_not_pass():
     checks = run_audit(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
     assert failing(checks) == ["copies"]
-    assert checks[-1].found == "cannot be told: fields within the noise: b0_s1"
+    assert checks[-1].found == "undecidable: fields within the noise: b0_s1"
 
 
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([*UNSEEN, "single_random"]))
