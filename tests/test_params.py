@@ -90,8 +90,8 @@ def test_missing_required_experiment_is_an_error(experiment, others):
     [
         ({"train_n": 2}, "train_n is at most every_n, 1"),
         ({"test_n": 2}, "test_n is at most every_n, 1"),
-        ({"regular_n": 5}, "regular_n stands there if and only if policies holds regular"),
-        ({"policies": ["regular"]}, "regular_n stands there if and only if policies holds regular"),
+        ({"regular_n": 5}, "regular_n is required if policies contains regular, and not allowed otherwise"),
+        ({"policies": ["regular"]}, "regular_n is required if policies contains regular, and not allowed otherwise"),
         ({"policies": ["each", "each"]}, "policies names each policy once"),
     ],
 )

@@ -103,7 +103,7 @@ def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dic
 
 
 def gaps(data: SceneData) -> dict[str, Any]:
-    """Return the gap between skin and chips on rigid and flexible boards, and by how many percent the latter is less."""
+    """Return the gap between skin and chips on rigid and flexible boards, and how many percent less the latter is."""
     of = simulation_settings(data.settings)
     protocols = {"rigid": "grid", "flexible": "flexible"}
     gap_mm = {kind: of.boards[of.protocols[name].boards].design.gap_mm for kind, name in protocols.items()}

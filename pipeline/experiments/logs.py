@@ -93,7 +93,7 @@ def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[E
 def score_pitches(
     log: Log, own: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
 ) -> list[dict[str, Any]]:
-    """Score the log with the board pitching after its quiet start, without and with a reference chip's reading subtracted.
+    """Score the log with a board that pitches after the quiet start, without and with a reference chip.
 
     `own.noise_uT` is the noise of one reading of the reference chip.
     """

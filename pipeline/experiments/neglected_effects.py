@@ -30,7 +30,7 @@ from reskin.simulation.contact import Response, Terms, drag_tip, simulate_respon
 from reskin.simulation.protocols import Plan
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-# Sizes of effects that a scene may neglect: design values, assumed.
+# Assumed sizes of effects that a scene may neglect.
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
 RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
 MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
@@ -40,26 +40,26 @@ PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # indentations for effects inside the 
 BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # of the powder's own field
 FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed
 FEW = 5
-COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # where every node is followed by itself
+COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # for effects that need every node to be followed separately
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect: rms error of dB and of the force in %, and largest error of the no-load field in uT, without it."""
+    """One effect, and the errors of neglecting it: rms of dB and force in %, largest of the no-load field in uT."""
 
     term: str
-    done: str  # by the main protocol: "left out" or "kept"
+    done: str  # "left out" or "kept" by the main protocol
     field_pct: float | None
     rest_uT: float | None
     force_pct: float | None
     how: str
-    left_out_by: tuple[str, ...] = ()  # protocols; empty for effects that are no term of a protocol
+    left_out_by: tuple[str, ...] = ()  # protocols; empty for effects that are not a term of a protocol
     computed_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The first skin of the main protocol, on which everything is measured, and that protocol."""
+    """The first skin of the main protocol, on which all effects are measured, and the plan of that protocol."""
 
     board: Board
     skin: Skin
@@ -104,12 +104,16 @@ def _make_subject(of: SimulationSettings, seed: int) -> Subject:
 
 
 def _over_time(on: Subject, without: Response, seed: int) -> list[Effect]:
-    """Simulate the whole protocol with a term, and compare with the simulation without."""
-    n, slack = len(on.plan), RELAXATION
+    """Compare simulations of the whole protocol with a term and without it."""
+    n, relaxation = len(on.plan), RELAXATION
     rows = []
     for name, terms, how in (
         ("ageing", Terms(ageing=AGEING), f"at the last of {n} contacts, a no-load reading before each"),
-        ("relaxation", Terms(relaxation=slack), f"{slack.approach_s:g} s down, held for {slack.hold_s:g} s"),
+        (
+            "relaxation",
+            Terms(relaxation=relaxation),
+            f"{relaxation.approach_s:g} s down, held for {relaxation.hold_s:g} s",
+        ),
         ("memory", Terms(memory=MEMORY), f"pokes held for {MEMORY.contact_s:g} s, {MEMORY.rest_s:g} s between them"),
     ):
         simulated = _simulate(on, terms, seed)
@@ -138,7 +142,7 @@ def _friction(on: Subject) -> Effect:
 
 
 def _earth(without: Response) -> Effect:
-    """Add a steady field to no-load reading and contact, and subtract one from the other."""
+    """Add a steady field to the no-load reading and to the contact, and subtract the former from the latter."""
     rest_T = without.rest_T[:, None] + EARTH_T
     seen_T = (rest_T + without.change_T) - rest_T
     how = "a steady field, as long as the board does not turn; a no-load reading before each contact"
@@ -147,7 +151,7 @@ def _earth(without: Response) -> Effect:
 
 
 def _hold(on: Subject) -> list[Effect]:
-    """Compare with an infinite layer that slides freely and whose force is linear elasticity's."""
+    """Compare with an infinite layer that slides freely and whose force is that of linear elasticity."""
     if on.skin.hold is None:
         return []
     free, deepest_m = replace(on.skin, hold=None), np.array([on.tip_m[..., 2].max()])
@@ -179,13 +183,13 @@ def _free_edge(on: Subject) -> list[Effect]:
 
 
 def _inside(on: Subject) -> list[Effect]:
-    """Deform the material of a few indentations as the scene does, and without one part of the physics."""
+    """Deform the material under a few indentations as the scene does, and without one part of the physics each."""
     skin, depth_m = on.skin, float(on.tip_m[..., 2].max()) + on.skin.depth_zero_m
     base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
     swapped = replace(press, base=base)
     true = _flow(on, depth_m, press)
-    wrong_N, true_N = (
+    swapped_N, true_N = (
         layer.force(np.array([depth_m]), **asdict(pressed), modulus_Pa=skin.modulus_Pa) for pressed in (swapped, press)
     )
     cases: dict[str, tuple[list[Moved], float, str]] = {
@@ -194,7 +198,7 @@ def _inside(on: Subject) -> list[Effect]:
             [_one_shot(on, place_m, depth_m, press) for place_m in PLACES_M], 0.0, "one linear step to the full depth",
         ),
         f"{skin.base} base": (
-            _flow(on, depth_m, swapped), _error_pct(wrong_N, true_N), f"a {base} base",
+            _flow(on, depth_m, swapped), _error_pct(swapped_N, true_N), f"a {base} base",
         ),
     }  # fmt: skip
     true_T, pokes = _change(on, true), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
@@ -208,7 +212,7 @@ Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray
 
 
 def _flow(on: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
-    """Follow the material under all indentations at once: the pressures are the same."""
+    """Follow the material under all indentations at once, because the contact pressures are the same."""
     r_m = np.concatenate([np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
     z_m = np.tile(on.coarse.nodes_m[:, 2], len(PLACES_M))
     end = deformation.follow(r_m, z_m, deformation.depth_steps((depth_m,), press), press=press)[-1]
@@ -244,7 +248,7 @@ def _steps(without: Response, of: SimulationSettings) -> Effect:
 
 
 def _own_field(on: Subject, of: SimulationSettings) -> Effect:
-    """Magnetise the powder by its own field too, to first order (boxes, magpylib)."""
+    """Compare with powder that is also magnetised by its own field, to first order (boxes, magpylib)."""
     rest = midpoints(on.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, on.skin.thickness_m, of.skin.polarity)
     sizes = {"saturation_T": of.skin.saturation_T, "half_field_T": of.skin.half_field_T}
@@ -265,7 +269,7 @@ def _own_field(on: Subject, of: SimulationSettings) -> Effect:
 
 
 def _too_deep(of: SimulationSettings, seed: int) -> Effect:
-    """Count, over all skins, the stops beyond the depths of published solutions."""
+    """Count, over all skins, the stops that are deeper than published solutions."""
     depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
     skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in list_captures(of, MAIN)]
     share_pct = 100 * sum(count_beyond_verified(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))

@@ -1,7 +1,7 @@
-"""The universal model of simulated skins alone, on held-out skins of a simulated scene.
+"""The universal model, built from simulated skins alone, on held-out skins of a simulated scene.
 
-It is calibrated to each skin by its no-load field, by unlabelled presses and by labels; forces also with one known
-weight. Networks of more and more simulated skins give the error against their number.
+The model is calibrated to each skin with its no-load field, unlabelled presses and labelled presses; forces are also
+corrected with one known weight. Networks of more and more training skins show how the error falls with their number.
 """
 
 import hashlib
@@ -50,26 +50,26 @@ from reskin.universal.network import Weights
 from reskin.universal.population import PLACES_N, Forces, Population, draw_population
 from reskin.universal.training import NOISE_uT, SkinPrior, draw_weights, train
 
-EXPERIMENT = "lobo"  # whose folds are used: their pools are those of adaptation
+EXPERIMENT = "lobo"  # its folds are used, with the pools of unlabelled pokes that adaptation uses
 POOL_MAX_N = 65  # presses: one at each place of the paper's grid, under any of its depths
 TESTED_MAX_N = 2000  # rows of a skin, drawn at random
-CALIBRATION_SKINS_N = 16  # simulated, for likelihood powers and weight shares
-FRESH_N = 32  # further simulated skins, for the coverage of intervals
+CALIBRATION_SKINS_N = 16  # simulated skins for choosing likelihood powers and weight shares
+FRESH_N = 32  # further simulated skins for measuring the coverage of intervals
 BY = ("way", "pokes_n", "labels_n")
 WAYS = ("map", "universal", "network")  # the map alone, map and networks, the networks alone
-WEIGHT_N = 5.0  # of the known weight, 500 g in the middle, which tells forces at all places best
-WEIGHT_SD = 0.02  # of the log of its assumed force: friction of the guide, and its mass
-LOG_FORCE_MIN_N = 0.2  # smaller forces do not count in errors of log F: the skin hardly feels them
+WEIGHT_N = 5.0  # known weight, 500 g in the middle, which is most informative about forces at all places
+WEIGHT_SD = 0.02  # sd of the log of its assumed force: friction of the guide, and error of its mass
+LOG_FORCE_MIN_N = 0.2  # smaller forces do not count in errors of log F: they hardly change the field
 
 PACKAGE = Path(reskin.universal.__file__).parent
 TRAINS = "reskin.universal.training"
-PART_N = 100  # skins that are cached together
-LOG_FORCE_STEP = 0.6  # at most, between two tabulated forces
-FORCE_SHARES = (0.7, 1.5)  # of the least and the largest force of the designed skin, as skins differ
+PART_N = 100  # skins per cached array
+LOG_FORCE_STEP = 0.6  # largest step of log F between two tabulated forces
+FORCE_SHARES = (0.7, 1.5)  # margins below the smallest and above the largest force of the design, as skins differ
 
 
 class CalibrationSize(NamedTuple):
-    """Numbers of unlabelled presses and of labels that the model is calibrated with."""
+    """Numbers of unlabelled presses and of labels for calibration."""
 
     presses_n: int
     labels_n: int
@@ -78,8 +78,8 @@ class CalibrationSize(NamedTuple):
 class PopulationSettings(Strict):
     """Section population.
 
-    skins_n: simulated skins of each network, the first of one population. steps_n: of each training. unlabelled_n,
-    labels_n: presses that the model is calibrated with.
+    skins_n: number of simulated training skins of each network, which are the first of one population. steps_n: of each
+    training run. unlabelled_n, labels_n: numbers of presses for calibration.
     """
 
     skins_n: Annotated[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], Field(min_length=1)]
@@ -88,33 +88,33 @@ class PopulationSettings(Strict):
     labels_n: tuple[Annotated[int, Field(ge=1, le=POOL_MAX_N)], ...]
 
     def sizes(self) -> list[CalibrationSize]:
-        """List more and more unlabelled presses, then all of them with more and more labels."""
+        """List increasing numbers of unlabelled presses, then the largest with increasing numbers of labels."""
         most_n = max(self.unlabelled_n)
         return [CalibrationSize(n, 0) for n in self.unlabelled_n] + [CalibrationSize(most_n, n) for n in self.labels_n]
 
 
 @dataclass(frozen=True)
 class DesignedSkins:
-    """Simulated skins about the design of a scene's skins, with the forces of its depths."""
+    """Simulated skins drawn around the design of a scene's skins, and the range of forces of the scene's depths."""
 
     prior: SkinPrior
     forces_N: tuple[float, float]
     seed: int
 
     def draw(self, name: str, which: slice, weight_N: float | None = None) -> Population:
-        """Draw some skins of the population of this name; the press of a weight, if given, is the last of each."""
+        """Draw some skins of the population of this name; if a weight is given, its press is the last of each skin."""
         prior, rng = self.prior, rng_for(self.seed, "population", name)
         return draw_population(prior.centre, prior.spreads, prior.setup, which, rng, Forces(*self.forces_N, weight_N))
 
     def tables(self) -> Tables:
-        """Tabulate the designed skin, for the map."""
+        """Tabulate the designed skin for the map."""
         first, last = np.log(self.forces_N)
         forces_N = np.exp(np.linspace(first, last, 1 + int(np.ceil((last - first) / LOG_FORCE_STEP))))
         return tabulate_map(self.prior.centre, self.prior.spreads, self.prior.setup, forces_N)
 
 
 def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> DesignedSkins:
-    """Return skins about a design, on boards as designed, with the law's parameters and the slide of the design."""
+    """Return skins drawn around a design, on boards as designed, with the law's parameters and slide of the design."""
     if design.hold is None:
         what = "hold of section skin is null, but this experiment needs a skin that slides"
         raise ParamsError(f"nominal.yaml: {what}. Run it in a scene whose skin has hold.")
@@ -136,12 +136,12 @@ def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, 
 
 
 def draw(designed: DesignedSkins, skins_n: int, report: Callable[[str], None]) -> Population:
-    """Draw a population part by part; parts are cached."""
+    """Draw a population in parts, which are cached."""
     parts = []
     for first in range(0, skins_n, PART_N):
         which = slice(first, min(first + PART_N, skins_n))
         parts.append(_cached(designed, f"skins {which}", partial(_drawn, designed, which)))
-        report(f"{which.stop} of {skins_n} skins are drawn")
+        report(f"{which.stop} of {skins_n} skins drawn")
     channels_n = (parts[0].shape[2] - 3) // 2
     stacked = np.split(np.concatenate(parts), (channels_n, 2 * channels_n, -1), axis=2)
     db_uT, rest_uT, place_mm, force_N = stacked
@@ -166,7 +166,7 @@ def train_network(designed: DesignedSkins, skins: Population, skins_n: int, step
 
 
 def _cached(designed: DesignedSkins, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
-    """Return an array from the cache, or make it. Its key: name, prior, code, and the first skin's fields (physics)."""
+    """Return an array from the cache, or make it; the key contains name, prior, code and the first skin's fields."""
     first_skin = hashlib.sha256(_drawn(designed, slice(1)).tobytes()).hexdigest()
     spreads = sorted(designed.prior.spreads.items())
     code = [digest(module) for module in imported(TRAINS)]
@@ -196,18 +196,18 @@ class KnownWeight:
 
 @dataclass(frozen=True)
 class TestSkin:
-    """A skin to score the model on, in its board's frame and axes."""
+    """A skin to score the model on, in the frame and axes of its board."""
 
     board: str
     rest_uT: Float[np.ndarray, " ch"]
-    pool: LabelledPresses  # the first are used for calibration
+    pool: LabelledPresses  # calibration uses the first of these
     weight: KnownWeight
     test_uT: Float[np.ndarray, "n ch"]
     true: Float[np.ndarray, "n 3"]  # x, y in mm from the board's middle, F in N
 
 
 def scene_skins(data: SceneData, fold: Fold, frame: Frame, rest_uT: Mapping[str, np.ndarray]) -> list[TestSkin]:
-    """Return the skins of a held-out board: a press at each place of their first passes, and rows of later ones."""
+    """Return the skins of a held-out board: one press per place from the first passes, test rows from later ones."""
     rows, found = data.rows, []
     for skin in np.unique(rows.skin[fold.test]):
         rng = rng_for(data.settings.seed, "population", "asked", str(skin))
@@ -224,7 +224,7 @@ def scene_skins(data: SceneData, fold: Fold, frame: Frame, rest_uT: Mapping[str,
 
 
 def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> LabelledPresses:
-    """Draw one indentation at each place, as the mean of its readings."""
+    """Draw one indentation at each place; a press is the mean of its readings."""
     rows = data.rows
     first = np.unique(rows.indentation[own], return_index=True)[1]
     _, place_i = np.unique(rows.target[own[first], :2].round(2), axis=0, return_inverse=True)
@@ -237,7 +237,7 @@ def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generat
 
 
 def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> KnownWeight:
-    """Take as the weight the press nearest to the middle whose force is nearest to the weight's."""
+    """Use as the weight, of the presses nearest to the middle, the one whose force is nearest to `WEIGHT_N`."""
     rows = data.rows
     off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
     middle = own[off_mm == off_mm.min()]
@@ -253,7 +253,7 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
 
 
 def known_weight(db_uT: Float[np.ndarray, " ch"], force_N: float, rng: np.random.Generator) -> KnownWeight:
-    """Take a press as that of a weight, whose assumed force is drawn about the true one."""
+    """Treat a press as that of a weight; its assumed force is drawn around the true one."""
     return KnownWeight(db_uT, force_N * float(np.exp(WEIGHT_SD * rng.standard_normal())))
 
 
@@ -282,7 +282,10 @@ def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSki
 def estimate(
     model: PriorModel, skin: TestSkin, size: CalibrationSize, powers: Sequence[Mapping[str, float]]
 ) -> list[dict[str, Estimate]]:
-    """Calibrate a model to a skin; estimate its test presses, and at last the weight's, in each way and power."""
+    """Calibrate a model to a skin, and estimate its test presses and, as the last, the press of the weight.
+
+    Returns one mapping by way (map, universal, network) per mapping of likelihood powers.
+    """
     labels = skin.pool[: size.labels_n]
     labels = replace(labels, force_N=np.maximum(labels.force_N, model.skin.tables.force_N[0]))
     data = CalibrationData(skin.rest_uT, skin.pool.db_uT[: size.presses_n])
@@ -298,7 +301,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class Calibration:
-    """For each way, the likelihood power, and the share of the weight's error in log F that corrects all forces."""
+    """By way: the likelihood power, and the share of the weight's error in log F by which all forces are corrected."""
 
     power: Mapping[str, float]
     weight_share: Mapping[str, float]
@@ -321,14 +324,14 @@ def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: Calibrati
 
 
 def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarray, " s"]) -> float:
-    """Return by least squares the share of the weight's error in log F that other presses have too."""
+    """Return the least-squares share of the weight's error in log F that the other presses have too."""
     return float(weight_off @ others_off / (weight_off @ weight_off))
 
 
 def score_skin(
     model: PriorModel, skin: TestSkin, size: CalibrationSize, calibration: Calibration
 ) -> list[dict[str, Any]]:
-    """Score each way on a skin; forces also with one known weight, and after the best factor (a diagnosis)."""
+    """Score each way on a skin; forces also corrected by one known weight, and by the best factor (diagnosis)."""
     rows = []
     (by_way,) = estimate(model, skin, size, [calibration.power])
     for way, found in by_way.items():
@@ -361,7 +364,7 @@ def _coverage(found: Estimate, skin: TestSkin) -> float:
 def score_all(
     designed: DesignedSkins, section: PopulationSettings, tested: Sequence[TestSkin], scene: str
 ) -> tuple[pd.DataFrame, pd.DataFrame, dict[str, Any]]:
-    """Score the model on every skin: by calibration data, with networks of fewer skins, and on fresh simulated skins.
+    """Score the model by calibration data, with networks of fewer training skins, and on fresh simulated skins.
 
     Returns rows by calibration data, rows by number of simulated skins, and further numbers.
     """
@@ -369,7 +372,7 @@ def score_all(
     networks: dict[int, Weights] = {}
     for n in section.skins_n:
         networks[n] = train_network(designed, skins, n, section.steps_n)
-        say(f"{scene} population: network of {n} skins is trained")
+        say(f"{scene} population: network of {n} skins trained")
     model = PriorModel(new_map(designed.tables()), [networks[max(section.skins_n)]])
     further = designed.draw("further", slice(CALIBRATION_SKINS_N), WEIGHT_N)
     further_skins = simulated_skins(further, rng_for(designed.seed, "population", "noise"))
@@ -395,7 +398,7 @@ def score_all(
 
 
 def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
-    """Summarise scores over boards, each the mean of its skins."""
+    """Summarise scores over boards; the score of a board is the mean over its skins."""
     found = []
     for key, own in rows.groupby(list(keys), sort=False):
         boards = own.groupby("board").mean(numeric_only=True).drop(columns=list(set(keys) - {"way"}))
@@ -404,7 +407,7 @@ def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
 
 
 def population(settings: Settings, section: PopulationSettings, folds: Path, indentations: Path, results: Path) -> None:
-    """Score the universal model of simulated skins on every held-out skin of a simulated scene."""
+    """Score the universal model, built from simulated skins, on every held-out skin of a simulated scene."""
     data, simulation = read_data(settings, indentations, folds), simulation_settings(settings)
     kind, design = simulation.main_boards, settings.shared_section(SkinDesign, "skin")
     designed = designed_skins(design, kind, simulation.main.depths_mm, settings.seed)

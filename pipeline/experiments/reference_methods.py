@@ -1,9 +1,9 @@
-"""Reference methods for a board that nobody calibrated, on the folds and tested rows of experiment labels (ours).
+"""Reference methods for a board without calibration, on the folds and test rows of experiment labels (ours).
 
-- Regressors and networks of known boards, with inputs aligned by the board's unlabelled pokes or by a few labels.
+- Regressors and networks of known boards, with inputs aligned by the new board's unlabelled pokes or by a few labels.
 - The universal model and a fitted physical model (inversion), given the skin's own unlabelled pokes, none, or another
   skin's.
-- Alarms: whether what a fitted model leaves unexplained detects a foreign board.
+- Alarms: whether the residual of a fitted model detects a foreign board.
 """
 
 import time
@@ -61,7 +61,7 @@ from reskin.universal.model import PriorModel
 OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method receives
 Key = tuple[str, str, int]  # method, unlabelled pokes, number of labels
 Point = dict[str, Any]  # scores of one method on one fold
-RNG = "rivals"  # name of the random draws, from an earlier name of this experiment
+RNG = "rivals"  # name of the random streams, from an earlier name of this experiment
 
 
 class ReferenceMethods(SectionWithRows):
@@ -122,7 +122,7 @@ def reference_methods(
 
 
 def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
-    """Return the fold of the board after this one, of the same draw: its pool is another skin's pokes."""
+    """Return the fold of the next board in the same draw; its pool has the pokes of another skin."""
     same = [one for one in folds if one.draw_i == fold.draw_i]
     names = [one.name for one in same]
     return same[(names.index(fold.name) + 1) % len(same)]
@@ -141,13 +141,13 @@ def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float
 def point(
     data: SceneData, fold: Fold, predicted: Float[np.ndarray, "b 3"], *, method: str, pokes: str, labels_n: int = 0
 ) -> Point:
-    """Score predictions (x and y as labelled, F) for the tested rows of a fold."""
+    """Score predictions (x and y in the labels' axes, F) for the test rows of a fold."""
     keys = {"method": method, "name": pokes, "labels_n": labels_n, "fold": fold.board, "seed_i": fold.draw_i}
     return keys | {"scores": score_test(data, fold.test, predicted.astype(np.float32))}
 
 
 def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict[str, Any]]:
-    """Summarise every method over boards, with the difference to its control, paired by board."""
+    """Summarise every method over boards, with its difference to its control, paired by board."""
     table = tidy([], {"rivals": points})
     table["labels_n"] = table["labels_n"].astype(int)
     groups: dict[Any, Any] = dict(iter(table.groupby(["method", "recipe", "labels_n"], sort=False)))
@@ -164,15 +164,15 @@ def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict
 
 # --- Models of known boards with aligned inputs ---
 
-EVERY_N = 10  # of a labelled poke's readings, one is a training row: they differ by noise alone
-SAME_MM = 0.5  # pokes that are nearer are at one place
+EVERY_N = 10  # every tenth reading of a labelled poke is a training row: its readings differ only by noise
+SAME_MM = 0.5  # pokes closer than this are at one place
 ALIGNMENTS = {"channels matched": match_channels, "CORAL": coral}
 DIRECT, AS_ROWS = "direct standardisation", "labels as rows"
 ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long without it"
 
 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
-    """Score a regressor of known boards as it is, with every alignment, and with labels as rows."""
+    """Score a regressor of known boards without changes, with every alignment, and with labels as training rows."""
     rows, view, pokes = data.rows, VIEW[method.inputs], pool_rows(data, fold)
     known, new, test = (view(rows.db_uT[at]) for at in (fold.train, fold.pool, fold.test))
     target, name = rows.target[fold.train], f"{method.title} ({method.inputs})"
@@ -196,15 +196,15 @@ def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Se
 
 
 def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) -> Float[np.ndarray, "b ch"]:
-    """Map a new board's tested fields to the known boards', by labelled pokes that have a pair on these.
+    """Map a new board's test fields to those of known boards, by labelled pokes with a counterpart on known boards.
 
-    Each pair has the same weight, however strong the poke; the ridge is chosen on the pairs.
+    Each pair has the same weight, however strong the poke; the ridge penalty is chosen on the pairs.
     """
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
     kept = np.isfinite(old_uT).all(axis=1)
     if not kept.any():
         what = f"no labelled poke is within {SAME_MM} mm of one on the known boards"
-        remedy = "Record known boards at the same places, or remove the experiment from the scene's."
+        remedy = "Record known boards at the same places, or remove the experiment from the scene."
         raise ParamsError(f"fold {fold.name}: {what}. {remedy}")
     length_uT = np.linalg.norm(new_uT[kept], axis=1, keepdims=True)
     new, old = new_uT[kept] / length_uT, old_uT[kept] / length_uT
@@ -215,9 +215,9 @@ def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) ->
 def pairs_uT(
     rows: Rows, train: Int64[np.ndarray, " a"], pokes: Sequence[Int64[np.ndarray, " r"]]
 ) -> Float[np.ndarray, "m ch"]:
-    """Give what known boards read at the place and force of each poke, mean over boards; NaN where there is no pair.
+    """Return what known boards read at the place and force of each poke, mean over boards; NaN where there is no pair.
 
-    Between the forces that a board has at a place, channels are linear in log F; beyond, they are constant.
+    Channels are interpolated linearly in log F between a board's forces at a place, and are constant beyond them.
     """
     found = np.full((len(pokes), rows.db_uT.shape[1]), np.nan)
     boards = [_poke_means(rows, train[rows.board[train] == board]) for board in np.unique(rows.board[train])]
@@ -253,7 +253,7 @@ def _interpolate(
 def score_adversarial(
     data: SceneData, fold: Fold, recipe: Recipe, weight: float
 ) -> tuple[list[Point], list[dict[str, Any]]]:
-    """Score a domain-adversarial network and its control, with the record of their trainings."""
+    """Score a domain-adversarial network and its control; also return the records of their training."""
     view, rows = VIEW[recipe.inputs], data.rows
     scaler = FIT[recipe.scaling](view(rows.db_uT[fold.train]), rows.target[fold.train])
     known, new, test = (scaler.encode(view(rows.db_uT[at])) for at in (fold.train, fold.pool, fold.test))
@@ -270,9 +270,9 @@ def score_adversarial(
 def train_until_converged(
     domains: Domains, recipe: Recipe, weight: float, seed: int, fold: str
 ) -> tuple[Weights, dict[str, Any]]:
-    """Train, and again with other draws while the network collapses, as all networks are.
+    """Train, and repeat with other random draws while the network collapses, as for all networks.
 
-    The draws do not depend on the weight, so a network and its control differ in the weight alone.
+    The draws do not depend on the weight, so a network and its control differ only in the weight.
     """
     for attempt_i in range(MAX_ATTEMPTS_N):
         weights = train_adversarial(domains, recipe, weight, rng_for(seed, RNG, "network", fold, attempt_i))
@@ -303,7 +303,7 @@ ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 @dataclass(frozen=True)
 class Seconds:
-    """Processor seconds until a method is calibrated to a skin, and of one reading of many."""
+    """Processor seconds for calibrating a method to a skin, and for one reading when many are estimated together."""
 
     name: str
     train_s: float
@@ -316,7 +316,7 @@ Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Second
 def score_unlabelled(
     known: KnownBoards, folds: Sequence[Fold], fold: Fold, variants: Variants
 ) -> tuple[list[Point], list[Seconds]]:
-    """Score the universal models and the inversion with a skin's own pokes, with none and with another skin's."""
+    """Score the universal models and the inversion, given a skin's own pokes, none, and another skin's."""
     points, took = [], []
     test_uT = known.frame.field(known.data.rows.db_uT[fold.test])
     rest_uT = known.presses[fold.board].rest_uT.ravel()
@@ -338,7 +338,7 @@ def estimate_universal(
     model: PriorModel, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses, test_uT: Float[np.ndarray, "b ch"],
     way: str,
 ) -> Iterator[Estimated]:  # fmt: skip
-    """Estimate by a map, a network and both, calibrated with a skin's field at rest and some pokes."""
+    """Estimate with a map, a network and both, calibrated with a skin's field at rest and some pokes."""
     start_s = time.process_time()
     calibrated = calibrate(model, rest_uT, pool).with_labels(0)
     ready_s = time.process_time()
@@ -357,7 +357,7 @@ def estimate_universal(
 def estimate_inversion(
     setup: Setup, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses, test_uT: Float[np.ndarray, "b ch"]
 ) -> Iterator[Estimated]:
-    """Invert a physical model that was fitted to some pokes; also with places shifted to centre these pokes."""
+    """Invert a physical model fitted to some pokes; also with places shifted so that these pokes are centred."""
     start_s = time.process_time()
     known = chart(fit_unlabelled(pool.db_uT, rest_uT, setup), setup)
     ready_s = time.process_time()
@@ -369,19 +369,19 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Compare every method with itself, given the skin's own pokes."""
+    """Name as control of each method without the skin's own pokes the same method with them."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
 
 # --- Alarms ---
 
-TESTED_EVERY_N = 10  # of the tested readings, one is used
+TESTED_EVERY_N = 10  # every tenth test reading is used
 OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards, made of the board's own readings: what a wrong plug, driver or skin does to its fields.
+# Foreign boards, made from the board's own readings: the effect of a wrong plug, driver or skin on its fields.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
@@ -393,7 +393,7 @@ ByBoard = Mapping[str, Float[np.ndarray, "_"]]
 
 @dataclass(frozen=True)
 class Board:
-    """A board in its chips' axes: the field at rest, unlabelled pokes, and tested readings."""
+    """Field at rest, unlabelled pokes and test readings of a board, in its chips' axes."""
 
     rest_uT: Float[np.ndarray, "1 ch"]
     pool_uT: Float[np.ndarray, "m ch"]
@@ -406,10 +406,10 @@ class Board:
 
 
 def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Evaluate the residual of inversion as an alarm for foreign boards, and as a flag of wrong estimates.
+    """Evaluate the residual of inversion as an alarm for foreign boards, and as a flag for wrong estimates.
 
-    A physical model is fitted to each board's unlabelled pokes of its first fold, and inverted for tested readings of
-    the board itself and of foreign boards.
+    A physical model is fitted to the unlabelled pokes of each board's first fold, and inverted for test readings of the
+    board itself and of foreign boards.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)
@@ -453,7 +453,7 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
 
 
 def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
-    """Give for each board the limit that this fraction of the other boards' readings exceeds."""
+    """Return for each board the limit that this fraction of the readings of all other boards exceeds."""
     others = {board: [own for other, own in value.items() if other != board] for board in value}
     return {board: float(np.quantile(np.concatenate(own), 1 - fraction)) for board, own in others.items()}
 
@@ -469,7 +469,7 @@ def alarm_statistics(left: ByBoard, right: ByBoard, limits: Mapping[str, float])
 
 
 def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]], fraction: float) -> dict[str, Any]:
-    """Summarise over boards the errors of flagged readings and of all others; absent for a board that flags none."""
+    """Summarise over boards the errors of flagged readings, over the boards that have any, and of all others."""
     found: dict[str, list[float]] = {}
     for board, limit in limits_of(value, fraction).items():
         flagged = value[board] > limit
@@ -486,7 +486,7 @@ def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]]
 def flag_by_universal(
     known: KnownBoards, nominal: Variant, folds: Sequence[Fold], fraction: float
 ) -> list[dict[str, Any]]:
-    """Flag readings of the universal model by the standard deviation of the place, and by the misfit of the map."""
+    """Flag readings by the universal model's standard deviation of the place, and by the misfit of its map."""
     sd_mm, misfit, off_mm = {}, {}, {}
     for board, fold in first_folds(folds).items():
         rows, test = known.data.rows, fold.test[::TESTED_EVERY_N]
@@ -502,7 +502,7 @@ def flag_by_universal(
 # --- Tables ---
 
 DASH = "–"
-# What each method can do and what it cannot, by its mechanism; whether it helps is in the columns beside it.
+# What each method can and cannot correct by its mechanism; the table's other columns show whether it helps.
 WHY = {
     "channels matched": "corrects the gain of each channel; a seat or a rotation mixes channels, and standard "
     "deviations also differ where forces do",
@@ -548,7 +548,7 @@ FLAGGED = (
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate aligned methods, the worth of unlabelled pokes, the alarm, and errors of flagged readings."""
+    """Tabulate methods with aligned inputs, methods with unlabelled pokes, alarms, and errors of flagged readings."""
     unlabelled = [row for row in numbers["methods"] if row["method"].startswith(("universal", INVERSION))]
     aligned = [row for row in numbers["methods"] if row not in unlabelled]
     alarm = numbers["alarm"]

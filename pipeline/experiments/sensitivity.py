@@ -20,7 +20,7 @@ from reskin.data.baseline import subtract
 from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
 
-RESOLVED_SHARE = 0.95  # of pairs of readings in the right order: resolved
+RESOLVED_SHARE = 0.95  # a difference is resolved if this share of reading pairs is in the right order
 WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
 
 
@@ -32,7 +32,7 @@ def group_by_level(
     levels_n: int,
     where: str,
 ) -> Float32[np.ndarray, "n p r ch"]:
-    """Group readings by filling, weight and reading; a stop is a run of equal force readings of the log."""
+    """Group readings by filling, weight and reading; a stop is a run of readings with equal force in the log."""
     new = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
     stops = np.split(np.arange(len(force_N)), new)
     fillings_n = len(np.unique(indentation))
@@ -47,7 +47,7 @@ def group_by_level(
 def analyse_levels(
     db_uT: Float32[np.ndarray, "n p r ch"], weight_N: Float64[np.ndarray, " p"]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Analyse the readings under weights that increase in equal steps: numbers, and data of the figures."""
+    """Analyse the readings under weights that increase in equal steps; return numbers, and data for the figures."""
     fitted, held = np.split(db_uT.astype(np.float64), [len(db_uT) // 2])
     along_uT = held @ direction(fitted)
     response_uT, step_N = along_uT.mean(axis=(0, 2)), float(weight_N[1] - weight_N[0])
@@ -96,9 +96,9 @@ def direction(db_uT: Float64[np.ndarray, "n p r ch"]) -> Float64[np.ndarray, " c
 
 
 def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarray, " d"]:
-    """Return the share of pairs of readings in the order of their weights, for differences of 1 step, 2 steps, ...
+    """Return the share of reading pairs in the order of their weights, for differences of 1 step, 2 steps, ...
 
-    A pair is two readings of the same filling, which share its no-load reading; equal responses count half.
+    A pair is two readings of the same filling, which share a no-load reading; equal responses count half.
     """
     levels_n = response_uT.shape[1]
     shares = []
@@ -109,7 +109,7 @@ def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarr
 
 
 def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | None:
-    """Return the smallest difference from which on all are resolved; None if the largest is not."""
+    """Return the smallest difference that is resolved together with all larger ones; None if the largest is not."""
     unresolved_i = np.flatnonzero(share < RESOLVED_SHARE)  # index 0 is one step
     last_i = int(unresolved_i.max(initial=-1))
     return None if last_i == len(share) - 1 else step_N * (last_i + 2)
@@ -118,9 +118,10 @@ def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | No
 def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndarray, " p"]) -> dict[str, Any]:
     """Test whether the mean response over fillings increases from every weight to the one `step_N` above it.
 
-    The step is the smallest whole number of steps whose mean rise exceeds the noise of one filling in 95 % of cases, so
-    that finer pouring does not make the response fall. It follows from noise and gain, not from the observed order, or
-    a fall would lengthen the step until it disappears. If no step is long enough, there is no `step_N`.
+    `step_N` is the smallest multiple of the weights' step whose mean rise exceeds the noise of one filling in 95 % of
+    cases; at finer steps, noise alone would make the response fall. `step_N` is computed from noise and gain, not from
+    the observed order: otherwise an observed fall would lengthen the step until the fall disappears. If no step is
+    large enough, `step_N` is missing.
     """
     mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
     noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # of one rise
@@ -138,7 +139,7 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
         falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
         step_N = steps_n * float(weight_N[1] - weight_N[0])
         found |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
-    if noise_uT > 0:  # of a linear rise, with the standard error of the mean
+    if noise_uT > 0:  # for a linear rise, with the standard error of the mean
         z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
         found["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
     return found

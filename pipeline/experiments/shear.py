@@ -27,7 +27,7 @@ from reskin.seeds import rng_for, seed_for
 PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
 PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
 DRAWN_N = 400  # points in a panel
-FORCE_DECIMALS = 3  # of a newton that is drawn
+FORCE_DECIMALS = 3  # of a force in N in the figure
 
 
 class Shear(SectionWithTraining):
@@ -39,7 +39,7 @@ class Shear(SectionWithTraining):
 
 
 def shear(settings: Settings, section: Shear, indentations: Path, results: Path) -> None:
-    """Train with five targets on both splits of every skin, and score what was held out."""
+    """Train networks with five targets on both splits of every skin, and score the held-out readings."""
     preload_training()
     rows = gather(read_captures(indentations), settings.section(Selection, "selection"), targets=SHEAR_TARGETS)
     by_reading = make_folds(rows, np.arange(len(rows)), "reading", section, settings.seed)
@@ -108,10 +108,10 @@ def summarise_shear(
     passes_n: int,
     seeds_n: int,
 ) -> dict[str, Any]:
-    """Summarise (fold, score) pairs of both splits over folds, each the mean of its seeds, with the forces' size.
+    """Summarise the (fold, scores) pairs of both splits over folds, and add the rms forces.
 
-    Of `lines_n` dragged lines in all, each place and depth was dragged along in each of `passes_n`. `sd_seeds` is the
-    standard deviation over the `seeds_n` networks of one fold, mean over folds.
+    The score of a fold is the mean over its seeds; `sd_seeds` is the standard deviation over the `seeds_n` networks of
+    one fold, averaged over folds. `lines_n` counts dragged lines over all passes; each pass drags along the same lines.
     """
 
     def over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
@@ -133,7 +133,7 @@ FORCES = ("Fx", "Fy", "Fz")
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate both splits beside the paper's numbers, which are of an unnamed split."""
+    """Tabulate both splits beside the paper's numbers; the paper does not say which split it used."""
     splits = {
         "random readings held out (ours; the paper names no split)": numbers,
         "whole lines held out": numbers["by_line"],
@@ -163,7 +163,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw predicted against true force of lines that were held out whole, a panel for each component."""
+    """Draw predicted against true force for held-out lines, one panel per component."""
     with drawing(7.6, 3.1) as figure:
         panels = figure.subplots(1, len(FORCES))
         for axes, name, true_N, predicted_N in zip(panels, FORCES, drawn["true"], drawn["predicted"], strict=True):

@@ -1,6 +1,6 @@
 """Sleeve: place estimates over the whole area of many boards under one skin (paper section 6).
 
-Networks and nearest neighbours learn from the first pokes and are tested on the last ones.
+Networks and nearest neighbours are trained on the first pokes and tested on the last ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
-NEAR_MM = 4.0  # near a border between two boards: about twice the skin's thickness, assumed
+NEAR_MM = 4.0  # a place closer to a border between boards is near it: about twice the skin's thickness, assumed
 Stats = dict[str, dict[str, float]]
 
 
@@ -45,14 +45,14 @@ class Sleeve(SectionWithTraining):
 
 @dataclass(frozen=True)
 class Area:
-    """A skin and what lies under it, in labels: mm from the skin's corner."""
+    """A skin, and the chips and borders of boards under it, in the labels' coordinates: mm from the skin's corner."""
 
     sides_mm: tuple[float, float]
     chips_mm: Float[np.ndarray, "k 2"]
-    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]  # between boards: x of upright ones, y of level ones
+    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]  # between boards: x of those along y, y of those along x
 
     def near_border(self, place_mm: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
-        """Mark places nearer than `NEAR_MM` to a border between two boards."""
+        """Mark places closer than `NEAR_MM` to a border between two boards."""
         near = np.zeros(len(place_mm), bool)
         for along_mm, borders_mm in zip(place_mm.T, self.borders_mm, strict=True):
             for border_mm in borders_mm:
@@ -90,7 +90,7 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Pat
 
 
 def area_of(settings: Settings) -> Area:
-    """Lay out the simulated sleeve."""
+    """Return the area of the simulated sleeve."""
     of = simulation_settings(settings)
     kind = of.boards[of.protocols["sleeve"].boards]
     tiles = kind.design.tiles
@@ -105,7 +105,7 @@ def lay_out(
     boards_n: tuple[int, int],
     pitch_mm: float,
 ) -> Area:
-    """Convert chips from the skin's middle to labels, and lay the borders between boards on a lattice."""
+    """Convert chip positions (from the skin's middle) to the labels' coordinates, and compute the borders of boards."""
     middle_mm = np.array(sides_mm) / 2
     x_mm, y_mm = (
         tuple(float(m + pitch_mm * (i - n / 2)) for i in range(1, n)) for m, n in zip(middle_mm, boards_n, strict=True)
@@ -114,14 +114,14 @@ def lay_out(
 
 
 def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]:
-    """Split rows into those of the first indentations of each capture, and those of its last ones."""
+    """Split rows into those of the first indentations of each capture and those of the last ones."""
     held = np.zeros(len(rows), bool)
     for capture in np.unique(rows.capture):
         own = rows.capture == capture
         indentations = np.unique(rows.indentation[own])  # in order of time
         test_n = round(test_fraction * len(indentations))
         if not 0 < test_n < len(indentations):
-            what = f"{test_n} of the {len(indentations)} of {capture} would be held out: a side is empty"
+            what = f"{test_n} of the {len(indentations)} pokes of {capture} would be held out: one side is empty"
             raise ParamsError(f"experiment sleeve: {what}. Poke more often.")
         held |= own & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held), np.flatnonzero(held)
@@ -130,7 +130,7 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
 def predict_by_neighbours(
     data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray
 ) -> dict[str, list[np.ndarray]]:
-    """Predict the test rows by k nearest neighbours, on fields and on their shape."""
+    """Predict the test rows by k nearest neighbours, with fields and with their shape as inputs."""
     none = np.zeros(0, np.int64)
     tasks = [
         ClassicalJob(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
@@ -143,7 +143,7 @@ def predict_by_neighbours(
 
 
 def rate_hz(captures: Sequence[Readings]) -> float:
-    """Measure the rate of frames, from the times of successive readings of an indentation."""
+    """Measure the frame rate from the times of successive readings of an indentation."""
     steps_n, steps_s = 0, 0.0
     for one in captures:
         same = (np.diff(one.indentation) == 0) & (np.diff(one.reading_i) == 1)
@@ -166,7 +166,7 @@ def score_places(
     indentation: Int[np.ndarray, " f"],
     area: Area,
 ) -> dict[str, Any]:
-    """Score a method's predictions, one for each seed: overall, near borders between boards, and elsewhere."""
+    """Score a method's predictions (one array per seed): overall, near borders between boards, and elsewhere."""
     near = area.near_border(true[:, :2])
     each_mm = [errors_mm(true, predicted) for predicted in predictions]
     scores: dict[str, Any] = over_seeds(
@@ -187,7 +187,7 @@ def score_places(
 
 
 def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
-    """Mean, standard deviation (n - 1; absent for one) and number of each metric over trainings."""
+    """Return the mean, standard deviation (n - 1; absent for one) and number of each metric over training runs."""
     stats: Stats = {}
     for name in scores[0]:
         values = np.array([one[name] for one in scores])
@@ -200,7 +200,7 @@ def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
 def draw_errors(
     area: Area, true: Float[np.ndarray, "f 3"], error_mm: Shaped[np.ndarray, " f"], indentation: Int[np.ndarray, " f"]
 ) -> dict[str, Any]:
-    """List every tested indentation with the mean error of its readings, and the chips and borders under the skin."""
+    """List every test indentation with the mean error of its readings, and the chips and borders under the skin."""
     _, first, which = np.unique(indentation, return_index=True, return_inverse=True)
     mean_mm = np.bincount(which, error_mm) / np.bincount(which)
     (x_mm, y_mm), (chips_x_mm, chips_y_mm) = true[first, :2].T, area.chips_mm.T

@@ -1,7 +1,8 @@
-"""Touches at numbered places of a real pad, one or two at once, recorded (paper section 7, future work).
+"""Recorded touches at numbered places of a real pad, one or two at once (paper section 7, future work).
 
-Which place was touched and how hard, how far the fields of two touches are the sum of two single ones, and whether two
-touches are detected. A recording is cut by time into what is known, what sets thresholds and what is tested.
+Estimates the place and force of a touch, tests whether the field of two touches is a sum of two single ones, and
+whether two touches can be detected. A recording is cut by time into known rows, rows that set thresholds, and test
+rows.
 """
 
 import re
@@ -42,17 +43,17 @@ from reskin.models.inputs import shape
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
-PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # in the account of a capture, by layouts that number places
-ROWS_MIN_N = 20  # touched rows of a recording
+PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # key in a capture's account, for layouts with numbered places
+ROWS_MIN_N = 20  # touched rows that a recording needs
 LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # model of force
-SUMS_N = 100  # sums of two single touches, of each pair of places, drawn
+SUMS_N = 100  # sums of two single touches that are drawn for each pair of places
 
 Fraction = Annotated[float, Field(gt=0, lt=1)]
 Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # by place
 
 
 class Touches(Strict):
-    """Section touches: how a recording is cut by time, and how many single touches a threshold may call two."""
+    """Section touches: how a recording is cut by time, and the share of single touches that may be called two."""
 
     train_fraction: Fraction
     aside_fraction: Fraction
@@ -61,7 +62,7 @@ class Touches(Strict):
     @model_validator(mode="after")
     def _check_test_rows_are_left(self) -> "Touches":
         if self.train_fraction + self.aside_fraction >= 1:
-            raise ValueError("train_fraction and aside_fraction leave rows to test: together less than 1")
+            raise ValueError("train_fraction plus aside_fraction must be less than 1, so that rows are left to test")
         return self
 
 
@@ -116,7 +117,7 @@ class Touched:
 
 @dataclass(frozen=True)
 class Split:
-    """A recording's rows by time: what is known, what thresholds are set on, what is tested; in this order."""
+    """A recording's rows by time, in this order: known rows, rows that set thresholds, test rows."""
 
     train: Touched
     aside: Touched
@@ -124,7 +125,7 @@ class Split:
 
 
 def touched_rows(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
-    """Take the rows with enough force; raise `ParamsError` for a recording whose places have no numbers."""
+    """Select the rows with enough force; raise `ParamsError` for a recording whose places have no numbers."""
     places = tuple(sorted(int(found[1]) for name in account if (found := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):
         what = f"one or two numbered places are needed; got {list(places)}"
@@ -145,7 +146,7 @@ def split_by_time(recording: Touched, section: Touches) -> Split:
 
 @dataclass(frozen=True)
 class Sorted:
-    """Recordings of one place and of two, reasons why others are left out, and why nothing can be computed."""
+    """Recordings of one place and of two, why others are left out, and why nothing can be computed, if so."""
 
     single: list[Touched]
     double: list[Touched]
@@ -154,10 +155,10 @@ class Sorted:
 
 
 def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
-    """Sort recordings by how many places they touch, and leave out those that cannot be used.
+    """Sort recordings by their number of places, and leave out those that cannot be used.
 
-    A recording needs `ROWS_MIN_N` touched rows; the places of a pair must have been recorded alone, too. A place that
-    was recorded alone twice would mix two blocks of time, so only its first recording is used.
+    A recording needs `ROWS_MIN_N` touched rows; each place of a pair must also have been recorded alone. If a place was
+    recorded alone twice, only the first recording is used, so that two periods of time are not mixed.
     """
     ordered = sorted(recordings, key=lambda one: (len(one.places), one.places, one.name))  # single places first
     left_out = {
@@ -185,7 +186,7 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
 
 
 def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
-    """Stack single touches: their changes of field, and the number of the place of each row."""
+    """Stack single touches: their changes of field, and the place number of each row."""
     numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
     return np.concatenate([part.db_uT for part in parts]), numbers
 
@@ -194,15 +195,15 @@ def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float
 
 
 def unit(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
-    """Give directions dB / (|dB| + noise): a weak reading's is short."""
+    """Return directions dB / (|dB| + noise), which are short for weak readings."""
     return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
 
 
 def name_places(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
-    """Predict the place that most of the nearest known directions are of."""
-    from sklearn.neighbors import KNeighborsClassifier  # late: it takes a second, and scenes are checked without it
+    """Predict the place by majority of the nearest known directions."""
+    from sklearn.neighbors import KNeighborsClassifier  # imported late: it takes a second
 
     voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit(known_uT), places)
     return np.asarray(voters.predict(unit(tested_uT)))
@@ -219,9 +220,9 @@ def directions(
 def left_over(
     known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
-    """Fit amplitudes of 0 or more of these places' directions row by row; give the residual as a share of dB.
+    """Fit non-negative amplitudes of these places' directions to each row; return the residual relative to |dB|.
 
-    How hard each place was pressed is not recorded: this is the least residual of any strengths.
+    How hard each place was pressed is not recorded, so this is the smallest residual for any strengths.
     """
     basis = np.stack([known[place] for place in places], axis=1)
     rows_uT = db_uT.astype(np.float64)
@@ -244,7 +245,7 @@ def score_unlike_one(
 
 
 def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
-    """Predict the place of later single touches, and of two touches: is it one of both?"""
+    """Predict the place of later single touches, and test whether that of two touches is one of their two places."""
     known_uT, numbers = joined([one.train for one in blocks])
     right_pct = [
         100 * float(np.isin(name_places(known_uT, numbers, part.db_uT), part.places).mean())
@@ -261,7 +262,7 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
 
 
 def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
-    """Fit force to fields of single touches; test it later in the same recordings, and in recordings left out."""
+    """Fit force to fields of single touches; test on later rows of the same recordings, and on recordings left out."""
     by_time = [_force_error(blocks, one.test, rng) for one in blocks]
     left_out = [_force_error([other for other in blocks if other is not one], one.test, rng) for one in blocks]
     spread = [{"mse_f_N2": float(one.test.force_N.var(dtype=np.float64))} for one in blocks]
@@ -279,7 +280,7 @@ def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generat
 
 
 def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
-    """Explain two touches by the directions of single ones, beside the residual of single touches themselves."""
+    """Fit two touches by the directions of single ones, and compare with the residual of single touches."""
     known = directions(*joined([one.train for one in blocks]))
     own_pct = [100 * float(np.median(left_over(known, one.test.places, one.test.db_uT))) for one in blocks]
     pairs = [explain_pair(known, (one.places[0], one.places[1]), one.db_uT) for one in double]
@@ -291,7 +292,7 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
 
 
 def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
-    """Return the residual of two touches by their two places, beside that of one place and of all other pairs."""
+    """Return the residual of two touches after a fit by their two places, by one place, and by all other pairs."""
     left = {of: float(np.median(left_over(known, of, db_uT))) for of in combinations(sorted(known), 2)}
     alone = {place: float(np.median(left_over(known, (place,), db_uT))) for place in known}
     least = min(alone, key=lambda place: alone[place])
@@ -309,7 +310,7 @@ def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.nda
 def evaluate_detection(
     blocks: Sequence[Split], double: Sequence[Touched], section: Touches, seed: int
 ) -> dict[str, Any]:
-    """Detect two touches at a set share of false alarms; with two controls: sums, and touches at unknown places."""
+    """Detect two touches at a given share of false alarms, with two controls: sums, and touches at unknown places."""
     known_uT, numbers = joined([one.train for one in blocks])
     known = directions(known_uT, numbers)
 
@@ -332,7 +333,7 @@ def evaluate_detection(
 
 
 def sums_of(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
-    """Add tested single touches of each two places, as experiment contacts does."""
+    """Add test rows of single touches for every pair of places, as experiment contacts does."""
     tested = [one.test.db_uT for one in blocks]
     drawn = [
         (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])
@@ -343,7 +344,7 @@ def sums_of(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[n
 
 
 def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: float) -> dict[str, float]:
-    """Return the share of single touches that detectors which know all other places call two; mean over places."""
+    """Return the percentage of single touches that are called two if their place is unknown; mean over places."""
     called = []
     for one in blocks:
         others = [other for other in blocks if other is not one]

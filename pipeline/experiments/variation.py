@@ -1,4 +1,4 @@
-"""Variation: how the field of equal indentations differs over time and from skin to skin (paper figure 4)."""
+"""Variation: how the field of equal indentations differs over time and between skins (paper figure 4)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -24,17 +24,17 @@ from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-SAME_MM = 1e-3  # labels are commanded values in float32
+SAME_MM = 1e-3  # tolerance of labels, which are commanded values in float32
 LISTED_N = 8  # places or depths that an error message names
 LINES_MAX_N = 40  # visits drawn in a panel
-DECIMALS = 1  # of a microtesla that is drawn
+DECIMALS = 1  # of a field in uT in the figures
 
 Count = Annotated[int, Field(ge=1)]
 Place_mm = tuple[float, float]
 
 
 class Variation(Strict):
-    """Section variation: the places and the depth that are compared, and over how many skins and contacts."""
+    """Section variation: the places and the depth to compare, and the numbers of skins and contacts."""
 
     places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
     depth_mm: Annotated[float, Field(gt=0)]
@@ -43,7 +43,7 @@ class Variation(Strict):
 
 
 def variation(settings: Settings, section: Variation, main: Path, indentations: Path, results: Path) -> None:
-    """Compare visits of equal places: of the worn skin in `indentations`, and of several skins in `main`."""
+    """Compare visits of the same places: over time on the worn skin in `indentations`, and between skins in `main`."""
     worn = read_captures(indentations)[0]
     boards: dict[str, str] = {}
     visits: dict[str, list[Visits]] = {}
@@ -114,7 +114,7 @@ def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
 def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the visits within a skin's first contacts with the first visit: field as read, and change of field.
 
-    Returns rms values over channels at the last visit, and the lines to draw: each visit's field less the first's.
+    Returns rms differences over channels at the last visit, and the lines to draw: field of each visit less the first.
     """
     early = visits.contacts_n - visits.contacts_n[0] < contacts_n
     before_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]
@@ -134,7 +134,7 @@ def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str
 
 
 def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Compare the mean changes of field of several skins: rms over channels and pairs, also relative to the change."""
+    """Compare the mean changes of field of several skins: rms difference over channels and pairs, also in percent."""
     mean_uT = {skin: of.db_uT.mean(axis=0) for skin, of in visits.items()}
     size_uT = rms(np.array(list(mean_uT.values())))
     numbers: dict[str, Any] = {"skins": list(mean_uT), "mean_db_uT": size_uT}
@@ -145,7 +145,7 @@ def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, 
 
 
 def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float]:
-    """Give how long a skin's first contacts take, and how much warmer its chips get in them, where known."""
+    """Return the duration of a skin's first contacts, and how much warmer its chips become, as far as known."""
     early = readings.n_contacts - readings.n_contacts[0] < contacts_n
     t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
     order = rank(readings.indentation[early])
@@ -155,7 +155,7 @@ def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float
 
 
 def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
-    """Choose skins, the first of each board before the second of any; `boards` holds each skin's board."""
+    """Choose skins, the first of each board before the second of any; `boards` maps skins to boards."""
     order: dict[str, int] = {}
     ranked = []
     for skin in sorted(boards):
@@ -175,7 +175,7 @@ MEANING = (
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate how far equal indentations differ over time and between skins; the paper gives no numbers."""
+    """Tabulate the differences of equal indentations over time and between skins; the paper gives no numbers."""
     lines = []
     for place in numbers["places"]:
         time, skins = place["time"], place["skins"]
@@ -201,7 +201,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw how the field varies over time (figure 4a) and from skin to skin (figure 4b), a panel a place."""
+    """Draw how the field varies over time (figure 4a) and between skins (figure 4b), one panel per place."""
     return {
         "variation_time.svg": _draw_time(numbers, drawn["places"], source),
         "variation_skins.svg": _draw_skins(numbers, drawn["places"], source),

@@ -1,4 +1,7 @@
-"""What decides table 2: its rows for different spreads and model errors of the simulated skins."""
+"""What decides table 2: its rows for different spreads and model errors of the simulated skins.
+
+A world is a simulation that differs from the scene in one factor.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,7 +45,7 @@ from reskin.simulation.capture import list_captures
 from reskin.simulation.rig import actual_positions, read_force
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-WAVES_N = 48  # cosines of the smooth error
+WAVES_N = 48  # cosines in the smooth error
 DEFAULT = "default"
 Size = Annotated[float, Field(ge=0, le=2)]
 Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
@@ -50,7 +53,7 @@ EXPERIMENTS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "ada
 
 
 class Residual(Strict):
-    """Error of the simulation: rms sizes relative to |dB|, correlation lengths, and the part specific to a skin."""
+    """Error of the simulation: rms sizes relative to |dB|, correlation lengths, and the part specific to each skin."""
 
     sizes: Sizes
     length_mm: Annotated[float, Field(gt=0, le=50)]
@@ -59,12 +62,12 @@ class Residual(Strict):
 
 
 class Worlds(Strict):
-    """Section `worlds`: the values of each factor; all others are the scene's."""
+    """Section `worlds`: the values of each factor; the other factors keep the scene's values."""
 
     residual: Residual
     skin_modulus: Sizes  # spreads.skin_modulus
-    amplitude_and_gap: Sizes  # times spreads.skin_amplitude and spreads.board_gap
-    friction: Sizes  # skin.hold.friction, of the tip that slides a skin
+    amplitude_and_gap: Sizes  # factor on spreads.skin_amplitude and spreads.board_gap
+    friction: Sizes  # skin.hold.friction, under the tip that slides a skin
 
 
 @dataclass(frozen=True)
@@ -78,12 +81,12 @@ class World:
 
     @property
     def name(self) -> str:
-        """Name in files and folds."""
+        """Name used in files and folds."""
         return f"{self.factor}-{self.value:g}"
 
 
 def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
-    """List the worlds, the default (the scene's settings) first."""
+    """List the worlds, beginning with the default (the scene's settings)."""
     spreads, hold = simulation.spreads, simulation.skin.hold
     found = [World(DEFAULT, 1.0, simulation)]
     found += [World("residual", size, simulation, size) for size in section.residual.sizes if size > 0]
@@ -117,9 +120,9 @@ def smooth(
 def with_residual(
     change_uT: Float[np.ndarray, "n ch"], at: Float[np.ndarray, "n 3"], size: float, how: Residual, seed: int, skin: str
 ) -> Float[np.ndarray, "n ch"]:
-    """Add the simulation's error to a skin's changes of field: `size` times |dB|, rms over indentations.
+    """Add the simulation's error to a skin's changes of field; its rms over indentations is `size` times |dB|.
 
-    A part is the same for all skins; the rest is drawn by the skin's name.
+    Part of the error is the same for all skins; the rest is drawn for the skin, by its name.
     """
     if size == 0:
         return change_uT
@@ -132,7 +135,7 @@ def with_residual(
 
 
 def rows_of(world: World, section: Worlds, seed: int) -> Rows:
-    """Simulate the main protocol on every skin of a world, and read its chips and the force sensor."""
+    """Simulate the main protocol on every skin of a world, with readings of its chips and of the force sensor."""
     parts = [_skin_rows(world, section, seed, board, skin) for board, skin in list_captures(world.simulation, MAIN)]
     rows = parts[0]
     for part in parts[1:]:
@@ -177,14 +180,14 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
 
 
 def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> Iterator[Fold]:
-    """Draw a world's folds, indexed in the rows of all worlds and named after it."""
+    """Draw a world's folds; they index the rows of all worlds and are named after the world."""
     for fold in draw_folds(rows, ("transfer", "lobo"), split, seed):
         sides = [side + before_n for side in (fold.train, fold.test, fold.pool)]
         yield Fold(fold.experiment, f"{world}.{fold.name}", *sides)
 
 
 def worlds(settings: Settings, section: Worlds, results: Path) -> None:
-    """Train the rows of table 2 in every world, and score them there."""
+    """Train the networks of table 2's rows in every world, and score them there."""
     preload_training()
     split = settings.section(Split, "split")
     listed = worlds_of(simulation_settings(settings), section)
@@ -202,7 +205,7 @@ def worlds(settings: Settings, section: Worlds, results: Path) -> None:
 
 
 def _train(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
-    """Train single, multi and triplet networks, adapt the last, and return their cards."""
+    """Train single, multi and triplet networks, adapt the triplet ones, and return the cards of all."""
     lobo = data.folds_of("lobo")
     jobs = make_jobs(data, data.settings.section(Training, "train_single"), data.folds_of("transfer"))
     jobs += make_jobs(data, data.settings.section(Training, "train_multi"), lobo)
@@ -244,7 +247,7 @@ def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
 
 
 def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dict[str, Any]:
-    """Return the settings of the default world, and the size of the trainings."""
+    """Return the settings of the default world, and the size of the training runs."""
     first = listed[0].simulation
     return {
         "residual_length_mm": section.residual.length_mm, "residual_own_share": section.residual.own_share,

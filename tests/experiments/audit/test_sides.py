@@ -248,7 +248,7 @@ def test_recorded_skins_pass_and_a_copy_fails(shared_data):
 def test_unusable_folds_are_an_error(experiment):
     fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
-        "lobo": "a side has no rows: 720 to train on, 0",
+        "lobo": "one side of the fold has no rows: 720 to train on, 0",
         "by_weather": "must be one of .*; got by_weath",
     }
     with pytest.raises(ParamsError, match=sentence[experiment]):
