@@ -142,10 +142,11 @@ def evaluate_board(
     truth = {s: (rows.target[one.weaker], rows.target[one.stronger]) for s, one in pairs.items()}
     numbers["falls"] = {}
     for separation_mm, both in truth.items():
-        each = [where_it_falls(*both, one) for one in predicted[separation_mm]]
+        each = [compare_prediction(*both, one) for one in predicted[separation_mm]]
         numbers["falls"][separation_mm] = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
     along = {
-        f"{s:g}": along_the_line(*truth[s], predicted[s][0])[:DRAWN_N].round(2).tolist() for s in section.separations_mm
+        f"{s:g}": position_along_line(*truth[s], predicted[s][0])[:DRAWN_N].round(2).tolist()
+        for s in section.separations_mm
     }
     return numbers, {"kept_aside": what, "along": along}
 
@@ -210,7 +211,7 @@ def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, 
     raise ParamsError(f"contacts: {what}. Record more, or remove the experiment from the scene.")
 
 
-def where_it_falls(
+def compare_prediction(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> dict[str, float]:
     """Compare a single predicted contact (x_mm, y_mm, F_N) with two true ones; force ratios need known forces."""
@@ -222,7 +223,7 @@ def where_it_falls(
     if (np.abs(stronger - weaker)[:, :2] > 0).any(axis=1).all():
         nearer = np.linalg.norm(off_mm[1], axis=1) < np.linalg.norm(off_mm[0], axis=1)
         numbers["nearer_the_stronger_pct"] = 100 * float(nearer.mean())
-        numbers["along"] = float(along_the_line(weaker, stronger, predicted).mean())
+        numbers["along"] = float(position_along_line(weaker, stronger, predicted).mean())
     force_N = np.stack([weaker[:, 2], stronger[:, 2]]).astype(np.float64)
     if not np.isnan(force_N).any():
         predicted_N = float(predicted[:, 2].sum(dtype=np.float64))
@@ -231,7 +232,7 @@ def where_it_falls(
     return numbers
 
 
-def along_the_line(
+def position_along_line(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
     """Project predictions onto the line through both contacts: 0 at the weaker one, 1 at the stronger one."""

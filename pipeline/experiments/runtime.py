@@ -1,4 +1,4 @@
-"""Error against run time of quadratures of the skin, and of integrators of its relaxation."""
+"""Error and run time of quadratures of the skin, and of integrators of its relaxation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -41,7 +41,7 @@ Changes = Float[np.ndarray, "n k 3"]
 
 @dataclass(frozen=True)
 class Prepared:
-    """A prepared computation of dB: all indentations of a trial in one call."""
+    """A prepared computation of dB; one call computes all indentations of a trial."""
 
     nodes_n: int
     call: Callable[[], Changes]
@@ -62,14 +62,14 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Indentations(Strict):
-    """Every place, from the skin's centre, at every depth."""
+    """Indentations at every place (relative to the skin's centre) and every depth."""
 
     places_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1)]
     depths_mm: Annotated[tuple[Positive, ...], Field(min_length=1)]
 
 
-REFERENCE = "reference"  # the method of a row with the largest error of the reference itself
-CANDIDATES = "Gauss in z"  # the rules of `magnet.place_nodes`
+REFERENCE = "reference"  # method name of the row that bounds the error of the reference itself
+CANDIDATES = "Gauss in z"  # method name of the rules of `magnet.place_nodes`
 ERROR_MAX = 0.02  # largest acceptable error of dB
 Key = tuple[str, str, str]  # study, method, setting
 
@@ -116,7 +116,7 @@ class TimedCall:
 
 @dataclass(frozen=True)
 class Choice:
-    """The cheapest acceptable rule (None: there is none), and the rule in use (None: not tried)."""
+    """The cheapest acceptable rule (None if there is none), and the rule in use (None if it was not tried)."""
 
     setting: str | None
     nodes_n: int | None
@@ -135,7 +135,7 @@ def rule_name(rule: Quadrature) -> str:
 def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ERROR_MAX) -> Choice:
     """Choose the rule with the fewest nodes among those whose error at the worst depth is below `error_max`.
 
-    The number of nodes is proportional to the time, but the same in every run.
+    The number of nodes is proportional to the run time, but is the same in every run.
     """
     tried = {row.setting: row for row in rows if row.method == CANDIDATES}
     passing = [row for row in tried.values() if row.error is not None and row.error < error_max]
@@ -153,9 +153,9 @@ def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ER
 
 
 def time_calls(calls: Sequence[TimedCall], repeats_n: int) -> list[Seconds]:
-    """Time all calls in `repeats_n` rounds, so that a busy moment of the machine affects all alike.
+    """Time all calls in `repeats_n` rounds, so that a busy moment of the machine affects all calls alike.
 
-    Each has run before, when its error was computed: compilation and caches are not included.
+    Each call has run before, when its error was computed, so compilation and filling of caches are not included.
     """
     if repeats_n < 1:
         raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Increase it.")
@@ -179,13 +179,13 @@ Layers = Annotated[int, Field(ge=1, le=100)]
 
 
 class Quadratures(Indentations):
-    """Indentations, number of skins, and (cell, layers) of every rule of every method."""
+    """Indentations, number of skins, and the (cell, layers) pairs of the rules of each method."""
 
     skins_n: Annotated[int, Field(ge=1, le=100)]
     rules: Annotated[dict[str, tuple[tuple[Cell_mm, Layers], ...]], Field(min_length=1)]
 
     def rules_of(self) -> dict[str, list[Quadrature]]:
-        """Rules by method, in SI units."""
+        """Return the rules by method, in SI units."""
         return {name: [Quadrature(milli * cell, n) for cell, n in rules] for name, rules in self.rules.items()}
 
 
@@ -193,8 +193,8 @@ class Quadratures(Indentations):
 class Reference:
     """Gauss rules along x, y and z: the finer one is the reference, the coarser one bounds its error.
 
-    Moved boxes would be an obvious reference, but rigid boxes overlap where the skin is compressed: they converge to
-    this one with the square of the cell, 5-9 % off at 0.4 mm x 20 layers, and within 1 % when extrapolated.
+    Moved boxes would be an obvious reference, but rigid boxes overlap where the skin is compressed. They converge to
+    this reference with the square of the cell size: 5-9 % off at 0.4 mm x 20 layers, within 1 % when extrapolated.
     """
 
     coarser: Quadrature
@@ -210,7 +210,7 @@ def study_quadratures(
 ) -> tuple[list[Precision], list[TimedCall]]:
     """Compare every rule of every method with the reference on all trials; the first trial is timed.
 
-    `parts` of a row holds the error by depth, of the worst skin; `error` is the largest of these.
+    `parts` of a row contains the error by depth, for the worst skin; `error` is the largest of these.
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
@@ -233,7 +233,7 @@ def errors(
     found_T: Sequence[Float[np.ndarray, "n k 3"]],
     truth_T: Sequence[Float[np.ndarray, "n k 3"]],
 ) -> dict[str, float]:
-    """Return rms error over rms dB at each depth (of the worst skin), and over everything."""
+    """Return the ratio of rms error to rms dB at each depth (for the worst skin), and over all depths and skins."""
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)
@@ -253,13 +253,13 @@ def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
 
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # of scipy.integrate
-IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that take the Jacobian, which is constant
-ATOL = 1e-3  # of the relative tolerance: states are shares, a few percent, of a force of 1
-DIVERGED = 1.0  # an error as large as the force itself
+IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept the Jacobian, which is constant
+ATOL = 1e-3  # absolute over relative tolerance: states are a few percent of a force of 1
+DIVERGED = 1.0  # relative error that counts as divergence: as large as the force itself
 PERIOD_S = 1.5  # twenty indentations take 30 s
 DOWN_S, HELD_S = 0.3, 0.7
 
-Forces = Float[np.ndarray, " u"]  # relaxed, relative to the peak elastic force; at the end of linear pieces
+Forces = Float[np.ndarray, " u"]  # relaxed forces relative to the peak elastic force, at the ends of linear pieces
 State = Float[np.ndarray, " p"]
 History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]  # times in s, and elastic forces, linear in between
 Rates = Callable[[float, State], State]
@@ -272,13 +272,13 @@ class Failed(Exception):
 
 
 class Integrators(Strict):
-    """Stiffness ratios, relative tolerances of the solvers, and steps of the explicit one."""
+    """Stiffness ratios, relative tolerances of the solvers, and steps of the explicit method."""
 
     ratios: Annotated[tuple[Annotated[float, Field(gt=1, le=1e12)], ...], Field(min_length=1)]
     tolerances: Annotated[tuple[Positive, ...], Field(min_length=1)]
     euler_steps_s: Annotated[tuple[Positive, ...], Field(min_length=1)]
     pokes_n: Annotated[int, Field(ge=1, le=1000)]
-    calls_per_poke_max_n: Annotated[int, Field(ge=1)]  # right-hand sides; more is a failure
+    calls_per_poke_max_n: Annotated[int, Field(ge=1)]  # evaluations of the right-hand side; more count as a failure
 
 
 class Counter:
@@ -301,7 +301,7 @@ class Counter:
 
 
 def study_integrators(tried: Integrators) -> tuple[list[Precision], list[TimedCall]]:
-    """Compare every integrator with 50 digits at every stiffness ratio; those that did not fail are timed."""
+    """Compare every integrator with a 50-digit solution at every stiffness ratio; those that did not fail are timed."""
     history, calls_max_n = repeated_presses(tried.pokes_n), tried.pokes_n * tried.calls_per_poke_max_n
     rows, calls = [], []
     for ratio in tried.ratios:
@@ -322,9 +322,9 @@ def study_name(ratio: float) -> str:
 
 
 def repeated_presses(pokes_n: int) -> History:
-    """Return the history of presses to a force of 1 that are held and released, again and again.
+    """Return the history of repeated presses to a force of 1 that are held and released.
 
-    Every press is the same, so that error and time per press hardly depend on their number.
+    All presses are the same, so that error and time per press hardly depend on their number.
     """
     knots_s = np.array([DOWN_S, DOWN_S + HELD_S, PERIOD_S])
     times_s = (PERIOD_S * np.arange(pokes_n)[:, None] + knots_s).ravel()
@@ -332,9 +332,10 @@ def repeated_presses(pokes_n: int) -> History:
 
 
 def stiff(ratio: float) -> Prony:
-    """Return the skin's relaxation with another ratio of the slowest to the fastest time; 1e7 is the skin's own.
+    """Return the skin's relaxation with another ratio of the slowest to the fastest time; the skin's own ratio is 1e7.
 
-    The slowest time and the shares stay; the fastest drops below any step of an explicit method.
+    The slowest time and the shares are unchanged; at large ratios the fastest time is below any step of an explicit
+    method.
     """
     slowest_s, fastest_s = SKIN_RELAXATION.tau_s.max(), SKIN_RELAXATION.tau_s.min()
     power = np.log(ratio) / np.log(slowest_s / fastest_s)
@@ -387,7 +388,7 @@ def _fresh(run: Run, calls_max_n: int) -> Forces:
 
 
 def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str | None]:
-    # Relative rms error, or why there is none.
+    # Returns the relative rms error, or the reason why there is none.
     try:
         found = run(counter)
     except Failed as failure:
@@ -397,7 +398,7 @@ def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str
     return (error, None) if error < DIVERGED else (None, f"diverged: error {error:.0e} of the force")
 
 
-RADII_N, HEIGHTS_N = 56, 16  # of the splines of the displacement; twice as many change dB by 0.1 %
+RADII_N, HEIGHTS_N = 56, 16  # knots of the splines of the displacement; twice as many change dB by 0.1 %
 
 
 @dataclass(frozen=True)
@@ -415,7 +416,7 @@ def prepare(trial: Trial, rest: Nodes) -> Prepared:
 
 
 def gauss_in_z(trial: Trial, rule: Quadrature) -> Prepared:
-    """Compute dB as the simulator does: cells that end at the seams, Gauss nodes over the thickness."""
+    """Compute dB as the simulator does, on its nodes: cells that end at the seams, Gauss nodes over the thickness."""
     return prepare(trial, place_nodes(trial.skin.thickness_m, rule))
 
 
@@ -430,10 +431,10 @@ def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of nodes that are already moved by the compiled kernel, for comparison with magpylib's times.
+    """Sum the field of nodes, already moved, with the compiled kernel, for comparison with magpylib's times.
 
-    It computes each node at rest and moved, which avoids the difference of large sums; for magpylib the field at rest
-    is kept.
+    The kernel computes each node both at rest and moved, which avoids the difference of large sums; for magpylib, the
+    field at rest is computed once.
     """
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
@@ -447,7 +448,7 @@ def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of the nodes by magpylib.core: all pairs of node and chip in one call per indentation."""
+    """Sum the field of the nodes with magpylib.core: all pairs of node and chip in one call per indentation."""
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
     moments = _turned(path, skin.moments_A_m2)
@@ -461,13 +462,13 @@ def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def magpylib_dipoles(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of the nodes by magpylib's objects: one Dipole per node with its path through all indentations."""
+    """Sum the field of the nodes with magpylib objects: one Dipole per node, with its path through all indentations."""
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     return _by_objects(trial, skin, lambda i: Dipole(moment=skin.moments_A_m2[i]))
 
 
 def magpylib_cuboids(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of equal boxes by magpylib's objects: Cuboids that move and turn with their centres."""
+    """Sum the field of equal boxes with magpylib objects: Cuboids that move and rotate with their centres."""
     rest = midpoints(trial.skin.thickness_m, rule)
     skin = with_nodes(trial, rest)
     j_T = mu_0 * skin.moments_A_m2 / rest.volumes_m3[:, None]
@@ -508,7 +509,7 @@ def _by_objects(trial: Trial, skin: Skin, at_origin: Callable[[int], Any]) -> Pr
 
 
 def paths(trial: Trial, skin: Skin) -> NodePath:
-    """Follow the skin's nodes through every indentation of the trial, by splines."""
+    """Follow the skin's nodes through every indentation of the trial, with splines of the displacement."""
     nodes_m = np.tile(skin.nodes_m, (len(trial.pokes_m), 1, 1))
     turns_rad = np.zeros_like(nodes_m)
     true_m = trial.pokes_m[:, 2] + skin.depth_zero_m
@@ -543,7 +544,7 @@ def _slide(
 
 @dataclass(frozen=True)
 class _DeformationSplines:
-    """Splines of the change of r, z and angle over (r, z); beyond their reach r^2 grows by a constant."""
+    """Splines over (r, z) of the changes of r, z and angle; beyond their reach, r^2 grows by a constant."""
 
     splines: tuple[RectBivariateSpline, ...]
     grown_m2: float
@@ -598,7 +599,7 @@ def with_nodes(trial: Trial, rest: Nodes) -> Skin:
 
 
 def midpoints(thickness_m: float, rule: Quadrature) -> Nodes:
-    """Place nodes at the centres of equal boxes that ignore the seams: the obvious lattice."""
+    """Place nodes at the centres of equal boxes, regardless of the seams."""
     side_m, _, high_m = box_m(thickness_m, rule)
     side_n = round(SKIN_SIDE_M / side_m)
     x_m = side_m * (np.arange(side_n) + 0.5) - SKIN_SIDE_M / 2
@@ -613,7 +614,7 @@ def box_m(thickness_m: float, rule: Quadrature) -> tuple[float, float, float]:
 
 
 def gauss_everywhere(thickness_m: float, rule: Quadrature, *, per_cell_n: int) -> Nodes:
-    """Place nodes in cells that end at the seams, with Gauss nodes along x and y too: one order higher."""
+    """Place nodes in cells that end at the seams, with Gauss nodes along x and y too, for a higher order."""
     spans_m = pairwise((-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2))
     edges_m = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in spans_m]
     starts_m, widths_m = np.concatenate([e[:-1] for e in edges_m]), np.concatenate([np.diff(e) for e in edges_m])
@@ -634,7 +635,7 @@ def _product(
     z_m: Float[np.ndarray, " j"],
     z_weight_m: Float[np.ndarray, " j"],
 ) -> Nodes:
-    # x and y alike, as the skin is.
+    # The same nodes along x and y, because the skin is square.
     nodes_m = np.stack(np.meshgrid(x_m, x_m, z_m, indexing="ij"), axis=-1).reshape(-1, 3)
     return Nodes(nodes_m, np.einsum("i,j,k->ijk", x_weight_m, x_weight_m, z_weight_m).ravel())
 
@@ -648,16 +649,16 @@ class RunTime(Strict):
 
 
 def runtime(settings: Settings, section: RunTime, results: Path) -> None:
-    """Compare quadratures and integrators; times differ between equal runs, so they are no output of DVC."""
+    """Compare quadratures and integrators; times differ between equal runs, so they are not an output of DVC."""
     of = simulation_settings(settings)
     rows, calls = study_quadratures(_trials(of, section.quadratures, settings.seed), section.quadratures.rules_of())
     more, more_calls = study_integrators(section.integrators)
     choice = choose(rows, used=of.main_boards.quadrature.in_si())
     seconds = time_calls([*calls, *more_calls], section.repeats_n)
     io.write_json(SECONDS / settings.scene / "runtime.json", [asdict(row) for row in seconds])
-    answer: dict[str, Any] = {"choice": asdict(choice)}
-    answer |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
-    io.write_json(results, answer)
+    content: dict[str, Any] = {"choice": asdict(choice)}
+    content |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
+    io.write_json(results, content)
     failed_n = sum(row.failure is not None for row in [*rows, *more])
     say(
         f"{settings.scene}: {len(rows) + len(more)} settings tried, {failed_n} failed; "

@@ -185,7 +185,7 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
     return Sorted(list(single.values()), double, left_out, problem)
 
 
-def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
+def stack_touches(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
     """Stack single touches: their changes of field, and the place number of each row."""
     numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
     return np.concatenate([part.db_uT for part in parts]), numbers
@@ -194,30 +194,30 @@ def joined(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float
 # --- Fields of touches ---
 
 
-def unit(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
+def unit_directions(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
     """Return directions dB / (|dB| + noise), which are short for weak readings."""
     return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
 
 
-def name_places(
+def predict_places(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
     """Predict the place by majority of the nearest known directions."""
     from sklearn.neighbors import KNeighborsClassifier  # imported late: it takes a second
 
-    voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit(known_uT), places)
-    return np.asarray(voters.predict(unit(tested_uT)))
+    voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit_directions(known_uT), places)
+    return np.asarray(voters.predict(unit_directions(tested_uT)))
 
 
 def directions(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"]
 ) -> dict[int, Float64[np.ndarray, " ch"]]:
     """Return the mean direction of each place's rows."""
-    units = unit(known_uT)
+    units = unit_directions(known_uT)
     return {int(place): units[places == place].mean(axis=0) for place in np.unique(places)}
 
 
-def left_over(
+def relative_residual(
     known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
     """Fit non-negative amplitudes of these places' directions to each row; return the residual relative to |dB|.
@@ -233,7 +233,7 @@ def score_unlike_one(
     known_uT: Float32[np.ndarray, "a ch"], known: Directions, tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Scores:
     """Score rows by the detectors of experiment contacts that need no network, and by the residual of one place."""
-    alone = [left_over(known, (place,), tested_uT) for place in known]
+    alone = [relative_residual(known, (place,), tested_uT) for place in known]
     return {
         "direction and length": neighbour_distance(shape(known_uT), shape(tested_uT)),
         "direction above noise": direction_distance(known_uT, tested_uT),
@@ -246,9 +246,9 @@ def score_unlike_one(
 
 def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
     """Predict the place of later single touches, and test whether that of two touches is one of their two places."""
-    known_uT, numbers = joined([one.train for one in blocks])
+    known_uT, numbers = stack_touches([one.train for one in blocks])
     right_pct = [
-        100 * float(np.isin(name_places(known_uT, numbers, part.db_uT), part.places).mean())
+        100 * float(np.isin(predict_places(known_uT, numbers, part.db_uT), part.places).mean())
         for part in [*(one.test for one in blocks), *double]
     ]
     singles_n = len(blocks)
@@ -281,8 +281,8 @@ def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generat
 
 def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
     """Fit two touches by the directions of single ones, and compare with the residual of single touches."""
-    known = directions(*joined([one.train for one in blocks]))
-    own_pct = [100 * float(np.median(left_over(known, one.test.places, one.test.db_uT))) for one in blocks]
+    known = directions(*stack_touches([one.train for one in blocks]))
+    own_pct = [100 * float(np.median(relative_residual(known, one.test.places, one.test.db_uT))) for one in blocks]
     pairs = [explain_pair(known, (one.places[0], one.places[1]), one.db_uT) for one in double]
     return {"single_touches_pct": statistic(own_pct), "pairs": pairs} | {
         f"mean_{name}": statistic([pair[name] for pair in pairs])
@@ -293,8 +293,8 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
 
 def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
     """Return the residual of two touches after a fit by their two places, by one place, and by all other pairs."""
-    left = {of: float(np.median(left_over(known, of, db_uT))) for of in combinations(sorted(known), 2)}
-    alone = {place: float(np.median(left_over(known, (place,), db_uT))) for place in known}
+    left = {of: float(np.median(relative_residual(known, of, db_uT))) for of in combinations(sorted(known), 2)}
+    alone = {place: float(np.median(relative_residual(known, (place,), db_uT))) for place in known}
     least = min(alone, key=lambda place: alone[place])
     others = [share for of, share in left.items() if of != pair]
     return {
@@ -311,7 +311,7 @@ def evaluate_detection(
     blocks: Sequence[Split], double: Sequence[Touched], section: Touches, seed: int
 ) -> dict[str, Any]:
     """Detect two touches at a given share of false alarms, with two controls: sums, and touches at unknown places."""
-    known_uT, numbers = joined([one.train for one in blocks])
+    known_uT, numbers = stack_touches([one.train for one in blocks])
     known = directions(known_uT, numbers)
 
     def scored(parts: Sequence[Float32[np.ndarray, "_ ch"]]) -> Scores:
@@ -319,7 +319,7 @@ def evaluate_detection(
 
     limits = thresholds(scored([one.aside.db_uT for one in blocks]), section.false_alarm_fraction)
     single = scored([one.test.db_uT for one in blocks])
-    sums = scored(sums_of(blocks, rng_for(seed, "touches", "sums")))
+    sums = scored(sum_pairs(blocks, rng_for(seed, "touches", "sums")))
     found = {
         "false_alarm_asked_pct": 100 * section.false_alarm_fraction,
         "false_alarm_pct": above_pct(single, limits),
@@ -332,7 +332,7 @@ def evaluate_detection(
     return found | {"detected_pct": above_pct(both, limits), "auc": roc_areas(single, both)}
 
 
-def sums_of(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
+def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
     """Add test rows of single touches for every pair of places, as experiment contacts does."""
     tested = [one.test.db_uT for one in blocks]
     drawn = [
@@ -348,9 +348,9 @@ def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: floa
     called = []
     for one in blocks:
         others = [other for other in blocks if other is not one]
-        known_uT, numbers = joined([other.train for other in others])
+        known_uT, numbers = stack_touches([other.train for other in others])
         known = directions(known_uT, numbers)
-        aside = score_unlike_one(known_uT, known, joined([other.aside for other in others])[0])
+        aside = score_unlike_one(known_uT, known, stack_touches([other.aside for other in others])[0])
         limits = thresholds(aside, false_alarm_fraction)
         called.append(above_pct(score_unlike_one(known_uT, known, one.test.db_uT), limits))
     return {name: float(np.mean([row[name] for row in called])) for name in called[0]}

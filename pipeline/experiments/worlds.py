@@ -106,7 +106,7 @@ def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
     return found
 
 
-def smooth(
+def draw_smooth_error(
     at: Float[np.ndarray, "n 3"], channels_n: int, how: Residual, rng: np.random.Generator
 ) -> Float[np.ndarray, "n ch"]:
     """Draw a smooth random function of each channel with variance 1, over x and y in mm and log force."""
@@ -127,8 +127,8 @@ def with_residual(
     if size == 0:
         return change_uT
     channels_n = change_uT.shape[1]
-    shared = smooth(at, channels_n, how, rng_for(seed, "worlds", "residual"))
-    own = smooth(at, channels_n, how, rng_for(seed, "worlds", "residual", skin))
+    shared = draw_smooth_error(at, channels_n, how, rng_for(seed, "worlds", "residual"))
+    own = draw_smooth_error(at, channels_n, how, rng_for(seed, "worlds", "residual", skin))
     unit = np.sqrt(1 - how.own_share) * shared + np.sqrt(how.own_share) * own
     length_uT = np.linalg.norm(change_uT, axis=1, keepdims=True)
     return change_uT + size * length_uT / np.sqrt(channels_n) * unit

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.experiments.stability.wire import Damage, decode_damaged, deliver, joined, records
+from pipeline.experiments.stability.wire import Damage, decode_damaged, decode_portions, join_mid_frame, records
 from reskin.board import stream
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import Frames, encode, line_bytes_max_n, record_type
@@ -50,7 +50,7 @@ def split_bytes(data: bytes, sizes: list[int]) -> list[bytes]:
 @given(frames_strategy(), EVERY_WIRE, st.lists(st.integers(0, 200), max_size=8))
 def test_frames_round_trip_in_any_chunks(frames, wire, sizes):
     data = encode(frames, wire)
-    decoded, account = deliver(split_bytes(data, sizes), wire, chips_of(frames))
+    decoded, account = decode_portions(split_bytes(data, sizes), wire, chips_of(frames))
     decimals = 2 if wire in TEXT_WIRES else 10
     np.testing.assert_array_equal(decoded.b_uT, frames.b_uT.astype(float).round(decimals).astype(np.float32))
     assert account["frames_n"] == len(frames)
@@ -63,7 +63,7 @@ def test_any_finite_floats_round_trip(chips_n, payload):
     values = np.frombuffer(payload[: len(payload) // (16 * chips_n) * 16 * chips_n], "<f4").reshape(-1, 4 * chips_n)
     values = np.where(np.isfinite(values), values, np.float32(0))
     data = b"".join(struct.pack(f"<{4 * chips_n}f", *row) + b"\r\n" for row in values)
-    frames, _ = deliver([data], "binary", chips_n)
+    frames, _ = decode_portions([data], "binary", chips_n)
     np.testing.assert_array_equal(frames.temperature_degC, values[:, ::4])
 
 
@@ -71,8 +71,8 @@ def test_any_finite_floats_round_trip(chips_n, payload):
 def test_byte_by_byte_equals_whole(wire):
     data = b"\x07rubbish" + encode(make_frames(6, 5, 1, crlf_share=0.3), wire)[5:-3]
     data = data[:200] + data[205:]
-    whole, account = deliver([data], wire, 5)
-    single, single_account = deliver([data[i : i + 1] for i in range(len(data))], wire, 5)
+    whole, account = decode_portions([data], wire, 5)
+    single, single_account = decode_portions([data[i : i + 1] for i in range(len(data))], wire, 5)
     assert len(whole) >= 3
     check_equal(whole, single)
     assert account == single_account
@@ -83,14 +83,14 @@ def test_frame_is_emitted_with_its_last_byte(wire):
     frames = make_frames(4, 5, 2)
     frame_stream, data = FrameStream(wire, 5), encode(frames, wire)
     arrivals = [i + 1 for i in range(len(data)) for _ in range(len(frame_stream.feed(data[i : i + 1])))]
-    whole, _ = deliver([data], wire, 5)
+    whole, _ = decode_portions([data], wire, 5)
     assert arrivals == whole.end_byte.tolist()
 
 
 @given(st.binary(max_size=600), EVERY_WIRE, st.integers(1, 3), st.lists(st.integers(0, 50), max_size=8))
 def test_random_bytes_decode_alike_in_any_chunks(data, wire, chips_n, sizes):
-    whole, account = deliver([data], wire, chips_n)
-    chunks, chunks_account = deliver(split_bytes(data, sizes), wire, chips_n)
+    whole, account = decode_portions([data], wire, chips_n)
+    chunks, chunks_account = decode_portions(split_bytes(data, sizes), wire, chips_n)
     check_equal(whole, chunks)
     assert account == chunks_account
     check_account(account, data)
@@ -102,8 +102,8 @@ FRAGMENTS = (b"\r\n", b"\r", b"\n", b"\r\n" * 9, b"\0" * 16, b"\0" * 7, b"B", b"
 @settings(max_examples=150)
 @given(st.lists(st.sampled_from(FRAGMENTS)).map(b"".join), st.integers(1, 2), st.lists(st.integers(1, 30), max_size=8))
 def test_terminators_decode_alike_in_any_chunks(data, chips_n, sizes):
-    whole, account = deliver([data], "binary", chips_n)
-    chunks, chunks_account = deliver(split_bytes(data, sizes), "binary", chips_n)
+    whole, account = decode_portions([data], "binary", chips_n)
+    chunks, chunks_account = decode_portions(split_bytes(data, sizes), "binary", chips_n)
     check_equal(whole, chunks)
     assert account == chunks_account
     check_account(account, data)
@@ -144,13 +144,15 @@ def test_missing_text_bytes_cost_only_touched_lines(frames, wire, where, missing
 def test_joining_mid_frame_loses_one_frame(frames, wire, where):
     length_n = record_type(wire, chips_of(frames)).itemsize
     joined_n = 1 + int(where * (length_n - 3))  # not between CR and LF: that costs the next frame too
-    assert decode_damaged(joined(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
+    assert decode_damaged(join_mid_frame(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
 
 
 def test_terminator_in_steady_temperature():
     frames = make_frames(50, 5, 3)
     frames.temperature_degC[:] = CRLF_TEMPERATURE_degC
-    assert not broken([decode_damaged(joined(frames, "binary", n / 82), frames, "binary") for n in range(1, 81)])
+    assert not broken(
+        [decode_damaged(join_mid_frame(frames, "binary", n / 82), frames, "binary") for n in range(1, 81)]
+    )
 
 
 def test_remains_of_two_frames_are_no_frame():
@@ -158,7 +160,7 @@ def test_remains_of_two_frames_are_no_frame():
     frames.temperature_degC[2], frames.b_uT[2, 0] = CRLF_TEMPERATURE_degC, 100.0
     data = encode(frames, "binary")
     # 8 bytes of frame 2 and 13 of frame 3 remain: after the CR LF in the temperature, exactly one frame's length.
-    kept, _ = deliver([data[: 2 * 18 + 8] + data[3 * 18 + 5 :]], "binary", 1)
+    kept, _ = decode_portions([data[: 2 * 18 + 8] + data[3 * 18 + 5 :]], "binary", 1)
     assert records(kept) == [record for i, record in enumerate(records(frames)) if i not in (2, 3)]
 
 
@@ -166,7 +168,7 @@ def test_remains_of_two_frames_are_no_frame():
 def test_failed_reads_are_still_frames(wire):
     frames = make_frames(20, 5, 4)
     frames.b_uT[:], frames.temperature_degC[:] = np.tile([8028.16, 5194.00, 12943.36], 5), -880.49
-    kept, account = deliver([encode(frames, wire)[30:]], wire, 5)
+    kept, account = decode_portions([encode(frames, wire)[30:]], wire, 5)
     assert len(kept) == 19
     assert account["frames_n"] == 19
 
@@ -175,7 +177,7 @@ def test_lost_bytes_are_counted_by_reason():
     frames = make_frames(10, 5, 5)
     frames.b_uT[3, 2], frames.temperature_degC[6, 0] = np.nan, np.inf
     data = b"junk\r\n" + encode(frames, "binary")[:-20]
-    _, account = deliver([data], "binary", 5)
+    _, account = decode_portions([data], "binary", 5)
     assert account == {
         "bytes_n": len(data), "frames_n": 7, "frame_bytes_n": 7 * 82,
         "not_finite_frames_n": 2, "skipped_not_finite_bytes_n": 2 * 82,
@@ -186,7 +188,7 @@ def test_lost_bytes_are_counted_by_reason():
 def test_infinite_clock_is_not_finite():
     frames = make_frames(3, 2, 6)
     frames.device_s[1] = np.inf
-    assert deliver([encode(frames, "binary-clock")], "binary-clock", 2)[1]["not_finite_frames_n"] == 1
+    assert decode_portions([encode(frames, "binary-clock")], "binary-clock", 2)[1]["not_finite_frames_n"] == 1
 
 
 @pytest.mark.parametrize("word", ["nan", "inf", "-inf", "ovf"])
@@ -194,7 +196,7 @@ def test_infinite_clock_is_not_finite():
 def test_text_nan_and_inf_are_not_finite(wire, word):
     line = encode(make_frames(1, 2, 7), wire)
     broken = word.encode() + line[line.index(b"\t") :]
-    _, account = deliver([line + broken + line], wire, 2)
+    _, account = decode_portions([line + broken + line], wire, 2)
     assert account["frames_n"] == 2
     assert account["not_finite_frames_n"] == 1
     assert account["skipped_not_finite_bytes_n"] == len(broken)
@@ -204,21 +206,21 @@ def test_text_nan_and_inf_are_not_finite(wire, word):
 def test_endless_line_is_skipped(chunk_n):
     line = encode(make_frames(1, 1, 8), "text-xyzt")
     data = line + b"9" * 3 * line_bytes_max_n(1) + line + line
-    kept, account = deliver([data[i : i + chunk_n] for i in range(0, len(data), chunk_n)], "text-xyzt", 1)
+    kept, account = decode_portions([data[i : i + chunk_n] for i in range(0, len(data), chunk_n)], "text-xyzt", 1)
     assert len(kept) == 2
     check_account(account, data)
 
 
 def test_rest_of_endless_line_is_no_frame():
     line = encode(make_frames(1, 1, 8), "text-xyzt")
-    kept, account = deliver([line + b"9" * 2 * line_bytes_max_n(1), line, line], "text-xyzt", 1)
+    kept, account = decode_portions([line + b"9" * 2 * line_bytes_max_n(1), line, line], "text-xyzt", 1)
     assert kept.end_byte.tolist() == [len(line), account["bytes_n"]]
 
 
 def test_text_end_bytes_over_several_blocks(monkeypatch):
     data = encode(make_frames(10, 2, 8), "text-xyzt")
     monkeypatch.setattr(stream, "BLOCK_LINES_N", 3)
-    kept, _ = deliver([data[:20], data[20:]], "text-xyzt", 2)
+    kept, _ = decode_portions([data[:20], data[20:]], "text-xyzt", 2)
     assert kept.end_byte.tolist() == np.cumsum([len(line) for line in data.splitlines(keepends=True)]).tolist()
 
 
@@ -226,7 +228,7 @@ def test_long_stream_with_many_breaks():
     frames = make_frames(3 * stream.BLOCK_FRAMES_N, 5, 9, crlf_share=0.01)
     data = encode(frames, "binary")
     data = b"".join(data[i + 7 : i + 82 * 100] for i in range(0, len(data), 82 * 100))
-    kept, account = deliver([data], "binary", 5)
+    kept, account = decode_portions([data], "binary", 5)
     assert len(kept) == len(frames) - -(-len(frames) // 100)
     assert account["frames_n"] == len(kept)
 

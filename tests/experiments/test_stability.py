@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.experiments.stability import extremes as extremes_module
 from pipeline.experiments.stability import physics, survey, wire
-from pipeline.experiments.stability.cases import measured, peak_bytes, refused
+from pipeline.experiments.stability.cases import error_case, peak_bytes, rejection_case
 from pipeline.experiments.stability.chip import chip_cases
 from pipeline.experiments.stability.extremes import extreme_cases, near, tips
 from pipeline.experiments.stability.physics import physics_cases, time_cases
@@ -132,14 +132,14 @@ def test_unraised_error_and_nan_do_not_hold():
     def raises():
         raise CaptureError("here: a thing must be so; got nothing. Mend it.")
 
-    assert refused("wire", "a", should="b", attempt=raises).happened.startswith("refused: here: a thing")
-    assert not refused("wire", "a", should="b", attempt=lambda: None).holds
-    assert not measured("wire", "a", should="b", happened="c", error=np.nan, limit=1.0).holds
+    assert rejection_case("wire", "a", should="b", attempt=raises).happened.startswith("refused: here: a thing")
+    assert not rejection_case("wire", "a", should="b", attempt=lambda: None).holds
+    assert not error_case("wire", "a", should="b", happened="c", error=np.nan, limit=1.0).holds
 
 
 def test_other_errors_are_not_the_expected_one():
     with pytest.raises(ZeroDivisionError):
-        refused("wire", "a", should="b", attempt=lambda: 1 / 0)
+        rejection_case("wire", "a", should="b", attempt=lambda: 1 / 0)
 
 
 def test_peak_memory_is_that_held_at_once():

@@ -15,7 +15,7 @@ from pipeline.experiments.touches import (
     evaluate_forces,
     evaluate_places,
     evaluate_superposition,
-    left_over,
+    relative_residual,
     sort_recordings,
     split_by_time,
     tables,
@@ -65,7 +65,7 @@ def test_residual_equals_bounded_least_squares():
     basis = np.stack([known[2], known[4]], axis=1)
     costs = [lsq_linear(basis, row.astype(float), (0, np.inf)).cost for row in db_uT]
     naive = np.sqrt(2 * np.array(costs)) / np.linalg.norm(db_uT.astype(float), axis=1)
-    np.testing.assert_allclose(left_over(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
+    np.testing.assert_allclose(relative_residual(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
 
 
 def test_residual_of_the_touched_pair_is_noise(cut):

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.experiments.stability.wire import deliver
+from pipeline.experiments.stability.wire import decode_portions
 from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encode_pieces, inject
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames
@@ -90,7 +90,7 @@ def test_every_byte_is_in_a_frame_or_counted_by_reason():
             left_n = len(clean[-1]) - int(rng.integers(3, len(clean[-1])))
             data = data[: len(data) - len(clean[-1]) + left_n]
             count.update(frames_n=-1, frame_bytes_n=-len(clean[-1]), skipped_truncated_bytes_n=left_n)
-        _, account = deliver(split_randomly(data, rng), script.wire, script.frames.temperature_degC.shape[1])
+        _, account = decode_portions(split_randomly(data, rng), script.wire, script.frames.temperature_degC.shape[1])
         assert account == {"bytes_n": len(data)} | {name: count[name] for name in REASONS}, f"seed {seed}"
         total += count
     assert all(total[name] > 100 for name in REASONS)  # every reason occurred

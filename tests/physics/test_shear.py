@@ -353,7 +353,7 @@ def test_traction_moves_by_force_over_stiffness():
     assert mean_per_m == pytest.approx(1 / of.stiffness_m, rel=1e-3)  # no waves below 0.3 mm
 
 
-def followed(force_N, nodes_m, of, steps_n):
+def follow_dipoles(force_N, nodes_m, of, steps_n):
     """Apply the force in many small steps, updating nodes and traction; the centre rests at 0."""
     at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / of.stiffness_m
     for step_i in range(steps_n):
@@ -367,7 +367,7 @@ def test_midpoint_steps_equal_many_small_steps():
     nodes_m, over = [0.5, 0.5, 1] * some_places_m(200), []
     for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):  # mu = 0.8, 0.4, 0.8; 1, 1, 2 steps
         of = shear.tabulate_depth(depth_m, **SKIN)
-        truth_m = followed([force_N, 0], nodes_m, of, 48)
+        truth_m = follow_dipoles([force_N, 0], nodes_m, of, 48)
         found_m, one_shot_m = (
             moved([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m
             for by in (shear.shear_in_steps, shear.shear_displacement)

@@ -234,7 +234,7 @@ def test_tables_equal_following_nodes(thickness_mm, at, error, base):
         depths_m = deformation.depth_steps(
             (float(poke_m[2]),), layer.IndentedLayer(one.thickness_m, one.tip_radius_m, base)
         )
-        truth = mechanics.followed(one, poke_m[:2], depths_m)
+        truth = mechanics.follow_dipoles(one, poke_m[:2], depths_m)
         # On a bonded base nothing moves past the table's reach.
         near = np.linalg.norm(
             one.nodes_m[:, :2] - poke_m[:2], axis=1, keepdims=True

@@ -1,4 +1,4 @@
-"""Stability: stiff, extreme and broken cases of physics, chips, wire formats and learning."""
+"""Stability: behaviour in stiff, extreme and faulty cases of physics, chips, wire formats and learning."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +18,7 @@ from reskin.simulation.settings import SimulationSettings
 
 
 def survey(of: SimulationSettings, seed: int) -> list[Case]:
-    """Run every case of physics, chip and wire format with the settings of a scene."""
+    """Run every case of physics, chips and wire formats with the settings of a scene."""
     board = of.main_boards.design
     chips_n = len(board.places_mm)
     return [
@@ -33,7 +33,7 @@ def survey(of: SimulationSettings, seed: int) -> list[Case]:
 
 
 def stability(settings: Settings, results: Path) -> None:
-    """Run every case on the scene's skins and chips and on small trainings, and write the table."""
+    """Run every case on the scene's skins and chips and on small training runs, and write the table."""
     with make_executor(imports="pipeline.experiments.stability.learning") as executor:
         learning = executor.submit(_learning_cases, settings.seed)  # in parallel with the physics
         cases = [*survey(simulation_settings(settings), settings.seed), *learning.result()]

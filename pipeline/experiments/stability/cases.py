@@ -1,6 +1,6 @@
-"""A row of the stability table: an extreme case, the expected and the actual behaviour.
+"""A row of the stability table: an extreme case, with the expected and the actual behaviour.
 
-The modules beside this one run cases on any inputs: the experiment tabulates those of a scene, tests draw others.
+The other modules of this package run cases on any inputs: the experiment uses those of a scene, tests draw others.
 """
 
 import tracemalloc
@@ -12,7 +12,7 @@ from reskin.errors import ReskinError
 
 @dataclass(frozen=True)
 class Case:
-    """A case: expected and actual behaviour, and the error where there is one."""
+    """A case: expected and actual behaviour, and the error if the case has one."""
 
     area: str
     case: str
@@ -23,23 +23,23 @@ class Case:
     holds: bool
 
 
-def measured(area: str, case: str, *, should: str, happened: str, error: float, limit: float) -> Case:
-    """Return a case that holds if its error is at most `limit`; NaN does not hold."""
+def error_case(area: str, case: str, *, should: str, happened: str, error: float, limit: float) -> Case:
+    """Return a case that holds if its error is at most `limit`; it does not hold for NaN."""
     return Case(area, case, should, happened, error, limit, holds=bool(error <= limit))
 
 
-def observed(area: str, case: str, *, should: str, happened: str, holds: bool) -> Case:
-    """Return a case that holds if a condition does."""
+def condition_case(area: str, case: str, *, should: str, happened: str, holds: bool) -> Case:
+    """Return a case that holds if a condition is true."""
     return Case(area, case, should, happened, None, None, holds=bool(holds))
 
 
-def refused(area: str, case: str, *, should: str, attempt: Callable[[], object]) -> Case:
-    """Return a case that holds if `attempt` raises `ReskinError`; other errors are bugs and propagate."""
+def rejection_case(area: str, case: str, *, should: str, attempt: Callable[[], object]) -> Case:
+    """Return a case that holds if `attempt` raises `ReskinError`; other exceptions are bugs and propagate."""
     try:
         attempt()
     except ReskinError as error:
-        return observed(area, case, should=should, happened=f"refused: {error}", holds=True)
-    return observed(area, case, should=should, happened="went on without a word", holds=False)
+        return condition_case(area, case, should=should, happened=f"refused: {error}", holds=True)
+    return condition_case(area, case, should=should, happened="no error was raised", holds=False)
 
 
 def peak_bytes(work: Callable[[], object]) -> int:

@@ -1,4 +1,4 @@
-"""Fields beyond a chip's range, and broken chips; the faults are those of real recordings."""
+"""Cases of fields beyond a chip's range, and of broken chips; the faults occur in real recordings."""
 
 from functools import partial
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from scipy.constants import micro, milli
 
-from pipeline.experiments.stability.cases import Case, measured, observed, refused
+from pipeline.experiments.stability.cases import Case, condition_case, error_case, rejection_case
 from pipeline.experiments.verification.signals import quiet, read_bare
 from reskin.board import faults
 from reskin.board.wire import Frames
@@ -21,7 +21,7 @@ FULL_TURN_N = 2**16
 
 
 def chip_cases(chip: ChipDesign, chips_n: int, seed: int) -> list[Case]:
-    """Fields beyond int16 and 50 mT, and a failed, a stuck and a reset chip on a board."""
+    """Run cases of fields beyond int16 and 50 mT, and of a failed, a stuck and a reset chip on a board."""
     sound_uT = _still_board(chip, chips_n, seed)
     broken_i = min(BROKEN_I, chips_n - 1)
     return [
@@ -52,7 +52,7 @@ def out_of_range(b_uT: Float[np.ndarray, "n 3"], case: str, should: str, *, wrap
         f"{overruns.clipped_n} as clipped"
     )
     error = float((np.abs(read_uT - truth_uT) / step_uT).max()) if counted else np.inf
-    return measured(AREA, case, should=should, happened=happened, error=error, limit=0.51)
+    return error_case(AREA, case, should=should, happened=happened, error=error, limit=0.51)
 
 
 def _failed(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
@@ -86,7 +86,7 @@ def _marked(case: str, found: Bool[np.ndarray, "f k"], expected: Bool[np.ndarray
     happened = (
         f"{hits_n} of {int(expected.sum())} readings marked, and {false_n} of the {int((~expected).sum())} others"
     )
-    return observed(AREA, case, should=should, happened=happened, holds=bool((found == expected).all()))
+    return condition_case(AREA, case, should=should, happened=happened, holds=bool((found == expected).all()))
 
 
 def _reset(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) -> list[Case]:
@@ -97,23 +97,23 @@ def _reset(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) 
     flagged, falsely = (np.flatnonzero(faults.reset_chips(b_uT, None)).tolist() for b_uT in (reset_uT, sound_uT))
     known = {f"GAIN_SEL {gain_sel} in the header": gain_sel, "no settings in the header": None}
     return [
-        observed(AREA, f"chip {broken_i} lost its settings: its LSB is 0.98 and 1.58 uT",
-                 should="that chip flagged, no other",
-                 happened=f"flagged: {flagged}; LSB found {found_uT[0]:.2f} and {found_uT[1]:.2f} uT",
-                 holds=flagged == [broken_i]),
-        observed(AREA, "no chip lost its settings", should="none flagged",
-                 happened=f"flagged: {falsely}", holds=not falsely),
+        condition_case(AREA, f"chip {broken_i} lost its settings: its LSB is 0.98 and 1.58 uT",
+                       should="that chip flagged, no other",
+                       happened=f"flagged: {flagged}; LSB found {found_uT[0]:.2f} and {found_uT[1]:.2f} uT",
+                       holds=flagged == [broken_i]),
+        condition_case(AREA, "no chip lost its settings", should="none flagged",
+                       happened=f"flagged: {falsely}", holds=not falsely),
         *(
-            refused(AREA, f"a chip loses its settings while it is recorded, {of_header}",
-                    attempt=partial(_detect, np.concatenate([sound_uT, reset_uT]), gain_of_header),
-                    should="reported by the ingest, with the chip and the frame")
+            rejection_case(AREA, f"a chip loses its settings while it is recorded, {of_header}",
+                           attempt=partial(_detect, np.concatenate([sound_uT, reset_uT]), gain_of_header),
+                           should="reported by the ingest, with the chip and the frame")
             for of_header, gain_of_header in known.items()
         ),
     ]  # fmt: skip
 
 
 def _detect(b_uT: Float32[np.ndarray, "f ch"], gain_sel: int | None) -> None:
-    """Look for faults as ingestion does, and refuse any."""
+    """Look for faults as ingestion does, and raise for any."""
     frames_n, chips_n, expected_lsb_uT = len(b_uT), b_uT.shape[1] // 3, None
     if gain_sel is not None:
         xy_uT, _, z_uT = steps_uT(gain_sel).tolist()
@@ -129,7 +129,7 @@ def _axes(chip_i: int) -> slice:
 
 
 def _still_board(chip: ChipDesign, chips_n: int, seed: int) -> Float32[np.ndarray, "f ch"]:
-    """Simulate readings of sound chips in constant fields, which only noise moves: faults are put into them."""
+    """Simulate readings of faultless chips in constant fields, which vary only by noise; cases add faults to them."""
     rng = rng_for(seed, "stability", "board")
     rest_T = rng.uniform(-2, 2, (chips_n, 3)) * milli
     return np.concatenate([read_bare(np.tile(chip_T, (FRAMES_N, 1)), chip, rng)[0] for chip_T in rest_T], axis=1)

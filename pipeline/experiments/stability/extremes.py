@@ -1,6 +1,6 @@
-"""Skins and indentations at the limits of what is allowed, against references.
+"""Cases of skins and indentations at the limits of what is allowed, compared with references.
 
-References: four times finer steps without tables; rings of pressure with the textbook's compliance of a layer;
+References: steps four times as fine and without tables; rings of pressure with the textbook compliance of a layer;
 magpylib's closed form of a magnetised box; and the exact scaling of lengths.
 """
 
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.constants import milli, mu_0
 from scipy.special import j0, j1
 
-from pipeline.experiments.stability.cases import Case, measured
+from pipeline.experiments.stability.cases import Case, error_case
 from pipeline.experiments.verification import mechanics
 from pipeline.experiments.verification.checks import no_spread
 from reskin.physics import layer, magnet, slide
@@ -21,21 +21,21 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 
 AREA = "physics"
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # the same on both sides: steps and scaling are compared, not quadrature
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # also for the reference: steps and scaling are tested, not quadrature
 PLACE_M = np.array([2.3, -1.1]) * milli  # on no node's axis
 DEPTHS = (0.6, 0.66, slide.DEEPEST)  # of the thickness
-FINER = 4  # times the product's steps
-STEPS_N = 40  # of the product's, over a depth of one thickness
+FINER = 4  # factor on the number of the simulator's steps
+STEPS_N = 40  # of the simulator, over a depth of one thickness
 RINGS_N, KEPT_WAVES = 160, 400.0  # rings of pressure; the shortest wave, k times the contact's radius
 SIZES = (0.1, 1.0, 10.0)  # tip radius over thickness
-PRESSED = 0.4  # of the lesser of thickness and tip radius
-GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # cells of so much of the gap
+PRESSED = 0.4  # depth relative to the smaller of thickness and tip radius
+GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # gaps between skin and chips, and cell size relative to the gap
 SLID_M = 0.1 * milli
 THICKNESSES_MM = (0.2, 20.0)
 
 
 def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Deep indentations, sharp and blunt tips, near chips, thin and thick skins."""
+    """Run cases of deep indentations, sharp and blunt tips, near chips, thin and thick skins."""
     even = no_spread(spreads)
     drawn = draw_board(board, even, seed=seed, name="b0")
     one = draw_skin(skin, even, seed=seed, name="b0_s0", rule=COARSE)
@@ -43,25 +43,25 @@ def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def deep(board: Board, skin: Skin) -> list[Case]:
-    """The deepest indentations: dB by tables against finer steps without tables."""
+    """Run cases of the deepest indentations: dB by tables, compared with finer steps without tables."""
     cases = []
     for share in DEPTHS:
         depth_m = share * skin.thickness_m
         _, (found_T,) = changes_of_field(board, skin, np.array([[*PLACE_M, depth_m]]))
         fine_m = mechanics.descent(depth_m + skin.depth_zero_m, FINER * round(STEPS_N * share))
-        moved = mechanics.followed(skin, PLACE_M, fine_m)
+        moved = mechanics.follow_dipoles(skin, PLACE_M, fine_m)
         truth_T = change_of_field((skin.nodes_m, skin.moments_A_m2), moved, board.chips_m)
         error = _error(found_T, truth_T)
         cases.append(
-            measured(AREA, f"dB of a press to {share:g} of the thickness",
-                     should=f"that of {FINER} times as many steps, without tables",
-                     happened=f"relative error {error:.1e}", error=error, limit=0.02)
+            error_case(AREA, f"dB of a press to {share:g} of the thickness",
+                       should=f"that of {FINER} times as many steps, without tables",
+                       happened=f"relative error {error:.1e}", error=error, limit=0.02)
         )  # fmt: skip
     return cases
 
 
 def tips(base: layer.Base) -> list[Case]:
-    """Sharp and blunt tips: force against rings of pressure on the textbook's layer."""
+    """Run cases of sharp and blunt tips: force, compared with rings of pressure on the textbook's layer."""
     cases = []
     for size in SIZES:
         thickness_m, tip_m = 2 * milli, 2 * milli * size
@@ -72,9 +72,9 @@ def tips(base: layer.Base) -> list[Case]:
         truth_N = ring_force_N(depth_m, thickness_m, tip_m, 1e6, base, reach_m=1.15 * contact.radius_m)
         error = abs(found_N / truth_N - 1)
         cases.append(
-            measured(AREA, f"a tip of {size:g} thicknesses", should="the force of rings of pressure that touch it",
-                     happened=f"{found_N:.4g} N, by rings {truth_N:.4g} N: relative error {error:.1e}",
-                     error=float(error), limit=0.01)
+            error_case(AREA, f"a tip of {size:g} thicknesses", should="the force of rings of pressure that touch it",
+                       happened=f"{found_N:.4g} N, by rings {truth_N:.4g} N: relative error {error:.1e}",
+                       error=float(error), limit=0.01)
         )  # fmt: skip
     return cases
 
@@ -82,10 +82,10 @@ def tips(base: layer.Base) -> list[Case]:
 def ring_force_N(
     depth_m: float, thickness_m: float, tip_radius_m: float, modulus_Pa: float, base: layer.Base, *, reach_m: float
 ) -> float:
-    """Return the force of a sphere on a layer by rings of even pressure, which touch it or carry no pressure.
+    """Return the force of a sphere on a layer, by rings of uniform pressure that touch the sphere or carry no pressure.
 
     The deflection by a ring is the Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8):
-    (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on one that holds it.
+    (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on a bonded base.
     """
     edges_m = np.linspace(0, reach_m, RINGS_N + 1)
     middles_m = (edges_m[1:] + edges_m[:-1]) / 2
@@ -113,7 +113,7 @@ def ring_force_N(
 
 
 def near(skin: SkinDesign) -> list[Case]:
-    """A uniformly magnetised skin that slides over ever nearer chips: dipoles against a box in closed form."""
+    """Run cases of a uniformly magnetised skin that slides over ever nearer chips: dipoles, compared with a box."""
     cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
     j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
     box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
@@ -127,15 +127,15 @@ def near(skin: SkinDesign) -> list[Case]:
         truth_T = box.getB(chips_m - middle_m - (SLID_M, 0.0, 0.0)) - box.getB(chips_m - middle_m)
         error = _error(found_T, truth_T)
         cases.append(
-            measured(AREA, f"chips {gap_mm:g} mm under a skin that slides {SLID_M / milli:g} mm",
-                     should=f"dB of a box in closed form (magpylib), with cells of {CELL_SHARE:g} of the gap",
-                     happened=f"{len(moments)} dipoles, relative error {error:.1e}", error=error, limit=0.03)
+            error_case(AREA, f"chips {gap_mm:g} mm under a skin that slides {SLID_M / milli:g} mm",
+                       should=f"dB of a box in closed form (magpylib), with cells of {CELL_SHARE:g} of the gap",
+                       happened=f"{len(moments)} dipoles, relative error {error:.1e}", error=error, limit=0.03)
         )  # fmt: skip
     return cases
 
 
 def scaled(board: Board, skin: Skin) -> list[Case]:
-    """Everything scaled: equal fields, forces as the square of lengths."""
+    """Run cases with all lengths scaled: fields stay equal, forces scale as the square of lengths."""
     poke_m = np.array([[*PLACE_M, 0.45 * skin.thickness_m]])
     (force_N,), (_, (change_T,)) = forces(skin, poke_m[:, 2]), changes_of_field(board, skin, poke_m)
     cases = []
@@ -145,15 +145,15 @@ def scaled(board: Board, skin: Skin) -> list[Case]:
         (other_N,), (_, (other_T,)) = forces(other, by * poke_m[:, 2]), changes_of_field(chips, other, by * poke_m)
         error = max(_error(other_T, change_T), abs(float(other_N / (by**2 * force_N)) - 1))
         cases.append(
-            measured(AREA, f"a skin of {thickness_mm:g} mm",
-                     should="equal dB where all lengths scale, force as their square",
-                     happened=f"{other_N:.3g} N, relative error {error:.1e}", error=error, limit=1e-6)
+            error_case(AREA, f"a skin of {thickness_mm:g} mm",
+                       should="equal dB where all lengths scale, force as their square",
+                       happened=f"{other_N:.3g} N, relative error {error:.1e}", error=error, limit=1e-6)
         )  # fmt: skip
     return cases
 
 
 def scale_skin(skin: Skin, by: float) -> Skin:
-    """Scale every length of a skin; its material stays, so springs scale as lengths."""
+    """Scale every length of a skin; its material is unchanged, so springs scale as lengths."""
     hold = skin.hold
     if hold is not None:
         x_m, y_m = hold.give_m

@@ -1,4 +1,4 @@
-"""Extreme cases of learning, on small trainings with random data in uT, mm and N."""
+"""Extreme cases of learning, in small training runs on random data in uT, mm and N."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float32
 
-from pipeline.experiments.stability.cases import Case, measured, observed, refused
+from pipeline.experiments.stability.cases import Case, condition_case, error_case, rejection_case
 from reskin.data.rows import Rows
 from reskin.data.splits import Split, draw_folds
 from reskin.metrics import METRICS, score
@@ -20,12 +20,12 @@ AREA = "learning"
 ROWS_N, TRAIN_N, CHANNELS_N = 240, 160, 15
 SIGNAL_uT = 50.0
 MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])  # mm, mm, N: 0.6 to 9.4 N, as recorded
-STEPS_N = BLOCK_STEPS_N  # the loop looks at its loss once
+STEPS_N = BLOCK_STEPS_N  # the training loop checks its loss once
 CONSTANT_uT = 12.3
 BOTTLENECK = "layer3.weight"
-ROUNDING = 1e-4  # of weights near 0.1: float32 sums of another order differ by 6e-8, and 50 steps amplify it
-STILL = 1e-12  # a rate at which nothing moves
-SCALE_POWERS = (-20, -10, 10, 20)  # of two, about 1e-6 to 1e6: float32 holds labels of these scales without rounding
+ROUNDING = 1e-4  # of weights near 0.1: float32 sums in another order differ by 6e-8, which 50 steps amplify
+STILL = 1e-12  # a learning rate at which the weights hardly change
+SCALE_POWERS = (-20, -10, 10, 20)  # of two, about 1e-6 to 1e6: float32 labels are scaled by these without rounding
 RECIPE = Recipe(
     architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=32,
     rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
@@ -38,7 +38,7 @@ def learning_cases(seed: int) -> list[Case]:
 
 
 def scaling_cases(seed: int) -> list[Case]:
-    """Constant channels, and labels of other scales."""
+    """Run cases of constant channels, and of labels of other scales."""
     job, rows = _job(seed), _rows(seed)
     return [
         _constant(job, rows, [7], "a channel that never moves"),
@@ -48,20 +48,20 @@ def scaling_cases(seed: int) -> list[Case]:
 
 
 def triplet_cases(seed: int) -> list[Case]:
-    """Identical readings, and equidistant places."""
+    """Run cases of triplets of identical readings, and of equidistant places."""
     job, rows = _job(seed), _rows(seed)
     return [_alike(job, rows), *_tied(job, rows)]
 
 
 def loop_cases(seed: int) -> list[Case]:
-    """Overflowing rates and weights, a dead network, very few rows, and the same seed twice."""
+    """Run cases of overflowing rates and weights, a dead network, very few rows, and the same seed twice."""
     job, rows = _job(seed), _rows(seed)
     overflow = [_explodes(job, rows, 1e1), _explodes(job, rows, 1e10), _beside_one_that_overflows(job, rows)]
     return [*overflow, _collapsed(job, rows), *_few(job, rows), _again(job, rows)]
 
 
 def fold_cases() -> list[Case]:
-    """Folds with more groups than exist."""
+    """Run cases of folds that need more groups than exist."""
     boards = ["b1", "b2", "b3"]
     folds = {
         "one board, to be left out": ("lobo", boards[:1], Split()),
@@ -69,8 +69,8 @@ def fold_cases() -> list[Case]:
         "three skins to train on where two are": ("sensors", boards, Split(sensors_skins_n=(3,), sensors_draws_n=1)),
     }
     return [
-        refused(AREA, case, should="refused, with what there is",
-                attempt=partial(draw_folds, Rows.of_labels(groups, skins=groups), [experiment], split, 0))
+        rejection_case(AREA, case, should="refused, with what there is",
+                       attempt=partial(draw_folds, Rows.of_labels(groups, skins=groups), [experiment], split, 0))
         for case, (experiment, groups, split) in folds.items()
     ]  # fmt: skip
 
@@ -92,8 +92,8 @@ def _constant(job: TrainingJob, rows: TrainingData, channels: list[int], case: s
     scaler = trained.scaler
     seen = float(np.abs(scaler.encode(db_uT)[:, channels]).max())
     happened = f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {seen:g} seen; {_words(trained)}"
-    return measured(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=happened,
-                    error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
+    return error_case(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=happened,
+                      error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
 
 
 def _alike(job: TrainingJob, rows: TrainingData) -> Case:
@@ -102,8 +102,8 @@ def _alike(job: TrainingJob, rows: TrainingData) -> Case:
     apart = _apart(plain.weights, pulled.weights)
     happened = f"weights {apart:g} apart from those without triplets after {STEPS_N} steps; {_words(pulled)}"
     should = "loss 0 and a finite gradient of 0: whatever its weight, it pulls nowhere"
-    return measured(AREA, "triplets of identical readings, weighed 1000", should=should, happened=happened,
-                    error=apart if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
+    return error_case(AREA, "triplets of identical readings, weighed 1000", should=should, happened=happened,
+                      error=apart if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
 
 
 def _tied(job: TrainingJob, rows: TrainingData) -> list[Case]:
@@ -115,7 +115,7 @@ def _tied(job: TrainingJob, rows: TrainingData) -> list[Case]:
         "two pokes a skin: from each, only the other one": (replace(job, train=np.arange(4)), rows),
     }
     should = "refused: nothing is nearer than anything, and no sampler is endless"
-    return [refused(AREA, case, should=should, attempt=partial(_train, *at)) for case, at in attempts.items()]
+    return [rejection_case(AREA, case, should=should, attempt=partial(_train, *at)) for case, at in attempts.items()]
 
 
 def _explodes(job: TrainingJob, rows: TrainingData, rate: float) -> Case:
@@ -127,7 +127,7 @@ def _explodes(job: TrainingJob, rows: TrainingData, rate: float) -> Case:
     sound = all(np.isfinite(value).all() for value in trained.weights.values())
     happened = f"{stopped}; weights of step {kept_step} of {steps_n}, {'all' if sound else 'not all'} finite{losses}"
     case = f"bottleneck scaled 1e3, learning rate {rate:g}"
-    return observed(AREA, case, should="stops, says where, and keeps the last finite weights", happened=happened,
+    return condition_case(AREA, case, should="stops, says where, and keeps the last finite weights", happened=happened,
                 holds=sound and trained.stopped_step == kept_step + STEPS_N)  # fmt: skip
 
 
@@ -137,9 +137,9 @@ def _beside_one_that_overflows(job: TrainingJob, rows: TrainingData) -> Case:
     beside, overflowing = train_stack([sound, broken], rows)
     apart = _apart(alone.weights, beside.weights)
     happened = f"{_words(overflowing)}; its neighbour: {_words(beside)}, {apart:g} from what it becomes alone"
-    return measured(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
-                    happened=happened, limit=ROUNDING,
-                    error=apart if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
+    return error_case(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
+                      happened=happened, limit=ROUNDING,
+                      error=apart if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
 
 
 def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:
@@ -153,8 +153,9 @@ def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:
         f"{'counted as collapsed' if dead.collapsed else 'taken as sound'}; the same network alive: "
         f"{alive.explained_min:.2g}, {'counted as collapsed' if alive.collapsed else 'taken as sound'}"
     )
-    return observed(AREA, "a network that died, with a finite loss", should="counted as collapsed, and it alone",
-                    happened=happened, holds=_is_sound(dead) and dead.collapsed and not alive.collapsed)  # fmt: skip
+    return condition_case(AREA, "a network that died, with a finite loss", should="counted as collapsed, and it alone",
+                          happened=happened,
+                          holds=_is_sound(dead) and dead.collapsed and not alive.collapsed)  # fmt: skip
 
 
 def _few(job: TrainingJob, rows: TrainingData) -> list[Case]:
@@ -162,13 +163,13 @@ def _few(job: TrainingJob, rows: TrainingData) -> list[Case]:
     error = float(np.abs(single.predicted - rows.target[job.train[:1]]).max())
     by_one = _train(_changed(job, batch_n=1), rows)
     return [
-        observed(AREA, "batches of one row", should="trained as ever", happened=_words(by_one),
-                 holds=_is_sound(by_one)),
-        measured(AREA, "one training row", should="answers that row's place and force",
-                 happened=f"off by {error:.1e} (mm, mm, N); {_words(single)}",
-                 error=error if _is_sound(single) else np.inf, limit=ROUNDING),
-        refused(AREA, "one training row, with triplets", should="refused: no triplet is in it",
-                attempt=partial(_train, _changed(replace(job, train=job.train[:1]), triplet_weight=0.1), rows)),
+        condition_case(AREA, "batches of one row", should="trained as ever", happened=_words(by_one),
+                       holds=_is_sound(by_one)),
+        error_case(AREA, "one training row", should="answers that row's place and force",
+                   happened=f"off by {error:.1e} (mm, mm, N); {_words(single)}",
+                   error=error if _is_sound(single) else np.inf, limit=ROUNDING),
+        rejection_case(AREA, "one training row, with triplets", should="refused: no triplet is in it",
+                       attempt=partial(_train, _changed(replace(job, train=job.train[:1]), triplet_weight=0.1), rows)),
     ]  # fmt: skip
 
 
@@ -182,8 +183,8 @@ def _label_scales(job: TrainingJob, rows: TrainingData) -> list[Case]:
         back = score(true, _times(trained.predicted, 1 / scale))
         error = max(abs(back[name] / as_ever[name] - 1) for name in METRICS)
         happened = ", ".join(f"{name} {back[name]:.4g}, was {as_ever[name]:.4g}" for name in METRICS)
-        cases.append(measured(AREA, f"labels times 2^{power}", should="taken back to mm and N: exactly as ever",
-                              happened=happened, error=error, limit=0.0))  # fmt: skip
+        cases.append(error_case(AREA, f"labels times 2^{power}", should="taken back to mm and N: exactly as ever",
+                                happened=happened, error=error, limit=0.0))  # fmt: skip
     return cases
 
 
@@ -197,7 +198,7 @@ def _again(job: TrainingJob, rows: TrainingData) -> Case:
     same_n = sum(value.tobytes() == twin.tobytes() for value, twin in pairs)
     away = _apart(first.weights, _train(replace(job, seed_i=1), rows).weights)
     happened = f"{same_n} of {len(pairs)} arrays identical bit for bit; another seed's weights {away:.2g} away"
-    return observed(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
+    return condition_case(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
                 happened=happened, holds=same_n == len(pairs) and away > 0)  # fmt: skip
 
 
@@ -210,7 +211,7 @@ def _changed(job: TrainingJob, **settings: float | int) -> TrainingJob:
 
 
 def _start(job: TrainingJob, rows: TrainingData, scale: float) -> Pretrained:
-    """Train a network, and scale its bottleneck."""
+    """Train a network, and scale the weights of its bottleneck."""
     trained = _train(job, rows)
     weights = {**trained.weights, BOTTLENECK: trained.weights[BOTTLENECK] * np.float32(scale)}
     return Pretrained("", weights, trained.scaler)

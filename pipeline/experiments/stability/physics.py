@@ -1,4 +1,4 @@
-"""Extreme skins, indentations, drags and times."""
+"""Cases of extreme skins, indentations, drags and times."""
 
 from dataclasses import asdict, replace
 from functools import partial
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import kilo, micro, milli
 
-from pipeline.experiments.stability.cases import Case, measured, observed, peak_bytes, refused
+from pipeline.experiments.stability.cases import Case, condition_case, error_case, peak_bytes, rejection_case
 from pipeline.experiments.verification import mechanics, signals
 from pipeline.experiments.verification.checks import scaled_error
 from pipeline.experiments.verification.mechanics import force_N
@@ -28,24 +28,24 @@ PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7]]) * milli
 DEPTH = 0.3  # of the thickness
 FLAGGED_DEPTH = 0.6  # of the thickness
 POKES_N = 2000
-BYTES_MAX_N = 1000  # a poke: 1e6 pokes in 1 GB, 120 bytes of each its result
+BYTES_MAX_N = 1000  # per poke: 1e6 pokes need 1 GB; 120 bytes of each are its result
 PATH_MM = (0.0, 0.1, 0.5, 4.0)  # of a drag
 STICKY = 1e6  # friction without slip
 STIFF = signals.stiff(1e8)
 
 
 def time_cases() -> list[Case]:
-    """Steps that no explicit integrator survives, steps of zero length, and impossible times."""
+    """Run cases of steps at which explicit integrators diverge, steps of zero length, and impossible times."""
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     same_n = int(np.count_nonzero(advance(state, 0.0, 0.0, SKIN_RELAXATION).view(np.int64) == state.view(np.int64)))
     return [
         _step("tau_max / tau_min 1e8, dt / tau_min 1e8", 1e8, "as in 50 digits (mpmath), and finite"),
         _step("dt / tau_min 1e-16", 1e-16, "as in 50 digits: (1 - exp(-x)) / x by expm1; plainly it is 11 % off"),
-        observed("time", "dt = 0", should="the state, bit for bit",
-                 happened=f"{same_n} of {len(state)} values identical bit for bit", holds=same_n == len(state)),
+        condition_case("time", "dt = 0", should="the state, bit for bit",
+                       happened=f"{same_n} of {len(state)} values identical bit for bit", holds=same_n == len(state)),
         *(
-            refused("time", f"a time step of {dt_s:g} s", should="refused, with the step named",
-                    attempt=partial(advance, signals.STATE, 1.0, dt_s, STIFF))
+            rejection_case("time", f"a time step of {dt_s:g} s", should="refused, with the step named",
+                           attempt=partial(advance, signals.STATE, 1.0, dt_s, STIFF))
             for dt_s in (-1 * micro, np.nan, np.inf)
         ),
     ]  # fmt: skip
@@ -55,11 +55,11 @@ def _step(case: str, dt_over_fastest: float, should: str) -> Case:
     dt_s = dt_over_fastest * float(STIFF.tau_s[0])
     found, error = advance(signals.STATE, 1.3, dt_s, STIFF), signals.step_error(dt_s, STIFF)
     happened = f"relative error {error:.1e}, {np.count_nonzero(np.isfinite(found))} of {len(found)} values finite"
-    return measured("time", case, should=should, happened=happened, error=error, limit=signals.ROUNDING)
+    return error_case("time", case, should=should, happened=happened, error=error, limit=signals.ROUNDING)
 
 
 def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Extreme variants of a scene's first skin on its first board."""
+    """Run cases on extreme variants of a scene's first skin on its first board."""
     drawn = draw_board(board, spreads, seed=seed, name="b0")
 
     def skin_of(spread: Spreads = spreads, name: str = "b0_s0", **changes: float) -> Skin:
@@ -88,7 +88,10 @@ def _pokes_m(skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n 3"]:
 
 
 def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
-    """Skins of no stiffness and of a metal's: the depth is prescribed, so the modulus only affects the friction."""
+    """Run cases of skins without stiffness and as stiff as metal.
+
+    The depth is prescribed, so the modulus affects only the friction.
+    """
     free = replace(usual, hold=None)
     firm = usual if usual.hold is None else replace(usual, hold=replace(usual.hold, friction=1e12))
     free_T, firm_T, soft_T, hard_T = (poke(board, skin) for skin in (free, firm, soft, hard))
@@ -98,21 +101,22 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
     soft_off_T, hard_off_T = float(np.abs(soft_T - free_T).max()), float(np.abs(hard_T - firm_T).max())
     held = clipped_n == len(hard_N) and bool((read_N[:, 2] == FORCE_RANGE_N[2]).all())
     return [
-        observed(AREA, "a skin of no stiffness, E = 0", should="no force, so no slide: dB of the layer's flow alone",
-                 happened=f"force {np.abs(soft_N).max():g} N; dB differs by {soft_off_T:g} T",
-                 holds=not soft_N.any() and soft_off_T == 0),
-        observed(AREA, "a stiff skin, E = 1 GPa",
-                 should="dB of a tip that never slips; force held at the sensor's range, and counted",
-                 happened=f"dB differs by {hard_off_T:g} T; {hard_N.max():.3g} N read as {read_N[:, 2].max():g} N, "
-                          f"{clipped_n} of {len(hard_N)} counted as clipped",
-                 holds=hard_off_T == 0 and held),
+        condition_case(AREA, "a skin of no stiffness, E = 0",
+                       should="no force, so no slide: dB of the layer's flow alone",
+                       happened=f"force {np.abs(soft_N).max():g} N; dB differs by {soft_off_T:g} T",
+                       holds=not soft_N.any() and soft_off_T == 0),
+        condition_case(AREA, "a stiff skin, E = 1 GPa",
+                       should="dB of a tip that never slips; force held at the sensor's range, and counted",
+                       happened=f"dB differs by {hard_off_T:g} T; {hard_N.max():.3g} N read as "
+                                f"{read_N[:, 2].max():g} N, {clipped_n} of {len(hard_N)} counted as clipped",
+                       holds=hard_off_T == 0 and held),
     ]  # fmt: skip
 
 
 def thickness(usual: Skin) -> list[Case]:
     return [
-        refused(AREA, f"a thickness of {skin.thickness_m / milli:.2g} mm", should="refused",
-                attempt=partial(forces, skin, np.array([1e-4])))
+        rejection_case(AREA, f"a thickness of {skin.thickness_m / milli:.2g} mm", should="refused",
+                       attempt=partial(forces, skin, np.array([1e-4])))
         for skin in (replace(usual, thickness_m=sign * usual.thickness_m) for sign in (0, -1))
     ]  # fmt: skip
 
@@ -124,15 +128,16 @@ def depth(board: Board, skin: Skin) -> list[Case]:
     flagged = layer.beyond_verified(shares * skin.thickness_m, skin.thickness_m)
     given_N = forces(skin, shares * skin.thickness_m)
     return [
-        observed(AREA, "a tip above the skin, depth < 0", should="dB and force exactly 0",
-                 happened=f"dB {lifted_T:g} T, force {lifted_N:g} N", holds=lifted_T == 0 and lifted_N == 0),
-        observed(AREA, "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness",
-                 should="flagged from 0.6 on, where no published solution vouches; the force is given all the same",
-                 happened=f"flagged: {', '.join(f'{s:g}' for s in shares[flagged])}; forces "
-                          f"{', '.join(f'{n:.3g}' for n in given_N)} N",
-                 holds=bool((flagged == (shares >= FLAGGED_DEPTH)).all() and np.isfinite(given_N).all())),
-        refused(AREA, "a poke through the skin, depth 1.5 of the thickness", should="refused",
-                attempt=lambda: poke(board, skin, 1.5)),
+        condition_case(AREA, "a tip above the skin, depth < 0", should="dB and force exactly 0",
+                       happened=f"dB {lifted_T:g} T, force {lifted_N:g} N", holds=lifted_T == 0 and lifted_N == 0),
+        condition_case(AREA, "depths of 0.2, 0.59, 0.6 and 0.8 of the thickness",
+                       should="flagged from 0.6 on, where no published solution vouches; the force is given "
+                              "all the same",
+                       happened=f"flagged: {', '.join(f'{s:g}' for s in shares[flagged])}; forces "
+                                f"{', '.join(f'{n:.3g}' for n in given_N)} N",
+                       holds=bool((flagged == (shares >= FLAGGED_DEPTH)).all() and np.isfinite(given_N).all())),
+        rejection_case(AREA, "a poke through the skin, depth 1.5 of the thickness", should="refused",
+                       attempt=lambda: poke(board, skin, 1.5)),
         _almost_through(board, skin),
     ]  # fmt: skip
 
@@ -141,12 +146,12 @@ def _almost_through(board: Board, skin: Skin) -> Case:
     case, attempt = "a poke to 0.95 of the thickness", partial(poke, board, skin, 0.95)
     followed_m = skin.thickness_m * depth_scale(skin.tip_radius_m / skin.thickness_m)
     if skin.base == "bonded" or 0.95 * skin.thickness_m + skin.depth_zero_m > followed_m:
-        return refused(AREA, case, should="refused, before the map folds or loses volume", attempt=attempt)
+        return rejection_case(AREA, case, should="refused, before the map folds or loses volume", attempt=attempt)
     largest_uT = float(np.abs(attempt()).max() / micro)
     beyond = bool(layer.beyond_verified(np.array([0.95 * skin.thickness_m]), skin.thickness_m).all())
-    return observed(AREA, case, should="finite, for a sliding skin keeps its volume there; counted as beyond 0.6",
-                    happened=f"dB of at most {largest_uT:.3g} uT; counted: {'yes' if beyond else 'no'}",
-                    holds=beyond and 0 < largest_uT < np.inf)  # fmt: skip
+    return condition_case(AREA, case, should="finite, for a sliding skin keeps its volume there; counted as beyond 0.6",
+                          happened=f"dB of at most {largest_uT:.3g} uT; counted: {'yes' if beyond else 'no'}",
+                          holds=beyond and 0 < largest_uT < np.inf)  # fmt: skip
 
 
 def place(board: Board, skin: Skin) -> list[Case]:
@@ -155,12 +160,12 @@ def place(board: Board, skin: Skin) -> list[Case]:
     beside_m = np.array([[skin.seat_m[0] + 0.51 * skin.sides_m[0], skin.seat_m[1], DEPTH * skin.thickness_m]])
     on_dipoles = replace(board, chips_m=skin.nodes_m[: len(board.chips_m)].copy())
     return [
-        refused(AREA, "a poke beside the skin, 0.2 mm past its edge",
-                should="refused, never extrapolated: a flagged reading would need a field",
-                attempt=lambda: changes_of_field(board, skin, beside_m)),
-        measured(AREA, "a place inside a magnet of the array", should="the field of the box, J included: as magpylib",
-                 happened=f"{len(inside_m)} places, relative error {error:.1e}", error=error, limit=1e-12),
-        refused(AREA, "a chip on a dipole, r = 0", should="refused", attempt=lambda: poke(on_dipoles, skin)),
+        rejection_case(AREA, "a poke beside the skin, 0.2 mm past its edge",
+                       should="refused, never extrapolated: a flagged reading would need a field",
+                       attempt=lambda: changes_of_field(board, skin, beside_m)),
+        error_case(AREA, "a place inside a magnet of the array", should="the field of the box, J included: as magpylib",
+                   happened=f"{len(inside_m)} places, relative error {error:.1e}", error=error, limit=1e-12),
+        rejection_case(AREA, "a chip on a dipole, r = 0", should="refused", attempt=lambda: poke(on_dipoles, skin)),
     ]  # fmt: skip
 
 
@@ -168,35 +173,35 @@ def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]
     once_T, bare_T, strong_T = (poke(board, skin) for skin in (usual, bare, strong))
     error, left_T = scaled_error(strong_T, 5 * once_T), float(np.abs(bare_T).max())
     return [
-        observed(AREA, "a skin without magnetisation", should="dB exactly 0", happened=f"at most {left_T:g} T",
-                 holds=left_T == 0),
-        measured(AREA, "five times the magnetisation", should="five times dB", happened=f"relative error {error:.1e}",
-                 error=error, limit=1e-12),
+        condition_case(AREA, "a skin without magnetisation", should="dB exactly 0", happened=f"at most {left_T:g} T",
+                       holds=left_T == 0),
+        error_case(AREA, "five times the magnetisation", should="five times dB", happened=f"relative error {error:.1e}",
+                   error=error, limit=1e-12),
     ]  # fmt: skip
 
 
 def single_precision(board: Board, fine: Skin) -> Case:
     rest = fine.nodes_m, fine.moments_A_m2
     depths_m = mechanics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
-    moved = mechanics.followed(fine, PLACES_M[0], depths_m)
+    moved = mechanics.follow_dipoles(fine, PLACES_M[0], depths_m)
     double_T = change_of_field(rest, moved, board.chips_m)
     x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (*rest, *moved, board.chips_m))
-    # Node by node, as the simulator does: the difference of two large sums would lose more digits.
+    # Subtract node by node, as the simulator does: the difference of two large sums would lose more digits.
     each_T = magnet.field_of_each(moved_x, moved_m, chips) - magnet.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
     error_uT = float(np.abs(single_T - double_T).max() / micro)
     happened = f"{single_T.dtype}, {len(x)} dipoles: {error_uT:.1e} uT off, of {np.abs(double_T).max() / micro:.3g} uT"
-    return measured(AREA, "dB in single precision", should="within 0.25 uT of double: a tenth of a chip's noise",
-                    happened=happened, error=error_uT, limit=0.25)  # fmt: skip
+    return error_case(AREA, "dB in single precision", should="within 0.25 uT of double: a tenth of a chip's noise",
+                      happened=happened, error=error_uT, limit=0.25)  # fmt: skip
 
 
 def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
     bytes_of = [skin.nodes_m.tobytes() + skin.moments_A_m2.tobytes() for skin in (first, again, renamed)]
     same, differs = bytes_of[0] == bytes_of[1], bytes_of[0] != bytes_of[2]
     words = {True: "the same bytes", False: "other bytes"}
-    return observed(AREA, "the same seed and name", should="the same bytes; another skin for another name",
-                    happened=f"drawn again: {words[same]}; by another name: {words[not differs]}",
-                    holds=same and differs)  # fmt: skip
+    return condition_case(AREA, "the same seed and name", should="the same bytes; another skin for another name",
+                          happened=f"drawn again: {words[same]}; by another name: {words[not differs]}",
+                          holds=same and differs)  # fmt: skip
 
 
 def memory(board: Board, skin: Skin) -> Case:
@@ -204,19 +209,19 @@ def memory(board: Board, skin: Skin) -> Case:
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, skin, pokes_m[:1])  # the table is computed once for all
+    changes_of_field(board, skin, pokes_m[:1])  # computes the cached table, so that it is not measured below
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
     each_n = (many_n - few_n) / (3 * POKES_N)
     happened = (
         f"{POKES_N} pokes {few_n / 1e6:.2f} MB, {4 * POKES_N} pokes {many_n / 1e6:.2f} MB: {each_n:.0f} bytes a poke, "
         f"results included, {each_n:.0f} MB for 1e6"
     )
-    return measured(AREA, "1e6 pokes", should=f"memory grows by no more than {BYTES_MAX_N} bytes a poke",
-                    happened=happened, error=each_n, limit=float(BYTES_MAX_N))  # fmt: skip
+    return error_case(AREA, "1e6 pokes", should=f"memory grows by no more than {BYTES_MAX_N} bytes a poke",
+                      happened=happened, error=each_n, limit=float(BYTES_MAX_N))  # fmt: skip
 
 
 def drag_cases(skin: SkinDesign) -> list[Case]:
-    """Drags along a line without friction, and without slip."""
+    """Run cases of drags along a line without friction, and without slip."""
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     depth_m, modulus_Pa = DEPTH * press.thickness_m, skin.modulus_kPa * kilo
     stiffness = modulus_Pa / 3 * shear.tabulate_depth(depth_m, **asdict(press)).stiffness_m
@@ -227,9 +232,9 @@ def drag_cases(skin: SkinDesign) -> list[Case]:
     )
     error = float(np.abs(sticky[:, 0] - stiffness * path_m[:, 0]).max() / sticky.max())
     return [
-        observed(AREA, "a drag without friction", should="no force sideways at all",
-                 happened=f"at most {np.abs(smooth).max():g} N over {PATH_MM[-1]:g} mm", holds=not smooth.any()),
-        measured(AREA, f"a drag with friction {STICKY:g}", should="sticks: force is stiffness times the way",
-                 happened=f"{sticky.max():.3g} N over {PATH_MM[-1]:g} mm, relative error {error:.1e}",
-                 error=error, limit=1e-12),
+        condition_case(AREA, "a drag without friction", should="no force sideways at all",
+                       happened=f"at most {np.abs(smooth).max():g} N over {PATH_MM[-1]:g} mm", holds=not smooth.any()),
+        error_case(AREA, f"a drag with friction {STICKY:g}", should="sticks: force is stiffness times the way",
+                   happened=f"{sticky.max():.3g} N over {PATH_MM[-1]:g} mm, relative error {error:.1e}",
+                   error=error, limit=1e-12),
     ]  # fmt: skip

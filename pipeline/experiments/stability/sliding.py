@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.constants import milli
 
-from pipeline.experiments.stability.cases import Case, measured, observed
+from pipeline.experiments.stability.cases import Case, condition_case, error_case
 from pipeline.experiments.stability.physics import COARSE
 from pipeline.experiments.verification.checks import no_spread
 from reskin.physics import shear, slide
@@ -32,7 +32,7 @@ PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # of 
 
 
 def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Cases of a skin without spreads on the first board; none if the base does not hold it by springs."""
+    """Run cases of a skin without spreads on the first board; none if the skin is not held by springs."""
     if skin.hold is None:
         return []
     even = no_spread(spreads)
@@ -42,7 +42,7 @@ def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def stick_slip(board: Board, skin: Skin) -> list[Case]:
-    """Drags with almost no friction, which slip at once, and without slip."""
+    """Run cases of drags with almost no friction, which slip at once, and of drags without slip."""
     path_m = _path(skin, skin.seat_m + PLACE_M, WAY_M, np.full(len(WAY_M), DEPTH))
     normal_N = forces(skin, path_m[:, 2])
     smooth, sticky = (_drag(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
@@ -52,26 +52,26 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
     off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
     off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
-    # Without slip, layer and springs in series take up the whole path.
+    # Without slip, layer and springs, which are in series, take up the whole path.
     pulled_N = sticky.force_N[0]
     slides_m_per_N = slide.compliance_m_per_N(path_m[:, :2] - skin.seat_m, skin.sides_m, _springs(skin))
     taken_m = pulled_N / _layer_N_per_m(skin, DEPTH) + (slides_m_per_N @ pulled_N[:, :, None])[:, :, 0]
     left_m = np.abs(taken_m[:, 0] - WAY_M).max() + np.abs(taken_m[:, 1]).max()
     return [
-        measured(AREA, f"a drag with friction {SMOOTH:g} on a skin that slides",
-                 should="slips at once: friction times the normal force, and dB that of pressing alone",
-                 happened=f"{drawn_N.max():.2g} N, relative error {off_N:.1e}; dB {off_T:.1e} of its size off",
-                 error=max(off_N, off_T), limit=1e-6),
-        measured(AREA, f"a drag with friction {STICKY:g} on a skin that slides",
-                 should="sticks: layer and base, one after the other, give way by as much as the tip goes",
-                 happened=f"{np.abs(pulled_N).max():.3g} N over {WAY_M[-1] / milli:g} mm; "
-                          f"{left_m / WAY_M[-1]:.1e} of the way unaccounted for",
-                 error=float(left_m / WAY_M[-1]), limit=1e-9),
+        error_case(AREA, f"a drag with friction {SMOOTH:g} on a skin that slides",
+                   should="slips at once: friction times the normal force, and dB that of pressing alone",
+                   happened=f"{drawn_N.max():.2g} N, relative error {off_N:.1e}; dB {off_T:.1e} of its size off",
+                   error=max(off_N, off_T), limit=1e-6),
+        error_case(AREA, f"a drag with friction {STICKY:g} on a skin that slides",
+                   should="sticks: layer and base, one after the other, give way by as much as the tip goes",
+                   happened=f"{np.abs(pulled_N).max():.3g} N over {WAY_M[-1] / milli:g} mm; "
+                            f"{left_m / WAY_M[-1]:.1e} of the way unaccounted for",
+                   error=float(left_m / WAY_M[-1]), limit=1e-9),
     ]  # fmt: skip
 
 
 def lift(board: Board, skin: Skin) -> Case:
-    """Drag a skin at its centre, then lift the tip: the friction force falls with the normal force."""
+    """Drag a skin at its centre, then lift the tip: the friction force decreases with the normal force."""
     mu, errors, last_N = 1.0, [], []
     for stops_n in LIFTS_N:
         share = np.append(DEPTH, np.linspace(DEPTH, 0, stops_n + 1))
@@ -87,13 +87,13 @@ def lift(board: Board, skin: Skin) -> Case:
     happened = (
         f"in {LIFTS_N[0]} and {LIFTS_N[1]} stops: {max(errors):.1e} of the first friction off; {max(last_N):g} N left"
     )
-    return measured(AREA, "a tip that pulls the skin and is lifted there",
-                    should="the least of spring and friction so far, in any number of stops; no force once it is off",
-                    happened=happened, error=float(max(*errors, *last_N)), limit=1e-9)  # fmt: skip
+    return error_case(AREA, "a tip that pulls the skin and is lifted there",
+                      should="the least of spring and friction so far, in any number of stops; no force once it is off",
+                      happened=happened, error=float(max(*errors, *last_N)), limit=1e-9)  # fmt: skip
 
 
 def edge(board: Board, skin: Skin) -> list[Case]:
-    """Indent just inside the free edge, at the middle of a side and at a corner."""
+    """Run cases of indentations just inside the free edge, at the middle of a side and at a corner."""
     half_m = np.array(skin.sides_m) / 2 - EDGE_M
     places_m = np.array([[half_m[0], 0.0], half_m])
     pokes_m = np.column_stack([skin.seat_m + places_m, np.full(2, 0.3 * skin.thickness_m)])
@@ -111,22 +111,22 @@ def edge(board: Board, skin: Skin) -> list[Case]:
     used = skin.hold.grip_N_per_m * np.hypot(*slides.move_m.T) / force_N
     sizes_uT = ", ".join(f"{1e6 * size:.3g}" for size in np.abs(change_T).max(axis=(1, 2)))
     return [
-        observed(AREA, f"pokes {EDGE_M / milli:g} mm inside the free edge, at a side and at a corner",
-                 should="finite dB, and some: half of what the tip would press is not there, and is not made up",
-                 happened=f"at most {sizes_uT} uT",
-                 holds=bool(np.isfinite(change_T).all() and (np.abs(change_T).max(axis=(1, 2)) > 0).all())),
-        measured(AREA, "the slide of a skin that is poked at its free edge",
-                 should="the place goes where the press takes it, turn and motion together",
-                 happened=f"{np.abs(slides.spin_rad).max():.2g} rad, relative error {off:.1e}", error=off,
-                 limit=ROUNDING),
-        observed(AREA, "the force that this slide takes", should="some, and no more than friction holds",
-                 happened=f"at most {used.max():.3g} of the tip's friction",
-                 holds=bool((used > 0).all() and (used <= 1).all())),
+        condition_case(AREA, f"pokes {EDGE_M / milli:g} mm inside the free edge, at a side and at a corner",
+                       should="finite dB, and some: half of what the tip would press is not there, and is not made up",
+                       happened=f"at most {sizes_uT} uT",
+                       holds=bool(np.isfinite(change_T).all() and (np.abs(change_T).max(axis=(1, 2)) > 0).all())),
+        error_case(AREA, "the slide of a skin that is poked at its free edge",
+                   should="the place goes where the press takes it, turn and motion together",
+                   happened=f"{np.abs(slides.spin_rad).max():.2g} rad, relative error {off:.1e}", error=off,
+                   limit=ROUNDING),
+        condition_case(AREA, "the force that this slide takes", should="some, and no more than friction holds",
+                       happened=f"at most {used.max():.3g} of the tip's friction",
+                       holds=bool((used > 0).all() and (used <= 1).all())),
     ]  # fmt: skip
 
 
 def force_control(skin: Skin) -> list[Case]:
-    """Force control: the depth of a force is the same on loading and unloading."""
+    """Run cases of force control: the depth for a force is the same on loading and unloading."""
     assert skin.hold is not None
     of = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
@@ -136,12 +136,12 @@ def force_control(skin: Skin) -> list[Case]:
     held_m, counted_n = slide.depth_at(beyond_N, **of), slide.count_clipped(beyond_N, **of)
     deepest = held_m / (slide.DEEPEST * skin.thickness_m)
     return [
-        measured(AREA, f"pressed to {slide.DEEPEST:g} of the thickness by force, and let go",
-                 should="the depth of each force is the depth that gives it, down and up, without a remainder",
-                 happened=f"{force_N.max():.3g} N at most; {off:.1e} of the thickness off", error=off, limit=1e-6),
-        observed(AREA, "a force that no allowed depth gives", should="held at the deepest, and counted",
-                 happened=f"{beyond_N[-1]:.2g} N held at {deepest[-1]:.6f} of the deepest; {counted_n} counted",
-                 holds=bool(np.abs(deepest - 1).max() < ROUNDING and counted_n == 2)),
+        error_case(AREA, f"pressed to {slide.DEEPEST:g} of the thickness by force, and let go",
+                   should="the depth of each force is the depth that gives it, down and up, without a remainder",
+                   happened=f"{force_N.max():.3g} N at most; {off:.1e} of the thickness off", error=off, limit=1e-6),
+        condition_case(AREA, "a force that no allowed depth gives", should="held at the deepest, and counted",
+                       happened=f"{beyond_N[-1]:.2g} N held at {deepest[-1]:.6f} of the deepest; {counted_n} counted",
+                       holds=bool(np.abs(deepest - 1).max() < ROUNDING and counted_n == 2)),
     ]  # fmt: skip
 
 
@@ -152,7 +152,7 @@ def _drag(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float)
 def _path(
     skin: Skin, start_m: Float[np.ndarray, "2"], way_m: Float[np.ndarray, " p"], share: Float[np.ndarray, " p"]
 ) -> Float[np.ndarray, "p 3"]:
-    """Lay stops along x, at shares of the thickness."""
+    """Return stops along x, at depths given as shares of the thickness."""
     return np.column_stack([start_m[0] + way_m, np.full(len(way_m), start_m[1]), share * skin.thickness_m])
 
 

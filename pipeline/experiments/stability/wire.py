@@ -1,4 +1,4 @@
-"""Damaged streams of every wire format, compared with the intact stream."""
+"""Cases of damaged streams of every wire format, compared with the intact stream."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 
-from pipeline.experiments.stability.cases import Case, measured, peak_bytes, refused
+from pipeline.experiments.stability.cases import Case, error_case, peak_bytes, rejection_case
 from pipeline.experiments.verification.signals import CRLF_degC, make_frames
 from reskin.board.stream import FrameStream, decode_all
 from reskin.board.wire import BLOCK_FRAMES_N, TEXT_WIRES, Frames, Wire, concatenate, encode
@@ -18,19 +18,19 @@ AREA = "wire"
 FRAMES_N = 40
 CUT_I = 20  # the frame in which a stream is damaged
 GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
-BLOCKS_N = 3  # and four times as many
+BLOCKS_N = 3  # memory for this number of blocks is compared with that for four times as many
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A damaged stream, and the losses allowed; all bytes must be accounted for in any case."""
+    """A damaged stream, and the losses that are allowed; all bytes must always be accounted for."""
 
     case: str
     should: str
     portions: Sequence[bytes]
     lost_n: int = 0
     false_n: int = 0
-    not_finite_n: int | None = 0  # exactly; None where garbage may look like a frame with NaN
+    not_finite_n: int | None = 0  # exact number; None if garbage may look like a frame with NaN
 
 
 def wire_cases(gain_sel: int, chips_n: int, seed: int) -> list[Case]:
@@ -40,7 +40,7 @@ def wire_cases(gain_sel: int, chips_n: int, seed: int) -> list[Case]:
     wires = get_args(Wire)
     return [
         *(decode_damaged(damage, frames, wire) for wire in wires for damage in _damages(frames, wire)),
-        *(decode_damaged(joined(full, wire, 0.5), full, wire) for wire in wires if wire not in TEXT_WIRES),
+        *(decode_damaged(join_mid_frame(full, wire, 0.5), full, wire) for wire in wires if wire not in TEXT_WIRES),
         *_refusals(frames),
         *(_memory(frames, wire) for wire in ("binary", "text-xyzt")),
     ]
@@ -66,7 +66,7 @@ def _damages(frames: Frames, wire: Wire) -> list[Damage]:
     ]  # fmt: skip
 
 
-def joined(frames: Frames, wire: Wire, where: float) -> Damage:
+def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
     """Start reading a stream inside its first frame."""
     data = encode(frames, wire)
     first_end = _clean(data, wire, frames).end_byte.tolist()[0]
@@ -76,7 +76,7 @@ def joined(frames: Frames, wire: Wire, where: float) -> Damage:
 
 def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
     """Decode a damaged stream, and count lost frames, false frames and bytes."""
-    kept, account = deliver(damage.portions, wire, frames.temperature_degC.shape[1])
+    kept, account = decode_portions(damage.portions, wire, frames.temperature_degC.shape[1])
     sent, got = (Counter(records(of)) for of in (_clean(encode(frames, wire), wire, frames), kept))
     missing_n, false_n = (sent - got).total(), (got - sent).total()
     skipped_n = sum(n for name, n in account.items() if name.startswith("skipped_"))
@@ -93,7 +93,7 @@ def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
 
 def _refusals(frames: Frames) -> list[Case]:
     chips_n = frames.temperature_degC.shape[1]
-    # At room temperature no CR LF stands in a float, where a frame of another length could end by chance.
+    # At room temperature no float contains CR LF, at which a frame of another length could end by chance.
     data = encode(replace(frames, temperature_degC=np.full_like(frames.temperature_degC, 25.0)), "binary")
     attempts: dict[str, tuple[bytes, Wire, int, str]] = {
         "a stream without a byte": (b"", "binary", chips_n, "refused"),
@@ -101,7 +101,7 @@ def _refusals(frames: Frames) -> list[Case]:
         "binary read as text": (data, "text-xyzt", chips_n, "refused, with what would fit"),
     }
     return [
-        refused(AREA, case, should=should, attempt=partial(decode_all, octets, wire, n, "stream.bin"))
+        rejection_case(AREA, case, should=should, attempt=partial(decode_all, octets, wire, n, "stream.bin"))
         for case, (octets, wire, n, should) in attempts.items()
     ]
 
@@ -121,8 +121,8 @@ def _memory(frames: Frames, wire: Wire) -> Case:
     happened = (
         f"blocks of {frames_n} frames: {BLOCKS_N} need {few_n / 1e6:.1f} MB, {4 * BLOCKS_N} need {many_n / 1e6:.1f} MB"
     )
-    return measured(AREA, f"a stream of any length ({wire})", should="no more memory for a longer stream, within 2 %",
-                    happened=happened, error=many_n / few_n - 1, limit=0.02)  # fmt: skip
+    return error_case(AREA, f"a stream of any length ({wire})", should="no more memory for a longer stream, within 2 %",
+                      happened=happened, error=many_n / few_n - 1, limit=0.02)  # fmt: skip
 
 
 def _with_not_finite(frames: Frames, wire: Wire) -> bytes:
@@ -141,7 +141,7 @@ def _clean(data: bytes, wire: Wire, frames: Frames) -> Frames:
     return decode_all(data, wire, frames.temperature_degC.shape[1], "stability")[0]
 
 
-def deliver(portions: Sequence[bytes], wire: Wire, chips_n: int) -> tuple[Frames, dict[str, int]]:
+def decode_portions(portions: Sequence[bytes], wire: Wire, chips_n: int) -> tuple[Frames, dict[str, int]]:
     """Decode a stream in portions; return frames and counts."""
     stream = FrameStream(wire, chips_n)
     parts = [stream.feed(portion) for portion in portions]
@@ -149,5 +149,5 @@ def deliver(portions: Sequence[bytes], wire: Wire, chips_n: int) -> tuple[Frames
 
 
 def records(frames: Frames) -> list[bytes]:
-    """Return the values of each frame as bytes, for comparison."""
+    """Return the values of each frame as bytes, so that frames can be compared."""
     return [row.tobytes() for row in np.hstack([frames.temperature_degC, frames.b_uT])]

@@ -1,4 +1,4 @@
-"""Verification of the simulator: each part against a reference that shares no code with it."""
+"""Verification of the simulator: each part is compared with a reference that shares no code with it."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -47,6 +47,6 @@ def verification(settings: Settings, results: Path) -> None:
         if not check.holds:
             say(
                 f"warning: {settings.scene}: {check.subject}, {check.law}: "
-                f"error {check.error:.3g}, past {check.tolerance:.3g}"
+                f"error {check.error:.3g} exceeds the tolerance {check.tolerance:.3g}"
             )
     say(f"{settings.scene}: {sum(check.holds for check in checks)} of {len(checks)} checks of the physics hold")

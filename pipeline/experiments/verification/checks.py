@@ -1,6 +1,6 @@
 """A row of the verification table, and the error measures that its checks use.
 
-The modules beside this one return checks for any inputs: the experiment tabulates those of a scene, tests draw others.
+The other modules of this package run checks on any inputs: the experiment uses those of a scene, tests draw others.
 """
 
 from dataclasses import dataclass
@@ -40,12 +40,12 @@ def relative_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*
 
 
 def scaled_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Return the largest absolute error over the largest absolute true value."""
+    """Return the ratio of the largest absolute error to the largest absolute true value."""
     return float(np.abs(found - truth).max() / np.abs(truth).max())
 
 
 def norm_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Return the Euclidean norm of the errors over that of the true values."""
+    """Return the ratio of the Euclidean norm of the errors to that of the true values."""
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 

@@ -30,7 +30,7 @@ from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
-HALF_SPACE_M = 100.0  # thickness of a layer whose base does not matter under a tip of millimetres
+HALF_SPACE_M = 100.0  # thickness of a layer whose base has no influence under a tip of a few millimetres
 A0 = 1.770  # integral of 1 - compliance (Dimitriadis et al. 2002 fit 1.780)
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002, powers of chi = sqrt(R d) / h
 RINGS_N = 40
@@ -40,7 +40,7 @@ BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)
 
 
 def check_contact(skin: SkinDesign) -> list[Check]:
-    """Check the layer's compliance, and the force down to 0.6 of the thickness, the range of published solutions."""
+    """Check the layer's compliance, and the force for depths up to 0.6 of the thickness, as in published solutions."""
     bonded = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
     sliding = IndentedLayer(bonded.thickness_m, bonded.tip_radius_m, "slipping")
     depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
@@ -166,7 +166,7 @@ def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarr
 
 
 def _disc_deflection_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float:
-    # Under unit pressure / 2G on a disc: that of a half-space (elliptic integrals) less the effect of the base.
+    # Deflection under unit pressure / 2G on a disc: a half-space's (elliptic integrals) less the effect of the base.
     m = (min(r_m, disc_m) / max(r_m, disc_m)) ** 2
     free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
     k = np.linspace(1e-3, 25, 1500) / h_m
@@ -226,19 +226,22 @@ def straight_drag(
                  )  # fmt: skip
 
 
-STEPS_N = 12  # of 0.1 mm at 1.2 mm
+STEPS_N = 12  # of 0.1 mm each for a depth of 1.2 mm
 STEP_M = 1e-7  # of finite differences
 HELD = {"bonded": "stays", "slipping": "keeps its height"}
 
 
 def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check one linear step, and the deformation down to a depth."""
+    """Check one linear step, and the finite deformation down to a depth."""
     far = far_field(press, depth_m) if press.base == "slipping" else []
     return [*one_small_step(press, depth_m), *finite_deformation(press, depth_m), *sunken_surface(press, depth_m), *far]
 
 
 def descent(depth_m: float, steps_n: int = STEPS_N) -> Float[np.ndarray, " d"]:
-    """List depths from 0 in even steps; the first is cut in four and in two, as the contact radius grows as a root."""
+    """List depths from 0 in equal steps; stops at a quarter and half of the first are added.
+
+    At small depths the contact radius grows as a square root.
+    """
     even = np.linspace(0, depth_m, steps_n + 1)
     return np.concatenate([[0.0, even[1] / 4, even[1] / 2], even[1:]])
 
@@ -312,7 +315,7 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 
 
 def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check that on a slipping base the displaced volume flows out through every circle around the tip."""
+    """Check that, on a slipping base, the displaced volume flows out through every circle around the tip."""
     h_m = press.thickness_m
     r_m, z_m = (part.ravel() for part in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
     end = deformation.follow(r_m, z_m, descent(depth_m), press=press)[-1]
@@ -329,10 +332,10 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
     return r_m.ravel(), z_m.ravel()
 
 
-def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
+def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
     """Follow all dipoles of a skin through an indentation to true depths without a table; then slide the skin.
 
-    Each moment turns by R of F = R U, from a singular value decomposition. No dipole may lie on the axis.
+    Each moment rotates by R of F = R U, from a singular value decomposition. No dipole may be on the tip's axis.
     """
     away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
@@ -353,9 +356,9 @@ def followed(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.nda
 
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # for checks that hold for any rule
 DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # for the errors of the table and of the steps
-EVERY_PLACE = 5  # of the protocol's 65
+EVERY_PLACE = 5  # every fifth of the protocol's 65 places
 REFERENCE_STEPS_N = 16
-UNSEEN_uT = 1.0  # a third of a chip's noise, to which it adds 5 %, as squares add
+UNSEEN_uT = 1.0  # a third of a chip's noise; added in squares, it increases the noise by 5 %
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # on no node's axis
 Places = Float[np.ndarray, "p 2"]
 
@@ -375,7 +378,7 @@ def check_indentations(
         skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
     )
     dense = skin_of(DENSE)
-    # The rig's compliance has a direction: without it there are symmetries.
+    # The rig's compliance has a direction, so the symmetries hold only without it.
     even = (
         skin
         if skin.hold is None
@@ -400,7 +403,7 @@ def quadrature(
     pokes_m: Float[np.ndarray, "n 3"],
     unseen_uT: float = UNSEEN_uT,
 ) -> list[Check]:
-    """Compare dB with that of the same skin on narrower cells, and on more layers."""
+    """Compare dB with that of the same skin with narrower cells, and with more layers."""
     found_T, cells_T, layers_T = (changes_of_field(board, each, pokes_m)[1] for each in (skin, *fine))
     size_T = np.linalg.norm(cells_T, axis=(1, 2), keepdims=True)
     allowed_T = np.maximum(0.02 * size_T, unseen_uT * micro)
@@ -424,7 +427,7 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
     _, found_T = changes_of_field(board, skin, pokes_m)
     before_T = field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
     depths_m = descent(depth_m + skin.depth_zero_m, REFERENCE_STEPS_N)
-    moved = [followed(skin, place_m, depths_m) for place_m in places_m]
+    moved = [follow_dipoles(skin, place_m, depths_m) for place_m in places_m]
     truth_T = np.stack([field_of(dipoles, board.chips_m) - before_T for dipoles in moved])
     return Check("dB of pokes", f"table, steps and kernel, {kind} depth ({depth_m / milli:g} mm)",
                  f"each node followed in {REFERENCE_STEPS_N} steps, F = R U by SVD, magpylib's dipoles",
@@ -433,7 +436,10 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
-    """Rotate, mirror and shift board, skin and indentations without spreads; the shift holds for any skin."""
+    """Check that dB rotates, mirrors or stays with board, skin and indentations (without spreads).
+
+    The check by shifting holds for any skin.
+    """
     sign = -1 if polarity == "checkerboard" else 1  # a quarter turn, or a mirror in x, swaps a checkerboard's poles
     mirror, shift_m = np.diag([-1.0, 1.0, 1.0]), np.array([0.4, -0.7, 0.0]) * milli
     pokes_m = each_depth(places_m, (0.3 * skin.thickness_m,))
@@ -457,7 +463,7 @@ def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = 
 def amplitude(
     board: Board, skin: Skin, stronger: Skin, *, pokes_m: Float[np.ndarray, "n 3"], factor: float = 2.5
 ) -> Check:
-    """Compare dB with that of a skin that is magnetised `factor` times as strongly."""
+    """Check that dB is `factor` times as large if the skin is magnetised `factor` times as strongly."""
     once_T, more_T = (_change(board.chips_m, each, pokes_m) for each in (skin, stronger))
     return Check("dB of pokes", "proportional to the magnetisation", f"itself, {factor:g} times",
                  scaled_error(more_T, factor * once_T), "1", 1e-12, "rounding")  # fmt: skip

@@ -1,6 +1,6 @@
 """Checks of magnetic fields, chips, wire formats and relaxation.
 
-References: magpylib, Maxwell's equations, the data sheet, recorded noise, struct, and 50 digits (mpmath).
+References: magpylib, Maxwell's equations, the data sheet, recorded noise, struct, and mpmath with 50 digits.
 """
 
 import struct
@@ -26,7 +26,7 @@ from reskin.physics.magnet import Dipoles, Quadrature, change_of_field, place_no
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 
-NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in sizes of a cell
+NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in units of a cell's side
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
 MU_0_DIGITS = 1e-8  # between CODATA years mu_0 differs by 1e-10 to 1e-9
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter turn about z
@@ -122,7 +122,7 @@ def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polar
 
 def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     rng = rng_for(seed, "verification", "dipoles")
-    # Off the origin, or a wrong sign of the separation could go unnoticed.
+    # Not centred at the origin: otherwise a wrong sign of the separation could go unnoticed.
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), (60, 3))
     moments = 1e-5 * rng.standard_normal((60, 3))
     moved_m, turned = nodes_m + 1e-4 * rng.standard_normal((60, 3)), moments + 1e-6 * rng.standard_normal((60, 3))
@@ -173,7 +173,7 @@ def quiet(gain_sel: int) -> ChipDesign:
 def read_bare(
     b_T: Float[np.ndarray, "f 3"], design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f 3"], Overruns]:
-    """Read a field with one ideal chip: not rotated, gain one, no offset."""
+    """Read a field with one ideal chip: no rotation, gain one, no offset."""
     eye = np.eye(3)[None]
     return read_field(b_T[:, None], Board("bare", np.zeros((1, 3)), eye, eye, np.zeros((1, 3))), design=design, rng=rng)
 
@@ -210,7 +210,7 @@ def conversion(gain_sel: int, seed: int) -> list[Check]:
 def noise(chip: ChipDesign, seed: int) -> list[Check]:
     read_uT, _ = read_bare(np.zeros((STILL_FRAMES_N, 3)), chip, rng_for(seed, "verification", "noise"))
     sd_uT = read_uT.std(axis=0)
-    # The noise of the design, and the rounding of counts.
+    # Noise of the design plus rounding to counts.
     design_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     expected_uT = np.sqrt(design_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12)
     low_uT, high_uT = np.array([RECORDED_NOISE_uT[axis == 2] for axis in range(3)]).T
@@ -239,7 +239,7 @@ CRLF_SHARE = 0.05
 
 
 def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
-    """Check encoding and decoding of each wire format; the error is the largest difference of any value."""
+    """Check encoding and decoding of each wire format; the error is the largest difference between any two values."""
     frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "verification", "frames"))
     laws: dict[Wire, Callable[[Frames, Wire], list[Check]]] = {
         "binary": binary,
@@ -251,7 +251,7 @@ def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
 
 
 def make_frames(frames_n: int, chips_n: int, *, gain_sel: int, rng: np.random.Generator) -> Frames:
-    """Make readings on the chip's grid; some temperatures contain CR LF in their bytes."""
+    """Make readings that are whole counts of the chip; the bytes of some temperatures contain CR LF."""
     counts = rng.integers(-20_000, 20_000, (frames_n, chips_n, 3))
     b_uT = (counts * steps_uT(gain_sel)).reshape(frames_n, -1).astype(np.float32)
     usual_degC = (rng.integers(2000, 4000, (frames_n, chips_n)) / 100).astype(np.float32)
@@ -319,7 +319,7 @@ ROUNDING = 1e-14  # a few dozen operations on doubles
 
 
 def check_relaxation() -> list[Check]:
-    """Check repeated indentations, single steps of any stiffness, and a held indentation."""
+    """Check relaxation in repeated indentations, in single steps of any stiffness, and in a held indentation."""
     steps = [step_error(1e-3 * dt, stiff(ratio)) for ratio, dt in product(RATIOS, STEPS)]
     return [
         many_pokes(),
@@ -330,7 +330,7 @@ def check_relaxation() -> list[Check]:
 
 
 def stiff(ratio: float) -> Prony:
-    """Return three relaxation times: 1 ms, `ratio` times as long, and their geometric mean."""
+    """Return a relaxation with three times: 1 ms, `ratio` times as long, and their geometric mean."""
     return Prony(np.array([1e-3, 1e-3 * np.sqrt(ratio), 1e-3 * ratio]), np.array([0.3, 0.2, 0.1]))
 
 
@@ -351,7 +351,7 @@ def held(time_s: Float[np.ndarray, " t"]) -> Check:
 
 
 def step_error(dt_s: float, prony: Prony) -> float:
-    """Return the error of a step of `aging.advance` against its formula in 50 digits."""
+    """Return the error of a step of `aging.advance` against its formula evaluated with 50 digits."""
     with mpmath.workdps(50):
         truth = []
         for q, tau, share in zip(STATE.tolist(), prony.tau_s.tolist(), prony.share.tolist(), strict=True):
@@ -364,9 +364,9 @@ def step_error(dt_s: float, prony: Prony) -> float:
 def hereditary(
     time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], prony: Prony
 ) -> Float[np.ndarray, " t"]:
-    """Return Lee & Radok's integral of relaxation(t - s) d elastic(s) in 50 digits, summed over all ramps.
+    """Return Lee & Radok's integral of relaxation(t - s) d elastic(s) with 50 digits, summed over all ramps.
 
-    Unlike `aging.relax` it carries no state from ramp to ramp.
+    Unlike `aging.relax`, it does not carry a state from ramp to ramp.
     """
     with mpmath.workdps(50):
         t, e, tau, share = (

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 
 from pipeline.experiments.contacts import (
     TOLERANCE_MM,
-    along_the_line,
+    compare_prediction,
     detection_rates,
     draw_pairs,
     keep_aside,
+    position_along_line,
     summarise_nested,
-    where_it_falls,
 )
 from reskin.data.grid import points_mm
 from reskin.errors import ParamsError
@@ -65,7 +65,7 @@ def test_weaker_contact_without_forces_has_the_smaller_field():
     pairs = pairs_at(4.0, rows=rows)
     length = [np.linalg.norm(rows.db_uT[side], axis=1) for side in (pairs.weaker, pairs.stronger)]
     assert (length[0] <= length[1]).all()
-    numbers = where_it_falls(rows.target[pairs.weaker], rows.target[pairs.stronger], ROWS.target[pairs.weaker])
+    numbers = compare_prediction(rows.target[pairs.weaker], rows.target[pairs.stronger], ROWS.target[pairs.weaker])
     assert not {"force_over_sum", "force_over_larger"} & set(numbers)
 
 
@@ -88,7 +88,7 @@ def contacts_of(*rows):
 def test_prediction_between_two_known_contacts():
     weaker, stronger = contacts_of([0, 0, 1], [0, 0, 1]), contacts_of([4, 0, 3], [0, 8, 3])
     predicted = contacts_of([3, 0.5, 4], [0, 5, 2])
-    numbers = where_it_falls(weaker, stronger, predicted)
+    numbers = compare_prediction(weaker, stronger, predicted)
     assert numbers["near_either_pct"] == 50  # the first: 1 mm and 0.5 mm from the stronger
     assert numbers["nearest_mm"] == pytest.approx((np.hypot(1, 0.5) + 3) / 2)
     assert numbers["along"] == pytest.approx((3 / 4 + 5 / 8) / 2)
@@ -102,7 +102,7 @@ def test_perpendicular_offset_keeps_the_projection(share, aside_mm):
     weaker, stronger = contacts_of([2, 3, 1]), contacts_of([5, 7, 2])
     foot = weaker[0] + share * (stronger - weaker)[0]
     predicted = contacts_of(foot + aside_mm * np.array([-0.8, 0.6, 0]))
-    assert along_the_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # float32
+    assert position_along_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # float32
 
 
 @pytest.mark.parametrize(
