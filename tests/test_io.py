@@ -48,7 +48,7 @@ def test_readings_are_written_reproducibly(tmp_path):
 
 
 def test_capture_without_readings_is_an_error(tmp_path):
-    with pytest.raises(SchemaError, match="no reading left"):
+    with pytest.raises(SchemaError, match="no readings left"):
         io.write_readings(tmp_path / "c0.parquet", [], {})
     assert list(tmp_path.iterdir()) == []
 
@@ -145,7 +145,7 @@ def test_wrong_unit_is_an_error(tmp_path):
 def test_missing_column_is_an_error(tmp_path):
     io.write_readings(tmp_path / "c0.parquet", [readings()], {})
     io.write_table(tmp_path / "c1.parquet", pq.read_table(tmp_path / "c0.parquet").drop_columns(["noload_uT"]))
-    with pytest.raises(SchemaError, match="no column noload_uT"):
+    with pytest.raises(SchemaError, match="column noload_uT is missing"):
         io.read_readings(tmp_path / "c1.parquet")
 
 
