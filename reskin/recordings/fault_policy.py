@@ -1,6 +1,6 @@
 """Policy for faulty readings, by fault: drop them, flag (keep and count) them, or refuse the recording.
 
-`FaultLog` applies it to a stream in portions, `check_rows` to a table as a whole; both count what they find.
+`FaultLog` applies it to a stream in portions, `check_rows` to a whole table; both count the faults that they find.
 """
 
 import math
@@ -24,7 +24,7 @@ from reskin.board.faults import (
 from reskin.config import Strict
 from reskin.errors import CaptureError, ParamsError
 
-USUAL_LSB = "that of the other chips, and not a reset chip's"
+USUAL_LSB = "that of the other chips, and not that of a reset chip"
 
 Action = Literal["drop", "flag", "refuse"]
 DropOrRefuse = Literal["drop", "refuse"]  # bytes between frames cannot be kept
@@ -35,18 +35,18 @@ class FaultPolicy(Strict):
     """The action taken for each fault; section `faults` of `params.yaml`."""
 
     failed_read: Action  # the I2C read of a chip failed
-    zeros: Action  # in place of a reading
-    stuck: Action  # a chip stays the same while others move
+    zeros: Action  # zeros in place of a reading
+    stuck: Action  # the readings of a chip stay the same while others change
     constant_channel: FlagOrRefuse  # Bx, By or Bz of a chip never changes while its other channels do
     chip_reset: FlagOrRefuse  # a chip's LSB is not that of the others, or changes
     too_hot: Action  # or too cold: temperature out of range
     saturated: Action  # field at the end of the chip's range
     int16_wrap: Action  # field jumps by more than int16 holds
-    repeated: Action  # frames come again, far more often than a fast loop sends them
-    dropped: FlagOrRefuse  # frames are missing by the board's clock
-    clock_jump: FlagOrRefuse  # the board's clock falls, or jumps
-    unplug: FlagOrRefuse  # nothing comes for a second or more
-    torn: DropOrRefuse  # bytes between frames that belong to none
+    repeated: Action  # identical frames follow each other, far more often than in a fast loop
+    dropped: FlagOrRefuse  # frames are missing, according to the board's clock
+    clock_jump: FlagOrRefuse  # the board's clock goes backwards, or jumps
+    unplug: FlagOrRefuse  # no data arrives for a second or more
+    torn: DropOrRefuse  # bytes between frames that belong to no frame
     wrong_baud: DropOrRefuse  # many such bytes in a row
 
 
@@ -78,9 +78,9 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
 
 @dataclass
 class FaultRecord:
-    """How often a fault was seen, first and last where (s of the stream, or rows from 1), and the action taken.
+    """How often a fault was seen, where it was first and last (s of the stream, or rows from 1), and the action taken.
 
-    Places are NaN as long as no time is known: the last bytes before a recorder was killed may have none.
+    The positions are NaN until a time is known: the last bytes before a recorder was killed may have no time.
     """
 
     count_n: int
@@ -90,9 +90,9 @@ class FaultRecord:
 
 
 class CheckedRows(NamedTuple):
-    """Masks of the frames or rows to keep, and of those dropped: not read, else a stuck chip, else out of range.
+    """Masks of the frames or rows to keep, and of those dropped, by the first reason: failed read, stuck chip, range.
 
-    `counts` has each fault's count, action and span, as accounts have them.
+    `counts` has the count, action and span of each fault, under the keys of an account.
     """
 
     keep: Bool[np.ndarray, " f"]
@@ -112,17 +112,17 @@ class CheckedRows(NamedTuple):
         }
 
     def part(self, rows: slice) -> "CheckedRows":
-        """Return some of the rows; `counts` stay those of all."""
+        """Return some of the rows; `counts` stays that of all rows."""
         return CheckedRows(self.keep[rows], self.failed[rows], self.stuck[rows], self.out_of_range[rows], self.counts)
 
 
 class FaultLog:
-    """Apply a policy to the faults of a recording, and count them; `unit` is that of places in accounts."""
+    """Apply a policy to the faults of a recording, and count them; `unit` is the unit of positions in accounts."""
 
     def __init__(self, policy: FaultPolicy, where: str, unit: Literal["ms", "row"]) -> None:
         self.records: dict[str, FaultRecord] = {}
         self._policy, self._where, self._unit = policy, where, unit
-        self._per_unit = {"ms": 1000, "row": 1}[unit]  # places are given in s, or rows
+        self._per_unit = {"ms": 1000, "row": 1}[unit]  # positions are passed in as s or rows
         self._span: tuple[float, float] | None = None
 
     def record(
@@ -132,7 +132,7 @@ class FaultLog:
         at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
         count_n: int | None = None,
     ) -> Bool[np.ndarray, " f"]:
-        """Count a fault where `mask` is set, or `count_n` times; return the mask of what is dropped for it.
+        """Count a fault where `mask` is set, or `count_n` times; return the mask of what the policy drops for it.
 
         Raises `CaptureError` if the policy refuses recordings with this fault.
         """
@@ -178,9 +178,9 @@ class FaultLog:
     def record_readings(
         self, readings: ReadingFaults, at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"]
     ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-        """Record the faults of single readings, each row under the first that fits.
+        """Record the faults of single readings.
 
-        Returns masks of the dropped rows: not read, and out of range.
+        Returns masks of the dropped rows: those with a failed read, and of the others those out of range.
         """
         failed, zeros = np.asarray(readings.failed_read.any(axis=1)), np.asarray(readings.zeros.any(axis=1))
         dropped = self.record("failed_read", failed, at) | self.record("zeros", zeros & ~failed, at)
@@ -213,18 +213,21 @@ class FaultLog:
     def record_constant(
         self, channels: list[str], at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"] | None = None
     ) -> None:
-        """Record channels that never changed in a whole recording, or refuse it; `at` None: the span of the stream."""
+        """Record channels that never changed in a whole recording, or refuse the recording.
+
+        `at` holds the positions; None stands for the span of the stream.
+        """
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
-                f"{self._where}: no change in the whole recording of {', '.join(channels)}. Check the wiring, the chip "
-                "and the columns, and record again; or accept it by faults: constant_channel: flag in params.yaml."
+                f"{self._where}: {', '.join(channels)} never changed in the whole recording. Check the wiring, the "
+                "chip and the columns, and record again; or accept it by faults: constant_channel: flag in params.yaml."
             )
         if channels:
             at = np.array(self._span) if at is None else at
             self.record("constant_channel", np.ones(len(at), bool), at)
 
     def account(self) -> dict[str, int]:
-        """Return the count and action of each fault found and, if known, its span, as accounts have them."""
+        """Return the count, action and (if known) span of each fault that was found."""
         account: dict[str, int] = {}
         done = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
         for fault, found in self.records.items():
@@ -244,9 +247,9 @@ def check_rows(
     policy: FaultPolicy,
     row: Int[np.ndarray, " f"] | None = None,
 ) -> CheckedRows:
-    """Find the faults of a table of readings as a whole, and decide which rows to keep.
+    """Find the faults of a whole table of readings, and decide which rows to keep.
 
-    A wrong LSB shows among all rows that were read, kept or not.
+    The LSB is checked on all rows without a failed read, whether they are kept or not.
 
     Parameters
     ----------
@@ -255,7 +258,7 @@ def check_rows(
     Raises
     ------
     CaptureError
-        if no row holds a reading of every chip, or for a fault that the policy refuses.
+        If no row has a reading of every chip, or for a fault that the policy refuses.
     """
     log = FaultLog(policy, where, "row")
     row = 1 + np.arange(len(b_uT)) if row is None else row

@@ -1,6 +1,6 @@
 """Turn a capture of any layout into readings, with an account of every lost or dropped byte and row.
 
-Frames are joined to the dwells of the probe log by the clocks of both.
+Frames are assigned to the dwells of the probe log by time, after the two clocks are aligned.
 """
 
 from collections import Counter
@@ -49,12 +49,12 @@ COUNTS = (
     "dropped_no_noload_indentations_n",
 )
 
-OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # in the account only where there are some
+OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # in the account only if there are such frames
 
 
 @dataclass(frozen=True)
 class TimedFrames:
-    """Frames with the stream time of each (NaN: unknown, as for all that follow), and which of them to keep."""
+    """Frames, the stream time of each (NaN: unknown for this frame and all later ones), and which frames to keep."""
 
     frames: Frames
     t_s: Float64[np.ndarray, " f"]
@@ -63,7 +63,7 @@ class TimedFrames:
 
 @dataclass(frozen=True)
 class _Held:
-    """Frames that lie in a dwell, in order of time."""
+    """Frames within a dwell, in order of time."""
 
     dwell_i: Int64[np.ndarray, " f"]
     t_s: Float64[np.ndarray, " f"]
@@ -81,7 +81,7 @@ class _Held:
 def join(
     blocks: Iterable[TimedFrames], log: ProbeLog, clock: ClockMap, header: Header, account: dict[str, int]
 ) -> Iterator[Readings]:
-    """Yield the readings of indentations that are over; `account` is complete once the last one was taken."""
+    """Yield the readings of finished indentations; `account` is complete once the last was yielded."""
     joiner = Joiner(log, clock, header)
     for block in blocks:
         readings = joiner.feed(block)
@@ -94,10 +94,11 @@ def join(
 
 
 class Joiner:
-    """Sorts frames into dwells; holds back the indentation that may still grow.
+    """Sorts frames into dwells; holds back the indentation that may still get frames.
 
-    A frame counts under the first reason that fits: no time, not finite, failed read, stuck chip, between dwells. The
-    no-load field of an indentation is the mean over its no-load dwell. `t_s` of a reading is the stream's time.
+    A dropped frame is counted under the first reason that applies: no time, not finite, failed read, stuck chip, out of
+    range, between dwells. The no-load field of an indentation is the mean over its no-load dwell. `t_s` of a reading is
+    stream time.
     """
 
     def __init__(self, log: ProbeLog, clock: ClockMap, header: Header) -> None:
@@ -111,7 +112,7 @@ class Joiner:
         self._count: Counter[str] = Counter()
 
     def feed(self, block: TimedFrames) -> Readings:
-        """Take the next frames; give the readings of all indentations that are now over (often none)."""
+        """Take the next frames; return the readings of all indentations that are now over (often none)."""
         probe_s = self._clock.probe_s(block.t_s)
         held = self._held.then(self._sort(block, probe_s))
         known_s = probe_s[np.isfinite(probe_s)]
@@ -130,7 +131,7 @@ class Joiner:
         return self._readings(held)
 
     def account(self) -> dict[str, int]:
-        """Count frames and indentations so far, by what became of them; each total is the sum of its parts."""
+        """Count the frames and indentations so far, used and dropped by reason; each total is the sum of its parts."""
         counted = {name: self._count[name] for name in COUNTS}
         counted |= {OUT_OF_RANGE: self._count[OUT_OF_RANGE]} if self._count[OUT_OF_RANGE] else {}
         logged_n = int((~self._log.contact).sum())
@@ -158,7 +159,7 @@ class Joiner:
         return _Held(dwell_i[keep], block.t_s[keep], frames.b_uT[keep], frames.temperature_degC[keep])
 
     def _readings(self, held: _Held) -> Readings:
-        """Turn the frames of whole indentations into readings, and count those that lack their other half."""
+        """Turn the frames of whole indentations into readings; count those without a no-load dwell or a contact."""
         group_i, contact = self._group_i[held.dwell_i], self._log.contact[held.dwell_i]
         with_noload, with_contact = group_i[~contact], group_i[contact]
         paired_noload, paired = np.isin(with_noload, with_contact), np.isin(with_contact, with_noload)
@@ -196,7 +197,7 @@ class Joiner:
 def _means(
     b_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"], wanted_i: Int64[np.ndarray, " g"]
 ) -> tuple[Float32[np.ndarray, "i ch"], Int64[np.ndarray, " g"]]:
-    """Return the mean field of each run of equal `group_i`, and the run that each of `wanted_i` belongs to."""
+    """Return the mean field of each run of equal `group_i`, and the index of the run for each of `wanted_i`."""
     runs_i, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
     if not len(runs_i):
         return b_uT, wanted_i
@@ -211,16 +212,16 @@ def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
 
 
 BLOCK_BYTES_N = 2**22
-SPREAD_MAX_degC = 10.0  # of the chips of one board, in one block
-# A whole that is counted, and the prefix and suffix of counts of its lost parts.
+SPREAD_MAX_degC = 10.0  # between the chips of one board, in one block
+# The key of a total, and the prefix and suffix of the keys that count its lost parts.
 LOSSES = (
     ("bytes_n", "skipped_", "_bytes_n"),
     ("frames_n", "dropped_", "_frames_n"),
     ("rows_read_n", "dropped_", "_rows_n"),
     ("logged_indentations_n", "dropped_", "_indentations_n"),
 )
-# Frames between dwells, and those of a dwell without its counterpart, are expected; so are rows of zeros where a
-# recorder asks faster than chips answer, of which its reader allows so many.
+# Not losses: frames between dwells, frames of a dwell without its counterpart, and rows of zeros, which a recorder
+# writes when it polls faster than the chips measure (the reader limits their number).
 NO_LOSS = (
     "dropped_between_dwells_frames_n",
     "dropped_no_noload_frames_n",
@@ -228,7 +229,7 @@ NO_LOSS = (
     "dropped_zero_rows_n",
 )
 
-Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]  # frames, and how many came before -> stream time of each
+Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]  # frames, number of earlier frames -> stream time of each
 
 
 class Opened(NamedTuple):
@@ -240,7 +241,7 @@ class Opened(NamedTuple):
 
 
 def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
-    """Check a capture's header and files, and begin to read it; `policy` says what becomes of faults."""
+    """Check a capture's header and files, and begin to read it; `policy` decides what to do about faults."""
     header = read_header(folder)
     check_same_capture(header, folder.name)
     for name, digest in header.files.items():
@@ -263,7 +264,7 @@ def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
 def read_header(folder: Path) -> Header:
     file = folder / HEADER_FILE
     if not file.is_file():
-        raise CaptureError(f"{file}: file not found, so this is no capture folder. Is it another --layout?")
+        raise CaptureError(f"{file}: file not found, so this is not a capture folder. Is it another --layout?")
     return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
 
 
@@ -281,7 +282,7 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
     """Begin to read a capture; the account is complete when the readings are exhausted.
 
-    Without sync marks the stream is read twice, first for the clock.
+    Without sync marks the stream is read twice, the first time to align the clocks.
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
@@ -308,7 +309,7 @@ def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFr
 def _timed_frames(
     folder: Path, header: Header, times_of: Timer, account: dict[str, int], policy: FaultPolicy
 ) -> Iterator[TimedFrames]:
-    """Decode the stream block by block; its own account and that of its faults are added when it has ended."""
+    """Decode the stream block by block; the counts of its bytes and faults are added to `account` at its end."""
     wire, where = _wire(header), str(folder / STREAM_FILE)
     stream, log = FrameStream(wire, header.chips_n), FaultLog(policy, where, "ms")
     frame_bytes_n = None if wire in TEXT_WIRES else record_type(wire, header.chips_n).itemsize
@@ -333,9 +334,9 @@ def _timed_frames(
 
 
 def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
-    """Check the first frames that were read for fields in other units and for the other order of text.
+    """Check the first good frames for wrong units, and for the other column order of text formats.
 
-    Returns False if no frame was read yet.
+    Returns False if there is no such frame yet.
     """
     read = np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
     read &= ~find_reading_faults(frames.b_uT, frames.temperature_degC).failed_rows
@@ -348,7 +349,7 @@ def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
         (low, high), swapped = np.percentile(temperature_degC, [5, 95]), np.percentile(swapped_degC, [5, 95])
         alike = float(swapped[1] - swapped[0]) < SPREAD_MAX_degC < float(high - low)
         if not _mostly_possible(temperature_degC) or (alike and _mostly_possible(swapped_degC)):
-            rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and alike on all chips"
+            rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and similar on all chips"
             remedy = f"Is the wire format {other}?"
             raise CaptureError(where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
     check_fields(b_uT, where, first_line_n=1)
@@ -361,7 +362,7 @@ def _mostly_possible(temperature_degC: Float32[np.ndarray, "f k"]) -> bool:
 
 
 def timer(folder: Path, header: Header) -> Timer:
-    """Choose how frames get a time, as the header's clock says."""
+    """Return the function that assigns times to frames, by the kind of the header's clock."""
     rate_hz = header.clock.rate_hz
     if header.clock.kind == "arrivals":
         table = _arrivals(folder)
@@ -376,7 +377,7 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the arrivals; a stream that is shorter than they say was cut off after it was recorded."""
+    """Read the arrivals; raise if the stream has fewer bytes, which means that it was cut after recording."""
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:

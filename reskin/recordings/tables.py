@@ -1,6 +1,6 @@
-"""Read tables from text and CSV files, and name the line and column of whatever is wrong.
+"""Read tables from text and CSV files, with errors that name the line and column.
 
-`parse_csv` reads this project's own files, whose columns and types are known; `read_cells` and `to_numbers` read those
+`parse_csv` reads this project's own files, whose columns and types are known; `read_cells` and `to_numbers` read files
 of other recorders.
 """
 
@@ -36,7 +36,7 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
             convert_options=pacsv.ConvertOptions(column_types=types, null_values=[""], strings_can_be_null=True),
         )
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
-        got = ascii(" ".join(str(error).split()))[1:-1][:200]  # a row of rubbish is no message
+        got = ascii(" ".join(str(error).split()))[1:-1][:200]  # the error may quote a long row of binary data
         raise CaptureError(f"{where}: not a CSV with columns {_list(types)}: {got}. Correct that row.") from None
     except FileNotFoundError:
         raise CaptureError(f"{where}: file not found. Copy the whole capture folder.") from None
@@ -45,7 +45,7 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
 
 
 def render_csv(table: pa.Table) -> str:
-    """Write a table as CSV text; numbers keep every digit that tells them apart, null is an empty field."""
+    """Write a table as CSV text, with the shortest digits that read back as the same number; null is an empty field."""
     sink = pa.BufferOutputStream()
     pacsv.write_csv(table, sink, pacsv.WriteOptions(include_header=False, quoting_style="none"))
     return ",".join(table.column_names) + "\n" + sink.getvalue().to_pybytes().decode()
@@ -71,12 +71,12 @@ def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
     return ",".join(names) or "none"
 
 
-# No reading, place or unix time of these recordings comes near it; float32 holds it without overflow.
+# All readings, places and unix times are far below this, and float32 can represent it.
 MAGNITUDE_MAX = 1e10
 
 
 def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[str]]:
-    """Split a text file into cells, one list a line and all of one length; `None` splits at any white space."""
+    """Split a text file into cells, one list per line, all of the same length; `None` splits at any white space."""
     text = _read_text(path, where)
     if separator == "," and ";" in text.partition("\n")[0]:
         raise CaptureError(
@@ -93,7 +93,7 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
 def to_numbers(
     cells: list[list[str]], where: str, *, names: Sequence[str], first_line_n: int = 1
 ) -> Float64[np.ndarray, "f c"]:
-    """Turn cells into finite numbers; `names` are the columns', `first_line_n` the file's line of `cells[0]`."""
+    """Parse cells as finite numbers; `names` are the column names, `first_line_n` is the line of `cells[0]`."""
     if cells and len(cells[0]) != len(names):
         found = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
         raise CaptureError(f"{where}: {found}. Is the layout right, and the number of chips?")
@@ -111,7 +111,7 @@ def to_numbers(
 def make_readings(
     header: Header, keep: Bool[np.ndarray, " rows"], **columns: Shaped[np.ndarray, "rows ..."]
 ) -> Readings:
-    """Make readings of the rows to keep; a column that is not given is unknown, and `reading_i` 0."""
+    """Make readings of the rows to keep; a column that is not given is NaN (unknown), but `reading_i` is 0."""
     no_degC = np.full((len(keep), header.chips_n), np.nan)
     columns = {"reading_i": np.zeros(len(keep)), "temperature_degC": no_degC, **columns}
     unknown = np.full(len(keep), np.nan)
@@ -137,7 +137,7 @@ def _dtype(name: str) -> type[np.generic]:
 
 def _read_text(path: Path, where: str) -> str:
     try:
-        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin a file with a mark of byte order
+        text = path.read_bytes().decode("utf-8-sig")  # spreadsheets begin a file with a byte order mark
     except UnicodeDecodeError as error:
         byte = f"{error.object[error.start]:#04x} at {error.start}"
         raise CaptureError(f"{where}: the file is not text: byte {byte}. Is it another file under this name?") from None
@@ -172,18 +172,18 @@ PHASES = ("noload", "contact")
 
 
 def count_chips_of(names: list[str]) -> int:
-    """Count the chips that columns `T<i>`, `Bx<i>`, `By<i>`, `Bz<i>` are of."""
+    """Count the chips from column names `T<i>`, `Bx<i>`, `By<i>`, `Bz<i>`."""
     numbers = [int(match[1]) for name in names if (match := re.fullmatch(r"(?:T|Bx|By|Bz)(\d{1,3})", name))]
     return max(numbers, default=0) + 1
 
 
 def check_columns(names: list[str], wanted: list[str], where: str, *, layout: str) -> None:
-    """Raise for a column that is not there, and for one that is there twice."""
+    """Raise for missing and for duplicate columns."""
     missing = [name for name in wanted if name not in names]
     if missing:
         raise CaptureError(
-            f"{where}: no column {', '.join(missing)}. See data/README.md: is this layout {layout}, and line 1 its "
-            "column names?"
+            f"{where}: no column {', '.join(missing)}. Is this layout {layout}, with column names in line 1? See "
+            "data/README.md."
         )
     twice = [name for name, times_n in Counter(names).items() if times_n > 1]
     if twice:
@@ -191,7 +191,7 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
 
 
 def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:
-    """Mark rows of contact from rows without; another word is an error, and so is a table without contact."""
+    """Mark the rows in contact; raise for other words than `noload` and `contact`, and for a table without contact."""
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {first_line_n + row_i}"
@@ -202,6 +202,6 @@ def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.nd
 
 
 def count_within(press: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count 0, 1, 2 ... within each block of equal numbers."""
+    """Number the rows of each block of equal numbers 0, 1, 2, ..."""
     begins = np.flatnonzero(np.diff(press, prepend=-1))
     return np.arange(len(press)) - np.repeat(begins, np.diff(begins, append=len(press)))

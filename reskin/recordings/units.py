@@ -1,4 +1,4 @@
-"""Check that fields, places, depths and forces of a recording are in uT, mm and N, by the values they can have."""
+"""Check that fields, places, depths and forces of a recording are in uT, mm and N, by their plausible values."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,23 +10,24 @@ from reskin.recordings.tables import FIRST_ROW
 
 # MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
 FULL_SCALE_uT = 32768 * 9.680
-# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT, which in mT or T is below this.
+# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT. The same in mT or T is below this.
 WEAKEST_uT = 20.0
-# The strongest skin known, 13000 uT, would be 130 G: weaker fields on a grid finer than any of the chip's are gauss.
+# The strongest skin known, 13000 uT, would be 130 G. Values below this, in steps finer than any step of the chip, are
+# in gauss.
 GAUSS_MAX = 200.0
 NANO_STEP_MIN = 100.0  # the finest step is 150 nT, the coarsest 9.68 uT
-# Forces on skins a few mm thick; a touch of 1 N read as grams would be 102.
+# Skins are a few mm thick and bear less; a force of 1 N in grams would be 102.
 FORCE_MAX_N = 100.0
-FORCE_MIN_N = 0.05  # the strongest touch of any recording is above it; a touch of 0.4 N in kg is not
+FORCE_MIN_N = 0.05  # every recording has a stronger touch; a touch of 0.4 N in kg is weaker
 SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
 EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 
 
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if fields are beyond the chip's full scale, too weak for the earth, or on a grid that no chip has in uT.
+    """Raise if fields exceed the chip's full scale, are weaker than the earth's, or have steps that no chip has in uT.
 
-    The grid shows only where values were not averaged; what is rounded to whole decimals shows none.
+    The steps are visible only if values were not averaged, and not if they were rounded to decimals.
     """
     _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
@@ -41,7 +42,7 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
 
 
 def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if changes of field are beyond the chip's full scale or in steps that no chip has; they may be weak."""
+    """Raise if field changes exceed the chip's full scale or have steps that no chip has; weak changes are allowed."""
     _check_full_scale(db_uT, where, first_line_n)
     step_uT = _find_step(db_uT)
     if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
@@ -50,7 +51,7 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
 
 
 def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
-    """Raise if a force is more than these skins bear, as forces in grams are; NaN is no force and passes."""
+    """Raise if a force is more than these skins bear, as forces in grams would be; NaN (unknown) is allowed."""
     too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
     if len(too_strong):
         got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
@@ -58,7 +59,7 @@ def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: 
 
 
 def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
-    """Raise if forces are known, and none of them is one that a gauge can tell from none, as in kg or kN."""
+    """Raise if forces are known but all too weak for a gauge to detect, as forces in kg or kN would be."""
     strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
     if 0 < strongest_N < FORCE_MIN_N:
         got = f"{strongest_N:.3g} at most"
@@ -67,7 +68,7 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
 
 
 def check_places(place_mm: Float[np.ndarray, "f axes"], where: str) -> None:
-    """Raise if places that differ lie closer together or wider apart than a skin's; NaN is no place and passes."""
+    """Raise if different places are closer together or farther apart than on a skin; NaN (unknown) is allowed."""
     known_mm = place_mm[np.isfinite(place_mm).all(axis=1)]
     extent_mm = float(np.ptp(known_mm, axis=0).max()) if len(known_mm) else 0.0
     if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
@@ -76,7 +77,7 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str) -> None:
 
 
 def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
-    """Raise if no depth is one that a robot presses, or one is deeper than a skin; 0 and NaN are none and pass."""
+    """Raise if the greatest depth is too small for a press or deeper than a skin; 0 and NaN (unknown) are allowed."""
     deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
     if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
         rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm where it is greatest"
@@ -108,7 +109,7 @@ def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n:
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:
-    """Return the usual step of the chips along x and y; NaN where none shows, or where it is a rounded decimal."""
+    """Return the usual step of the chips along x and y; NaN if no step is visible, or if it comes from rounding."""
     steps_uT = faults.find_lsb(b_uT, step_min_uT=0.0, steps_min_n=faults.SURE_STEPS_MIN_N)[:, 0]
     steps_uT = steps_uT[np.isfinite(steps_uT)]
     if not len(steps_uT):

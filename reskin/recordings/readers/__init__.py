@@ -1,4 +1,4 @@
-"""Readers of recordings in other layouts, one module each: files in, `Readings` and an account of dropped rows out."""
+"""Readers of other layouts, one module each. They convert files to `Readings` and an account of dropped rows."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,13 +11,13 @@ from reskin.schema import Readings
 
 
 class Reader(Protocol):
-    """The functions that each module of a layout has."""
+    """The functions that the module of each layout has."""
 
     def collect(self, recording: Path) -> dict[str, Path]:
-        """Find a recording's files: name in the capture folder -> source."""
+        """Find a recording's files; return source paths by the name in the capture folder."""
 
     def count_chips(self, files: Mapping[str, Path]) -> int:
-        """Count the chips that collected files have columns for."""
+        """Count the chips from the columns of the collected files."""
 
     def read(self, folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, dict[str, int]]:
         """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""

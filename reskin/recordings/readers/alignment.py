@@ -1,23 +1,24 @@
-"""Join files row by row: changes of their lag within a recording, and passes over the skin."""
+"""Align files row by row: find changes of the lag within a recording, and number the passes over the skin."""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 
-LAGS = np.arange(-2, 6)  # rows that fields may come after their labels
-ROWS_MIN_N = 300  # a shorter recording does not say enough
-BLOCK_ROWS_N = 500  # over which the field's slow drift is removed
+LAGS = np.arange(-2, 6)  # possible lags of the fields behind their labels, in rows
+ROWS_MIN_N = 300  # in a shorter recording, a change cannot be detected
+BLOCK_ROWS_N = 500  # length of the blocks over which the field's slow drift is removed
 ROUNDS_N = 4
-OUTLIER = 4.0  # times the median distance: more counts as much
-# A change is reported if it explains as much as this many misaligned rows. Over the two public recordings and windows
-# of them the largest value without a change is 12; a row lost 100 rows before the end gives 40 or more.
+OUTLIER = 4.0  # larger distances are clipped to this multiple of the median distance
+# A change is reported if it explains as much as this many misaligned rows. In the two public recordings and windows of
+# them, the largest value without a change is 12; a row lost 100 rows before the end gives 40 or more.
 EVIDENCE_ROWS_MIN_N = 30
-CONTRAST_MIN = 0.3  # of what a misaligned row costs, over its standard deviation: noise alone reaches 0.17 in 300 rows
+# Least mean cost of a misaligned row, over its standard deviation. Noise alone reaches 0.17 in 300 rows.
+CONTRAST_MIN = 0.3
 
 
 class Change(NamedTuple):
-    """From label row `row` (counted from 0) on, fields come `after` rows late, before it `before` rows."""
+    """From label row `row` (counted from 0) on, fields lag by `after` rows; before it, by `before` rows."""
 
     row: int
     before: int
@@ -28,11 +29,11 @@ def find_change(
     b_uT: Float64[np.ndarray, "f ch"], label: Float64[np.ndarray, "f 3"], contact: Bool[np.ndarray, " f"],
     sound: Bool[np.ndarray, " f"],
 ) -> Change | None:  # fmt: skip
-    """Return where the lateness changes; None if one lateness explains all rows as well.
+    """Return where the lag changes; None if a single lag explains the rows as well.
 
-    Every place has its own line of field against force, fitted to all rows as they are aligned so far. Rows are then
-    split into two parts with a lateness each so that fields lie nearest to these lines, and the lines are fitted again.
-    `label` is x and y in mm and force in N; rows that are not `sound` say nothing.
+    For each place, a line of field against force is fitted to all rows, as they are aligned so far. Then the rows are
+    split into two parts with different lags such that the fields are nearest to these lines, and the lines are fitted
+    again. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
     """
     if len(label) < ROWS_MIN_N or not contact.any():
         return None
@@ -45,7 +46,7 @@ def find_change(
         lag = np.where(row < at, LAGS[before_i], LAGS[after_i])
     gain = distance.sum(axis=1).min() - distance[before_i, :at].sum() - distance[after_i, at:].sum()
     apart = distance[after_i] - distance[before_i]
-    misaligned = float(np.where(row < at, apart, -apart).mean())  # what a row costs that has the other lateness
+    misaligned = float(np.where(row < at, apart, -apart).mean())  # mean cost of giving a row the lag of the other part
     if misaligned <= CONTRAST_MIN * apart.std() or gain < EVIDENCE_ROWS_MIN_N * misaligned:
         return None
     return Change(at, int(LAGS[before_i]), int(LAGS[after_i]))
@@ -60,7 +61,7 @@ def _best_lag(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], force_N: Float64[np.ndarray, " f"],
     place: Int64[np.ndarray, " f"],
 ) -> Int64[np.ndarray, " f"]:  # fmt: skip
-    """Return the one lateness with which lines fit best, for every row."""
+    """Return for every row the single lag with which the lines fit best."""
     costs = []
     for lag_i, lag in enumerate(LAGS):
         lags = np.full(len(place), lag)
@@ -72,7 +73,7 @@ def _fit_lines(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], force_N: Float64[np.ndarray, " f"],
     place: Int64[np.ndarray, " f"], lag: Int64[np.ndarray, " f"],
 ) -> Float64[np.ndarray, "f ch"]:  # fmt: skip
-    """Return the field that each label row should have: per place a least-squares line of field against force."""
+    """Return the expected field of each label row, from a least-squares line of field against force at its place."""
     at = np.arange(len(place)) + lag
     used = (at >= 0) & (at < len(place))
     used[used] &= sound[at[used]]
@@ -93,7 +94,7 @@ def _fit_lines(
 def _distances(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], expected_uT: Float64[np.ndarray, "f ch"]
 ) -> Float[np.ndarray, "l f"]:
-    """Return for each lateness and label row how far its field lies from the expected one; 0 where one is unknown."""
+    """Return for each lag and label row the distance of the field from the expected one; 0 if either is unknown."""
     distance = np.zeros((len(LAGS), len(field_uT)))
     row = np.arange(len(field_uT))
     known = (row + LAGS[0] >= 0) & (row + LAGS[-1] < len(row))
@@ -104,9 +105,9 @@ def _distances(
 
 
 def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
-    """Return two different latenesses (their indices) and the row between them with the least sum of distances."""
+    """Return the indices of two different lags, and the row of the change, with the least sum of distances."""
     lags_n = len(distance)
-    before = np.concatenate([np.zeros((lags_n, 1)), np.cumsum(distance, axis=1)], axis=1)  # of the rows before each
+    before = np.concatenate([np.zeros((lags_n, 1)), np.cumsum(distance, axis=1)], axis=1)  # sums over earlier rows
     after = before[:, -1:] - before
     cost = before[:, None] + after  # [before after row]
     cost[range(lags_n), range(lags_n)] = np.inf
@@ -115,9 +116,9 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
 
 
 AGREEMENT_MIN = 0.95
-SEEN_TWICE_MIN = 0.25  # a shift of half the recording leaves half the moves to compare, of which some touch nothing
+SEEN_TWICE_MIN = 0.25  # a shift by half the recording leaves half the moves to compare, some of them without contact
 PROBES_N = 256
-PROBES_MIN_N = 8  # fewer say nothing
+PROBES_MIN_N = 8  # with fewer, a period is not excluded
 GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
@@ -141,12 +142,12 @@ def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " 
 def _likely_periods(
     place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"], moves: Int64[np.ndarray, "moves 2"]
 ) -> Int64[np.ndarray, " p"]:
-    """Leave out the shifts at which most of a few moves of the first half differ: trying all on all is quadratic."""
+    """Return the periods that a sample of moves from the first half does not exclude; testing all is quadratic."""
     half_n = len(contact) // 2
     early = moves[moves[:, 1] < half_n]
     if not len(early):
         return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
-    # Steps of the golden section lie evenly, and in step with no grid.
+    # Multiples of the golden ratio are evenly spread, and not in phase with any grid.
     probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
     tried_n, same_n = np.zeros((2, half_n), np.int64)
     for first, second in probes:
@@ -160,7 +161,10 @@ def _likely_periods(
 
 
 def _find_moves(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, "moves 2"]:
-    """Rows of the last contact at one place and of the first at the next: a shift within a dwell cannot match both."""
+    """Return the rows of the last contact at each place and of the first at the next place.
+
+    A shift within a dwell cannot match both.
+    """
     rows = np.flatnonzero(contact)
     pairs = np.stack([rows[:-1], rows[1:]], axis=1)
     return pairs[(place_mm[pairs[:, 0]] != place_mm[pairs[:, 1]]).any(axis=1)]

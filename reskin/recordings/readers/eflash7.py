@@ -1,9 +1,8 @@
-"""Read layout `eflash7`: an eFlesh pad pressed over a six-axis sensor, one CSV file a recording.
+"""Read layout `eflash7`: an eFlesh pad pressed over a six-axis sensor, one CSV file per recording.
 
-One place is touched, or two at once, of a 3 x 3 grid of unknown pitch: `x_mm`, `y_mm` are NaN, and the account counts
-One or two places of a 3 x 3 grid of unknown pitch are touched: `x_mm`, `y_mm` are NaN, and the account counts
-baseline, so `b_uT` lacks a constant in each channel. The no-load field is the mean of the untouched rows with which a
-recording begins, and forces are relative to theirs.
+One or two places of a 3 x 3 grid of unknown pitch are touched: `x_mm`, `y_mm` are NaN, and the account counts the rows
+of each place by its number. The recorder subtracted a baseline, so `b_uT` lacks a constant in each channel. The no-load
+field is the mean over the untouched rows at the start of a recording, and forces are relative to their mean force.
 """
 
 import re
@@ -24,16 +23,16 @@ from reskin.schema import Readings
 
 READINGS = "readings.csv"
 FILES = (READINGS,)
-FIRST_LINE_N = 2  # the file's line of the first row of numbers
-SIDE_N = 3  # places a side of the grid
+FIRST_LINE_N = 2  # line of the first row of numbers in the file
+SIDE_N = 3  # places per side of the grid
 ONE, TWO = ("x_pos", "y_pos"), ("pos1_x", "pos1_y", "pos2_x", "pos2_y")
 FORCES = ("fx", "fy", "fz")
 ON_SKIN = -1.0  # the file has compression as negative fz
-TOUCH_N = 0.5  # assumed, as the file marks no touches: one begins where the force rises above this
-# Chips are read about ten times a second, and the recorder writes zeros where it asked too early.
+TOUCH_N = 0.5  # assumed, as the file does not mark touches: a touch begins when the force rises above this
+# The chips measure about ten times a second, and the recorder writes zeros when it polls too early.
 ZERO_FRACTION_MAX = 0.25  # 4 to 10 % in 19 recordings
 GAP_s = 0.5
-# 19 recordings begin with 1.4 to 17 s without contact; noise is 3 to 6 uT, a touch 500 and more.
+# 19 recordings begin with 1.4 to 17 s without contact; the noise is 3 to 6 uT, a touch is 500 uT or more.
 STILL_uT = 40.0
 STILL_ROWS_MIN_N = 5
 
@@ -42,7 +41,7 @@ Account = dict[str, int]
 
 @dataclass(frozen=True)
 class _Table:
-    """The columns of one file; `places` are the numbers of the touched places, `force_N` that on the gauge."""
+    """The columns of one file; `places` are the numbers of the touched places, `force_N` is the force on the gauge."""
 
     time_s: Float64[np.ndarray, " f"]
     b_uT: Float64[np.ndarray, "f ch"]
@@ -69,7 +68,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read all rows from the first touch on as readings, touched or not; the rows before it are the no-load reading."""
+    """Read all rows from the first touch on as readings, in contact or not; earlier rows are the no-load reading."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.b_uT.shape[1] != 3 * header.chips_n:
@@ -79,7 +78,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
-    written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` tells those of some
+    written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` has zeros of some chips
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
     b_uT = table.b_uT[written]
     rows = check_rows(b_uT, unknown_degC, header.expected_lsb_uT, where=where, policy=policy, row=row[written])
@@ -149,7 +148,7 @@ def _read_table(path: Path, where: str) -> _Table:
 
 
 def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
-    """Number the touched places, column 1 to 3 and row 1 to 3 of each; a recording has one place, or one pair."""
+    """Number the touched places from their columns and rows, each 1 to 3; a recording has one place or one pair."""
     moved = np.flatnonzero((place != place[0]).any(axis=1))
     if len(moved):
         raise CaptureError(f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Add each place by itself.")
@@ -164,7 +163,7 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
 
 
 def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows in which the recorder wrote zeros for all chips; a change of 0 everywhere looks the same."""
+    """Mark the rows with zeros for all chips, which the recorder writes without a reading; raise for too many."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
         found = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
@@ -173,15 +172,15 @@ def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray
 
 
 def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows from the first one on in which no channel has moved; raise if they are too few."""
+    """Mark the rows at the start before any channel changes by more than `STILL_uT`; raise if they are too few."""
     first_uT = np.median(b_uT[whole][:STILL_ROWS_MIN_N], axis=0)
     moved = whole & (np.abs(b_uT - first_uT) > STILL_uT).any(axis=1)
     untouched = whole & ~np.logical_or.accumulate(moved)
     if untouched.sum() < STILL_ROWS_MIN_N:
         line_n = FIRST_LINE_N + int(moved.argmax())
         raise CaptureError(
-            f"{where}: fewer than {STILL_ROWS_MIN_N} rows before the first touch: fields move by more than "
-            f"{STILL_uT:g} uT in line {line_n}. Begin to record before it."
+            f"{where}: fewer than {STILL_ROWS_MIN_N} rows before the first touch: fields change by more than "
+            f"{STILL_uT:g} uT in line {line_n}. Start the recording earlier before the touch."
         )
     return untouched
 
@@ -197,7 +196,7 @@ def _check_force(gauge_N: Float64[np.ndarray, "f 3"], force_N: Float64[np.ndarra
 
 
 def _number_touches(pressed_N: Float64[np.ndarray, " f"], whole: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
-    """Number the touches: one begins where the force rises above `TOUCH_N`, and lasts until the next."""
+    """Number the touches: a touch begins when the force rises above `TOUCH_N`, and lasts until the next one."""
     pressed = pressed_N >= TOUCH_N
     begins = pressed & ~np.concatenate([[False], pressed[:-1]])
     return np.maximum(np.cumsum(begins) - 1, 0)

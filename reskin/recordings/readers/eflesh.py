@@ -1,8 +1,9 @@
 """Read layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder.
 
-Places are robot coordinates less their minimum, so a scan begins at 0 mm. The depth is counted down from the highest z
-of the recording, which may be above the skin: its offset is unknown. One axis of force is known; along x or y its sign
-is not, as the recorder does not state whether it is the force on the skin or on the gauge. Such rows are counted.
+Places are robot coordinates minus their minimum, so a scan begins at 0 mm. The depth is counted down from the highest z
+of the recording, which may be above the skin, so its offset is unknown. The force along one axis is known. Its sign is
+unknown along x and y, because the recorder does not state whether it is the force on the skin or on the gauge; such
+rows are counted.
 """
 
 from collections.abc import Mapping
@@ -34,14 +35,15 @@ FILES = (SENSOR, STATES, CHANGES)
 
 FORCE_AXES = ("x", "y", "z")
 NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
-WEIGHT_COLUMN = 4  # of states.csv, after time, x, y and z; a recording of places only has none
+WEIGHT_COLUMN = 4  # of states.csv, after time, x, y and z; missing if only places were recorded
 NO_NEW_WEIGHT = -1.0
 CLOCKS_APART_MAX_s = 0.05  # both files are written in one loop, milliseconds apart
 PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
-# Rounding of raw - dB in float32 stays below 0.004 uT; in a new reading some channel moves by an LSB, 0.15 uT or more.
+# Rounding of raw - dB in float32 stays below 0.004 uT; in a new no-load reading at least one channel changes by an LSB,
+# 0.15 uT or more.
 SAME_NOLOAD_uT = 0.02
 
-# A robot that holds its height wanders by 1e-4 of it; a press in m that is mistaken for mm is some hundredths of it.
+# As a part of the height: a robot that holds its height varies by 1e-4; a press in m, taken for mm, is some hundredths.
 HELD_PART = 1e-3
 
 Account = dict[str, int]
@@ -59,7 +61,7 @@ def collect(recording: Path) -> dict[str, Path]:
 
 
 def count_chips(files: Mapping[str, Path]) -> int:
-    """Count the chips from the columns of `sensor.csv`: one time, then three a chip."""
+    """Count the chips from the columns of `sensor.csv`: the time, then three columns per chip."""
     where = str(files[SENSOR])
     columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
@@ -68,7 +70,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read every row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
+    """Read each row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
     time_s, b_uT, noload_uT = _read_fields(folder, header)
     states = _read_states(folder, header)
     _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
@@ -108,7 +110,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 def _read_fields(
     folder: Path, header: Header
 ) -> tuple[Float64[np.ndarray, " f"], Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f ch"]]:
-    """Read times, raw fields and no-load fields; both files of the sensor must hold the same times."""
+    """Read times, raw fields and no-load fields; the times of both sensor files must agree."""
     names = ["time", *(f"B{axis}{chip}" for chip in range(header.chips_n) for axis in "xyz")]
     sensor, changes = (
         to_numbers(read_cells(folder / name, where, separator=","), where, names=names)
@@ -142,7 +144,7 @@ def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
-    """Rows pair in order, so the clocks must agree row by row, and go on."""
+    """Raise unless the clocks agree row by row, because rows are paired in order, and times increase."""
     apart = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
     if len(apart):
         where = f"{header.capture}/{STATES} line {apart[0] + 1}"
@@ -160,10 +162,11 @@ def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndar
 def _number_passes(
     place_mm: Float64[np.ndarray, "f 2"], noload_uT: Float64[np.ndarray, "f ch"]
 ) -> tuple[Int32[np.ndarray, " f"], Int32[np.ndarray, " f"]]:
-    """Number passes, and the touches before each row.
+    """Return the pass number of each row, and the number of touches before it.
 
-    Over many places each row is a touch, and a pass ends when the places repeat. At a single place the robot
-    strokes up and down and takes a fresh baseline before each stroke: a new no-load field begins a pass, one touch.
+    With many places, each row is a touch, and a pass ends when the places repeat. With a single place, the robot
+    strokes up and down and takes a new baseline before each stroke, so each new no-load field begins a pass with one
+    touch.
     """
     if place_mm.any():
         everywhere = np.ones(len(place_mm), bool)
@@ -174,7 +177,7 @@ def _number_passes(
 
 
 def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Return the force of the gauge by its column, NaN where it had no new reading; nothing without a gauge."""
+    """Return the gauge's force under the name of its column, NaN in rows without a new value; empty without a gauge."""
     if states.shape[1] <= WEIGHT_COLUMN:
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
@@ -189,7 +192,7 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
 
 
 def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
-    """Count down from the highest z; NaN where the robot held z, or the gauge measured along the skin: no depth."""
+    """Return depths below the highest z; NaN if the robot held z constant or the gauge measured along the skin."""
     along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
     z_mm = states[:, 3]
     return np.full(len(states), np.nan) if along or _holds_height(z_mm) else z_mm.max() - z_mm

@@ -1,10 +1,12 @@
-"""Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row an indentation.
+"""Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row per indentation.
 
-Rows below the gauge's 0.02 N count as no contact, wherever the truths place them: they stay, without place or force.
-Those that begin a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are unknown (NaN).
-Fields may come late: row i of the truths belongs to a later row of the readings. By how many rows is given in the
-header (`rows_late`) or else found: the lag at which |dB| correlates best with the force. A recording whose lag changes
-on the way lost a row in one file, and is refused.
+Rows with a force below 0.02 N count as no contact, whatever place the truths give; they are kept without place and with
+zero force. The rows at the start of a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are
+unknown (NaN).
+
+The fields may lag: row i of the truths belongs to a later row of the readings. The lag in rows is given in the header
+(`rows_late`); otherwise it is the lag at which |dB| correlates best with the force. If the lag changes within a
+recording, a row is missing in one of the files, and the recording is refused.
 """
 
 from collections.abc import Mapping
@@ -24,11 +26,11 @@ from reskin.schema import Readings
 READINGS = "readings.txt"
 TRUTHS = "truths.txt"
 FILES = (READINGS, TRUTHS)
-CONTACT_MIN_N = 0.02  # the recorder labels weaker rows (10, 10, 0), a real place: only force tells them apart
+CONTACT_MIN_N = 0.02  # the recorder labels weaker rows (10, 10, 0), which is also a real place
 VALUES_PER_CHIP_N = 4
 ROWS_LATE = ("0", "1", "2", "3", "4", "5")
-# Only a recording of so many rows tells its lateness, and by so much more of correlation than rows as recorded: the
-# public one has 0.65 instead of 0.45 over 23300 rows.
+# A lag is trusted if it was found over this many rows and improves the correlation by this much. In the public
+# recording of 23300 rows, it is 0.65 instead of 0.45.
 LATE_ROWS_MIN_N, LATE_GAIN_MIN = 100, 0.1
 
 Account = dict[str, int]
@@ -46,7 +48,7 @@ def collect(recording: Path) -> dict[str, Path]:
 
 
 def count_chips(files: Mapping[str, Path]) -> int:
-    """Count the chips from the columns of the readings: X, Y, Z, T a chip."""
+    """Count the chips from the columns of the readings: X, Y, Z, T per chip."""
     where = str(files[READINGS])
     columns_n = len(read_cells(files[READINGS], where, separator=None)[0])
     if columns_n == 0 or columns_n % VALUES_PER_CHIP_N:
@@ -55,7 +57,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read all rows but those with a failed chip; the no-load field of a row is the mean of its pass's corner rows."""
+    """Read all rows without faults; the no-load field of a row is the mean over the corner rows of its pass."""
     said_n = _rows_late(header)
     b_uT, temperature_degC = _read_fields(folder, header)
     truths = _read_truths(folder, header)
@@ -134,7 +136,7 @@ def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Head
 
 
 def _rows_late(header: Header) -> int | None:
-    """Read by how many rows the header says that fields come late; None if it leaves that to the recording."""
+    """Return the lag of the fields in rows, as the header gives it; None if the header does not give it."""
     if "rows_late" not in header.options:
         return None
     rows_late = header.options["rows_late"]
@@ -147,7 +149,7 @@ def _rows_late(header: Header) -> int | None:
 def _best_rows_late(
     b_uT: Float64[np.ndarray, "f ch"], force_N: Float64[np.ndarray, " f"], rows: CheckedRows
 ) -> tuple[int, bool]:
-    """Find by how many rows the fields come late, as |dB| goes best with the force then, and whether that is sure."""
+    """Return the lag in rows at which |dB| correlates best with the force, and whether it can be trusted."""
     correlations = []
     for rows_late_n in range(min(len(ROWS_LATE), len(force_N) - 1)):
         whole = rows.keep[rows_late_n:]
@@ -166,7 +168,7 @@ def _best_rows_late(
 def _check_lateness(
     b_uT: Float64[np.ndarray, "f ch"], truths: Float64[np.ndarray, "f 3"], rows: CheckedRows, header: Header
 ) -> None:
-    """Refuse a recording whose fields fall behind their truths, or overtake them, on the way."""
+    """Raise if the lag between fields and truths changes within a recording."""
     change = find_change(b_uT, truths, truths[:, 2] >= CONTACT_MIN_N, rows.keep)
     if change is None:
         return
@@ -181,7 +183,7 @@ def _check_lateness(
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark the rows of each pass before its first contact: the indenter is at the first corner, off the skin."""
+    """Mark the rows of each pass before its first contact, when the indenter is at the first corner, off the skin."""
     touches_before_n = np.cumsum(contact)
     begins = np.flatnonzero(np.diff(pass_i, prepend=-1))
     before_pass_n = (touches_before_n - contact)[begins]
@@ -191,7 +193,7 @@ def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"
 def _noload_field(
     b_uT: Float64[np.ndarray, "f ch"], pass_i: Int32[np.ndarray, " f"], corner: Bool[np.ndarray, " f"], header: Header
 ) -> Float64[np.ndarray, "f ch"]:
-    """Return each row the mean field of the corner rows of its pass."""
+    """Return for each row the mean field over the corner rows of its pass."""
     noload_uT = mean_by_group(b_uT[corner], pass_i[corner], int(pass_i.max()) + 1)
     without = np.flatnonzero(np.isnan(noload_uT[:, 0]))
     if len(without):

@@ -1,7 +1,8 @@
-"""Read layout `lab`: a robot and a six-axis gauge, one CSV file a depth, about 100 readings an indentation.
+"""Read layout `lab`: a robot and a six-axis gauge, one CSV file per depth, about 100 readings per indentation.
 
-The file has the force on the gauge (Fz negative in compression), so all three are negated, see `reskin.schema` and
-`ON_SKIN`. The depth is only an index in the file's name, so `depth_mm` is NaN; there is no clock, so `t_s` is NaN.
+The file has the force on the gauge (Fz negative in compression), so all three components are negated; see
+`reskin.schema` and `ON_SKIN`. The depth is only an index in the file's name, so `depth_mm` is NaN; there is no clock,
+so `t_s` is NaN.
 """
 
 from collections.abc import Mapping
@@ -29,10 +30,11 @@ from reskin.schema import Readings
 
 READINGS = "readings.csv"
 FILES = (READINGS,)
-FIRST_LINE_N = 2  # the file's line of the first row of numbers
-# The skin feels the opposite of the gauge. On both public boards pokes carry the skin by 48 um along the labels' +x
-# (fitted on fields alone: `compare`), and the mean Fx of all six files is negative: turned, it pushes along +x.
-# Along y both are too small to tell, but right-handed axes with z into the skin, as Fz asks, leave only the labels' y.
+FIRST_LINE_N = 2  # line of the first row of numbers in the file
+# The force on the skin is the opposite of that on the gauge. Evidence along x: on both public boards, pokes shift the
+# skin by 48 um along the labels' +x (fitted to fields alone by experiment `compare`), and the mean Fx is negative in
+# all six files, so the negated force pushes along +x. Along y, both are too small to decide; but for right-handed axes
+# with z into the skin, as the sign of Fz requires, the y axis of the force must be that of the labels.
 ON_SKIN = -1.0
 
 Account = dict[str, int]
@@ -66,7 +68,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read contact rows as readings; the no-load field of a row is the mean over its press's `noload` rows."""
+    """Read contact rows as readings; the no-load field of a row is the mean over the `noload` rows of its press."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.temperature_degC.shape[1] != header.chips_n:
@@ -140,7 +142,7 @@ def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.nda
 
 
 def _check_table(table: _Table, where: str) -> None:
-    """Check units and signs, and that a press has one place."""
+    """Check units and signs, and that each press has one place."""
     check_fields(table.b_uT, where, first_line_n=FIRST_LINE_N)
     for axis in range(3):
         check_forces(table.force_N[:, axis], where, first_line_n=FIRST_LINE_N)

@@ -1,6 +1,6 @@
-"""Read and write the log that a board writes to an SD card (paper, section 6): one CSV line a frame, without labels.
+"""Read and write the log that a board writes to an SD card (paper, section 6): one CSV line per frame, without labels.
 
-A line has seconds of the board's clock, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware does.
+A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware does.
 """
 
 from codecs import BOM_UTF8
@@ -20,11 +20,11 @@ TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
 HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
-KEPT_SHARE_MIN = 0.5  # assumed: less than this is no log of what was touched
+KEPT_SHARE_MIN = 0.5  # assumed: with fewer good frames, contacts would be missed
 Log = tuple[
     Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
-]  # s, uT, degC, an account
-GAP_FRAMES = 1.5  # times the usual step of time; in between, a frame or more is missing
+]  # s, uT, degC, account
+GAP_FRAMES = 1.5  # times the usual time step; in a longer step, one frame or more is missing
 
 
 def column_names(chips_n: int) -> list[str]:
@@ -46,9 +46,9 @@ def render(
 def read_log(path: Path) -> Log:
     """Read time in s, field in uT and temperature in degC of the frames in which every chip was read, and an account.
 
-    Failed reads and stuck chips cost a frame and are counted; if they leave less than half of the log, it is refused,
-    as is one of a chip that lost its settings. `gaps_n` counts the places where time goes on by more than the usual
-    step, `gap_frames_n` the frames that fit in there.
+    Frames with failed reads or stuck chips are dropped and counted. A log is refused if fewer than half of its frames
+    are left, or if a chip lost its settings. `gaps_n` counts the time steps that are longer than usual, `gap_frames_n`
+    the frames that are missing there.
     """
     where = str(path)
     chips_n = _chips_n(path, where)
@@ -85,7 +85,7 @@ def keep_whole(
 
 
 def _check_kept(account: dict[str, int], where: str) -> None:
-    """Raise if faults left too little of a log; say which."""
+    """Raise if too few frames without faults are left, naming the faults."""
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
@@ -96,7 +96,7 @@ def _check_kept(account: dict[str, int], where: str) -> None:
 
 
 def _chips_n(path: Path, where: str) -> int:
-    """Count the chips that the header line names; a last line without an end was cut."""
+    """Count the chips that the header line names; raise if the last line has no end, because it was cut."""
     try:
         with path.open("rb") as file:
             first = file.readline(HEADER_LETTERS_MAX)

@@ -1,4 +1,4 @@
-"""Reader of layout `table`: any rig's recording in one CSV or Parquet file with named columns."""
+"""Read layout `table`: a recording of any rig in one CSV or Parquet file with named columns."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,12 +37,12 @@ CSV, PARQUET = "readings.csv", "readings.parquet"
 FILES = (CSV,)
 NEEDED = ("phase", "x_mm", "y_mm")
 OPTIONAL = ("indentation", "pass", "t_s", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
-FIRST_LINE_N = 2  # of a CSV file: the first row of numbers
+FIRST_LINE_N = 2  # line of the first row of numbers in a CSV file
 EMPTY = ("", "nan", "NaN")
 STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
 
-SUBTRACTED_PART = 0.5  # assumed: of the field in contact, at the chip that reads most
+SUBTRACTED_PART = 0.5  # assumed: no-load field over field in contact, both at the chip with the strongest field
 
 Account = dict[str, int]
 
@@ -67,7 +67,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read contact rows as readings; the no-load field of a row is the mean of the last no-load rows before it."""
+    """Read contact rows as readings; a row's no-load field is the mean over the block of no-load rows before it."""
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
     names, cells = _read_cells(folder / name, where)
@@ -87,7 +87,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
     rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
     press = _number_presses(numbers, contact, where)
-    block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)  # a block of no-load rows, and the contacts after it
+    block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)  # a run of no-load rows and the contacts after it
     rest = ~contact & rows.keep
     noload_uT = mean_by_group(b_uT[rest], block[rest], int(block[-1]) + 1)[block]
     keep = contact & rows.keep
@@ -131,17 +131,17 @@ def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
 
 
 def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
-    """Raise for a column that would be ignored, though its name is nearly one that is known: `Fz` for `Fz_N`."""
+    """Raise for an unknown column, which would be ignored, if its name resembles a known one: `Fz` for `Fz_N`."""
     for name in names:
         if name not in columns and name.lower().split("_")[0] in STEMS:
             known = ", ".join((*NEEDED, *OPTIONAL))
             raise CaptureError(
-                f"{where}: column {name!r} is nearly, but not, one of {known}. Rename the column, or remove it."
+                f"{where}: column {name!r} is not known, but resembles one of {known}. Rename the column, or remove it."
             )
 
 
 def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
-    """Return whether nothing stands in a column that may be left out, as in a template that was not filled in there."""
+    """Return whether an optional column is empty, as in a template that was filled in only partly."""
     at = names.index(column)
     return (column in OPTIONAL or column[0] == "T") and all(row[at].strip() in EMPTY for row in cells)
 
@@ -149,7 +149,7 @@ def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]])
 def _to_numbers(
     names: list[str], cells: list[list[str]], known: Sequence[str], contact: Bool[np.ndarray, " f"], where: str
 ) -> Float64[np.ndarray, "f c"]:
-    """Turn the known columns into numbers; a place, depth or force of a row without contact may be empty."""
+    """Parse the known columns as numbers; in rows without contact, place, depth and force may be empty."""
     at = [names.index(column) for column in known]
     may_lack = {column for column in known if column[0] != "B"}
     picked = [[row[i].strip() for i in at] for row in cells]
@@ -183,9 +183,9 @@ def _check(
 
 
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
-    """Raise if fields are weak, and weakest without contact: a baseline was subtracted already.
+    """Raise if fields are weak, and much weaker without contact than in contact: a baseline was subtracted already.
 
-    In other units both shrink alike: a skin's field at rest is larger than what a press changes of it.
+    Wrong units also make fields weak, but scale both alike; in raw fields, the field at rest exceeds its change.
     """
     chips_uT = np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3), axis=2)
     if np.median(chips_uT) >= WEAKEST_uT or contact.all() or not contact.any():
@@ -201,9 +201,9 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
 def _number_presses(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str
 ) -> Int[np.ndarray, " f"]:
-    """Number presses from 0: by `indentation` if it is there, else one more at each touch and each new place."""
+    """Number presses from 0: by column `indentation` if given, else a new press at each touch and each new place."""
     if "indentation" in numbers:
-        rows = np.flatnonzero(contact)  # a number of rows without contact says nothing
+        rows = np.flatnonzero(contact)  # the numbers of rows without contact are ignored
         number = numbers["indentation"][rows]
         begins = np.flatnonzero(np.diff(number, prepend=np.nan) != 0)
         firsts, counts = np.unique(number[begins], return_counts=True)
@@ -224,7 +224,7 @@ def _number_presses(
 def _find_passes(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], press: Int[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]
 ) -> Int[np.ndarray, " f"]:
-    """Number the passes by the presses' places and greatest depths, as they repeat in order."""
+    """Number the passes: a new pass begins where the sequence of places and greatest depths of presses repeats."""
     of_press = [
         np.array([part.max() for part in np.split(numbers[name][contact], np.flatnonzero(np.diff(press[contact])) + 1)])
         for name in ("x_mm", "y_mm", "depth_mm")

@@ -211,7 +211,7 @@ def test_constant_channels_are_named(tmp_path):
     rows = table()
     rows["Bz0"], rows["Bz1"] = 12.5, 0.0
     rows.to_csv(tmp_path / plain.CSV, index=False)
-    assert "no change in the whole recording of Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT)" in error_of(tmp_path)
+    assert "Bz of chip 0 (12.5 uT), Bz of chip 1 (0 uT) never changed in the whole recording" in error_of(tmp_path)
 
 
 def test_subtracted_baseline_is_named(tmp_path):
