@@ -18,7 +18,7 @@ TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
 
 @dataclass(frozen=True)
 class Arrivals:
-    """The chunks of a stream in order, axis c: bytes come in all, and when."""
+    """The chunks of a stream in order, axis c: number of bytes up to the end of each, and its time of arrival."""
 
     byte_end: Int64[np.ndarray, " c"]
     t_s: Float64[np.ndarray, " c"]
@@ -49,16 +49,16 @@ def parse(source: str | Path, where: str) -> Arrivals:
 
 
 def render(arrivals: Arrivals) -> str:
-    """Write arrivals as CSV; `parse` gives the same arrivals back."""
+    """Write arrivals as CSV; `parse` returns the same arrivals."""
     return tables.render_csv(pa.table({name: getattr(arrivals, name) for name in TYPES}))
 
 
 def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[np.ndarray, " f"]:
-    """Return each frame the time of its last byte, on a straight line between the ends of the chunks around it.
+    """Return the time of each frame's last byte, interpolated linearly between the ends of chunks.
 
-    A byte came before its chunk was read and, but for the port's buffer, after the one before it was: the error is
-    less than the time between the two. Frames of the first chunk lie on a line at the stream's mean rate. A frame
-    past the last chunk has no time: NaN.
+    A byte arrived before its chunk was read and, apart from the port's buffer, after the previous chunk was read, so
+    the error is less than the time between the two. In the first chunk, times are extrapolated at the stream's mean
+    rate. The time of a frame after the last chunk is NaN.
     """
     byte_end, t_s = arrivals.byte_end, arrivals.t_s
     s_per_byte = (t_s[-1] - t_s[0]) / (byte_end[-1] - byte_end[0])
@@ -67,24 +67,26 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
 
 
 def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
-    """Return each frame the time of its place in a stream of constant rate; 0 at the start of the stream.
+    """Return the time of each frame in a stream of constant rate; 0 at the start of the stream.
 
-    `frame` is the place in frames: bytes up to its end over bytes a frame, where frames have one length, so that
-    broken bytes keep their time; else a running count. Frames lost before the dump shift all that follow.
+    `frame` is the position in frames. If all frames have the same length, it is the number of bytes up to the frame's
+    end over the length, so that damaged bytes take up their share of the time; otherwise it is a running count. Frames
+    that were lost before they were dumped shift all later times.
     """
     return frame / rate_hz
 
 
-RATE_LIMIT = 0.1  # a nominal rate may be some per cent off; more is a mark in milliseconds, or of another event
+RATE_LIMIT = 0.1  # a nominal rate may be off by some per cent; more means a mark in milliseconds or of another event
 STEPS_PER_DWELL_N = 16
 STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
-SEARCH_STEPS_N = 2**16  # the first search sees 4,000 dwell lengths of either clock; 50 ppm blur it by a fifth of one
-WINDOW_STEPS_N = 2**14  # afterwards each 1,000 dwell lengths give an offset of their own, for the rate
-EXPLAINED_MIN = 0.5  # 0 is chance, 1 is every dwell
-MARGIN_MIN = 1.5  # indentations; shifted by one period, a periodic protocol loses one, and one may be too weak to see
-SEEN_MIN = 0.5  # of the dwells that any shift lays on the stream: a few fit somewhere by chance
-PEAK_DROP = 0.05  # the offset is the middle of the peak this far below its top: a top can be flat, flanks are steep
-AWAY_NOISES = 1.5  # times the median distance of no-load: 2.7 sd for the 15 channels of a board
+SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths for the first search, over which 50 ppm of rate shift by 0.2 dwells
+WINDOW_STEPS_N = 2**14  # then each window of 1,000 dwell lengths gets its own offset, from which the rate follows
+EXPLAINED_MIN = 0.5  # share of dwell time that must agree: 0 by chance, 1 if every dwell agrees
+# In indentations. A periodic protocol that is shifted by one period loses one, and one contact may be too weak to see.
+MARGIN_MIN = 1.5
+SEEN_MIN = 0.5  # a shift must overlap this share of the dwells that the best shift overlaps: a few fit by chance
+PEAK_DROP = 0.05  # the offset is the peak's middle at this relative depth below its top, which can be flat
+AWAY_NOISES = 1.5  # times the median distance without load: 2.7 sd for the 15 channels of a board
 STRETCH_PERIODS_N = 32
 START_FRAMES_N = 4
 REFERENCE_FRAMES_N = 4096
@@ -96,9 +98,9 @@ Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
 
 @dataclass(frozen=True)
 class ClockMap:
-    """The line between the clocks; `residual_s` is the largest misfit of the marks (or windows) it was drawn through.
+    """The line between the clocks; `residual_s` is the largest misfit of the marks (or windows) that it was fitted to.
 
-    `explained` is the share of dwell time that the field agrees with, 0 for chance; 1 where marks were given.
+    `explained` is the share of dwell time that the field agrees with, 0 by chance; it is 1 if marks were given.
     """
 
     offset_s: float
@@ -107,12 +109,12 @@ class ClockMap:
     explained: float
 
     def probe_s(self, stream_s: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " f"]:
-        """Return the probe's time of each stream time; NaN stays NaN."""
+        """Convert stream times to probe times; NaN stays NaN."""
         return self.offset_s + self.rate * stream_s
 
 
 def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
-    """Draw the line through sync marks (stream time, probe time): one gives the offset, more also the rate."""
+    """Fit the line to sync marks (stream time, probe time): one mark gives the offset, several also the rate."""
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
         raise CaptureError(where, "clock.marks", "one or more pairs of finite times", given, "Correct them.")
@@ -122,9 +124,9 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
 
 
 def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMap:
-    """Find the line that lays the field's contacts on the dwells of the probe log.
+    """Find the line that aligns the contacts in the field with the dwells of the probe log.
 
-    The stream begins with the robot lifted. Memory: 1 byte a sixteenth of a dwell.
+    The stream must begin with the robot lifted. Memory: 1 byte per sixteenth of a dwell.
     """
     if not log.contact.any():
         raise CaptureError(f"{where}: the probe log has no contacts. Record the capture again.")
@@ -151,7 +153,7 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
 
 
 class _Pattern:
-    """What a contact signal of +1 and -1 should be: the dwells, contact and no-load weighing the same in all."""
+    """The expected contact signal: positive in contact dwells, negative in no-load dwells, with equal total weights."""
 
     def __init__(self, log: ProbeLog) -> None:
         dwell_s = log.t_end_s - log.t_start_s
@@ -160,17 +162,17 @@ class _Pattern:
         self.start_s, self.end_s = float(log.t_start_s[0]), float(log.t_end_s[-1])
         self.period_s = float(np.median(np.diff(firsts))) if len(firsts) > 1 else self.end_s - self.start_s
         self.quiet = 1 - float(dwell_s[log.contact].sum()) / (self.end_s - self.start_s)
-        scaled = len(firsts) * weight * dwell_s  # so that one indentation weighs 1
+        scaled = len(firsts) * weight * dwell_s  # so that one indentation has weight 1
         self._knots_s = np.stack([log.t_start_s, log.t_end_s], axis=1).ravel()
         self._signed = _running(np.where(log.contact, scaled, -scaled))
         self._dwelt = _running(scaled)
 
     def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the weight of each step of a grid in probe time: contact above 0, no-load below, between dwells 0."""
+        """Return the weight of each step of a grid in probe time: contact > 0, no-load < 0, between dwells 0."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
 
     def dwelt(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the same without sign."""
+        """Return the same weights without signs."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._dwelt))
 
 
@@ -180,19 +182,19 @@ def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
 
 
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
-    """Find the offset at any lag, by FFT; raise if a second one fits about as well."""
+    """Find the offset among all lags, by FFT; raise if another offset fits about as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
-    samples = signal / np.abs(signal).mean()  # most steps may lie between two frames
+    samples = signal / np.abs(signal).mean()  # most steps may be between two frames
     weights, dwelt = (of(pattern.start_s, steps_n, step_s) for of in (pattern.signed, pattern.dwelt))
     seen = _correlate(dwelt, np.abs(samples))
-    # What is matched, less what a poor fit would match: else a shift that loses a dwell here may win it back there,
-    # by laying more of the log on the stream.
+    # The match, minus what a poor fit would match. Without this, a shift that loses a dwell could compensate for it by
+    # overlapping more of the log.
     score = _correlate(weights, samples) - EXPLAINED_MIN * seen
     score[seen < SEEN_MIN * seen.max()] = 0.0
     top_i = int(score.argmax())
     away = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
     margin = score[top_i] - score[away].max(initial=0.0)
-    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # matched less than seen; a dwell amiss counts twice
+    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # seen but not matched; a wrong dwell counts twice
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
             f"{where}: the field fits the dwells at two times almost equally well, {margin:.2g} of {dwelt.sum():.0f} "
@@ -204,7 +206,7 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
 def _follow(
     window: Int8[np.ndarray, " g"], pattern: _Pattern, probe_s: float, step_s: float
 ) -> tuple[float, float, float]:
-    """Find how far a window's offset lies from the one expected; return this, its match and the dwell time it saw."""
+    """Return the deviation of a window's offset from the expected one, its match, and the dwell time it overlaps."""
     reach_n = int(pattern.period_s / step_s) // 2 + 1
     begin_s, steps_n = probe_s - reach_n * step_s, len(window) + 2 * reach_n
     samples = window.astype(np.float64)
@@ -215,8 +217,8 @@ def _follow(
 
 
 def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
-    """Correlate at every lag at which both overlap, by FFT: scipy.signal's without the second that its import takes."""
-    from scipy.fft import irfft, next_fast_len, rfft  # late: only a capture without clock marks pays for it
+    """Correlate at every lag with an overlap, by FFT, like scipy.signal.correlate, whose import takes a second."""
+    from scipy.fft import irfft, next_fast_len, rfft  # imported late: only needed for captures without clock marks
 
     lags_n = len(signal) + len(window) - 1
     size = next_fast_len(lags_n, real=True)
@@ -224,7 +226,7 @@ def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " 
 
 
 def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
-    """Return the middle of a peak between its flanks at `PEAK_DROP` below its top, in fractions of a step."""
+    """Return the middle of a peak between its flanks, `PEAK_DROP` below its top, with a resolution below a step."""
     level = (1 - PEAK_DROP) * score[top_i]
     below_i = np.flatnonzero(score < level)
     left_i, right_i = below_i[below_i < top_i][-1:], below_i[below_i > top_i][:1]
@@ -261,16 +263,17 @@ def _contact_signal(
 def _touched(
     blocks: Iterable[Block], pattern: _Pattern
 ) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
-    """Decide for each frame whether its field is away from a running no-load field by more than noise.
+    """Decide for each frame whether its field differs from a running no-load field by more than noise.
 
-    The log says how much of the time the skin is not touched: so many of the frames, the nearest to the last no-load
-    field, are no-load, and half of these surely so. They give the next no-load field, and their spread the noise.
+    The log tells in which share of the time the skin is not touched. This share of the frames, those nearest to the
+    previous no-load field, are taken as no-load. The nearer half of them gives the next no-load field and the noise.
     """
     noload_uT, noise_uT = None, np.inf
     for t_s, b_uT in _stretches(blocks, STRETCH_PERIODS_N * pattern.period_s):
         if noload_uT is None:
             noload_uT = np.median(b_uT[:START_FRAMES_N], axis=0)
-        if noise_uT == np.inf or t_s[-1] - t_s[0] > STRETCH_PERIODS_N * pattern.period_s / 4:  # else all may be contact
+        # A short stretch may be all contact.
+        if noise_uT == np.inf or t_s[-1] - t_s[0] > STRETCH_PERIODS_N * pattern.period_s / 4:
             sample = b_uT[:: -(-len(b_uT) // REFERENCE_FRAMES_N)]
             far_uT = np.linalg.norm(sample - noload_uT, axis=1)
             noload_uT = sample[far_uT <= np.quantile(far_uT, pattern.quiet / 2)].mean(axis=0)
@@ -279,7 +282,7 @@ def _touched(
 
 
 def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
-    """Cut blocks in time, and leave out frames that are not finite: over a stretch the no-load field stays."""
+    """Cut blocks into stretches with a nearly constant no-load field; leave out frames that are not finite."""
     for t_s, b_uT in blocks:
         good = np.isfinite(b_uT).all(axis=1) & np.isfinite(t_s)
         t_s, b_uT = t_s[good], b_uT[good]
@@ -292,7 +295,7 @@ def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
 def _line(
     at_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
 ) -> ClockMap:
-    """Draw the least-squares line through offsets seen at stream times; one gives no rate."""
+    """Fit the least-squares line to offsets at stream times; with a single offset, the rate is 1."""
     mid_s, mean_s = at_s.mean(), offset_s.mean()  # centred, as clocks may count from 1970
     spread_s2 = ((at_s - mid_s) ** 2).sum()
     slope = float(((at_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(at_s) > 1 else 0.0

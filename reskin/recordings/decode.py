@@ -1,4 +1,4 @@
-"""Decode a dump of a serial port to a table with one row for each frame, and encode a table as frames."""
+"""Decode a serial dump to a table with one row per frame, and read such a table."""
 
 import numpy as np
 import pyarrow as pa
@@ -11,7 +11,7 @@ from reskin.recordings import clocks
 
 
 def decode_dump(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[pa.Table, dict[str, int]]:
-    """Decode a dump; raise `CaptureError` if there is not one frame in it. Units stand in the fields' metadata."""
+    """Decode a dump; raise `CaptureError` if it has no frames. Units are in the metadata of the table's fields."""
     frames, account = decode_all(data, wire, chips_n, where)
     values = [*frames.b_uT.T, *frames.temperature_degC.T, frames.device_s, frames.end_byte]
     fields = [
@@ -27,8 +27,8 @@ def read_frames(
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
     """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
 
-    Time is the device's where all frames have it, else that of a constant rate; lost bytes then keep their time, if
-    frames have one length.
+    Time is the device's if all frames have it, otherwise that of a constant rate. If all frames have the same length,
+    lost bytes take up their share of the time.
     """
     chips_n = sum(name.startswith("temperature") for name in table.column_names)
     if table.column_names != list(_columns(chips_n)):

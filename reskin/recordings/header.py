@@ -37,8 +37,8 @@ class _Frozen(BaseModel):
 class Clock(_Frozen):
     """How frames get a time: from `arrivals.csv`, from a constant rate, or not at all (`recording`).
 
-    `marks` are pairs (stream time, probe time) of one event seen by both clocks, in seconds; with none, ingest
-    aligns the clocks by the contacts themselves.
+    `marks` are pairs (stream time, probe time) in seconds, each for one event seen by both clocks; without marks,
+    ingest aligns the clocks by the contacts.
     """
 
     kind: Literal["arrivals", "rate", "recording"]
@@ -48,7 +48,7 @@ class Clock(_Frozen):
     @model_validator(mode="after")
     def _rate_is_there(self) -> "Clock":
         if (self.kind == "rate") != (self.rate_hz is not None):
-            raise ValueError("rate_hz belongs to clock kind 'rate', and to no other")
+            raise ValueError("rate_hz must be given for clock kind 'rate', and only for it")
         return self
 
 
@@ -79,18 +79,18 @@ class Header(_Frozen):
     protocol: str
     contacts_before_n: Annotated[int, Field(ge=0)]
     options: dict[str, str]
-    files: dict[str, str]  # name -> sha256, of everything but this header
+    files: dict[str, str]  # name -> sha256, of all files but this header
     note: str
 
     @property
     def expected_lsb_uT(self) -> tuple[float, float] | None:
-        """LSB along x, y and along z by the firmware's settings, if they are known."""
+        """LSB along x and y, and LSB along z, by the firmware's settings; None if they are unknown."""
         return None if self.firmware is None else (self.firmware.lsb_xy_uT, self.firmware.lsb_z_uT)
 
     @model_validator(mode="after")
     def _stream_has_wire(self) -> "Header":
         if (self.layout == "native") != (self.wire is not None):
-            raise ValueError("wire belongs to layout 'native', and to no other")
+            raise ValueError("wire must be given for layout 'native', and only for it")
         return self
 
 
@@ -106,8 +106,8 @@ def parse(text: str, where: str) -> Header:
         raise CaptureError(f"{where}: {field}: {rule}; got {got}. Correct the header or record again.") from None
 
 
-def recorded(where: str, **fields: Any) -> Header:
-    """Make and check the header of a recording; what is not given is that of one whose own files say all."""
+def make_header(where: str, **fields: Any) -> Header:
+    """Make and check the header of a recording; defaults are for a recording that needs nothing but its own files."""
     usual: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
@@ -123,14 +123,14 @@ def render(header: Header) -> str:
 
 
 def check_same_capture(header: Header, folder: str) -> None:
-    """Raise if a capture folder was renamed by hand, which would give two names to one thing."""
+    """Raise if a capture folder was renamed by hand, so that its name differs from that in its header."""
     if header.capture != folder:
         rule = f"the folder's name {folder!r}"
         raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename it back.")
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:
-    """Write a capture's files (bytes, or copies of paths), hash them into the header, and write that last."""
+    """Write a capture's files (bytes, or copies of paths); then write the header, with their hashes."""
     with io.replacing(folder) as temporary:
         temporary.mkdir()
         for name, content in contents.items():
@@ -142,7 +142,7 @@ def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | P
 
 
 def seal(folder: Path, header: Header) -> Header:
-    """Hash the files that a folder holds into its header, and write that."""
+    """Write the header of a folder, with the hashes of its files."""
     names = sorted(path.name for path in folder.iterdir() if path.name != HEADER_FILE)
     complete = header.model_copy(update={"files": {name: io.sha256(folder / name) for name in names}})
     io.write_text(folder / HEADER_FILE, render(complete))

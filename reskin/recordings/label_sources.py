@@ -31,12 +31,12 @@ from reskin.recordings.labels import (
 
 @dataclass
 class LabelContext:
-    """What a source works with: writer, clock in unix seconds, stop event; `mark` gives one event on both clocks."""
+    """What a source of labels works with: writer, clock in unix seconds, stop event and function for clock marks."""
 
     writer: ProbeLogWriter
     unix_s: Callable[[], float]
     stop: threading.Event
-    mark: Callable[[float, float], object]  # unix time, time of the source's own clock
+    mark: Callable[[float, float], object]  # takes the times of one event by unix time and by the source's own clock
 
     def hold(self, label: Label, dwell_s: float) -> Dwell:
         """Wait `dwell_s`, or until the recording stops; return the dwell."""
@@ -46,7 +46,7 @@ class LabelContext:
 
 
 class LabelSource(NamedTuple):
-    """A source of labels: its name in the header, the order of places, and a function that runs until it ends."""
+    """A source of labels: its name in the header, the order of places, and a function that runs until labels end."""
 
     name: str
     scan: str | None
@@ -56,7 +56,7 @@ class LabelSource(NamedTuple):
 def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: float) -> LabelSource:
     """Take labels from a generator, or from a function that is called until it returns None.
 
-    The program moves the robot before it gives a label; the next label is taken after the dwell.
+    The program moves the robot before it returns a label; the next label is requested after the dwell.
     """
     each = iter(labels, None) if callable(labels) else iter(labels)
 
@@ -76,7 +76,7 @@ def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: 
 
 
 class LabelThread:
-    """Run a source of labels in a thread; `problem` says what ended it early."""
+    """Run a source of labels in a thread; `problem` says why it ended early."""
 
     def __init__(self, source: LabelSource, context: LabelContext) -> None:
         self.summary, self.problem = "", ""
@@ -91,7 +91,7 @@ class LabelThread:
         self._thread.join(wait_s)
         writer = self._label_context.writer
         writer.close()
-        lost = {"without a no-load dwell before": writer.without_noload_n, "out of order": writer.out_of_order_n}
+        lost = {"without a no-load dwell before them": writer.without_noload_n, "out of order": writer.out_of_order_n}
         counts = [f"{writer.touches_n} touches labelled", *(f"{n} {why}" for why, n in lost.items() if n)]
         return "; ".join(filter(None, (", ".join(counts), self.summary, self.problem)))
 
@@ -117,7 +117,7 @@ class Places:
     row_n: int
 
     def order(self, scan: str, rng: np.random.Generator) -> list[int]:
-        """Order the places for one pass: drawn anew, or row by row, there and back."""
+        """Order the places for one pass: at random, or row by row with every other row backwards."""
         if scan == RANDOM:
             return [int(i) for i in rng.permutation(len(self.xy_mm))]
         rows = [list(range(first, first + self.row_n)) for first in range(0, len(self.xy_mm), self.row_n)]
@@ -125,7 +125,7 @@ class Places:
 
 
 def parse_places(text: str) -> Places | None:
-    """Read `line:N:STEP_MM`, along x, or `grid:NXxNY:STEP_MM`, both perhaps with `@X_MM,Y_MM` of the first place.
+    """Parse `line:N:STEP_MM` (along x) or `grid:NXxNY:STEP_MM`; both may end in `@X_MM,Y_MM`, the first place.
 
     >>> parse_places("line:3:2@0,8").xy_mm
     [(0.0, 8.0), (2.0, 8.0), (4.0, 8.0)]
@@ -143,7 +143,7 @@ def parse_places(text: str) -> Places | None:
 
 
 TABLE_POLL_s = 0.02
-BETTER_s = 0.005  # a clock mark is replaced by one that is so much better
+BETTER_s = 0.005  # a clock mark is replaced if the delay of a new one is less by this much
 
 
 def from_table(file: Path) -> LabelSource:
@@ -157,7 +157,7 @@ def from_table(file: Path) -> LabelSource:
                 if not samples or not is_new:
                     continue
                 late_s = came_s - samples[-1].t_s if table.clock == "t_s" else best_s
-                if late_s < best_s - BETTER_s:  # a row is written after its time: the least delay is nearest to none
+                if late_s < best_s - BETTER_s:  # rows arrive after their time: the least delay is nearest to zero
                     best_s = late_s
                     context.mark(came_s, samples[-1].t_s)
                 context.writer.write_all(dwells.feed(samples))
@@ -173,7 +173,7 @@ def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
 
 
 def _grown(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
-    """Yield what a file holds and what is appended, with whether it is new; wait for a missing file."""
+    """Yield a file's content and what is appended, each with whether it is new; wait for a missing file."""
     is_new = not file.exists()
     while not stop.is_set() and not file.exists():
         stop.wait(TABLE_POLL_s)
@@ -205,7 +205,7 @@ def _check_grows(file: Path, stream: BinaryIO) -> None:
         )
 
 
-KEPT_N = 10_000  # samples, of which a touch is a few hundred
+KEPT_N = 10_000  # samples; a touch has a few hundred
 
 
 class ForceGauge:
@@ -218,7 +218,7 @@ class ForceGauge:
         self._without_n = 0
 
     def during(self, start_s: float, end_s: float) -> Label:
-        """Return the mean force between two times; NaN, and counted, without a sample."""
+        """Return the mean force between two times; without a sample, return NaN and count the contact."""
         found = [one.label for one in list(self._kept) if one.label and start_s <= one.t_s <= end_s]
         self._without_n += not found
         return mean_label(found) if found else Label(True)
@@ -226,7 +226,7 @@ class ForceGauge:
     def summary(self) -> str:
         """Say how many lines could not be read, and how many contacts have no force."""
         bad = _bad_lines(f"the gauge at {self.port}", self._gauge)
-        without = f"{self._without_n} touches without a force: the gauge at {self.port} sent none while they lasted"
+        without = f"{self._without_n} touches without a force: the gauge at {self.port} sent none during them"
         return "; ".join(filter(None, (bad, self._silent, without if self._without_n else "")))
 
     @contextmanager
@@ -245,10 +245,10 @@ class ForceGauge:
         try:
             self.read(device, context, self._kept.extend)
         except CaptureError as error:
-            self._silent = f"{error} Forces are missing from then on"
+            self._silent = f"{error} Later forces are missing"
 
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
-        """Read until the recording stops; raise `CaptureError` if the gauge is unplugged before."""
+        """Read until the recording stops; raise `CaptureError` if the gauge is unplugged before that."""
         while not context.stop.is_set():
             try:
                 chunk = read_waiting(device)
@@ -277,19 +277,19 @@ def from_gauge(port: str, baud: int) -> LabelSource:
 
 POLL_s = 0.05
 ENDS = ("q", "quit", "end")
-# A place, a force, or both with a blank between: else 12N would be place 1 with 2 N.
+# A place, a force, or both separated by a blank; without the blank, 12N could be place 1 with 2 N.
 REPLY = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
 Say = Callable[[str], object]
 
 
 @dataclass(frozen=True)
 class Prompts:
-    """Ask a person to press places one after the other; Enter says that the tip stands still."""
+    """Prompt a person to press places one after the other; the person presses Enter when the tip is still."""
 
     places: Places
     dwell_s: float
     say: Say
-    lines: Callable[[], Iterable[str]]  # what is typed, line by line
+    lines: Callable[[], Iterable[str]]  # the lines that are typed
     forces: ForceGauge | None
     rng: np.random.Generator
     scan: str = RANDOM
@@ -304,8 +304,8 @@ class Prompts:
 
     def _ask(self, context: LabelContext, typed: Iterator[str]) -> None:
         n = len(self.places.xy_mm)
-        self.say(f"{n} places, {self.scan} order. Enter when it holds still; or type the number of another place, a "
-                 "force such as 0.8N, or both; s passes a place over, q ends.")  # fmt: skip
+        self.say(f"{n} places, {self.scan} order. Press Enter when the tip is still; or type the number of another "
+                 "place, a force such as 0.8N, or both; s skips a place, q ends.")  # fmt: skip
         for pass_i in count():
             order = self.places.order(self.scan, self.rng)
             for i, place_i in enumerate(order):
@@ -336,7 +336,8 @@ class Prompts:
             if found and int(found[1] or place_i) < len(self.places.xy_mm):
                 x_mm, y_mm = self.places.xy_mm[int(found[1] or place_i)]
                 return Label(True, x_mm, y_mm, Fz_N=float(found[2] or math.nan))
-            self.say(f"  {line[:20]!r} is no place from 0 to {len(self.places.xy_mm) - 1}, and no force such as 0.8N")
+            last = len(self.places.xy_mm) - 1
+            self.say(f"  {line[:20]!r} is neither a place from 0 to {last} nor a force such as 0.8N")
         return None
 
     def _with_force(self, dwell: Dwell) -> Dwell:

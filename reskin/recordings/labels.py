@@ -1,6 +1,6 @@
-"""Labels of a recording as they come: samples of a table or a force gauge -> dwells -> rows of `probe.csv`.
+"""Labels during a recording: samples of a table or a force gauge -> dwells -> rows of `probe.csv`.
 
-Where they come from: `label_sources`.
+The sources of labels are in `label_sources`.
 """
 
 import math
@@ -20,22 +20,22 @@ from reskin.recordings.probe import CONTACT, LABELS, NOLOAD, TYPES
 from reskin.recordings.units import SAME_PLACE_mm
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
-TIME_STEP_s = 1e-6  # as it is written
-TIME_MAX_s = 1e11  # unix time is below it for 3,000 years, unless it is in milliseconds
-CLOCKS = ("unix_s", "t_s")  # this machine's, or one of the source's own
+TIME_STEP_s = 1e-6  # resolution of the written times
+TIME_MAX_s = 1e11  # unix time stays below this for 3,000 years, but not in milliseconds
+CLOCKS = ("unix_s", "t_s")  # this machine's clock, or the source's own
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
 CONTACT_N = 0.05  # assumed: above the noise of a gauge
-NOLOAD_N = 0.025  # between the two, contact begins or ends
+NOLOAD_N = 0.025  # between this and CONTACT_N, contact begins or ends
 DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer contact is several dwells, each with its own force
-DWELL_SAMPLES_MAX_N = 10_000  # of a clock that stands still
+DWELL_SAMPLES_MAX_N = 10_000  # limit if the clock stands still
 LINE_BYTES_MAX_N = 4096
-GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # by how many stand in a line, in N
+GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # by the number of values in a line, in N
 
 
 class Label(NamedTuple):
-    """The label of a dwell, in which nothing moves; NaN where a number is not known.
+    """The label of a dwell, during which nothing moves; unknown numbers are NaN.
 
-    Forces have the signs of `reskin.schema`: on the skin, `Fz_N` positive in compression.
+    Forces have the signs of `reskin.schema`: forces on the skin, `Fz_N` positive in compression.
     """
 
     contact: bool
@@ -45,11 +45,11 @@ class Label(NamedTuple):
     Fx_N: float = math.nan
     Fy_N: float = math.nan
     Fz_N: float = math.nan
-    pass_i: int = 0  # which round over all places
+    pass_i: int = 0  # number of the pass over all places
 
 
 class Dwell(NamedTuple):
-    """A label and its time, on the clock of its source."""
+    """A label with its start and end, on the clock of its source."""
 
     label: Label
     t_start_s: float
@@ -57,9 +57,10 @@ class Dwell(NamedTuple):
 
 
 class ProbeLogWriter:
-    """Write the probe log of a recording as labels come: each contact with the no-load dwell before it, or not at all.
+    """Write the probe log of a recording as labels arrive, each contact together with the no-load dwell before it.
 
-    So a killed recorder leaves a log that `probe.parse` reads. Contacts that it would refuse are counted.
+    This way, a killed recorder leaves a log that `probe.parse` accepts. Contacts that it would refuse are counted and
+    not written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -67,7 +68,7 @@ class ProbeLogWriter:
         self._indentation = -1
         self._end_s = -math.inf
         self._noload: Dwell | None = None
-        self._touch: Label | None = None  # the first of the touch that may go on
+        self._touch: Label | None = None  # first label of a touch that may continue
         self._lock = threading.Lock()
         self._file = (folder / PROBE_FILE).open("xb", buffering=0)
         io.append(self._file, (",".join(TYPES) + "\n").encode())
@@ -79,14 +80,14 @@ class ProbeLogWriter:
 
     @contextmanager
     def locked(self) -> Iterator[bool]:
-        """Hold the lock; the value says whether labels are still taken."""
+        """Hold the lock; yield whether labels are still accepted."""
         with self._lock:
             yield not self._file.closed
 
     def write(self, dwell: Dwell) -> None:
         """Write a contact; keep a no-load dwell for the contact that follows it.
 
-        A contact may go on over several dwells at one place; at another place, it lacks a no-load dwell.
+        A contact may continue over several dwells at one place. At another place, it needs its own no-load dwell.
         """
         _check(dwell)
         with self.locked() as is_open:
@@ -117,7 +118,7 @@ class ProbeLogWriter:
 
 
 def same_place(a: Label, b: Label) -> bool:
-    """Return whether two labels are of one place; coordinates that both do not know count as equal."""
+    """Return whether two labels have the same place; a coordinate that is unknown in both counts as equal."""
     return all(
         abs(a_mm - b_mm) <= SAME_PLACE_mm or (math.isnan(a_mm) and math.isnan(b_mm))
         for a_mm, b_mm in ((a.x_mm, b.x_mm), (a.y_mm, b.y_mm))
@@ -140,7 +141,7 @@ def _check(dwell: Dwell) -> None:
             raise CaptureError("a label", name, "a number", value, remedy)
     if not 0 <= label.pass_i < 2**31:
         raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Count rounds from 0.")
-    if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # of NaN, nothing is so
+    if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # False for NaN
         raise CaptureError(
             f"a label: {dwell.t_start_s} to {dwell.t_end_s} s is not a span of time. Is the clock in seconds?"
         )
@@ -154,7 +155,7 @@ class Sample(NamedTuple):
 
 
 class LineBuffer:
-    """Split bytes into lines of text; a line without end is cut at `LINE_BYTES_MAX_N`."""
+    """Split bytes into lines of text; a line longer than `LINE_BYTES_MAX_N` is cut."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -167,7 +168,7 @@ class LineBuffer:
 
 
 class SampleTable:
-    """Read samples from a CSV that comes in portions; `bad_n` counts unreadable lines."""
+    """Read samples from a CSV that arrives in portions; `bad_n` counts unreadable lines."""
 
     def __init__(self, where: str) -> None:
         self._where = where
@@ -192,7 +193,7 @@ class SampleTable:
         clocks = [name for name in CLOCKS if name in names]
         shows_touch = "phase" in names or "Fz_N" in names
         if len(clocks) != 1 or not shows_touch or len(set(names)) < len(names):
-            needed = f"one of {' and '.join(CLOCKS)}, phase or Fz_N, and no column twice"
+            needed = f"either {' or '.join(CLOCKS)}, phase or Fz_N or both, and no column twice"
             raise CaptureError(
                 f"{self._where}: row 1 must name {needed}; found {ascii(names)[:120]}. Known columns: "
                 f"{', '.join(COLUMNS)}."
@@ -216,14 +217,14 @@ class SampleTable:
 
 
 class GaugeLines:
-    """Read lines of a force gauge: one number, Fz, or three, Fx Fy Fz, in N and with the signs of `Label`."""
+    """Read lines of a force gauge: one number (Fz) or three (Fx Fy Fz), in N and with the signs of `Label`."""
 
     def __init__(self) -> None:
         self._lines = LineBuffer()
         self.bad_n, self.first_bad = 0, ""
 
     def feed(self, data: bytes, came_s: float) -> list[Sample]:
-        """Take the next bytes and their time; return the forces of the complete lines."""
+        """Take the next bytes and their time of arrival; return the forces of the complete lines."""
         samples = []
         for line in self._lines.feed(data):
             try:
@@ -238,15 +239,15 @@ class GaugeLines:
 
 
 class DwellBuilder:
-    """Join samples of one contact at one place, or of no contact, into dwells; forces and depths are means.
+    """Join samples of one contact at one place, or of a time without contact, to dwells with mean forces and depths.
 
-    A contact of several `DWELL_MAX_s` becomes as many dwells, so that a killed recording has its labels too.
+    A contact longer than `DWELL_MAX_s` is cut into several dwells, so that a killed recording has labels for it too.
     `short_n` counts contacts that are too short for a dwell.
     """
 
     def __init__(self) -> None:
         self._run: list[Sample] = []
-        self._cut: Sample | None = None  # where a contact that goes on was cut
+        self._cut: Sample | None = None  # where a contact that continues was cut
         self.short_n = 0
 
     def feed(self, samples: Iterable[Sample]) -> Iterator[Dwell]:
@@ -256,7 +257,7 @@ class DwellBuilder:
             if run and not _goes_on(run[0], run[-1], sample):
                 yield from self.close()
             if sample.label is not None:
-                if len(self._run) > 1 and not sample.label.contact:  # a long rest is one dwell, of its two ends
+                if len(self._run) > 1 and not sample.label.contact:  # without contact, keep only first and last sample
                     self._run.pop()
                 self._run.append(sample)
                 if sample.label.contact and (self._lasts_s() >= DWELL_MAX_s or len(self._run) >= DWELL_SAMPLES_MAX_N):
@@ -274,18 +275,18 @@ class DwellBuilder:
             self.short_n += 1
 
     def summary(self) -> str:
-        """Say how many contacts were too short; a table with a row only at each change of state has no others."""
+        """Say how many contacts were too short, as all are in a table with rows only at changes of state."""
         if not self.short_n:
             return ""
-        least = f"{DWELL_MIN_s:g} s from its first line to its last"
-        return f"{self.short_n} touches left out: one lasts {least}, so write lines all the while"
+        least = f"{DWELL_MIN_s:g} s from first to last line"
+        return f"{self.short_n} touches left out: a touch needs {least}, so write lines continuously"
 
     def _lasts_s(self) -> float:
         return self._run[-1].t_s - self._run[0].t_s if self._run else 0.0
 
 
 def mean_label(labels: list[Label]) -> Label:
-    """Return the first label, with the mean of each number that all have."""
+    """Return the first label with the mean of each number; NaN if a label lacks it."""
     means: dict[str, Any] = {name: math.fsum(getattr(label, name) for label in labels) / len(labels) for name in LABELS}
     return labels[0]._replace(**means)
 

@@ -1,8 +1,8 @@
-"""Find captures whose places are turned, mirrored or exchanged, by comparison with other captures of their scene.
+"""Find captures whose places are rotated, mirrored or swapped, by comparison with other captures of their scene.
 
-Boards of one scene read alike where they are pressed alike, so the place of a press can be looked up among the presses
-of other captures. If the looked-up places agree with the labels only after the labels are turned or mirrored, the
-labels of one of them are probably wrong. Nothing is assumed of the board, so one capture alone shows nothing.
+Boards of one scene give similar readings for similar presses, so the place of a press can be looked up among the
+presses of other captures. If the looked-up places agree with the labels only after the labels are rotated or mirrored,
+the labels of either side are probably wrong. Nothing is assumed about the board, so a single capture cannot be checked.
 """
 
 from collections.abc import Iterable
@@ -13,9 +13,9 @@ from jaxtyping import Float
 
 from reskin.schema import Readings
 
-PRESSES_MIN_N = 20  # fewer presses do not tell
-EXPLAINED_MIN = 0.5  # of the places' variance, that another orientation must explain
-GAIN_MIN = 0.5  # and so much more than the labels as they are
+PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
+EXPLAINED_MIN = 0.5  # share of the places' variance that another orientation must explain
+GAIN_MIN = 0.5  # and how much more it must explain than the labels as they are
 WAYS = {
     "as they are": [[1, 0], [0, 1]],
     "with x and y exchanged": [[0, 1], [1, 0]],
@@ -30,7 +30,7 @@ WAYS = {
 
 @dataclass(frozen=True)
 class Presses:
-    """Places in mm, from their middle, and directions of the change of field (unit vectors), one per press."""
+    """Places in mm, relative to their middle, and unit vectors along the field change, one per press."""
 
     place_mm: Float[np.ndarray, "n 2"]
     direction: Float[np.ndarray, "n ch"]
@@ -55,10 +55,11 @@ def presses_of(blocks: Iterable[Readings]) -> Presses:
 
 
 def other_orientation(own: Presses, others: Presses) -> str | None:
-    """Return how the labels would have to be changed to agree with those of other captures; None if not at all.
+    """Return how the labels must be changed to agree with those of other captures; None if no change is needed.
 
-    Each press gets the mean place of the three presses of `others` that are nearest in direction. A way to change the
-    labels counts if it explains `EXPLAINED_MIN` of the variance of these places, `GAIN_MIN` more than the labels do.
+    Each press gets the mean place of the three presses of `others` with the nearest directions. A change of the labels
+    is reported if it explains at least `EXPLAINED_MIN` of the variance of these places, and `GAIN_MIN` more than the
+    labels as they are.
     """
     comparable = own.direction.shape[1:] == others.direction.shape[1:]
     if not comparable or min(len(own.place_mm), len(others.place_mm)) < PRESSES_MIN_N:

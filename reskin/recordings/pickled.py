@@ -1,7 +1,7 @@
 """Convert archives of pickled samples (.npz, written by the rig of layout `lab`) to one CSV file of that layout.
 
-No pickle is loaded: its opcodes are followed as data, so nothing in it is imported, called or run. Anything but plain
-values and NumPy numbers is refused.
+No pickle is loaded: its opcodes are interpreted as data, so nothing in it is imported, called or run. Anything but
+plain values and NumPy numbers is refused.
 """
 
 import pickletools
@@ -19,15 +19,15 @@ CHIPS_N = 5
 COLUMNS = [f"{what}{chip}" for chip in range(CHIPS_N) for what in ("T", "Bx", "By", "Bz")]
 HEAD = ",".join(["indent", "phase", "x_mm", "y_mm", *COLUMNS, "Fx", "Fy", "Fz"])
 PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # the archive's name for the samples of each phase
-REMEDY = "Is it a recording of port and depth, copied whole?"
-BYTES_MAX_N = 500_000_000  # those of lab's port and depth hold 10 to 30 MB
+REMEDY = "Is it the recording of one port and depth, copied whole?"
+BYTES_MAX_N = 500_000_000  # the archives of scene lab have 10 to 30 MB
 MARK = object()
 
 
 def to_lab_csv(archive: bytes, where: str) -> bytes:
-    """Write an archive's samples as CSV: by indentation, first those without load; degC and uT to 1e-4, N to 1e-6.
+    """Write an archive's samples as CSV, by indentation, the no-load samples of each first.
 
-    Lines end as in the CSV of RFC 4180.
+    Values are rounded to 1e-4 degC, 1e-4 uT and 1e-6 N. Lines end in CR LF, as in RFC 4180.
     """
     try:
         with zipfile.ZipFile(BytesIO(archive)) as file:
@@ -39,7 +39,7 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
     except CaptureError:
         raise
-    except Exception as error:  # an archive may hold anything; it is refused, with the reason
+    except Exception as error:  # an archive may contain anything; the error names the reason
         samples_of = " and ".join(PHASES.values())
         raise CaptureError(
             f"{where}: not a .npz with samples under {samples_of}: {_describe(error)}. {REMEDY}"
@@ -57,7 +57,7 @@ def _row(sample: Mapping[str, Any]) -> str:
 
 
 def decode_array(npy: bytes, where: str) -> Any:
-    """Return the objects of an .npy file that holds an array of them."""
+    """Return the objects in an .npy file with an array of objects."""
     stream = BytesIO(npy)
     version = np.lib.format.read_magic(stream)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -68,9 +68,9 @@ def decode_array(npy: bytes, where: str) -> Any:
 
 
 def decode(pickled: bytes, where: str) -> Any:
-    """Return the plain values of a pickle: lists, tuples, dicts, numbers, text, bytes; NumPy's numbers and arrays too.
+    """Return the plain values of a pickle: lists, tuples, dicts, numbers, text, bytes, NumPy numbers and arrays.
 
-    Of protocols 3 and 4, in which NumPy has written arrays of objects.
+    Supports protocols 3 and 4, in which NumPy writes arrays of objects.
     """
     stack = _Stack([], {})
     try:
@@ -84,7 +84,7 @@ def decode(pickled: bytes, where: str) -> Any:
         return plain(stack.values.pop())
     except CaptureError:
         raise
-    except Exception as error:  # bytes that are no pickle fail anywhere: in pickletools, on an empty stack, in NumPy
+    except Exception as error:  # other bytes may fail anywhere: in pickletools, on an empty stack, in NumPy
         raise CaptureError(f"{where}: the pickle cannot be read: {_describe(error)}. {REMEDY}") from None
 
 
@@ -111,13 +111,13 @@ class _Stack:
         self.values.append(value)
 
     def last(self, length: int) -> list[Any]:
-        """Take so many values off the top."""
+        """Pop `length` values from the stack."""
         taken = self.values[-length:]
         del self.values[-length:]
         return taken
 
     def since_mark(self) -> list[Any]:
-        """Take what was pushed since the last mark off the top, and the mark."""
+        """Pop the values since the last mark, and the mark; return the values."""
         at = max(i for i, value in enumerate(self.values) if value is MARK)
         taken = self.values[at + 1 :]
         del self.values[at:]
@@ -170,9 +170,9 @@ STEPS: Mapping[str, Step] = {
 
 
 def plain(value: Any, known: dict[int, Any] | None = None) -> Any:
-    """Convert NumPy's calls into lists and numbers; raise `ValueError` for any other call.
+    """Convert calls of NumPy functions to lists and numbers; raise `ValueError` for any other call.
 
-    A value that a pickle uses several times is converted once, or nested lists of one list would take forever.
+    A value that a pickle uses several times is converted once; otherwise nested references could take forever.
     """
     known = {} if known is None else known
     if not isinstance(value, NESTED):
@@ -184,7 +184,7 @@ def plain(value: Any, known: dict[int, Any] | None = None) -> Any:
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:
     match value:
-        case list() | tuple():  # of a million numbers, most likely: each is plain already
+        case list() | tuple():  # probably of a million numbers, which need no conversion
             return type(value)(plain(item, known) if isinstance(item, NESTED) else item for item in value)
         case dict():
             return {plain(key, known): plain(item, known) for key, item in value.items()}

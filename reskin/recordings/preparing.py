@@ -1,4 +1,4 @@
-"""Prepare a recording of any layout to be added: the header of its capture, and the files that go with it.
+"""Prepare a recording of any layout for `reskin add`: make the header of its capture and collect its files.
 
 Nothing is written here; see `header.write_capture`.
 """
@@ -23,7 +23,7 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import READERS
 
 NATIVE_FILES = (headers.STREAM_FILE, headers.ARRIVALS_FILE, headers.PROBE_FILE)
-UNNAMED = "unnamed"  # board and skin of a recording that was made without their names
+UNNAMED = "unnamed"  # name of board and skin in a recording that was made without names
 
 Marks = tuple[tuple[float, float], ...]
 Prepared = tuple[Header, Mapping[str, bytes | Path]]
@@ -31,7 +31,7 @@ Prepared = tuple[Header, Mapping[str, bytes | Path]]
 
 @dataclass(frozen=True)
 class CaptureNames:
-    """The names of a board and skin, and of the capture; None makes the last from the others."""
+    """The names of a board, a skin and a capture; without the last, it is made from the others and the file name."""
 
     board: str
     skin: str
@@ -40,7 +40,7 @@ class CaptureNames:
 
 @dataclass(frozen=True)
 class Dump:
-    """What a bare serial dump lacks: wire format, chips, rate, the rig's probe log, and marks between the clocks."""
+    """What a bare serial dump lacks: wire format, number of chips, rate, the rig's probe log, and clock marks."""
 
     wire: Wire
     chips_n: int
@@ -66,7 +66,7 @@ def parse_marks(texts: list[str]) -> Marks:
 
 @contextmanager
 def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
-    """Add to an error about a recording the layouts that it can be read in, if `layout` is none of them."""
+    """Add to an error about a recording the layouts that it can be read in, unless `layout` is one of them."""
     try:
         yield
     except ReskinError as error:
@@ -138,7 +138,7 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
     marks_before = found.clock.marks
     if probe is not None:
         _need(probe)
-        marks_before = () if headers.PROBE_FILE in files else marks_before  # those of the recorded log
+        marks_before = () if headers.PROBE_FILE in files else marks_before  # they belong to the log that is replaced
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
         raise CaptureError(f"{recording}: the capture has no probe log. Add --probe PROBE.csv.")
@@ -161,7 +161,7 @@ def _check_names(names: CaptureNames) -> None:
 def _header(names: CaptureNames, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:
     _check_names(names)
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", recording.resolve().stem)
-    return headers.recorded(
+    return headers.make_header(
         str(recording), capture=names.name or f"{names.board}_{names.skin}_{stem}"[:64], board=names.board,
         skin=names.skin, layout=layout, chips_n=chips_n, protocol=f"as recorded in {stem}", note="added by reskin add",
         **fields,

@@ -1,7 +1,7 @@
-"""The probe log `probe.csv`: places, depths and forces of the rig, one row a dwell, on the rig's own clock.
+"""The probe log `probe.csv`: places, depths and forces of the rig, one row per dwell, on the rig's own clock.
 
-Rows are in order of time. An indentation is one no-load dwell (robot lifted) and then its contact dwells (one, unless
-the robot drags).
+Rows are in order of time. An indentation is one no-load dwell (robot lifted), followed by its contact dwells (one,
+unless the robot drags).
 """
 
 from dataclasses import dataclass
@@ -70,7 +70,7 @@ def parse(source: str | Path, where: str) -> ProbeLog:
 
 
 def render(log: ProbeLog) -> str:
-    """Write a probe log as CSV; `parse` gives the same log back."""
+    """Write a probe log as CSV; `parse` returns the same log."""
     arrays = {name: getattr(log, name) for name in TYPES if name != "phase"}
     arrays["phase"] = np.where(log.contact, CONTACT, NOLOAD)
     # from_pandas: NaN becomes null, which CSV writes as an empty field
@@ -100,6 +100,6 @@ def _check_order(log: ProbeLog, where: str) -> None:
     falls = np.diff(number, prepend=number[0]) < 0
     refuse_row(falls, where, "indentation", "rising with time", number, "Number indentations on over the passes.")
     opens = np.diff(number, prepend=-1) != 0
-    remedy = "Log one no-load dwell, and then the contact, of every indentation."
+    remedy = "Log one no-load dwell, and then the contact dwells, of every indentation."
     refuse_row(opens & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
     refuse_row(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)

@@ -1,7 +1,7 @@
-"""Record a board as a capture folder that `reskin add` takes, with its labels if they come meanwhile.
+"""Record a board as a capture folder for `reskin add`, with labels if a source provides them during the recording.
 
-The capture is written into `<folder>.part`, its header first, and renamed when the recording has ended: a killed
-recorder leaves a `.part` that can still be added, with the labels that had come.
+The capture is written into `<folder>.part`, its header first, and renamed when the recording has ended. A killed
+recorder leaves a `.part` folder that can still be added, with the labels received until then.
 """
 
 import sys
@@ -16,7 +16,7 @@ from typing import NamedTuple
 from reskin import io
 from reskin.board.wire import Wire
 from reskin.errors import CaptureError
-from reskin.recordings.header import HEADER_FILE, Clock, Header, recorded, render, seal
+from reskin.recordings.header import HEADER_FILE, Clock, Header, make_header, render, seal
 from reskin.recordings.label_sources import LabelContext, LabelSource, LabelThread
 from reskin.recordings.labels import ProbeLogWriter
 from reskin.recordings.preparing import UNNAMED
@@ -36,8 +36,8 @@ class CaptureInfo:
     labels: LabelSource | None = None
 
 
-class Recorded(NamedTuple):
-    """A finished recording, a summary of its labels, and the error that ended the labels, if one did."""
+class CaptureResult(NamedTuple):
+    """A finished recording, a summary of its labels, and the error that ended the labels, if any."""
 
     stream: Recording
     labels: str
@@ -49,8 +49,8 @@ NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
 
 def record_capture(
     port: str, folder: Path, *, info: CaptureInfo, settings: PortSettings, report: Report, watch: Watch
-) -> Recorded:
-    """Record a port as a native capture, and labels if `info` has a source of them, until either ends."""
+) -> CaptureResult:
+    """Record a port as a native capture, with labels if `info` has a source of labels, until either ends."""
     part, header = begin_capture(folder, info, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
     stop, headers, label_thread = threading.Event(), [header], None
     try:
@@ -60,24 +60,22 @@ def record_capture(
     except CaptureError as error:
         if label_thread is not None:
             label_thread.end()
-        io.remove(part)  # no frame came: there is nothing to keep
-        if (
-            label_thread is not None and label_thread.failed is not None
-        ):  # this ended the recording, before a frame came
+        io.remove(part)  # no frame arrived: there is nothing to keep
+        if label_thread is not None and label_thread.failed is not None:  # this ended the recording
             raise label_thread.failed from error
         raise
     summary = label_thread.end() if label_thread is not None else ""
     failed = label_thread.failed if label_thread is not None else None
     if isinstance(failed, OSError) and failed.errno == ENOSPC:
         done = replace(done, ended="not written")
-    if done.ended != "not written":  # else the disk is full; the .part can be added as it is
+    if done.ended != "not written":  # otherwise the disk is full; the .part folder can be added as it is
         end_capture(folder, headers[-1])
-    return Recorded(done, summary, failed)
+    return CaptureResult(done, summary, failed)
 
 
 def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
-    """Make the context of a source of labels; its clock is that of the arrivals until `mark` gives another."""
-    offset_s = time.time() - time.monotonic()  # the system's clock may be set while we record
+    """Make the context of a source of labels; labels are on the clock of the arrivals until `mark` is called."""
+    offset_s = time.time() - time.monotonic()  # the system's clock may be adjusted during the recording
     writer = ProbeLogWriter(part)
 
     def unix_s() -> float:
@@ -85,7 +83,7 @@ def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> 
 
     def mark(stream_s: float, source_s: float) -> None:
         with writer.locked() as is_open:
-            if is_open:  # else the header is sealed
+            if is_open:  # otherwise the header is final
                 clock = headers[-1].clock.model_copy(update={"marks": ((stream_s, source_s),)})
                 headers[-1] = headers[-1].model_copy(update={"clock": clock})
                 io.write_text(part / HEADER_FILE, render(headers[-1]))
@@ -102,7 +100,7 @@ def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, 
         if path.exists():
             raise CaptureError(f"{path}: the folder exists already. Choose another --out.")
     options = {"scan": info.scan} | ({"labels": info.labels.name} if info.labels is not None else {})
-    header = recorded(
+    header = make_header(
         f"--out {folder.name}", capture=folder.name, board=info.board, skin=info.skin, layout="native",
         wire=wire, chips_n=chips_n, options=options,
         clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says",

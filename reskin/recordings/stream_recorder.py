@@ -19,24 +19,24 @@ from reskin.board.wire import TEXT_WIRES, Frames, Wire
 from reskin.errors import CaptureError
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 
-HEAD_BYTES_N = 16384  # the first bytes are kept to say what fits, should no frame come
+HEAD_BYTES_N = 16384  # the first bytes, kept to suggest a wire format if no frame arrives
 
 Report = Callable[[Mapping[str, int]], None]  # called with the account many times a second
-Watch = Callable[[Frames], object]  # called with frames as they come
+Watch = Callable[[Frames], object]  # called with frames as they arrive
 Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame", "not written"]
 
 
 @dataclass(frozen=True)
 class PortSettings:
-    """How to read a port, and for how long; `math.inf` seconds and no `bytes_max_n` go on until stopped."""
+    """How to read a port, and for how long: with `math.inf` seconds and no `bytes_max_n`, until stopped."""
 
     baud: int
     wire: Wire
     chips_n: int
     duration_s: float
     bytes_max_n: int | None
-    silence_s: float  # a port that sends nothing for so long has ended
-    no_frame_s: float  # a port that sends has so long to send its first frame
+    silence_s: float  # the recording ends if the port sends nothing for this long
+    no_frame_s: float  # the recording ends if no frame arrives within this time of the first byte
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ def record(
     report: Report = lambda account: None,
     watch: Watch = lambda frames: None,
 ) -> Recording:
-    """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or the settings say so.
+    """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or a limit in the settings.
 
-    Raises `CaptureError` if the port does not open or not one frame comes. A port that falls silent after its first
-    frame ends the recording: what came is kept.
+    Raises `CaptureError` if the port does not open or not one frame arrives. The recording also ends if the port falls
+    silent after its first frame; what arrived is kept.
     """
     with (
         open_port(port, settings.baud) as device,
@@ -74,9 +74,9 @@ def record(
 
 
 class CaptureWriter:
-    """Write the two files of a recording as it comes: first each chunk of bytes, then its time of arrival.
+    """Write the two files of a recording as it proceeds: each chunk of bytes first, then its time of arrival.
 
-    So no arrival is of bytes that are not there. A chunk that a full disk does not take whole is taken back.
+    In this order, no arrival refers to bytes that are missing. A chunk that a full disk takes only in part is removed.
     """
 
     def __init__(self, folder: Path, wire: Wire) -> None:
@@ -99,7 +99,7 @@ class CaptureWriter:
         self._arrivals.close()
 
     def write(self, chunk: bytes, unix_s: float) -> bytes:
-        """Write a chunk; return what was written of it: the first line of text may be cut inside a number."""
+        """Write a chunk and return what was written: all but a first line of text, which may start inside a number."""
         if self._in_partial_line:
             partial, newline, rest = chunk.partition(b"\n")
             self.partial_line_bytes_n += len(partial + newline)
@@ -115,7 +115,7 @@ class CaptureWriter:
 
 
 class _Recorder:
-    """A recording since its port was opened."""
+    """A recording in progress."""
 
     def __init__(self, port: str, settings: PortSettings, writer: CaptureWriter, watch: Watch) -> None:
         self._port, self._settings, self._writer, self._watch = port, settings, writer, watch
@@ -123,11 +123,11 @@ class _Recorder:
         self._head = b""
         self._start_s = self._last_byte_s = time.monotonic()
         self._first_byte_s = math.inf
-        # The system's clock may be set while we record, and arrival times must not fall.
+        # The system's clock may be adjusted during the recording, but arrival times must not go backwards.
         self._unix_s = time.time() - self._start_s
 
     def listen(self, device: Device, stop: threading.Event, report: Report) -> Ended:
-        """Read until there is a reason to end; return it."""
+        """Read until there is a reason to end; return the reason."""
         while not (ended := self._reason_to_end(stop)):
             report(self._frames.account())
             try:
@@ -141,7 +141,7 @@ class _Recorder:
         return ended
 
     def finish(self, ended: Ended) -> Recording:
-        """Return the finished recording; raise `CaptureError` if there is no frame in it."""
+        """Return the finished recording; raise `CaptureError` if it has no frames."""
         self._frames.close()
         account = self._frames.account()
         duration_s = time.monotonic() - self._start_s

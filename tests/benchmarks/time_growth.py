@@ -26,7 +26,7 @@ from pipeline.manage.registry import Entry, Registry, write_registry
 from pipeline.provenance import code_version, machine
 from reskin import io
 from reskin.config import read_yaml
-from reskin.recordings.header import HEADER_FILE, recorded, write_capture
+from reskin.recordings.header import HEADER_FILE, make_header, write_capture
 from tests.benchmarks.pages import MEASURED
 from tests.stages.checkout import ROOT, copy_checkout, variables
 
@@ -137,7 +137,7 @@ def lay_captures(root: Path, captures_n: int, rng: np.random.Generator) -> None:
     for i in range(captures_n):
         labels = {"board": f"b{i % BOARDS_N}", "skin": f"b{i % BOARDS_N}_s{i // BOARDS_N}"}
         name, target = f"c{i}", root / "data/raw" / SCENE / f"c{i}"
-        header = recorded("growth", capture=name, layout="table", chips_n=5, protocol="", note="", **labels)
+        header = make_header("growth", capture=name, layout="table", chips_n=5, protocol="", note="", **labels)
         write_capture(target, header, {"readings.csv": recording(rng)})
         entries[name] = Entry(layout="table", chips_n=5, fingerprints=(f"{i:064x}",), copy_of=None, **labels)
         targets.append(str(target))

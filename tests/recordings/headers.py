@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from reskin.config import parse, read_yaml
+from reskin.recordings import header
 from reskin.recordings.fault_policy import FaultPolicy
-from reskin.recordings.header import Header, recorded
+from reskin.recordings.header import Header
 
 LAB = {"board": "board1", "skin": "skin1", "layout": "lab", "chips_n": 5, "protocol": "", "note": ""}
 # The fault policy of params.yaml.
@@ -14,4 +15,4 @@ AS_USUAL = parse(FaultPolicy, read_yaml(Path(__file__).parents[2] / "params.yaml
 
 def make_header(**changed: Any) -> Header:
     """Make the header of a recorded lab capture with five chips; `changed` fields are validated like the rest."""
-    return recorded("test", **({"capture": "a_capture"} | LAB | changed))
+    return header.make_header("test", **({"capture": "a_capture"} | LAB | changed))

@@ -31,8 +31,8 @@ def test_header_round_trip(rate_hz, marks):
         ({"board": "../b"}, "board: String should match pattern"),
         ({"format": "reskin-capture/2"}, "format: Input should be 'reskin-capture/1'"),
         ({"colour": "red"}, "colour: Extra inputs are not permitted; got 'red'"),
-        ({"wire": "binary"}, "wire belongs to layout 'native', and to no other"),
-        ({"clock": {"kind": "rate", "rate_hz": None, "marks": []}}, "rate_hz belongs to clock kind 'rate'"),
+        ({"wire": "binary"}, "wire must be given for layout 'native', and only for it"),
+        ({"clock": {"kind": "rate", "rate_hz": None, "marks": []}}, "rate_hz must be given for clock kind 'rate'"),
     ],
 )
 def test_invalid_field_is_named(changed, message):

@@ -203,14 +203,14 @@ def test_gauge_force_is_averaged_over_each_touch(context, tmp_path, fake_gauge):
 def test_touches_without_gauge_data_are_counted(context, fake_gauge):
     fake_gauge(repeat(b""))
     prompter, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=ForceGauge("gauge", 9600))
-    assert prompter.run(context) == "2 touches without a force: the gauge at gauge sent none while they lasted"
+    assert prompter.run(context) == "2 touches without a force: the gauge at gauge sent none during them"
 
 
 def test_labels_continue_without_unplugged_gauge(context, fake_gauge):
     gauge = fake_gauge([b"0.5\n"])
     prompter, _ = prompts(["", "", "", "0.8N", "q"], forces=ForceGauge("gauge", 9600))
     assert "gauge: lost the force gauge" in (message := prompter.run(with_gauge(context, gauge)))
-    assert "Forces are missing from then on" in message
+    assert "Later forces are missing" in message
     assert context.writer.touches_n == 2
 
 

@@ -134,7 +134,7 @@ def test_force_threshold_replaces_phase():
 
 @pytest.mark.parametrize("head", ["x_mm,y_mm,Fz_N", "t_s,unix_s,Fz_N", "t_s,x_mm,y_mm", "t_s,t_s,Fz_N", ""])
 def test_invalid_columns_are_refused(head):
-    with pytest.raises(CaptureError, match="row 1 must name one of unix_s and t_s"):
+    with pytest.raises(CaptureError, match="row 1 must name either unix_s or t_s"):
         SampleTable("log").feed(head.encode() + b"\n")
 
 
@@ -158,7 +158,7 @@ def test_too_short_touches_are_counted():
     changes = "t_s,phase,x_mm,y_mm\n0,noload,4,8\n1,contact,4,8\n2,noload,4,8\n3,contact,5,8\n4,noload,5,8\n"
     list(dwells.feed(table.feed(changes.encode())))
     assert dwells.short_n == 2
-    assert dwells.summary().startswith("2 touches left out: one lasts 0.05 s")
+    assert dwells.summary().startswith("2 touches left out: a touch needs 0.05 s")
     long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))  # 0.52 s: a dwell, and 0.01 s
     assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1
     assert dwells.short_n == 2
