@@ -1,1 +1,1 @@
-"""Boards while they run: contacts, alarms, the page of `reskin live`, recording, and emulated boards."""
+"""Running boards: contacts, alarms, the page of `reskin live`, recording, and emulated boards."""

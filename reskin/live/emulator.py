@@ -1,4 +1,4 @@
-"""An emulated board: plays a capture or a simulation into a pseudo-terminal or a TCP socket, with faults if asked."""
+"""An emulated board: plays a capture or a simulation into a pseudo-terminal or TCP socket, with faults if requested."""
 
 import os
 import re
@@ -33,12 +33,12 @@ from reskin.simulation.settings import MAIN, parse_simulation
 
 NOMINAL_SOURCE = "nominal"
 SEED = 2021  # of a simulation without a seed of its own
-WALK = "log"  # the protocol that is most like a hand: touches, and pauses between them
+WALK = "log"  # the protocol that most resembles use by hand: touches with pauses between them
 
 START_S, DURATION_S = 3.0, 1.0  # defaults of a fault
 TORN_EVERY_N, TORN_BYTES_N = 10, 7
-CRLF_TEMPERATURE_degC = 34.513275  # its float32 holds the bytes 0D 0A
-FULL_SCALE_uT, WRAP_uT = 50_000.0, 2**16 * 0.15  # of the chip; of int16 at its finest step
+CRLF_TEMPERATURE_degC = 34.513275  # as float32 it contains the bytes 0D 0A
+FULL_SCALE_uT, WRAP_uT = 50_000.0, 2**16 * 0.15  # range of the chip; range of int16 at its finest step
 MAGNET_uT = 400.0
 HOT_degC = 150.0
 CLOCK_JUMP_S = 3600.0
@@ -49,8 +49,8 @@ BYTE_FAULTS = ("repeated", "dropped", "torn", "wrong-baud")
 FAULTS = (*VALUE_FAULTS, *BYTE_FAULTS, "stall", "unplug")
 
 TICK_S = 0.1  # longest delay until a stop is noticed
-LATE_MAX_S = 0.1  # a player that was blocked for longer does not catch up
-SENT_TOGETHER_N = 256  # most frames sent at once, when they are overdue
+LATE_MAX_S = 0.1  # after being blocked for longer, the player does not catch up
+SENT_TOGETHER_N = 256  # maximum number of overdue frames that are sent at once
 HOST = "127.0.0.1"
 
 Source = Literal["simulated", "recorded"]
@@ -58,26 +58,26 @@ Source = Literal["simulated", "recorded"]
 
 @dataclass(frozen=True)
 class Script:
-    """A stream to play, cut behind each frame: its bytes, the frames, and when each piece is sent."""
+    """A stream to play, cut after each frame: the frames, the pieces of bytes, and when each piece is sent."""
 
     source: Source
     wire: Wire
     frames: Frames
     pieces: list[bytes]
-    t_s: Float64[np.ndarray, " f"]  # since the start
-    away_s: dict[int, float] = field(default_factory=dict)  # by piece: how long the board is unplugged before it
+    t_s: Float64[np.ndarray, " f"]  # time since the start
+    away_s: dict[int, float] = field(default_factory=dict)  # by piece, how long the board is unplugged before it
 
     def __len__(self) -> int:
         return len(self.pieces)
 
     @property
     def duration_s(self) -> float:
-        """Duration, with the pause until the first frame is sent again."""
+        """Duration, including the pause until the first frame is sent again."""
         return float(self.t_s[-1] * len(self) / max(len(self) - 1, 1)) if len(self) else 0.0
 
 
 def read_script(source: str) -> Script:
-    """Read the folder of a capture, or simulate: `nominal`, or a YAML file with a section `simulate` (a scene)."""
+    """Read a capture's folder, or simulate: `nominal`, or a scene's YAML file (with a section `simulate`)."""
     folder = Path(source)
     if (folder / HEADER_FILE).is_file():
         return read_capture(folder)
@@ -102,7 +102,10 @@ def read_capture(folder: Path) -> Script:
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)
         return _binary_script(header.source, b_uT, temperature_degC, t_s)
     if header.wire is None:
-        raise CaptureError(f"{folder}: layout {header.layout} holds no bytes of a port; native and sd-card do.")
+        raise CaptureError(
+            f"{folder}: a capture of layout {header.layout} cannot be replayed as a serial stream. Give one of layout "
+            "native or sd-card."
+        )
     data = io.read_bytes(folder / STREAM_FILE)
     frames, _ = decode_all(data, header.wire, header.chips_n, str(folder / STREAM_FILE))
     t_s = timer(folder, header)(frames, 0)
@@ -114,7 +117,7 @@ def read_capture(folder: Path) -> Script:
 
 
 def simulate(section: Mapping[str, Any], seed: int, where: str) -> Script:
-    """Simulate the first skin of a section `simulate`: its protocol `log` if it has one, else its grid."""
+    """Simulate the first skin of a section `simulate`: its protocol `log` if it has one, otherwise its grid."""
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = WALK if WALK in simulation.protocols else MAIN
     board, skin = list_captures(simulation, protocol)[0]
@@ -129,7 +132,7 @@ def _binary_script(source: Source, b_uT: np.ndarray, temperature_degC: np.ndarra
 
 
 def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
-    """Encode frames as the firmware sends them, each on its own."""
+    """Encode frames as the firmware sends them, one piece of bytes per frame."""
     data = encode(frames, wire)
     if wire in TEXT_WIRES:
         return data.splitlines(keepends=True)
@@ -161,7 +164,7 @@ def parse_fault(text: str) -> Fault:
 
 
 def inject(script: Script, fault: Fault) -> Script:
-    """Return a script with a fault. Faults of one chip are those of chip 1, or of the only chip."""
+    """Return a script with a fault. Faults of a single chip are injected into chip 1, or into the only chip."""
     inside = (script.t_s >= fault.start_s) & (script.t_s < fault.start_s + fault.duration_s)
     if not inside.any():
         raise ParamsError(
@@ -204,19 +207,19 @@ def _change_values(frames: Frames, fault: str) -> None:
         case "int16-wrap":
             b_uT[::2, chip_i, 2] -= WRAP_uT * np.sign(b_uT[::2, chip_i, 2])
         case "magnet":
-            b_uT[:, :, 2] += MAGNET_uT  # chips are turned about z, so that it is the same for all
+            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated about z only, so the change is the same for all
         case "too-hot":
             temperature_degC[:, chip_i] = HOT_degC
         case "crlf":
             temperature_degC[:, chip_i] = CRLF_TEMPERATURE_degC
         case "clock-jump":
             if np.isnan(frames.device_s).all():
-                raise ParamsError("--fault: clock-jump needs frames with a clock. Take binary-clock.")
+                raise ParamsError("--fault: clock-jump needs frames with a clock. Give a capture of wire binary-clock.")
             frames.device_s[:] += CLOCK_JUMP_S
 
 
 def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
-    """Return pieces as a bad connection delivers them."""
+    """Return pieces as a bad connection would deliver them."""
     if fault == "repeated":
         return [2 * piece for piece in pieces]
     if fault == "dropped":
@@ -237,15 +240,15 @@ class EmulatedPort:
         self.plug_in()
 
     def plug_in(self) -> None:
-        """Make the port."""
+        """Create the port."""
         raise NotImplementedError
 
     def unplug(self) -> None:
-        """Remove the port: as a pulled cable does, and to clean up at the end."""
+        """Remove the port, as when a cable is pulled, and to clean up at the end."""
         raise NotImplementedError
 
     def send(self, data: bytes, stop: threading.Event) -> int:
-        """Send bytes, as fast as they are read, until `stop`; return how many were sent."""
+        """Send bytes as fast as they are read, until `stop` is set; return how many were sent."""
         raise NotImplementedError
 
     def was_opened(self) -> bool:
@@ -255,7 +258,7 @@ class EmulatedPort:
 
 
 class Terminal(EmulatedPort):
-    """A pseudo-terminal; with a link it keeps its name when it is unplugged and plugged in again."""
+    """A pseudo-terminal; with a link, its name stays the same when it is unplugged and plugged in again."""
 
     def __init__(self, link: Path | None = None) -> None:
         if not hasattr(os, "openpty"):
@@ -268,11 +271,11 @@ class Terminal(EmulatedPort):
     def plug_in(self) -> None:
         import fcntl
         import termios
-        import tty  # none of them is on Windows
+        import tty  # these modules do not exist on Windows
 
         self._far, self._near = os.openpty()
         tty.setraw(self._near)
-        # Packet mode tells when a reader opens the terminal, because that flushes it.
+        # Packet mode reports when a reader opens the terminal, because opening flushes it.
         fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
         self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)
@@ -293,7 +296,7 @@ class Terminal(EmulatedPort):
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
-                if readable:  # what a reader writes is ignored
+                if readable:  # data from the reader is ignored
                     self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
                     sent_n += os.write(self._far, data[sent_n:])
@@ -333,7 +336,7 @@ class TcpServer(EmulatedPort):
                 sent_n += self._client.send(data[sent_n:])
             except TimeoutError:
                 continue
-            except OSError:  # the reader has gone: wait for another
+            except OSError:  # the reader has disconnected: wait for another
                 if self._client is not None:
                     self._client.close()
                 self._client = None
@@ -341,7 +344,7 @@ class TcpServer(EmulatedPort):
 
 
 def make_port(kind: str) -> EmulatedPort:
-    """Make `pty`, `tcp`, `tcp:NUMBER`, or a pseudo-terminal with a link at a path."""
+    """Create the port `pty`, `tcp`, `tcp:NUMBER`, or a pseudo-terminal with a link at a path."""
     name, _, number = kind.partition(":")
     if kind == "pty":
         return Terminal()
@@ -349,7 +352,7 @@ def make_port(kind: str) -> EmulatedPort:
         return TcpServer(int(number or 0))
     if Path(kind).parent.is_dir() and "/" in kind:
         return Terminal(Path(kind))
-    raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT or ./NAME of a link to be made. Try: pty")
+    raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT or ./NAME of a link to create. Try: pty")
 
 
 def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: float = 1.0, loop: bool = False) -> int:
@@ -358,8 +361,8 @@ def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: fl
     Parameters
     ----------
     script, port : what to send, and where
-    stop : ends it when set, from another thread
-    speed : multiple of the script's own rate; `math.inf` sends as fast as the reader takes it
+    stop : event that ends sending when another thread sets it
+    speed : multiple of the script's own rate; `math.inf` sends as fast as the reader reads
     loop : start again at the end, and whenever a reader opens the port
 
     Returns
@@ -374,7 +377,7 @@ def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: fl
                 port.unplug()
                 stop.wait(script.away_s[i])
                 port.plug_in()
-                replugged = True  # the reader that opens it next continues where the script was
+                replugged = True  # the next reader that opens the port continues within the script
             now_s, due_s = time.monotonic() - start_s, float(script.t_s[i]) / speed
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
@@ -394,7 +397,7 @@ def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: fl
 
 
 def _end_of_batch(script: Script, first: int, script_s: float) -> int:
-    """Return the end of the pieces that are due and sent together; an unplugging ends them."""
+    """Return the end of the pieces that are due and sent together, at the latest at the next unplugging."""
     last = first + 1
     end = min(len(script), first + SENT_TOGETHER_N)
     while last < end and script.t_s[last] <= script_s and last not in script.away_s:

@@ -1,4 +1,4 @@
-"""Alarms of a running board: faults by name and chip, its frame rate, and fields from outside."""
+"""Alarms of a running board: faults by name and chip, a low frame rate, and external fields."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -10,15 +10,16 @@ from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults, find_reading
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
-BATCH_FRAMES_N = 40  # a tenth of a second of five chips: the delay of faults that show over several frames
+BATCH_FRAMES_N = 40  # a tenth of a second with five chips: the delay of faults that need several frames
 RATE_WINDOW_S = 1.0
-SLOW_SHARE = 0.7  # assumed, of the usual rate: frames are missing
-USUAL_GAIN = 1e-4  # by which the usual rate follows, each time frames come: half a minute of 400 Hz
-ACTIVE_S = 2.0  # an alarm stays on for so long after it was last seen
-COMMON_SHARE_MAX = 0.2  # of |dB|^2 that chips do not share; 0.45 or more in all presses of scenes quick and lab
+SLOW_SHARE = 0.7  # assumed: below this share of the usual rate, frames are missing
+USUAL_GAIN = 1e-4  # weight of each new rate in the running mean of the usual rate: half a minute at 400 Hz
+ACTIVE_S = 2.0  # how long an alarm stays on after it was last seen
+# Share of |dB|^2 that is not common to all chips. In all presses of scenes quick and lab it is 0.45 or more.
+COMMON_SHARE_MAX = 0.2
 COMMON_MIN_uT = 50.0  # about the earth's field
 
-# A controller acts on each reading at once: a reading beyond the chip's range has no place and no force.
+# A controller uses each reading at once, so a reading beyond the chip's range must not give a place and force.
 LIVE_POLICY = FaultPolicy(
     failed_read="drop", zeros="drop", stuck="drop", too_hot="drop", saturated="drop", torn="drop", wrong_baud="drop",
     constant_channel="flag", chip_reset="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag",
@@ -28,7 +29,7 @@ LIVE_POLICY = FaultPolicy(
 
 @dataclass
 class Alarm:
-    """How often something was seen, in frames or bytes, and when, in unix seconds."""
+    """An alarm, with the number of frames or bytes that it concerns, and when it was seen, in unix seconds."""
 
     name: str
     count_n: int
@@ -47,7 +48,7 @@ class Health:
         self._chips_n = chips_n
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)  # an alarm needs less evidence than a refusal
         self._batch: list[Frames] = []
-        self._stuck = False  # a chip is stuck since the last batch, and the policy does not let it pass
+        self._stuck = False  # a chip was stuck at the end of the last batch, and the policy does not only flag this
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
 
@@ -63,7 +64,7 @@ class Health:
         return [alarm for alarm in list(self.alarms.values()) if now_s - alarm.last_s <= ACTIVE_S]
 
     def feed(self, frames: Frames, now_s: float) -> Bool[np.ndarray, " f"]:
-        """Take the next frames; return the mask of those to use: without any fault that the policy does not flag.
+        """Take the next frames; return the mask of frames to use, those whose faults, if any, the policy only flags.
 
         Faults of single readings are found at once, the others in batches of `BATCH_FRAMES_N` frames.
         """
@@ -80,12 +81,12 @@ class Health:
         return np.asarray(~faulty & (not self._stuck))
 
     def feed_change(self, db_uT: Float[np.ndarray, " ch"], turn: Float64[np.ndarray, "k 3 3"], now_s: float) -> None:
-        """Look at a change of field: one that all chips share comes from outside, or the board was turned."""
+        """Raise an alarm if the field change is common to all chips: an external field, or the board was rotated."""
         b_uT = np.einsum("kij,kj->ki", turn, db_uT.reshape(-1, 3).astype(np.float64))
         common_uT = b_uT.mean(axis=0)
         apart = ((b_uT - common_uT) ** 2).sum() / max((b_uT**2).sum(), 1e-9)
         alike = len(b_uT) > 1 and apart < COMMON_SHARE_MAX and np.linalg.norm(common_uT) > COMMON_MIN_uT
-        self.note("field from outside: a magnet or iron near, or the board was turned", int(alike), now_s)
+        self.note("external field: a magnet or iron is near, or the board was turned", int(alike), now_s)
 
     def _note_batch(self, faults: Faults, now_s: float) -> None:
         stuck = self._note_chips("stuck", faults.stuck, now_s, "stuck")
@@ -95,16 +96,16 @@ class Health:
         self.note("the board's clock jumps", int(faults.clock_jump.sum()), now_s, "clock_jump")
         for window in faults.scale:
             reset = np.repeat(window.unusual[None], len(window.t_s), axis=0)
-            self._note_chips("another step than the others: reset", reset, now_s, "chip_reset")
+            self._note_chips("step differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_chips(self, name: str, mask: Bool[np.ndarray, "f k"], now_s: float, fault: str) -> Bool[np.ndarray, " f"]:
-        """Count a fault by chip; return the mask of the frames not to use for it."""
+        """Count a fault by chip; return the mask of the frames that must not be used because of it."""
         for chip_i in np.flatnonzero(mask.any(axis=0)):
             self.note(f"chip {chip_i}: {name}", int(mask[:, chip_i].sum()), now_s, fault)
         return np.asarray(mask.any(axis=1)) & (getattr(self.policy, fault) != "flag")
 
     def _measure_rate(self, frames_n: int, now_s: float) -> None:
-        """Measure the frame rate over a second: below the usual rate, frames are missing (they carry no number)."""
+        """Measure the frame rate over a second. A low rate shows missing frames, as frames have no numbers."""
         self._arrivals.append((now_s, frames_n))
         self._arrived_n += frames_n
         while now_s - self._arrivals[0][0] > RATE_WINDOW_S:
@@ -117,4 +118,4 @@ class Health:
         usual_hz = self.rate_hz if np.isnan(self._usual_hz) else self._usual_hz
         self._usual_hz = usual_hz + USUAL_GAIN * (self.rate_hz - usual_hz)
         slow = self.rate_hz < SLOW_SHARE * self._usual_hz
-        self.note("slower than it was: frames are missing", int(slow), now_s, "dropped")
+        self.note("slower than before: frames are missing", int(slow), now_s, "dropped")

@@ -28,25 +28,25 @@ GAUGE_BAUD = 9600
 SILENCE_S = NO_FRAME_S = 5.0
 
 
-class Finished(NamedTuple):
+class RecordingResult(NamedTuple):
     """A finished recording."""
 
     folder: Path
     summary: str
-    error: Exception | None  # that ended its labels
+    error: Exception | None  # the error that ended the labels, if any
 
 
 def label_source(
     labels: str | None, gauge: str | None, scan: str | None, *, dwell_s: float, say: Callable[[str], object]
 ) -> LabelSource | None:
-    """Return the source of labels that the options of `reskin record` ask for, None without any.
+    """Return the source of labels for the options of `reskin record`; None without such options.
 
     Parameters
     ----------
     labels : places to prompt for, such as `grid:5x5:4`, or the CSV file that a robot's program appends to
     gauge : port of a force gauge, `PORT` or `PORT@BAUD`
     scan : order of prompts, "random" or "snake"
-    dwell_s : how long the label of a prompt holds
+    dwell_s : how long a prompted label is valid
     say : called with each prompt
     """
     port, _, baud = (gauge or "").partition("@")
@@ -58,7 +58,7 @@ def label_source(
     if (places := parse_places(labels)) is None:
         if Path(labels).suffix != ".csv" or gauge:
             raise ParamsError(
-                f"--labels: {labels} is none of grid:NXxNY:STEP_MM, line:N:STEP_MM, or a .csv file (without --gauge). "
+                f"--labels: {labels} is not grid:NXxNY:STEP_MM, line:N:STEP_MM, or a .csv file (without --gauge). "
                 "Try: --labels grid:5x5:4"
             )
         return from_table(Path(labels))
@@ -77,15 +77,15 @@ def record_board(
     seconds: float = float("inf"),
     baud: int = BAUD,
     names: Mapping[str, str] | None = None,
-) -> Finished:
+) -> RecordingResult:
     """Record until stopped, until the labels end, or until the board is unplugged.
 
     Parameters
     ----------
     board : the port and its wire format
-    labels : where labels come from, if they come during the recording
+    labels : source of labels during the recording, if any
     folder : the capture's folder, which must be new; the default is captures/DATE-TIME
-    seconds : longest duration
+    seconds : maximum duration
     baud : baud rate; USB ports ignore it
     names : names of board and skin and the order of places, under the keys board, skin and scan
     """
@@ -106,4 +106,5 @@ def record_board(
         folder = folder.with_name(f"{folder.name}.part")
         where = f"{folder}: no more could be written"
     counted = "; ".join([counts, *alarms, *([of_labels] if of_labels else [])])
-    return Finished(folder, f"recorded {where} ({stream.ended} after {stream.duration_s:.1f} s): {counted}", error)
+    summary = f"recorded {where} ({stream.ended} after {stream.duration_s:.1f} s): {counted}"
+    return RecordingResult(folder, summary, error)

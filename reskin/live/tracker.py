@@ -1,7 +1,7 @@
-"""Estimate contacts on a board while it runs: bytes from its port -> frames -> changes of field -> place and force.
+"""Estimate contacts on a running board: bytes from its port -> frames -> field changes -> place and force.
 
-`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes; the caller's
-thread decodes them and estimates, so that a slow controller loses none.
+`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes, so that a slow
+controller loses none; the caller's thread decodes them and estimates.
 """
 
 import threading
@@ -40,22 +40,22 @@ from reskin.universal.calibration import CHANNELS_N
 from reskin.universal.map import Estimate
 from reskin.universal.model import Universal
 
-NOLOAD_S = 1.0  # without contact, over which the no-load reading is averaged
+NOLOAD_S = 1.0  # time without contact over which the no-load reading is averaged
 NOLOAD_FRAMES_MAX_N = 10_000
-HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # from which the wire format is detected
-SILENT_S = 0.3  # without data, after which a controller receives a contact of NaN
+HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # amount of data from which the wire format is detected
+SILENT_S = 0.3  # after this time without data, a controller receives a contact of NaN
 OPENING_S = 10.0
-ENDS_KEPT_N = 256  # chunks, to time frames that are decoded late
+ENDS_KEPT_N = 256  # number of chunks whose ends are kept, to time frames that are decoded late
 FRAME_BYTES_MIN_N = 16  # per chip, in any wire format
-SPACING_MM = 5.0  # at which chips are drawn whose places are unknown
-UNKNOWN_SDS = 10.0  # assumed, of an input in training; 6 in scene quick, 7 on lab's boards under its models
-MISFIT_MAX = (
-    4.0  # assumed, chi^2 per channel: about 1 where the skin is like those that the universal model was made from
-)
+SPACING_MM = 5.0  # spacing of chips on the page if their places are unknown
+# Largest input of a network, in standard deviations over training. Assumed; 6 is reached in scene quick, and 7 on the
+# boards of scene lab with its own models.
+UNKNOWN_SDS = 10.0
+MISFIT_MAX = 4.0  # assumed, chi^2 per channel; about 1 for skins like those that the universal model was made from
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"
-UNKNOWN_SKIN = "unknown skin: the model knows no such change of field"
+UNKNOWN_SKIN = "unknown skin: the model has not seen such a field change"
 
 Models = Sequence[Network] | Universal  # an empty sequence: no estimates
 
@@ -64,23 +64,23 @@ class Prediction(NamedTuple):
     """Predictions for readings in contact."""
 
     target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
-    sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if not known
-    unknown: Bool[np.ndarray, " f"]  # unlike any skin that the model knows
+    sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if unknown
+    unknown: Bool[np.ndarray, " f"]  # unlike the skins that the model was trained on
 
 
 class NetworkEstimator:
-    """The mean of trained networks. Their standard deviation is their disagreement, not their error."""
+    """The mean of trained networks. The standard deviation is that between the networks, not of their error."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         self.channels_n: int = networks[0].card["input"]["channels_n"]
         self.name = f"{len(networks)} network{'s' if len(networks) > 1 else ''}"
         self._networks = networks
         self._inputs = [(VIEW[one.card["recipe"]["inputs"]], Scaler.of_arrays(one.tensors)) for one in networks]
-        for network in networks:  # imports torch and builds the network now, not at the first contact
+        for network in networks:  # import torch and build the network now, not at the first contact
             network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Do nothing: networks use changes of field only."""
+        """Do nothing: networks use field changes only."""
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
         targets = np.stack([network(db_uT) for network in self._networks]).astype(np.float64)
@@ -90,10 +90,10 @@ class NetworkEstimator:
 
 
 class UniversalEstimator:
-    """The universal model, calibrated on the page: to the no-load field and to presses.
+    """The universal model with a further calibration to the no-load field and to presses.
 
-    The model that is passed in is not changed, and its own calibration is kept. New presses here replace the earlier
-    ones made here, so that a dozen bad presses are corrected by another dozen.
+    The model that is passed in is not changed, and its own calibration is kept. New presses replace those of an earlier
+    call, so that bad presses can be corrected by repeating them.
     """
 
     channels_n = CHANNELS_N
@@ -102,7 +102,7 @@ class UniversalEstimator:
     def __init__(self, model: Universal) -> None:
         self._given = model
         self._noload_uT = model.noload_uT
-        self._presses_uT = np.zeros((0, CHANNELS_N))  # changes of field of presses at unknown places
+        self._presses_uT = np.zeros((0, CHANNELS_N))  # field changes for presses at unknown places
         self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))
         self._calibrate()
 
@@ -112,7 +112,7 @@ class UniversalEstimator:
         self._calibrate()
 
     def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
-        """Calibrate to presses at unknown places; return what that did to standard deviation and misfit."""
+        """Calibrate to presses at unknown places; return a text with standard deviation and misfit before and after."""
         before, self._presses_uT = self._estimate(db_uT), db_uT.astype(np.float64)
         self._calibrate()
         after = self._estimate(db_uT)
@@ -126,9 +126,9 @@ class UniversalEstimator:
     def label(
         self, place_mm: Float[np.ndarray, "n 2"], db_uT: Float[np.ndarray, "n ch"], held_out: Bool[np.ndarray, " n"]
     ) -> str:
-        """Calibrate to presses at known places; return the error at the held-out ones before and after.
+        """Calibrate to presses at known places; return a text with the error at held-out presses before and after.
 
-        Nobody measured the force: the model's own estimate stands for it.
+        The force was not measured; the model's own estimate is used as its label.
         """
 
         def error_mm() -> float:
@@ -174,7 +174,7 @@ def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the chips of a board lie, in the frame of labels."""
+    """Positions of a board's chips, in the frame of the labels."""
 
     known: bool
     chips_mm: Float64[np.ndarray, "k 2"]
@@ -184,9 +184,9 @@ class Layout:
 
 
 def layout_of(chips_n: int) -> Layout:
-    """Return the nominal board with this number of chips; chips of other boards are laid out in a row.
+    """Return the layout of the nominal board with this number of chips; for other numbers, chips are put in a row.
 
-    The bytes do not say which board it is: five chips are taken for the paper's board, forty for its sleeve.
+    The bytes do not identify the board: five chips are assumed to be the paper's board, forty its sleeve.
     """
     for name, settings in nominal("boards").items():
         design = parse(BoardDesign, settings["design"], f"nominal board {name}")
@@ -207,15 +207,15 @@ def layout_of(chips_n: int) -> Layout:
 class Contact(NamedTuple):
     """One reading of a board, with its estimate.
 
-    Without contact the place is NaN and the force 0. All three are NaN where nothing is known: a failed read, or a
-    board that is silent or unplugged. `alarms` then says why.
+    Without contact the place is NaN and the force 0. If nothing is known, all three are NaN, and `alarms` says why: a
+    failed read, or a board that is silent or unplugged.
     """
 
-    t_s: float  # unix time at which its last byte came
+    t_s: float  # unix time at which its last byte arrived
     x_mm: float
     y_mm: float
     F_N: float
-    sd_mm: tuple[float, float]  # of x and y: the universal model's, or between networks (NaN for a single one)
+    sd_mm: tuple[float, float]  # of x and y, from the universal model or between networks (NaN for one network)
     b_uT: Float32[np.ndarray, " ch"]
     alarms: tuple[str, ...]  # what is wrong with the board; empty when all is well
 
@@ -236,7 +236,7 @@ class Estimates:
 
 
 class LiveSkin:
-    """A skin at work on a port, returned by `reskin.open`.
+    """A skin on a port, returned by `reskin.open`.
 
     Use it in a `with` statement, which opens the port and takes the no-load reading. Iterate over it for the latest
     contact, or over `every()` for each reading.
@@ -248,7 +248,7 @@ class LiveSkin:
         self.port, self.fault_policy = port, fault_policy
         self.detected = find.DetectedBoard(port, WAITING)
         self.description = port  # with wire format, chips and scale, once they are detected
-        self.account: Counter[str] = Counter()  # of all streams since the start, as `FrameStream` counts
+        self.account: Counter[str] = Counter()  # the counts of `FrameStream`, over all streams since the start
         self.reader = Reader(port, baud)
         self.estimator: NetworkEstimator | UniversalEstimator | None = None
         if isinstance(models, Universal):
@@ -257,18 +257,18 @@ class LiveSkin:
             self.estimator = NetworkEstimator(models)
         self._model_problem = ""
         self._head: list[Chunk] = []
-        self._partial_first_bytes_n = 0  # of frames that were on their way when the port was opened
+        self._partial_first_bytes_n = 0  # bytes of frames that were being sent when the port was opened
         self._restart_noload()
 
     def __enter__(self) -> "LiveSkin":
-        """Open the port, detect what it sends, and take the no-load reading: nothing may touch the skin meanwhile."""
+        """Open the port, detect the wire format, and take the no-load reading; nothing may touch the skin meanwhile."""
         self.reader.start(there=True)
         try:
             end_s = self.reader.unix_s() + OPENING_S
             while not self.zeroed:
                 if self.reader.unix_s() > end_s:
                     raise CaptureError(
-                        f"{self.port}: no no-load reading within {OPENING_S:g} s: "
+                        f"{self.port}: could not take a no-load reading within {OPENING_S:g} s: "
                         f"{'; '.join(self.alarms()) or 'no data'}. Run `reskin ports` to see what the port sends."
                     )
                 self.poll(SILENT_S)
@@ -281,15 +281,15 @@ class LiveSkin:
         self.reader.stop()
 
     def __iter__(self) -> Iterator[Contact]:
-        """Yield the latest reading, each at most once; those in between are decoded and skipped.
+        """Yield the latest reading, each at most once; earlier ones are decoded and skipped.
 
-        When no data comes for `SILENT_S`, or the board is unplugged, a contact of NaN says so.
+        Yields a contact of NaN if no data arrives for `SILENT_S`, or the board is unplugged.
         """
         while True:
             yield self._contact(self.poll(SILENT_S, latest=True), -1)
 
     def every(self) -> Iterator[Contact]:
-        """Yield every reading. A caller two minutes late loses the oldest; `reader.missed_bytes_n` counts them."""
+        """Yield every reading. A caller that is two minutes late loses the oldest; see `reader.missed_bytes_n`."""
         while True:
             estimates = self.poll(SILENT_S)
             for i in range(max(len(estimates) if estimates else 0, 1)):
@@ -297,7 +297,7 @@ class LiveSkin:
 
     def zero(self) -> None:
         """Take a new no-load reading from the next second without contact; may be called from any thread."""
-        self._noload_asked = True  # the thread that polls restarts it: only that thread changes the frames gathered
+        self._noload_asked = True  # the polling thread restarts it, as only that thread may change the collected frames
 
     @property
     def zeroed(self) -> bool:
@@ -306,17 +306,17 @@ class LiveSkin:
 
     @property
     def silent(self) -> bool:
-        """Whether no data comes, so that the last reading is out of date."""
+        """Whether no data arrives, so that the last reading is out of date."""
         return not self.detected.problem and self.reader.unix_s() - self._ends[-1][1] > SILENT_S
 
     @property
     def lost_bytes_n(self) -> int:
-        """Bytes that were read too late or belong to no frame, but for a frame cut off by opening the port."""
+        """Number of bytes read too late or outside frames, except for a frame that was cut by opening the port."""
         skipped_n = sum(count for name, count in self.account.items() if name.startswith("skipped_"))
         return skipped_n + self.reader.missed_bytes_n - self._partial_first_bytes_n
 
     def alarms(self) -> tuple[str, ...]:
-        """Return what is wrong now."""
+        """Return the current alarms."""
         alarms = []
         if self.reader.problem and not self.reader.plugged_in:
             alarms.append(f"{'unplugged' if self.reader.was_plugged_in else 'not open'}: {self.reader.problem}")
@@ -330,7 +330,7 @@ class LiveSkin:
         return tuple(alarms)
 
     def poll(self, wait_s: float, *, latest: bool = False) -> Estimates | None:
-        """Decode what has come and estimate.
+        """Decode the data that has arrived, and estimate.
 
         Parameters
         ----------
@@ -339,7 +339,7 @@ class LiveSkin:
 
         Returns
         -------
-        Estimates, or None if no frame came
+        Estimates, or None if no frame arrived
         """
         chunks = self.reader.take(wait_s)
         if not chunks:
@@ -381,14 +381,14 @@ class LiveSkin:
         return chunks
 
     def _reject_model(self, estimator: NetworkEstimator | UniversalEstimator, chips_n: int) -> None:
-        """Raise for networks of other boards; do without the universal model, which may be the default."""
+        """Raise for networks of other boards; drop the universal model with an alarm, as it may be the default."""
         if isinstance(estimator, NetworkEstimator):
             raise SchemaError(
                 f"{self.port}: the board has {3 * chips_n} channels, but the model {estimator.channels_n}. "
                 "Give a model that was trained on such boards."
             )
         self.estimator = None
-        self._model_problem = f"no place and force: the {estimator.name} is for five chips. Give a model of this board."
+        self._model_problem = f"no place or force: the {estimator.name} is for five chips. Give a model for this board."
 
     def _start_stream(self, detected: find.DetectedBoard) -> None:
         self._stream = FrameStream(detected.wire, detected.chips_n)
@@ -397,7 +397,7 @@ class LiveSkin:
         self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Return the frames in chunks and when each came; a board that was plugged in again starts a new stream."""
+        """Return the frames in chunks with arrival times; a board that was plugged in again starts a new stream."""
         starts = [i for i, (chunk, _) in enumerate(chunks) if chunk == PLUGGED_IN]
         parts = []
         for first, last in pairwise([0, *starts, len(chunks)]):
@@ -410,7 +410,7 @@ class LiveSkin:
         return frames, np.concatenate([t_s for _, t_s in parts])
 
     def _decode_stream(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Decode chunks of one stream; a frame came when the chunk that ends it did."""
+        """Decode chunks of one stream; the arrival time of a frame is that of the chunk with its last byte."""
         for chunk, came_s in chunks:
             self._ends.append((self._ends[-1][0] + len(chunk), came_s))
         frames = self._stream.feed(b"".join(chunk for chunk, _ in chunks))
@@ -427,7 +427,7 @@ class LiveSkin:
         self.account += new
         lost_n = sum(count for name, count in new.items() if name.startswith("skipped_"))
         frame_n = new["frame_bytes_n"] / new["frames_n"] if new["frames_n"] else frame_min_n
-        # The port was opened within a frame. One more byte: a last byte alone does not show where the next one begins.
+        # The port was opened within a frame. One byte more may be lost: a frame's last byte cannot be told apart alone.
         if at_start and self._first_bytes_n + lost_n <= frame_n + 1:
             self._first_bytes_n += lost_n
             self._partial_first_bytes_n += lost_n
@@ -435,14 +435,14 @@ class LiveSkin:
         self.health.note("bytes lost between frames", lost_n, now_s, "torn")
         self._garbage_bytes_n = 0 if new["frames_n"] else self._garbage_bytes_n + lost_n
         if self._garbage_bytes_n > GARBAGE_FRAMES_N * frame_min_n:
-            self.health.note("no frames in what comes: wrong baud rate?", lost_n, now_s, "wrong_baud")
+            self.health.note("no frames in the data: wrong baud rate?", lost_n, now_s, "wrong_baud")
 
     def _restart_noload(self) -> None:
         self.noload_uT: Float64[np.ndarray, " ch"] | None = None
-        self._contact_uT = np.inf  # length of a change of field above which there is contact
+        self._contact_uT = np.inf  # |dB| above which there is contact
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
-        self._noload_asked = False  # last: a request from here on is seen by the next `poll`
+        self._noload_asked = False  # last, so that the next `poll` sees any later request
 
     def _take_noload(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
         """Collect a second of frames; if nothing moved, take their mean as the no-load reading."""
@@ -456,7 +456,7 @@ class LiveSkin:
             return
         self._quiet, self._quiet_from_s = [], np.inf
         with suppress(CaptureError):  # something moved: the next second may be quiet
-            # Evenly spaced times: frames of one chunk came at once.
+            # Evenly spaced times, because the frames of a chunk have the same arrival time.
             b_uT = b_uT[: quiet_start(np.linspace(0, lasted_s, len(b_uT)), b_uT, where=self.port)]
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)
@@ -492,7 +492,7 @@ class LiveSkin:
 
 
 class LiveSkins:
-    """Skins on several ports. Iterate for a tuple of their latest contacts, in the order of the ports."""
+    """Skins on several ports. Iterate over it for tuples of their latest contacts, in the order of the ports."""
 
     def __init__(self, skins: Sequence[LiveSkin]) -> None:
         self.skins = skins
@@ -522,7 +522,7 @@ class LiveSkins:
         self._open_ports.close()
 
     def __iter__(self) -> Iterator[tuple[Contact, ...]]:
-        """Yield the latest contact of each board whenever one has a new one; that of a silent board is NaN."""
+        """Yield the latest contacts of all boards whenever any board has a new one; a silent board's is NaN."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._error or (self._new and None not in self._latest))

@@ -15,7 +15,7 @@ from tests.live.boards import make_script
 SCRIPT = make_script(pokes_n=2)
 ALARMS = {
     "failed-read": "chip 1: failed I2C reads",
-    "chip-reset": "chip 1: another step than the others: reset",
+    "chip-reset": "chip 1: step differs from the other chips: reset",
     "stuck": "chip 1: stuck",
     "saturated": "chip 1: field at the end of the range",
     "int16-wrap": "chip 1: past int16",
@@ -115,7 +115,7 @@ def test_missing_frames_make_a_board_slower():
     health = Health(5)
     for i in np.flatnonzero(half):
         health.feed(SCRIPT.frames.where(np.arange(len(SCRIPT)) == i), float(SCRIPT.t_s[i]))
-    assert set(health.alarms) == {"slower than it was: frames are missing"}
+    assert set(health.alarms) == {"slower than before: frames are missing"}
     assert health.rate_hz == pytest.approx(200, rel=0.1)
 
 
@@ -146,7 +146,7 @@ def test_common_field_is_an_outside_field():
     health.feed_change(np.array([200.0, 0, 0, -100, 50, 0, 0, 0, 100, 0, -50, 0, 30, 0, 0]), turn, 0.0)
     assert health.alarms == {}
     health.feed_change(np.tile([0.0, 0.0, 400.0], 5), turn, 0.0)
-    assert [name.split(":")[0] for name in health.alarms] == ["field from outside"]
+    assert [name.split(":")[0] for name in health.alarms] == ["external field"]
 
 
 def test_fault_policy_setting():
@@ -169,7 +169,7 @@ def test_stuck_chip_is_invalid_unless_flagged():
         assert lost_n == pytest.approx(unbelieved_n, abs=100)
 
 
-RESET, FAILED = "another step than the others: reset", "failed I2C reads"
+RESET, FAILED = "step differs from the other chips: reset", "failed I2C reads"
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ from tests.live.boards import (
 )
 
 SCRIPT = make_script(pokes_n=2)
-LATE = {"no data", "slower than it was: frames are missing"}  # possible alarms of a healthy board on a busy machine
+LATE = {"no data", "slower than before: frames are missing"}  # possible alarms of a healthy board on a busy machine
 
 
 def test_every_reading_has_time_place_and_force(tmp_path):
@@ -120,12 +120,12 @@ def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
     for i in range(0, len(garbage), chunk_n):
         skin._decode_stream([(garbage[i : i + chunk_n], 0.0)])
     assert skin.lost_bytes_n > 0.9 * len(garbage)
-    assert {"bytes lost between frames", "no frames in what comes: wrong baud rate?"} <= set(skin.health.alarms)
+    assert {"bytes lost between frames", "no frames in the data: wrong baud rate?"} <= set(skin.health.alarms)
 
 
 def test_magnet_raises_only_the_outside_field_alarm(tmp_path):
     skin, _ = played(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
-    assert {word.split(":")[0] for word in skin.health.alarms} == {"field from outside"}
+    assert {word.split(":")[0] for word in skin.health.alarms} == {"external field"}
 
 
 def test_no_load_reading_waits_for_a_still_skin():

@@ -111,7 +111,7 @@ def test_prompts_accept_index_force_and_skip(context, tmp_path):
     assert log.x_mm[log.contact].tolist() == [9.0, 3.0, 5.0]
     assert log.Fz_N[log.contact][1:] == pytest.approx([0.8, 1.5])
     assert np.isnan(log.Fz_N[log.contact][0])
-    assert len([line for line in printed if "is no place" in line]) == 2
+    assert len([line for line in printed if "is neither a place" in line]) == 2
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_force_is_never_split_into_place_and_force(context, tmp_path, line, x_mm
     prompter.run(context)
     log = log_of(tmp_path)
     np.testing.assert_equal((log.x_mm[1], log.Fz_N[1]), (x_mm, force_N))
-    assert len([line for line in printed if "is no place" in line]) == 5
+    assert len([line for line in printed if "is neither a place" in line]) == 5
 
 
 def test_snake_order_and_invalid_places():
