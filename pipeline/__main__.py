@@ -1,4 +1,4 @@
-"""`python -m pipeline STAGE --scene NAME ...` runs a stage, as dvc.yaml does; other words are commands of `reskin`."""
+"""Run a stage (`python -m pipeline STAGE --scene NAME ...`, as dvc.yaml does); any other name is a `reskin` command."""
 
 import argparse
 import sys
@@ -8,11 +8,11 @@ import pipeline
 
 
 def main() -> None:
-    """Run a stage, or a command of `reskin`."""
+    """Run the stage or the `reskin` command that the command line names."""
     here, code = Path.cwd().resolve(), Path(pipeline.__file__).resolve()
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if not code.is_relative_to(here) and (here / "pipeline/__main__.py").is_file():
-        sys.exit(f"error: the code in {code.parent} would run in {here}. Try: cd {here}; python -m pipeline ...")
+        sys.exit(f"error: {here} is a checkout, but the code of {code.parent} runs. Try: cd {here}; python -m pipeline")
     try:
         if name == "code":
             from pipeline.stages.code import write_digests

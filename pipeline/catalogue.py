@@ -12,18 +12,18 @@ Kind = Literal["models", "curve", "analysis", "study", "report"]
 
 
 class Experiment(Strict):
-    """What a scene can run, and what it needs.
+    """An experiment that scenes can run, and what it needs of a scene.
 
     kind: what its stage writes: `models` with cards; points of a `curve`; the results of an `analysis` (numbers, data
-    of its figures, losses of its captures); those of a `study` (numbers alone); or nothing, as it is part of the
+    of its figures, losses of its captures); those of a `study` (numbers alone); or nothing, if it is part of the
     `report`. Analyses and studies are modules of `pipeline.experiments`.
     stage: the stage that runs it. key: the name of its results in numbers.json; an experiment that is renamed keeps it.
-    needs: experiments that the scene runs besides.
-    protocol: the simulated protocol whose captures it reads; None: those of the main protocol.
+    needs: experiments that the scene must run too.
+    protocol: the simulated protocol whose captures it reads; None: the main protocol.
     folds: the keys of section `split` that its folds are drawn with; None: it has no folds of its own.
-    settings: the scene holds a section of settings, named as the stage.
-    recorded: a scene of recordings may run it. alone: a scene may run nothing else, as it needs neither folds nor
-    places in mm.
+    settings: whether the scene has a section of settings for it, with the stage's name.
+    recorded: whether a recorded scene may run it. alone: whether a scene may run only this experiment, because it
+    needs neither folds nor places in mm.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Experiment(Strict):
 
 
 class ExperimentFile(Strict):
-    """`pipeline/experiments/<name>.yaml`: its needs, its section of the report page, its rows of the checklist."""
+    """`pipeline/experiments/<name>.yaml`: what it needs, its section of the report page, its rows of the checklist."""
 
     experiment: dict[str, Any]  # fields of `Experiment`
     section: dict[str, Any] | None = None

@@ -1,7 +1,7 @@
-"""Commands that manage a checkout: recordings, scenes, results. `reskin.cli` adds them to the `reskin` command there.
+"""Commands that manage the recordings, scenes and results of a checkout, which is the working directory.
 
-The checkout is the working directory. Each command imports what it needs when it runs, so that `reskin --help` is
-quick.
+`reskin.cli` adds them to `reskin` if it runs in a checkout. Each command imports what it needs when it runs, so that
+`reskin --help` is quick.
 """
 
 import sys
@@ -26,7 +26,13 @@ app.add_typer(scenes, name="scenes")
 
 Layout = Literal["capture", "serial-binary", "serial-text", ReaderLayout]
 Board = Annotated[str, Option(help="Name of the circuit board.")]
-Marks = Annotated[list[str] | None, Option(help="capture, serial-*: STREAM_S,PROBE_S of one event; may be repeated.")]
+Marks = Annotated[
+    list[str] | None,
+    Option(
+        help="Layouts capture, serial-*: STREAM_S,PROBE_S, the times of one event in the recording and in the "
+        "robot's log; may be repeated."
+    ),
+]
 
 
 def checked_plan() -> "Plan":
@@ -39,24 +45,31 @@ def checked_plan() -> "Plan":
 @app.command()
 def add(
     recording: Annotated[Path, Argument(help="A file or a folder, depending on the layout.")],
-    layout: Annotated[Layout, Option(help="Its format.")],
+    layout: Annotated[Layout, Option(help="Format of the recording (see data/README.md).")],
     board: Board,
     skin: Annotated[str, Option(help="Name of the skin; a skin belongs to one board.")],
-    scene: Annotated[str, Option(help="The scene to add it to.")],
-    like: Annotated[str | None, Option(help="The scene to copy for a new SCENE.")] = None,
-    name: Annotated[str | None, Option(help="Name of the capture. Default: from board and skin.")] = None,
-    probe: Annotated[Path | None, Option(help="capture, serial-*: the robot's log (CSV).")] = None,
-    chips_n: Annotated[int, Option("--chips", help="serial-*: chips in a frame.", min=1, max=64)] = 5,
-    rate_hz: Annotated[float, Option("--rate-hz", help="serial-*: frames a second.")] = 400.0,
-    wire: Annotated[Wire | None, Option(help="serial-*: wire format. Default: binary or text-xyzt.")] = None,
+    scene: Annotated[str, Option(help="Scene to add the recording to.")],
+    like: Annotated[str | None, Option(help="Create SCENE as a copy of this scene first.")] = None,
+    name: Annotated[str | None, Option(help="Name of the capture. Default: made from board and skin.")] = None,
+    probe: Annotated[Path | None, Option(help="Layouts capture, serial-*: log of the robot (CSV).")] = None,
+    chips_n: Annotated[int, Option("--chips", help="Layouts serial-*: chips in a frame.", min=1, max=64)] = 5,
+    rate_hz: Annotated[float, Option("--rate-hz", help="Layouts serial-*: frames per second.")] = 400.0,
+    wire: Annotated[
+        Wire | None,
+        Option(help="Layouts serial-*: wire format. Default: binary for serial-binary, text-xyzt for serial-text."),
+    ] = None,
     mark: Marks = None,
-    rows_late: Annotated[int | None, Option(help="ini: rows that fields lag. Default: detected.", min=0, max=5)] = None,
-    force_axis: Annotated[Literal["x", "y", "z"], Option(help="eflesh: direction of the force gauge.")] = "z",
+    rows_late: Annotated[
+        int | None,
+        Option(help="Layout ini: number of rows by which fields lag behind labels. Default: detected.", min=0, max=5),
+    ] = None,
+    force_axis: Annotated[Literal["x", "y", "z"], Option(help="Layout eflesh: direction of the force gauge.")] = "z",
     allow_copy: Annotated[
-        bool, Option("--allow-copy", help="Accept bytes that were added under another label.")
+        bool,
+        Option("--allow-copy", help="Add it even if the scene has the same readings under another board or skin."),
     ] = False,
 ) -> None:
-    """Add a recording to a scene; then `dvc repro` uses it."""
+    """Add a recording to a scene. The next `dvc repro` uses it."""
     from pipeline import plan
     from pipeline.manage import add as adding
     from pipeline.scenes import read_plan
@@ -64,7 +77,7 @@ def add(
 
     names, marks = preparing.CaptureNames(board, skin, name), preparing.parse_marks(mark or [])
     running = read_plan(ROOT / PLAN).scenes
-    with plan.copied(ROOT, scene, like), preparing.suggesting_layout(recording, layout):
+    with plan.scene_copy(ROOT, scene, like), preparing.suggesting_layout(recording, layout):
         if layout == "capture":
             prepared = preparing.native(recording, names, probe, marks)
         elif layout == "serial-binary" or layout == "serial-text":
@@ -82,9 +95,11 @@ def add(
 
 @app.command()
 def fetch(
-    source: Annotated[str | None, Argument(help="lab, ini, eflesh or eflash7. Default: list them.")] = None,
-    origin: Annotated[str | None, Option("--from", help="A git mirror or a folder instead of its home.")] = None,
-    yes: Annotated[bool, Option("--yes", help="Agree to use data without a licence.")] = False,
+    source: Annotated[str | None, Argument(help="lab, ini, eflesh or eflash7. Default: list these sources.")] = None,
+    origin: Annotated[
+        str | None, Option("--from", help="Git mirror, or folder of the files, to read instead of the source's home.")
+    ] = None,
+    yes: Annotated[bool, Option("--yes", help="Do not ask before fetching data that have no licence.")] = False,
 ) -> None:
     """Fetch public recordings, verify them, and add them to their scene."""
     from pipeline.manage import fetch as fetching
@@ -96,7 +111,10 @@ def fetch(
 
 
 @app.command()
-def remove(scene: str, capture: str) -> None:
+def remove(
+    scene: Annotated[str, Argument(help="Scene that the capture belongs to.")],
+    capture: Annotated[str, Argument(help="Name of the capture.")],
+) -> None:
     """Remove a recorded capture from a scene."""
     from pipeline.manage import add as adding
 
@@ -106,7 +124,7 @@ def remove(scene: str, capture: str) -> None:
 
 @app.command()
 def merge() -> None:
-    """Resolve conflicts of captures, plan and dvc.lock after a git merge of two people's recordings."""
+    """Resolve conflicts in captures, plan, dvc.lock and reports after a git merge of two people's recordings."""
     from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(ROOT))
@@ -114,27 +132,27 @@ def merge() -> None:
 
 @app.command()
 def publish() -> None:
-    """Log to MLflow what is missing there, from the models of the scenes that run."""
+    """Write to MLflow the training runs and reports that are missing there, of the scenes that `dvc repro` runs."""
     from pipeline.scenes import read_scene
     from pipeline.stages.report import read_curves
     from pipeline.tracking import publish as write
 
     for name in checked_plan().scenes:
         scene, results = read_scene(ROOT, name), ROOT / "data/results" / name
-        arms = {arm: ROOT / "data/models" / name / arm for arm in scene.model_stages}
+        models = {stage: ROOT / "data/models" / name / stage for stage in scene.model_stages}
         written = [results / f"{stage}.json" for stage in (*scene.curves.values(), *scene.analyses)]
-        missing = [path for path in (*arms.values(), *written) if not path.exists()]
+        missing = [path for path in (*models.values(), *written) if not path.exists()]
         if missing:
             typer.echo(f"{name}: {missing[0].relative_to(ROOT)} not found; run dvc repro first")
             continue
-        counts = write(arms, read_curves(scene, results), ROOT / "reports" / name, scene=name, root=ROOT)
+        counts = write(models, read_curves(scene, results), ROOT / "reports" / name, scene=name, root=ROOT)
         typer.echo(f"{name}: MLflow runs {counts}")
 
 
 @app.command()
 def compare(
-    scene: Annotated[str | None, Argument(help="A scene. Default: all that run.")] = None,
-    against: Annotated[str, Option(help="A git revision, or a folder with reports.")] = "HEAD",
+    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all that `dvc repro` runs.")] = None,
+    against: Annotated[str, Option(help="Git revision, or folder, of the reports to compare with.")] = "HEAD",
 ) -> None:
     """Compare fresh reports with the committed ones; exit status 1 if any value differs."""
     from pipeline.manage.compare import compare_scene
@@ -145,10 +163,14 @@ def compare(
 
 @app.command()
 def verify_reports(
-    names: Annotated[list[str] | None, Argument(metavar="[SCENE]...", help="Default: all that run.")] = None,
-    against: Annotated[Path | None, Option(help="Folder of finished reports, instead of a rerun.")] = None,
+    names: Annotated[
+        list[str] | None, Argument(metavar="[SCENE]...", help="Default: all scenes that `dvc repro` runs.")
+    ] = None,
+    against: Annotated[
+        Path | None, Option(help="Folder with the reports of an earlier rerun, to compare without running again.")
+    ] = None,
 ) -> None:
-    """Run scenes again in a clean copy of the last commit; exit status 1 if any value of their reports differs."""
+    """Rerun scenes in a fresh clone of the last commit; exit status 1 if any value of their reports differs."""
     from pipeline.manage.verify import verify
 
     sys.exit(verify(ROOT, names or list(checked_plan().scenes), against, typer.echo))
@@ -156,15 +178,17 @@ def verify_reports(
 
 @app.command()
 def check_cache() -> None:
-    """Verify the files in DVC's cache; damaged ones are moved aside, and `dvc repro` makes them again."""
+    """Verify the files in DVC's cache and move damaged ones aside; `dvc repro` then makes them again."""
     from pipeline.manage import cache
 
     sys.exit(cache.check(ROOT, typer.echo))
 
 
 @app.command()
-def readme(check: Annotated[bool, Option("--check", help="Only report whether it is up to date.")] = False) -> None:
-    """Write the generated parts of README.md and docs from the committed reports."""
+def readme(
+    check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if they are out of date.")] = False,
+) -> None:
+    """Write the generated parts of README.md and docs from the results in reports/."""
     from pipeline.report.readme import fill_pages
 
     changed, shown = fill_pages(ROOT, write=not check)
@@ -176,7 +200,7 @@ def readme(check: Annotated[bool, Option("--check", help="Only report whether it
 
 @scenes.command("list")
 def list_scenes() -> None:
-    """List the scenes; a star marks those that `dvc repro` runs."""
+    """List all scenes; a star marks those that `dvc repro` runs."""
     from pipeline import plan
 
     running = checked_plan().scenes
@@ -185,7 +209,7 @@ def list_scenes() -> None:
 
 
 @scenes.command()
-def use(names: list[str]) -> None:
+def use(names: Annotated[list[str], Argument(help="Names of all scenes to run.")]) -> None:
     """Set the scenes that `dvc repro` runs."""
     from pipeline import plan
     from pipeline.manage import tidy as tidying
@@ -198,7 +222,7 @@ def use(names: list[str]) -> None:
 
 @scenes.command()
 def tidy() -> None:
-    """Remove the files of experiments that the scenes no longer run."""
+    """Remove the output files of experiments that the scenes no longer run."""
     from pipeline.manage import tidy as tidying
 
     stale = tidying.tidy(ROOT, checked_plan())
@@ -210,5 +234,5 @@ def tidy() -> None:
 
 @scenes.command()
 def check() -> None:
-    """Check scenes, params.yaml, and that the plan is up to date."""
+    """Check the scenes in the plan and params.yaml, and that the plan is up to date."""
     checked_plan()

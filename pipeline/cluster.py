@@ -1,8 +1,8 @@
 """Run calls on a Dask cluster: a `concurrent.futures` executor for the address of a scheduler.
 
-Workers see the checkout at its own path (one machine, or a shared file system), because results are files in it. They
-give the same bits as a local run: a worker with other code, libraries, variables or more than one thread is refused
-before work begins, and one that joins later at its first call.
+Workers must see the checkout under the same path (on the same machine, or on a shared file system), because results are
+files in it. Results are the same bits as those of a local run: a worker with other code, libraries or variables, or
+with more than one thread, is refused before work begins, or at its first call if it joins later.
 """
 
 import os
@@ -22,10 +22,10 @@ from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
-CONNECT_MAX_s, WORKERS_MAX_s = 20.0, 60.0  # a worker that is started beside us imports for seconds
+CONNECT_MAX_s, WORKERS_MAX_s = 20.0, 60.0  # a worker that starts at the same time imports for seconds
 HOW = "docs/cluster.md says how workers are started."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
-CODE = (".py", ".json", ".safetensors")  # sources, and the tables that come with them; settings come with a call
+CODE = (".py", ".json", ".safetensors")  # sources and their tables; settings are sent with each call
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
 
 
@@ -36,7 +36,7 @@ def _version(library: str) -> str:
         return "none"
 
 
-# As imported: a worker may outlive an edit of a file, and goes on with the code in its memory.
+# Computed at import: a worker that runs while a file is edited continues with the code in its memory.
 IMPORTED = {"sources as imported": package_digest(*PACKAGES, suffixes=CODE)} | {
     name: _version(name) for name in LIBRARIES
 }
@@ -56,7 +56,7 @@ class Cluster(Executor):
         except BaseException:
             self._client.close()
             raise
-        self._executor = self._client.get_executor(pure=False)  # a call writes files: it is run as often as asked
+        self._executor = self._client.get_executor(pure=False)  # calls write files, so none may be skipped
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run a call on one of the workers."""
@@ -67,13 +67,13 @@ class Cluster(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for what was submitted, or cancel it, and leave the cluster as it was."""
+        """Wait for submitted calls, or cancel them, and disconnect; the cluster goes on running."""
         self._executor.shutdown(wait=wait and not cancel_futures)
         self._client.close()
 
 
 def run_on_worker(folder: str, own: Mapping[str, str], call: Callable[[], Any]) -> Any:
-    """Run a call on a worker, in the folder of the checkout, to which paths of stages are relative.
+    """Run a call on a worker, in the folder of the checkout, because the paths of stages are relative to it.
 
     The worker is checked again, because it may have joined after `_check_workers`.
     """
@@ -88,7 +88,7 @@ def import_on_worker(name: str) -> None:
 
 
 def describe_process() -> dict[str, str]:
-    """Return what decides the bits of a result: versions and sources as imported, and variables."""
+    """Return what determines the bits of a result: versions, sources as imported, and environment variables."""
     from reskin.numerics import DEVICE_VARIABLE, device
 
     return {
@@ -115,7 +115,7 @@ def _connect(address: str) -> Any:
 
 
 def _check_workers(client: Any, address: str) -> None:
-    """Raise if there is no worker, or one that would give other bits than this process."""
+    """Raise if there is no worker, or if a worker would compute other bits than this process."""
     workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
     if not workers:
         raise ParamsError(f"RESKIN_EXECUTOR: the scheduler at {address} has no workers. {HOW}")
@@ -129,17 +129,17 @@ def _check_workers(client: Any, address: str) -> None:
 
 def _compare(own: Mapping[str, str], theirs: Mapping[str, str], name: str) -> None:
     for what, value in own.items():
-        got = theirs.get(what, "nothing")  # of a worker that imported an older version of this module
+        got = theirs.get(what, "nothing")  # missing if the worker imported an older version of this module
         if got != value:
             raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Restart it. {HOW}")
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
-    """Copy the result or error of a Dask future to ours; a worker that died is reported as a local one is."""
+    """Copy the result or error of a Dask future to ours; raise the same error for a dead worker as locally."""
     from distributed import KilledWorker
 
     if submitted.cancelled():  # by Dask, when it loses the scheduler; nobody waits for calls that we cancel
-        remedy = "Finished trainings are cached: start it again, then repeat the command."
+        remedy = "Finished training runs are cached: start the scheduler again, then repeat the command."
         future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))
         return
     error = submitted.exception()

@@ -1,6 +1,6 @@
 """Summarise the readings of a skin: fields, noise, resolution and forces, as numbers with units in their names.
 
-Simulated and recorded skins are summarised alike, so that they can be compared.
+Simulated and recorded skins are summarised in the same way, so that they can be compared.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,16 +15,16 @@ from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
 FORCES_N = (0.5, 1.0, 2.0, 3.0)  # at which changes of field are compared
-NEAR = 0.2  # of the force
-ENOUGH_N = 20  # readings, or a number is not given
-LAGS_N = (1, 10, 100, 1000)  # contacts from one no-load reading to another
-STEP_READINGS_N = 2000  # show the chips' steps
-PRESSED_N = 0.5  # below, a weak chip shows its noise
+NEAR = 0.2  # relative tolerance of these forces
+ENOUGH_N = 20  # fewest readings from which a number is computed
+LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
+STEP_READINGS_N = 2000  # readings from which the chips' steps are found
+PRESSED_N = 0.5  # below this force, a weak chip shows mostly its noise
 
 
 def describe(readings: Readings) -> dict[str, float]:
-    """Describe one capture; what it does not hold, or hardly, is absent."""
-    # A row with a force but no place is no contact; one with neither is a contact that nobody labelled.
+    """Describe one capture; quantities for which it has too few readings are absent."""
+    # A row with a force but no place is not a contact; a row with neither is an unlabelled contact.
     touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
     change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
     return {
@@ -39,17 +39,20 @@ def describe(readings: Readings) -> dict[str, float]:
 
 
 def without_rest(described: Mapping[str, float]) -> dict[str, float]:
-    """Leave out the fields at rest and their changes: what a recorder subtracted before it wrote is not known."""
+    """Leave out the fields at rest and their changes, which are unknown if the recorder subtracted a baseline."""
     of_rest = ("field_at_rest", "rest_changes")
     return {name: number for name, number in described.items() if not name.startswith(of_rest)}
 
 
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Give mean, sd, least and most over skins of every quantity of (skin, description); a skin's captures averaged."""
+    """Return the mean, sd, least and most value over skins of every quantity.
+
+    described: pairs of a skin and the description of one capture. The captures of a skin are averaged first.
+    """
     rows = pd.DataFrame([numbers for _, numbers in described])
     skins = rows.groupby([skin for skin, _ in described], sort=False).mean()
     weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
-    if {weak, strong} <= set(skins):  # captures of one skin may each hold one force alone, so this is asked of the skin
+    if {weak, strong} <= set(skins):  # of skins, as each capture of a skin may have one force only
         skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
     found = summarise(skins)
     return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
@@ -65,9 +68,10 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
 
 
 def _wander(readings: Readings) -> dict[str, float]:
-    """Give by how much the field at rest differs between contacts so far apart, rms over channels and pairs.
+    """Return the rms difference of the field at rest between contacts separated by each lag, over channels and pairs.
 
-    A random walk grows as the root; what a contact leaves behind stands from the first on, and repeats with the scan.
+    The difference due to a random walk grows as the square root of the lag. The difference due to what a contact leaves
+    behind has its full size at lag 1, and repeats with the scan.
     """
     _, first_i = np.unique(rank(readings.indentation), return_index=True)
     rest_uT = readings.noload_uT[first_i].astype(np.float64)
@@ -79,7 +83,7 @@ def _wander(readings: Readings) -> dict[str, float]:
 
 
 def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
-    # At one stop of one indentation nothing moves: what is left is noise. Pooled over stops.
+    # Nothing moves during one stop of an indentation, so deviations from the stop's mean are noise. Pooled over stops.
     stops = [part[touched] for part in (readings.indentation, readings.x_mm, readings.y_mm)]
     by_stop = pd.DataFrame(readings.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
     freedom_n = int(touched.sum()) - by_stop.ngroups
@@ -99,7 +103,7 @@ def _steps(readings: Readings) -> dict[str, float]:
 def _rate(readings: Readings) -> dict[str, float]:
     """Return the rate of readings within one stop, if the capture has a clock."""
     between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
-    known_s = between_s[between_s > 0]  # NaN, no clock, is not
+    known_s = between_s[between_s > 0]  # leaves out NaN (no clock)
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
 
 

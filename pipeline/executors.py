@@ -1,6 +1,7 @@
 """Executors: run calls in processes, in this process or on a cluster, as RESKIN_EXECUTOR says.
 
-An environment variable and not a setting, because the place of a training must not change its hash.
+This is an environment variable rather than a setting, because the hash of a training run must not depend on where it
+runs.
 """
 
 import multiprocessing
@@ -16,14 +17,14 @@ from reskin.errors import ParamsError
 
 VARIABLE = "RESKIN_EXECUTOR"
 DEFAULT, HERE = "processes:2", "here"
-CLUSTER = "dask:"  # before the address of a scheduler that runs already
+CLUSTER = "dask:"  # prefix of the address of a running scheduler
 
 
 def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
     """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2), `here`, or `dask:ADDRESS`.
 
-    Each process has one thread. A single task runs here, unless the variable is set. Module `imports` is imported once
-    for all processes.
+    Each process has one thread. A single task runs in this process, unless the variable is set. Module `imports` is
+    imported once for all processes.
     """
     if address := _scheduler_address():
         from pipeline.cluster import Cluster  # imported late: Dask is an extra
@@ -59,15 +60,16 @@ def _scheduler_address() -> str:
 
 
 def _context(imports: str) -> ForkServerContext:
-    # forkserver: a forked child of a threaded parent can hang in BLAS; that of a process that only imports does not.
+    # forkserver: a child forked from a multi-threaded process can hang in BLAS; one forked from a process that has only
+    # imported modules does not.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([imports])
     return context
 
 
 def end_workers() -> None:
-    """Stop the process that forks workers, so that their time counts as that of our children."""
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # else it ends after this process
+    """Stop the process that forks workers, so that their CPU time counts as that of this process's children."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # it would end only after this process
 
 
 class Here(Executor):
@@ -84,7 +86,7 @@ class Here(Executor):
 
 
 def _end_with_parent() -> None:
-    """End a worker when its stage is killed: an orphan would go on beside the next attempt."""
+    """End a worker when its stage is killed; otherwise it would keep running beside the next attempt."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -20,16 +20,17 @@ HEADER = """\
 # Which scenes run, and the items that each stage of dvc.yaml iterates over. Generated from pipeline/scenes and
 # data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
 """
-MANY_N = 30  # captures of a recorded scene; with more, one stage reads them all (docs/growth.md)
-NOT_INGESTED = {"walk"}  # kinds of protocols that record no probe: their experiment reads the log as it is
+MANY_N = 30  # captures of a recorded scene; if there are more, one stage reads all (docs/growth.md)
+NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the probe; their experiment reads the raw capture
 
 
 def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
     """Derive the plan: the experiments of each scene, its recorded captures, and the items of every stage.
 
     Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures, one
-    for each protocol of a scene, and `ingest` over recorded captures. An experiment on the captures of a protocol that
-    recorded scenes may run too (`drift`) iterates over scenes, each with its folder of captures.
+    for each protocol of a scene, and `ingest` over recorded captures. An experiment that has a protocol of its own in
+    simulated scenes, and that recorded scenes may run too (`drift`), iterates over scenes, each with its folder of
+    captures.
     """
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
@@ -47,8 +48,8 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
         for protocol, settings in scene.simulate.protocols.items() if scene.simulate else ():
             folder = _folder(name, protocol)
             if folder in simulate or (folder in scenes and folder != name):
-                what = f"the folder {folder} of a protocol is that of another scene or protocol"
-                raise ParamsError(f"scene {name}: {what}. Rename one.")
+                what = f"protocol {protocol} has the same folder, {folder}, as another scene or protocol"
+                raise ParamsError(f"scene {name}: {what}. Rename one of them.")
             simulate[folder] = {"scene": name, "protocol": protocol}
             if settings.kind not in NOT_INGESTED:
                 ingest_simulated[folder] = name
@@ -88,13 +89,13 @@ def scene_file(root: Path, name: str) -> Path:
     """Return the file of a scene; raise `ParamsError` if there is none."""
     known = scene_names(root)
     if name not in known:
-        remedy = f"Check the name, or copy a scene: {SCENES}/{name}.yaml, or reskin add --like SCENE."
+        remedy = f"Check the name, or create {SCENES}/{name}.yaml, for example with reskin add --like SCENE."
         raise ParamsError(f"no scene {name}. The scenes are: {', '.join(known)}. {remedy}")
     return root / SCENES / f"{name}.yaml"
 
 
 @contextmanager
-def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
+def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
     """Write scene `name` as a copy of scene `like`, and remove it if the block fails; without `like`, do nothing.
 
     Comments are copied, except those above the first setting, which describe the other scene.
@@ -121,7 +122,7 @@ def copied(root: Path, name: str, like: str | None) -> Iterator[None]:
 
 
 def use(root: Path, names: Sequence[str]) -> None:
-    """Write the plan of exactly these scenes; raise if `dvc repro` runs, as its stages read the plan."""
+    """Write the plan for exactly these scenes; raise if `dvc repro` is running, because its stages read the plan."""
     require_idle(root)
     yaml = YAML()
     yaml.width = 120
@@ -133,17 +134,17 @@ def use(root: Path, names: Sequence[str]) -> None:
 
 
 def _keep_outputs(root: Path) -> None:
-    """Make DVC leave the outputs of scenes that left the plan in the working tree.
+    """Keep DVC from deleting the outputs of scenes that are no longer in the plan.
 
-    DVC lists the outputs that it wrote; `dvc checkout`, `dvc exp run` and `dvc exp apply` delete those on the list that
-    no stage of the current plan writes.
+    DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete the listed
+    outputs that no stage of the current plan writes, so the list is emptied.
     """
     if not (root / DVC_FILES).is_dir():  # DVC has not run here
         return
-    from dvc.exceptions import DvcException  # late: DVC takes a second
+    from dvc.exceptions import DvcException  # imported late: it takes a second
     from dvc.repo import Repo
 
-    with suppress(DvcException), Repo(str(root)) as repo:  # where DVC does not start, it deletes nothing either
+    with suppress(DvcException), Repo(str(root)) as repo:  # a DVC that cannot start deletes nothing
         repo.state.links.clear()
 
 

@@ -1,4 +1,4 @@
-"""Tell which stage of `dvc repro` runs, such as `stage 5 of 39`."""
+"""Report the place of the running stage in `dvc repro`, such as `stage 5 of 39`."""
 
 import hashlib
 import os
@@ -14,13 +14,13 @@ ORDER = Path(".reskin/order.json")
 
 def announce() -> str | None:
     """Return the place of this stage among all stages; None if DVC does not run it."""
-    stage = os.environ.get(VARIABLE, "").rpartition(":")[2]  # `dvc.yaml:` stands before it where there are more files
+    stage = os.environ.get(VARIABLE, "").rpartition(":")[2]  # with several files, DVC puts `dvc.yaml:` before it
     if not stage:
         return None
     try:
         order = stages_in_order()
         return f"stage {order.index(stage) + 1} of {len(order)}" if stage in order else None
-    except Exception as error:  # no fault of DVC or of a file may end a stage for the sake of this line
+    except Exception as error:  # a stage must not fail because of this line
         return f"its place among all stages is unknown ({type(error).__name__} {error})"
 
 

@@ -14,9 +14,9 @@ from reskin import io
 from reskin.code import ROOT, files_of, normalised
 from reskin.numerics import departures
 
-EXPERIMENTS = (".dvc", "tmp", "exps")  # where DVC makes copies of a checkout for experiments, and deletes them
+EXPERIMENTS = (".dvc", "tmp", "exps")  # folder of the copies of a checkout that DVC makes for experiments, and deletes
 PACKAGES = (ROOT / "pipeline", ROOT / "reskin")
-NO_CODE = ("plan.yaml", "scenes")  # settings beside the code
+NO_CODE = ("plan.yaml", "scenes")  # settings in the folders of the code
 COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # times of trainings and predictions on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
@@ -25,7 +25,7 @@ INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd"
 
 
 def home() -> Path:
-    """Return the checkout with the caches: the working directory, or the one around DVC's copy for an experiment."""
+    """Return the checkout with the caches: the working directory, or the one around it if it is a copy by DVC."""
     here = Path.cwd()
     around = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
     return around[-1] if around else Path()
@@ -38,7 +38,7 @@ def is_experiment() -> bool:
 def code_version() -> str:
     """Return the last commit that changed the two packages, with `+dirty` if they changed since; `unknown` outside git.
 
-    Not HEAD: a later commit of results must not make equal results look different.
+    HEAD is not used, because a later commit of results must not make equal results look different.
     """
     of_code = (*map(str, PACKAGES), *(f":(exclude){PACKAGES[0] / name}" for name in NO_CODE))
     commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *of_code)
@@ -97,15 +97,15 @@ def versions() -> dict[str, str]:
 
 
 def clear_cost(folder: Path, stage: str) -> None:
-    """Delete the record of trainings of a stage's last run."""
+    """Delete the record of the training runs in a stage's last run."""
     io.remove(_trainings_file(folder, stage))
 
 
 def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
-    """Record trainings of a stage's run.
+    """Record the training runs of a stage.
 
-    trained: for each key, the seconds that the training took, and whether an earlier run did it. waited_s: how long the
-    stage waited for them.
+    trained: for each key, the seconds that training took, and whether its result was reused from an earlier run.
+    waited_s: how long the stage waited for them.
     """
     before = _read_trainings(folder, stage)
     reused = {key for key, (_, again) in trained.items() if again} - set(before["computed_s"])
@@ -120,7 +120,7 @@ def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float
 
 
 def record_cost(folder: Path, stage: str, seconds: float) -> None:
-    """Record the cost of a stage beside the pipeline: in an output, it would differ between equal runs.
+    """Record the cost of a stage outside its outputs, because costs differ between equal runs.
 
     A stage that does not run, or that DVC restores, keeps the cost of its last run.
     """
@@ -133,7 +133,8 @@ def record_cost(folder: Path, stage: str, seconds: float) -> None:
         folder / f"{stage}.json",
         {
             "seconds": round(seconds, 2),
-            # Trainings side by side took less than their sum; other work meanwhile, such as imports, counts here.
+            # Parallel training runs take less time than their sum. The waiting time beyond what they took in this run
+            # counts here, such as imports of workers.
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,
             "reused_n": len(trained["reused"]),
@@ -151,9 +152,9 @@ def read_costs(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def total_cost_s(costs: Iterable[Mapping[str, Any]]) -> float:
-    """Return the total cost of stages in seconds; a training that two of them share counts once.
+    """Return the total cost of stages in seconds; a training run that two stages share counts once.
 
-    Trainings are added as if one ran after another: where two run side by side, less time passes.
+    Times of training runs are added as if one ran after another; if two run in parallel, less time passes.
     """
     stages = list(costs)
     trainings_s = {key: seconds for cost in stages for key, seconds in cost["trainings_s"].items()}

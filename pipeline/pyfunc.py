@@ -1,6 +1,6 @@
 """MLflow's loader of trained networks: `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle is opened.
 
-The model takes changes of field in uT, one row a reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...), and returns
+The model takes changes of field in uT, one row per reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...), and returns
 x_mm, y_mm and force_N.
 """
 

@@ -18,7 +18,7 @@ from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Name, Recip
 from reskin.recordings.fault_policy import FaultPolicy
 
 MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
-# The rows of table 2 and their experiments; a scene that runs all of these has the table early.
+# The rows of table 2 and their experiments. A scene that runs all of these gets the table before its report.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 EXPERIMENTS: Mapping[str, Experiment] = {one.name: one for one in (*LEARNING, *read_experiments())}
@@ -27,7 +27,7 @@ SECTIONS = {one.stage for one in EXPERIMENTS.values() if one.settings}
 
 
 def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
-    """Name the stages that run those of the named experiments that are of some kinds, each once, in a fixed order."""
+    """Return the stages that run the named experiments of the given kinds, each once and in a fixed order."""
     chosen = set(names)
     return list(dict.fromkeys(one.stage for one in EXPERIMENTS.values() if one.name in chosen and one.kind in kinds))
 
@@ -42,7 +42,7 @@ Source = Literal["simulated", "recorded"]
 
 
 class OnBoards(Strict, extra="allow"):
-    """The settings of a protocol that the plan needs: its kind, its kind of boards, its terms of physics."""
+    """The settings of a protocol that the plan needs: its kind, its kind of boards, and its terms of physics."""
 
     kind: str
     boards: str
@@ -50,14 +50,14 @@ class OnBoards(Strict, extra="allow"):
 
 
 class Simulation(Strict):
-    """Section `simulate`. `pipeline.simulation` checks the rest, so that only its stages depend on the physics."""
+    """Section `simulate`. `pipeline.simulation` checks the rest: only stages that import it depend on the physics."""
 
     boards: dict[str, dict[str, Any]]
     protocols: Annotated[dict[str, OnBoards], Field(min_length=1)]
 
 
 class Scene(Strict, extra="allow"):
-    """One named set-up: its captures or how to simulate them, its experiments, and a section of settings for each."""
+    """One named set-up: its captures or how to simulate them, its experiments, and their sections of settings."""
 
     source: Source
     seed: Seed
@@ -68,7 +68,7 @@ class Scene(Strict, extra="allow"):
 
     @property
     def rows(self) -> list[Experiment]:
-        """What its experiments need, in the order of the scene's file."""
+        """The catalogue's entries of its experiments, in the order of the scene's file."""
         return [EXPERIMENTS[name] for name in self.experiments]
 
     @property
@@ -102,11 +102,11 @@ class Scene(Strict, extra="allow"):
 
     @property
     def described(self) -> str:
-        """The name of the description of its captures in numbers.json."""
+        """The key under which numbers.json describes its captures."""
         return "recorded" if self.source == "recorded" else MAIN_PROTOCOL
 
     def runs(self, unit: str) -> bool:
-        """Tell whether the scene runs a stage, or its part for one protocol: `drift`, `simulate-wear`."""
+        """Return whether the scene runs a stage (`drift`), or a stage for one protocol (`simulate-wear`)."""
         stage, _, part = unit.partition("-")
         if stage in {one.stage for one in EXPERIMENTS.values() if one.kind != "report"}:
             return stage in {one.stage for one in self.rows}
@@ -115,7 +115,7 @@ class Scene(Strict, extra="allow"):
     @model_validator(mode="after")
     def _check_sections(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
-            raise ValueError("section simulate stands in a scene if and only if its source is simulated")
+            raise ValueError("a scene has a section simulate if and only if its source is simulated")
         for one in self.rows:
             if missing := set(one.needs) - set(self.experiments):
                 raise ValueError(f"experiment {one.name} needs {', '.join(sorted(missing))} in the same scene")
@@ -127,14 +127,14 @@ class Scene(Strict, extra="allow"):
             *(_differences("simulate.protocols", {*self.simulate.protocols}, self.protocols) if self.simulate else ()),
         ]
         if wrong:
-            raise ValueError(f"a scene holds exactly the settings of its experiments; {'; '.join(wrong)}")
+            raise ValueError(f"a scene must have exactly the settings that its experiments need; {'; '.join(wrong)}")
         return self
 
     @model_validator(mode="after")
     def _check_source(self) -> "Scene":
         if not self.with_folds and not any(one.alone for one in self.rows):
             sufficient = sorted(one.name for one in EXPERIMENTS.values() if one.folds is not None or one.alone)
-            raise ValueError(f"experiments holds at least one of {', '.join(sufficient)}")
+            raise ValueError(f"experiments must include at least one of {', '.join(sufficient)}")
         beyond = sorted(one.name for one in self.rows if not one.recorded)
         if self.simulate is None and beyond:
             raise ValueError(f"only a simulated scene can run experiments {', '.join(beyond)}")
@@ -181,14 +181,14 @@ def check_scene(settings: Settings) -> Scene:
         if model := section_of(getattr(module_of(stage), stage)):
             settings.section(model, stage)
     if scene.simulate is not None:
-        from pipeline.simulation import simulation_settings  # the physics, for a simulated scene only
+        from pipeline.simulation import simulation_settings  # imports the physics, which recorded scenes do not need
 
         simulation_settings(settings)
     return scene
 
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's experiments, and that its sections are there; their stages check the content of sections."""
+    """Check a scene's experiments and that it has the sections they need, but not the content of the sections."""
     for name, value in content.items():
         if name not in {*Scene.model_fields, *SECTIONS}:
             found = repr(value)[:80]

@@ -1,6 +1,6 @@
 """Settings of a scene: its own file, `params.yaml`, and the nominal skin of the library, each read once.
 
-`dvc.yaml` lists the sections that a stage parses as its parameters (tests/test_settings.py compares the two).
+The sections that a stage parses are its `params` in `dvc.yaml` (tests/test_settings.py compares the two).
 """
 
 import inspect
@@ -39,9 +39,9 @@ class SectionWithRows(Strict):
 
 
 class Training(SectionWithRows):
-    """Recipes by name, each trained on every fold with `seeds_n` seeds; `paper` is the headline.
+    """Recipes by name, each trained on every fold with `seeds_n` seeds; `paper` is the headline recipe.
 
-    In the file: the name of a shared `recipe`, `steps_n`, and changes of the recipe by variant.
+    The scene's file gives the name of a shared `recipe`, `steps_n`, and for each variant the values that differ.
     """
 
     recipes: dict[Name, Recipe | AugmentedRecipe]
@@ -53,7 +53,7 @@ class Training(SectionWithRows):
 
 
 class SectionWithTraining(SectionWithRows):
-    """Base of sections that hold a `training` of their own."""
+    """Base of sections that contain a subsection `training`."""
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
@@ -64,7 +64,8 @@ class SectionWithTraining(SectionWithRows):
 class Adaptations(SectionWithRows):
     """Adaptations by name, each with `pokes_n` unlabelled indentations of every held-out skin.
 
-    In the file: the name of a shared `adaptation`, its `base` (a recipe of section train_triplet), `steps_n`, variants.
+    The scene's file gives the name of a shared `adaptation`, its `base` (a recipe of section train_triplet), `steps_n`
+    and the variants.
     """
 
     pokes_n: Count
@@ -89,7 +90,7 @@ class Settings:
 
     where: the scene's file, for error messages. of_scene: its content.
     shared: the content of `params.yaml` and of the library's nominal skin.
-    captures: names of its recorded captures; none if it is simulated.
+    captures: names of its recorded captures; empty if it is simulated.
     held_out: its experiments that have folds of their own. models: its stages that write models.
     """
 

@@ -6,7 +6,7 @@ from reskin.errors import ParamsError
 from reskin.simulation.protocols import Load
 from reskin.simulation.settings import MAIN, SimulationSettings, parse_simulation
 
-# Protocols that experiments read, and the kind that each can read.
+# The protocols that experiments read, and the kind that each must have.
 KINDS = {
     "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter", "glass": "load",
     "grip": "load", "press": "press", "log": "walk",
@@ -29,14 +29,15 @@ def check_protocols(simulation: SimulationSettings, where: str) -> None:
     """Raise ParamsError, which names `where`, if an experiment cannot read one of the protocols."""
     main = simulation.main.boards
     if simulation.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
-        raise ParamsError(f"{where}: skin_mm of the boards of protocol {MAIN} is {list(SKIN_MM)}. Correct it there.")
+        rule = f"skin_mm of the boards of protocol {MAIN} must be {list(SKIN_MM)}"
+        raise ParamsError(f"{where}: {rule}. Correct it there.")
     for name, protocol in simulation.protocols.items():
         kind, boards, skins_n = KINDS.get(name, protocol.kind), protocol.boards, protocol.skins_n
         faults = {
-            f"kind is {kind}, which its experiment reads, not {protocol.kind}": protocol.kind != kind,
-            f"boards is {main}, as of {MAIN}, not {boards}": name in ON_MAIN_BOARDS and boards != main,
-            f"boards is another kind than that of {MAIN}, not {boards} too": name in ON_OTHER_BOARDS and boards == main,
-            f"skins_n is 1, as its experiment reads one skin, not {skins_n}": name in OF_ONE_SKIN and skins_n != 1,
+            f"kind must be {kind}, which its experiment reads, not {protocol.kind}": protocol.kind != kind,
+            f"boards must be {main}, as for {MAIN}, not {boards}": name in ON_MAIN_BOARDS and boards != main,
+            f"boards must differ from {boards}, the boards of {MAIN}": name in ON_OTHER_BOARDS and boards == main,
+            f"skins_n must be 1, as one skin is read, not {skins_n}": name in OF_ONE_SKIN and skins_n != 1,
         }
         for fault in (rule for rule, is_broken in faults.items() if is_broken):
             raise ParamsError(f"{where}: protocol {name}: {fault}. Correct it there.")

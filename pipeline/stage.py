@@ -15,7 +15,7 @@ from reskin.errors import ReskinError, explaining
 
 
 def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Call the function of a stage; its paths are the command's options, its settings those of `--scene`."""
+    """Run the function of a stage with the paths that the options give and the settings of `--scene`."""
     stage = work.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=work.__doc__)
     parser.add_argument("--scene", required=True)
@@ -44,7 +44,7 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
-    """Name a run for its cost; a stage that runs for every capture or protocol of a scene is named with that."""
+    """Return the name under which the cost is recorded: the stage, and the capture or protocol if it runs for each."""
     if stage == "ingest":
         return f"{stage}-{options['indentations'].stem}"
     if stage in ("simulate", "ingest_simulated"):

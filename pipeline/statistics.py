@@ -1,7 +1,7 @@
-"""The table of scores of all trainings, and the statistics over boards that reports give of it.
+"""The table of scores of all training runs, and the statistics over boards that reports compute from it.
 
-A row of the table is one training on one skin, or on all skins that it was tested on. The unit of inference is the
-board: its skins share it and the network that never saw it.
+A row of the table has the scores of one network on one skin, or on all skins that it was tested on. The unit of
+inference is the board, because its skins share the board and the network that was trained without it.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -20,14 +20,14 @@ COUNTS = (
 )  # fmt: skip
 KEYS = (*NAMES, *COUNTS)  # every other column is a metric
 UNCERTAINTY = ("coverage_pct", "half_width_mm")  # of 90 % intervals, of methods that give an uncertainty
-ALL_SKINS = ""  # in column `skin`: all rows that a training was tested on
-AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places: the latter after one offset a board, a diagnosis
+ALL_SKINS = ""  # in column `skin`: all skins that a network was tested on
+AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places; the latter after one offset per board, a diagnosis
 METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by experiment
 CONFIDENCE = 0.95  # convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct")  # between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")
-DECIMALS = 12  # of a difference in %, mm2 or N2: what is below is rounding of float sums
-BOARDS_MIN = 4  # from so many on there is an interval; of fewer, each board's value is given
+DECIMALS = 12  # of a difference in %, mm2 or N2; further decimals are rounding errors of float sums
+BOARDS_MIN = 4  # fewest boards for an interval; with fewer, each board's value is given
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
 VERDICTS = (
@@ -41,7 +41,7 @@ VERDICTS = (
 
 Cards = Sequence[Mapping[str, Any]]
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
-# mean, n; where n > 1 also sd; where n are boards, ci95: [low, high], or of few boards values: each board's own
+# mean, n; if n > 1, sd; over boards, also ci95: [low, high], or `values` of each board if there are few
 Stat = Mapping[str, Any]
 
 
@@ -49,12 +49,12 @@ Stat = Mapping[str, Any]
 
 
 def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFrame:
-    """Tabulate the scores of all trainings.
+    """Tabulate the scores of all training runs.
 
     Parameters
     ----------
     cards
-        Cards of models. Networks adapted to one skin each also get a row for all skins of their fold, by fold and seed.
+        Cards of models. Networks adapted to one skin each also get a joint row for all skins of a fold, for each seed.
     points
         Points of sweeps, by experiment.
 
@@ -70,7 +70,7 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
         for point in own
     ]
     rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
-    alike: dict[Hashable, list[dict[str, Any]]] = {}  # for all skins: one training, or one for each skin
+    alike: dict[Hashable, list[dict[str, Any]]] = {}  # rows for all skins: of one network, or one per skin
     for row in (row for row in rows if row["skin"] == ALL_SKINS):
         alike.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
     kept = [*map(_pool, alike.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
@@ -95,7 +95,7 @@ def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make the rows of a training: all skins as labelled and registered, then each skin."""
+    """Make the rows of a training run: all skins as labelled and registered, then each skin."""
     boards = {*scores["board_of"].values()}
     every = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
     rows = [every | {"places": AS_LABELLED} | scores["all"], every | {"places": REGISTERED} | scores["registered"]]
@@ -105,7 +105,7 @@ def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, 
 
 
 def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Pool scores of one fold and seed that were tested on a skin each, weighted by their numbers of rows."""
+    """Pool the scores of networks of one fold and seed, each tested on one skin, weighted by their numbers of rows."""
     rows_n = np.array([row["rows_n"] for row in rows])
     known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
     parts = {name: np.array([row[name] for row in rows]) for name in known}
@@ -118,7 +118,7 @@ def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def to_csv(table: pd.DataFrame) -> str:
-    """Write the table with six significant digits, as numbers.json has."""
+    """Write the table with six significant digits, as in numbers.json."""
     return table.convert_dtypes().to_csv(index=False, float_format="%.6g")
 
 
@@ -130,23 +130,23 @@ def select(rows: pd.DataFrame, **values: str | float) -> pd.DataFrame:
 
 
 def whole(rows: pd.DataFrame, places: str = AS_LABELLED) -> pd.DataFrame:
-    """Select the rows about all skins that a training was tested on: one a training."""
+    """Select the rows for all skins that a network was tested on: one row per training run."""
     return select(rows, skin=ALL_SKINS, places=places)
 
 
 def by_skin(rows: pd.DataFrame) -> pd.DataFrame:
-    """Select the rows about single skins."""
+    """Select the rows for single skins."""
     return rows[rows["skin"] != ALL_SKINS]
 
 
 def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Return the values by index and column; NaN is left out."""
+    """Return the values by index and column, without NaN."""
     known = {str(index): row.dropna() for index, row in rows.iterrows()}
     return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
 
 
 def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Count trainings: all, those that collapsed, and those of them that were kept because every repeat collapsed.
+    """Count training runs: all, those that collapsed, and collapsed ones kept because every repeat collapsed.
 
     >>> tally([{"collapsed": False, "collapsed_before_n": 1}, {"collapsed": True, "collapsed_before_n": 2}])
     {'trainings_n': 5, 'collapsed_n': 4, 'kept_collapsed_n': 1}
@@ -223,9 +223,10 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 
 
 def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
-    """Summarise values: `mean` and `n`, and of two or more `sd` (n - 1).
+    """Summarise values: `mean` and `n`, and for two or more values `sd` (n - 1).
 
-    Of `boards` also the interval `ci95`, or of fewer than `BOARDS_MIN` their `values`, in the order of the boards.
+    boards: the values are those of boards. Then two or more also have the interval `ci95`, or, if they are fewer than
+    `BOARDS_MIN`, the `values` themselves in the order of the boards.
     """
     stat = {"mean": float(np.mean(values)), "n": len(values)}
     if len(values) < 2:
@@ -238,7 +239,7 @@ def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict
 
 
 def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise each column over the rows that have it. `differences`: the columns are not bounded as metrics are."""
+    """Summarise each column over the rows that have it; columns with `differences` are not bounded as metrics are."""
     known = {str(name): units[name].dropna().to_numpy() for name in units}
     return {
         name: statistic(values, boards=boards, metric="" if differences else name)
@@ -248,9 +249,9 @@ def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = 
 
 
 def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise every metric over units (groups by these columns), each the mean of its rows.
+    """Summarise every metric over units, which are groups by these columns; a unit's value is the mean of its rows.
 
-    `sd_seeds` is the mean sd within a unit; it is not given over several boards.
+    `sd_seeds` is the mean sd within a unit; it is left out for several boards.
     """
     groups = rows.groupby(list(unit))[_metrics(rows)]
     summary = summarise(groups.mean(), boards=boards)
@@ -258,9 +259,9 @@ def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str
 
 
 def add_seed_sd(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> dict[str, dict[str, Any]]:
-    """Add `sd_seeds` to each statistic: the standard deviation (n - 1) of the rows of a unit, mean over units.
+    """Add `sd_seeds` to each statistic: the standard deviation (n - 1) of the rows of a unit, averaged over units.
 
-    The rows of a unit are networks that differ in their seed. A metric whose units have one row each is left as it is.
+    The rows of a unit are networks that differ in their seed. Metrics whose units have one row each get none.
     """
     sds = rows.groupby(list(unit))[_metrics(rows)].std().mean().dropna()
     return {
@@ -269,19 +270,20 @@ def add_seed_sd(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> 
 
 
 def over_folds(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise trainings over folds, each the mean of its seeds."""
+    """Summarise training runs over folds; a fold's value is the mean over its seeds."""
     return over_units(whole(rows), "fold")
 
 
 def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> dict[str, dict[str, Any]]:
-    """Summarise trainings over held-out boards, each the mean of its trainings (seeds, draws of skins)."""
+    """Summarise training runs over held-out boards; a board's value is the mean over its seeds and draws of skins."""
     return over_units(whole(rows, places), "board", boards=True)
 
 
 def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise pairs of a training and a test skin, as the paper does (3 x 9 pairs).
+    """Summarise over pairs of a training skin and a test skin, as the paper does (3 x 9 pairs).
 
-    `ci95` is over training skins and test boards alike (`two_way_error`); `training_n` and `boards_n` count them.
+    For `ci95`, training skins and test boards are both samples (`two_way_error`); `training_n` and `boards_n` count
+    them.
     """
     own = by_skin(rows)
     pairs, crossed = over_units(own, "fold", "skin"), own.groupby(["fold", "board"])[_metrics(own)].mean()
@@ -298,9 +300,10 @@ def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
 def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
     """Compute the standard error of a mean over rows and columns that are both samples, and its degrees of freedom.
 
-    Training skins are rows, test boards columns; cells may be missing. The variance is that of row means over their
-    number plus that of column means over theirs, with Satterthwaite's degrees of freedom. The error is a little too
-    large, because the residual variance of cells counts twice. None below two rows or `BOARDS_MIN` columns.
+    Training skins are rows, test boards are columns, and cells may be missing. The squared error is the variance of the
+    row means divided by the number of rows, plus the variance of the column means divided by the number of columns,
+    with Satterthwaite's degrees of freedom. It is slightly too large, because it counts the residual variance of cells
+    twice. Return None for fewer than two rows or `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None
@@ -311,7 +314,7 @@ def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
 
 
 def board_means(rows: pd.DataFrame) -> pd.DataFrame:
-    """Average networks on each skin, then the skins of each board: a row a board."""
+    """Average networks on each skin, then the skins of each board; return one row per board."""
     return _skin_means(rows).groupby("board").mean()
 
 
@@ -327,12 +330,15 @@ def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def paired(of: pd.DataFrame, over: pd.DataFrame) -> dict[str, Any]:
-    """Summarise the paired differences of two methods on the same skins over boards; `by_board` has each board's."""
+    """Summarise over boards the difference of two methods on the same skins; `by_board` has each board's value."""
     return summarise_differences(differences(of, over))
 
 
 def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
-    """Subtract skin by skin, each side the mean of its networks there; a row a board, the mean of its skins."""
+    """Subtract the mean over networks of one method from that of the other on each skin; average the skins of a board.
+
+    Returns one row per board.
+    """
     ours, theirs = _skin_means(of), _skin_means(over)
     if not ours.index.equals(theirs.index):
         raise _unpaired(sorted(ours.index.symmetric_difference(theirs.index)))
@@ -342,7 +348,8 @@ def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
 def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
     """Summarise differences over boards; `by_board` has each board's value.
 
-    Over `BOARDS_MIN` boards or more, `p` is the p-value of no difference, from `se` and `df` (degrees of freedom).
+    With `BOARDS_MIN` boards or more, `p` is the p-value of the hypothesis of no difference, from the standard error
+    `se` and the degrees of freedom `df`.
     """
     summary = summarise(by_board, boards=True, differences=True)
     means = {name: stat | {"mean": round(stat["mean"], DECIMALS)} for name, stat in summary.items()}
@@ -353,20 +360,20 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
 
 
 def paired_with_single(of: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
-    """Summarise differences of networks of many skins and of one skin each, where the latter were tested: as `paired`.
+    """Summarise, like `paired`, how networks of many skins differ from networks of one skin on the latter's test skins.
 
-    Both the boards and the single networks' training skins are samples: interval and `p` are of `two_way_error`.
+    Both the boards and the single networks' training skins are samples, so the interval and `p` use `two_way_error`.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
     ours, skins = _skin_means(of), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
     if unpaired := sorted(set(skins) - set(ours.index)):
         raise _unpaired(unpaired)
-    apart = (ours.loc[skins, theirs.columns].set_axis(theirs.index) - theirs).groupby(["fold", "board"]).mean()
-    found = summarise_differences(apart.groupby("board").mean())
-    for name in apart:
+    by_pair = (ours.loc[skins, theirs.columns].set_axis(theirs.index) - theirs).groupby(["fold", "board"]).mean()
+    found = summarise_differences(by_pair.groupby("board").mean())
+    for name in by_pair:
         if name in found:
             stat = {key: value for key, value in found[name].items() if key in ("mean", "sd", "n", "values")}
-            error = two_way_error(apart[name].dropna().unstack())
+            error = two_way_error(by_pair[name].dropna().unstack())
             found[name] = stat if error is None else stat | _t_test(stat["mean"], *error)
     return found
 
@@ -409,5 +416,5 @@ def verdict_within(stat: Stat, margin: float) -> str:
 
 
 def combine_verdicts(verdicts: Sequence[str]) -> str:
-    """Judge a claim of several parts: contradicted if one part is, supported if all are."""
+    """Judge a claim with several parts: contradicted if one part is contradicted, supported if all are supported."""
     return next((verdict for verdict in (CONTRADICTED, FEW_BOARDS, UNDECIDED) if verdict in verdicts), SUPPORTED)

@@ -1,6 +1,6 @@
-"""Write finished trainings and reports to MLflow. They are read from files, so that it can be done at any later time.
+"""Write finished training runs and reports from their files to MLflow, which is possible at any later time.
 
-Nothing reads MLflow back to compute a result, and a server that is away never delays one for long.
+No result is computed from MLflow, and a server that does not answer delays a stage only briefly.
 """
 
 import hashlib
@@ -28,36 +28,36 @@ STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
 LOADER = "pipeline.pyfunc"
 PARENT = "mlflow.parentRunId"
-LAYOUT = 2  # version of what a training's run holds; runs of an older one are written again
+LAYOUT = 2  # version of what an MLflow run contains; runs of an older version are written again
 METRICS_MAX_N = 1000  # in one call to MLflow
 TIMEOUT_S = 2.0
 LOCK_TIMEOUT_S = 5.0  # reading by a UI, or writing of a run by another process, takes much less
-PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # limit on all writing; a server in a local network takes 0.1 s a run
-NOT_METRICS = {"provenance", "runtime", "described", "variants"}  # of numbers.json: costs, and what trainings have
+PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # limit on all writing; a local server takes 0.1 s per run
+NOT_METRICS = {"provenance", "runtime", "described", "variants"}  # costs, and what other runs have
 
-# Points of a sweep or an experiment, by stage: the name of the curve, the step (pokes, skins, contacts), means by name.
+# A point of a sweep or an experiment: the name of its curve, its step (pokes, skins or contacts), and means by name.
 Point = tuple[str, int, Mapping[str, float]]
 Curves = Mapping[str, Sequence[Point]]
 
 
-class TrackingAway(ReskinError):
-    """The tracking server does not answer; the message says what to do."""
+class TrackingUnavailable(ReskinError):
+    """The tracking server or store cannot be used; the message says what to do."""
 
     exit_code = 3
 
 
 def server_uri() -> str | None:
-    """Return the tracking server of the environment variable; None: the embedded store is used."""
+    """Return the tracking server that the environment variable names; None if the embedded store is used."""
     return os.environ.get(VARIABLE) or None
 
 
 def tracking_uri(root: Path) -> str:
-    """Return the URI of the tracking server, else of the embedded store of the checkout."""
+    """Return the URI of the tracking server, or of the checkout's embedded store if no server is named."""
     return server_uri() or f"{SQLITE}{(root / STORE).resolve()}"
 
 
 def probe(uri: str | None) -> None:
-    """Raise `TrackingAway` if an HTTP server does not answer within two seconds, or a SQLite file is locked."""
+    """Raise `TrackingUnavailable` if an HTTP server does not answer within two seconds, or a SQLite file is locked."""
     if uri is None:
         return
     if uri.startswith(SQLITE):
@@ -68,8 +68,8 @@ def probe(uri: str | None) -> None:
                 return
         except (urllib.error.URLError, http.client.HTTPException, OSError, ValueError) as error:
             reason = getattr(error, "reason", error) or type(error).__name__
-            raise TrackingAway(
-                f"MLflow at {uri} does not answer ({reason}). Results are made all the same; "
+            raise TrackingUnavailable(
+                f"MLflow at {uri} does not answer ({reason}). Results are computed anyway; "
                 "`reskin publish` sends them when it is back."
             ) from None
 
@@ -82,17 +82,17 @@ def _probe_sqlite(file: str) -> None:
             store.execute("BEGIN IMMEDIATE")
             store.rollback()
     except sqlite3.Error as error:  # MLflow itself would try ten times, for minutes
-        raise TrackingAway(
+        raise TrackingUnavailable(
             f"MLflow's store {file} cannot be written ({error}; waited up to {LOCK_TIMEOUT_S:.0f} s). "
-            "Results are kept. Does another program hold it? Then `reskin publish` sends them."
+            "Results are kept. If another program has locked it, run `reskin publish` when that has ended."
         ) from None
 
 
 def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene: str, root: Path) -> dict[str, int]:
-    """Write every training of a scene to MLflow once, and its report.
+    """Write every training run and the report of a scene to MLflow, each once.
 
-    A sweep or an experiment is one run whose metrics go over its steps: hundreds of children would hide the others.
-    Tag `current` marks the runs of the present results. Restored results that were written before are tagged again and
+    A sweep or an experiment is one MLflow run, its metrics by step: hundreds of child runs would hide the others.
+    Tag `current` marks the runs of the present results. Restored results that were written before are tagged again but
     not written again.
 
     Parameters
@@ -109,11 +109,11 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
     Returns
     -------
     dict
-        Numbers of new and kept trainings, and of superseded runs.
+        Numbers of new and kept training runs, and of superseded MLflow runs.
 
     Raises
     ------
-    TrackingAway
+    TrackingUnavailable
         The server does not answer, or takes too long.
     """
     uri = tracking_uri(root)
@@ -133,9 +133,9 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
 
 
 class Publisher:
-    """Writes the runs of one scene, each once; remembers the keys of those that are current.
+    """Writes the MLflow runs of one scene, each once, and remembers the keys of the current ones.
 
-    A run's tag `run_key` is a digest of its content, by which it is found again.
+    The tag `run_key` is a digest of a run's content, by which the run is found again.
     """
 
     def __init__(self, client: Any, scene: str, root: Path, *, runs_n: int) -> None:
@@ -160,7 +160,7 @@ class Publisher:
         A run that a killed process left unfinished is replaced.
         """
         if time.monotonic() > self.end_s:
-            raise TrackingAway(
+            raise TrackingUnavailable(
                 f"MLflow took longer than {self.limit_s:.0f} s. Results are kept; `reskin publish` sends the rest."
             )
         self.current.add(key)
@@ -176,7 +176,7 @@ class Publisher:
         return str(run.info.run_id), True
 
     def set_tags(self, run: Any, tags: Mapping[str, str]) -> None:
-        """Set the tags of a run that differ."""
+        """Set those tags of a run whose values differ."""
         for name, value in tags.items():
             if run.data.tags.get(name) != value:
                 self.client.set_tag(run.info.run_id, name, value)
@@ -191,7 +191,7 @@ class Publisher:
             self.client.log_batch(run_id, metrics[start : start + METRICS_MAX_N], texts if not start else ())
 
     def write_trainings(self, stage: str, cards: Mapping[Path, dict[str, Any]]) -> int:
-        """Write a stage's trainings as children of a run of the stage; return how many are new."""
+        """Write a stage's training runs as children of an MLflow run of the stage; return how many are new."""
         keys = [run_key(card) for card in cards.values()]
         parent_key = hashlib.sha256("".join(sorted(keys)).encode()).hexdigest()[:32]
         parent_id, unwritten = self.open_run(stage, parent_key)
@@ -206,7 +206,7 @@ class Publisher:
         return new_n
 
     def write_training(self, stage: str, parent_id: str, file: Path, card: dict[str, Any]) -> bool:
-        """Write one training: settings, scores, loss curve, data sets and model; True if it is new."""
+        """Write one training run: settings, scores, loss curve, datasets and model; return whether it is new."""
         tags = {name: card[name] for name in ("scene", "question", "recipe_name", "fold", "git")}
         tags |= {"cell": card["key"], "kind": "training"}
         tags |= {"board": ", ".join(card["test_boards"]), "skin": ", ".join(card["test_skins"])}
@@ -225,7 +225,7 @@ class Publisher:
         self.client.log_inputs(run_id, datasets=_datasets(card))
         for artifact in (file, file.with_suffix(".safetensors")):
             self.client.log_artifact(run_id, str(artifact), "model")
-        # File MLmodel names the loader and the weights. It is YAML, of which JSON is a part.
+        # File MLmodel names the loader and the weights. It is a YAML file; JSON is valid YAML.
         flavor = {"python_function": {"loader_module": LOADER, "data": f"{file.stem}.safetensors"}}
         about = {"artifact_path": "model", "flavors": flavor, "run_id": run_id}
         self.client.log_text(run_id, json.dumps(about, indent=2), "model/MLmodel")
@@ -233,7 +233,7 @@ class Publisher:
         return True
 
     def write_curve(self, stage: str, points: Sequence[Point]) -> None:
-        """Write the points of a sweep or an experiment as one run."""
+        """Write the points of a sweep or an experiment as one MLflow run."""
         run_id, unwritten = self.open_run(stage, _digest([stage, points]))
         if unwritten:
             rows = ((f"{curve}.{name}", value, step) for curve, step, means in points for name, value in means.items())
@@ -241,10 +241,10 @@ class Publisher:
             self.client.set_terminated(run_id)
 
     def write_report(self, reports: Path) -> None:
-        """Write the report's numbers and files; its key covers numbers, figures and tables, but no costs.
+        """Write the report's numbers and files; its key covers numbers, figures and tables, but not costs.
 
-        Tag `inputs` names the results that the report shows. Where these were restored and the report was not
-        (`dvc checkout` restores no report), the report that was written with them is the current one.
+        Tag `inputs` identifies the results that the report shows. If these were restored without the report
+        (`dvc checkout` does not restore reports), the report that was written with them is the current one.
         """
         inputs = _digest(sorted(self.current))
         before = self.find("report", inputs=inputs)
@@ -268,7 +268,7 @@ class Publisher:
             self.client.set_terminated(run_id)
 
     def mark_superseded(self) -> int:
-        """Tag runs that are no longer current, so that `tags.current = 'true'` shows each result once."""
+        """Tag the runs that are no longer current, so that `tags.current = 'true'` shows each result once."""
         marked_n, token = 0, None
         while True:
             page = self.client.search_runs(
@@ -284,7 +284,7 @@ class Publisher:
 
 
 def run_key(card: Mapping[str, Any]) -> str:
-    """Digest a card without its commit: equal results of two commits are one run."""
+    """Return a digest of a card without its commit: equal results of two commits are one run."""
     return _digest({name: value for name, value in card.items() if name != "git"} | {"published_as": LAYOUT})
 
 
@@ -294,14 +294,14 @@ def _digest(value: Any) -> str:
 
 @contextmanager
 def _client(uri: str) -> Iterator[Any]:
-    """Give a client with short time-outs, whose errors are raised as `TrackingAway`."""
-    # Before the import: MLflow reads these once. Without limits a dead server costs minutes a call.
+    """Yield a client with short time-outs, whose errors are raised as `TrackingUnavailable`."""
+    # Set before the import, because MLflow reads these once. Without limits, each call to a dead server takes minutes.
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     import logging
 
-    # Errors are raised with one sentence, which MLflow's own traceback would hide.
+    # Errors are raised as one sentence, which MLflow's own log of the traceback would hide.
     levels = {"alembic": "WARNING", "mlflow": "WARNING", "mlflow.store.db.utils": "CRITICAL"}
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
@@ -313,7 +313,7 @@ def _client(uri: str) -> Iterator[Any]:
         yield mlflow.MlflowClient(tracking_uri=uri)
     except (MlflowException, SQLAlchemyError, OSError) as error:
         sentence = " ".join(str(error).partition("[SQL:")[0].split())[:200]
-        raise TrackingAway(
+        raise TrackingUnavailable(
             f"MLflow at {uri} failed ({sentence}). Results are kept; `reskin publish` sends them later."
         ) from None
 
@@ -324,13 +324,13 @@ def _experiment(client: Any, scene: str, root: Path) -> str:
     if found is not None:
         return str(found.experiment_id)
     location = None if server_uri() else (root / ARTIFACTS / scene).resolve().as_uri()
-    # The kind tells the UI to show trainings, not chats.
+    # The kind makes the UI show training runs, not chats.
     kind = {"mlflow.experimentKind": "custom_model_development"}
     return str(client.create_experiment(scene, artifact_location=location, tags=kind))
 
 
 def _datasets(card: Mapping[str, Any]) -> list[Any]:
-    """Describe the skins that a network was trained and tested on as data sets."""
+    """Describe the skins that a network was trained and tested on as datasets."""
     from mlflow.entities import Dataset, DatasetInput, InputTag
 
     inputs = []
@@ -350,9 +350,9 @@ def _datasets(card: Mapping[str, Any]) -> list[Any]:
 
 
 def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
-    """Flatten numbers.json to name, value and step: a list of rows that begin with a count is a curve over it.
+    """Flatten numbers.json to (name, value, step); a list of rows that begin with a count is a curve over that count.
 
-    Other lists, texts, costs and what the runs of trainings hold are left out.
+    Other lists, texts, costs and the content of training runs are left out.
     """
     shown = {name: value for name, value in numbers.items() if name not in NOT_METRICS}
     return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(shown, "", 0)]

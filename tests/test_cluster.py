@@ -126,7 +126,7 @@ def test_lost_scheduler_is_an_error():
     submitted, future = Future(), Future()
     submitted.cancel()  # as Dask does with all calls after losing the scheduler
     cluster._copy_outcome(future, "tcp://there", submitted)
-    with pytest.raises(ParamsError, match="Lost the Dask scheduler at tcp://there. Finished trainings are cached"):
+    with pytest.raises(ParamsError, match="Lost the Dask scheduler at tcp://there. Finished training runs are cached"):
         future.result(0)
 
 

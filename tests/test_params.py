@@ -31,7 +31,7 @@ def test_params_and_plan_are_valid():
         ({"seed": -1}, "seed must be greater than or equal to 0; got -1"),
         ({"experiments": ["lobbo"]}, r"experiments.0 must be .*'lobo'.*; got 'lobbo'"),
         ({"experiments": []}, "experiments must"),
-        ({"source": "simulated"}, "section simulate stands in a scene if and only if its source is simulated"),
+        ({"source": "simulated"}, "a scene has a section simulate if and only if its source is simulated"),
         ({"train_single": TRAINING}, "no experiment uses train_single of the scene"),
         ({"experiments": ["lobo", "transfer"], "train_single": TRAINING}, "split lacks transfer_skins_n"),
         ({"split": {"transfer_skins_n": 3}}, "no experiment uses transfer_skins_n of split"),

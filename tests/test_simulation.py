@@ -19,7 +19,7 @@ FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
 )  # fmt: skip
 def test_wrong_kind_of_protocol(name, kind):
     other = HAND if kind == "grid" else GRID | {"skins_n": 1}
-    sentence = f"test: protocol {name}: kind is {kind}, which its experiment reads, not {other['kind']}. "
+    sentence = f"test: protocol {name}: kind must be {kind}, which its experiment reads, not {other['kind']}. "
     with pytest.raises(ParamsError, match=sentence) as refused:
         check_protocols(with_protocol(name, other), "test")
     assert "\n" not in str(refused.value)
@@ -28,13 +28,28 @@ def test_wrong_kind_of_protocol(name, kind):
 @pytest.mark.parametrize(
     ("name", "protocol", "changes", "sentence"),
     [
-        ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n is 1, .*, not 2"),
-        ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n is 1, .*, not 2"),
-        ("glass", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol glass: boards is rigid, .* flexible"),
-        ("grip", LOAD | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol grip: boards is rigid, .* flexible"),
-        ("hand", HAND | {"boards": "flexible"}, {"boards": FLEXIBLE}, "protocol hand: boards is rigid, .* flexible"),
-        ("drag", DRAG | {"boards": "flexible"}, FRICTION, "protocol drag: boards is rigid, as of grid, not flexible"),
-        ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards is another kind .*, not rigid too"),
+        ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n must be 1, .*, not 2"),
+        ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n must be 1, .*, not 2"),
+        (
+            "glass",
+            LOAD | {"boards": "flexible"},
+            {"boards": FLEXIBLE},
+            "protocol glass: boards must be rigid, .* flexible",
+        ),
+        (
+            "grip",
+            LOAD | {"boards": "flexible"},
+            {"boards": FLEXIBLE},
+            "protocol grip: boards must be rigid, .* flexible",
+        ),
+        (
+            "hand",
+            HAND | {"boards": "flexible"},
+            {"boards": FLEXIBLE},
+            "protocol hand: boards must be rigid, .* flexible",
+        ),
+        ("drag", DRAG | {"boards": "flexible"}, FRICTION, "protocol drag: boards must be rigid, .* flexible"),
+        ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards must differ from rigid"),
     ],
 )
 def test_wrong_boards_or_skins(name, protocol, changes, sentence):
@@ -55,5 +70,5 @@ def test_suitable_protocols(name, protocol, changes):
 
 def test_main_boards_have_the_skin_of_the_paper():
     changed = synthesis("boards", rigid=SECTIONS["boards"]["rigid"] | {"skin_mm": (50.8, 101.6)})
-    with pytest.raises(ParamsError, match="skin_mm of the boards of protocol grid is .20.0, 20.0."):
+    with pytest.raises(ParamsError, match="skin_mm of the boards of protocol grid must be .20.0, 20.0."):
         check_protocols(changed, "test")

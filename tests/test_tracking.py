@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pipeline import tracking
-from pipeline.tracking import TrackingAway, probe, publish
+from pipeline.tracking import TrackingUnavailable, probe, publish
 from reskin import io
 
 
@@ -237,13 +237,13 @@ def test_interrupted_curve_is_written_again(tmp_path):
 
 def test_broken_store_is_reported(tmp_path):
     (tmp_path / "mlflow.db").write_bytes(b"junk" * 99)
-    with pytest.raises(TrackingAway, match="Results are kept"):
+    with pytest.raises(TrackingUnavailable, match="Results are kept"):
         write(tmp_path, b0="k0")
 
 
 @pytest.mark.parametrize("uri", ["http://localhost:notaport", "http://", "https://[::1", "http://127.0.0.1:99999"])
 def test_mistyped_address_is_reported(uri):
-    with pytest.raises(TrackingAway, match="does not answer"):
+    with pytest.raises(TrackingUnavailable, match="does not answer"):
         probe(uri)
 
 
@@ -252,7 +252,7 @@ def test_unreachable_server_is_reported_within_seconds(kind, request, tmp_path, 
     uri = request.getfixturevalue(kind)
     monkeypatch.setenv("MLFLOW_TRACKING_URI", uri)
     start_s = time.monotonic()
-    with pytest.raises(TrackingAway, match="`reskin publish` sends them when it is back"):
+    with pytest.raises(TrackingUnavailable, match="`reskin publish` sends them when it is back"):
         write(tmp_path, b0="k0")
     assert time.monotonic() - start_s < 15  # two of these the time-out; MLflow's retries take 20
 
@@ -267,7 +267,7 @@ def test_locked_store_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(tracking, "LOCK_TIMEOUT_S", 0.1)
     with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
         other.execute("BEGIN EXCLUSIVE")
-        with pytest.raises(TrackingAway, match="database is locked.*Results are kept"):
+        with pytest.raises(TrackingUnavailable, match="database is locked.*Results are kept"):
             write(tmp_path, b0="k0")
     write(tmp_path, b0="k0")
 
@@ -285,7 +285,7 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
     handler = logging.Handler()
     handler.emit = messages.append
     logging.getLogger("mlflow.store.db.utils").addHandler(handler)
-    with pytest.raises(TrackingAway, match=r"failed \(.*no such table: tags\)\. Results are kept"):
+    with pytest.raises(TrackingUnavailable, match=r"failed \(.*no such table: tags\)\. Results are kept"):
         write(tmp_path, b0="k1")
     logging.getLogger("mlflow.store.db.utils").removeHandler(handler)
     assert messages == []
@@ -293,7 +293,7 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
 
 def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
     monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # no time for two trainings
-    with pytest.raises(TrackingAway, match="took longer than 0 s"):
+    with pytest.raises(TrackingUnavailable, match="took longer than 0 s"):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()
     assert write(tmp_path, b0="k0", b1="k1")["new_n"] == 2

@@ -110,9 +110,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
     if all(_is_unchanged(folder / file.path, file) for file in source.files):
         say(f"{folder}: {source.size}, there already and unchanged")
     else:
-        commit = (
-            f"commit {source.commit}" if source.commit else "newest commit (none is pinned; checksums are verified)"
-        )
+        commit = f"commit {source.commit}" if source.commit else "newest commit (none is pinned; checksums are checked)"
         say(f"{name}: {source.size}; licence: {source.terms}\nhome: {source.home}, {commit}")
         if where is not None:
             say(f"taken from: {where}")

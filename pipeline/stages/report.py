@@ -44,7 +44,7 @@ from pipeline.scenes import EXPERIMENTS, TABLE_2, Scene, parse_scene, stages
 from pipeline.settings import Settings
 from pipeline.stage import say
 from pipeline.statistics import tidy, to_csv
-from pipeline.tracking import Curves, TrackingAway, metrics_of
+from pipeline.tracking import Curves, TrackingUnavailable, metrics_of
 from pipeline.tracking import publish as write_runs
 from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.choice import choose, fingerprint, to_record
@@ -183,8 +183,8 @@ def publish(settings: Settings, models: Path, results: Path, reports: Path) -> N
     try:
         counts = write_runs(folders, read_curves(scene, results), reports, scene=experiment, root=home())
         say(f"{experiment}: MLflow runs {counts}")
-    except TrackingAway as away:
-        say(f"warning: {name} is not in MLflow: {away}")
+    except TrackingUnavailable as error:
+        say(f"warning: {name} is not in MLflow: {error}")
 
 
 def read_curves(scene: Scene, results: Path) -> Curves:

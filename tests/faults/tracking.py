@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from pipeline.tracking import TrackingAway, probe
+from pipeline.tracking import TrackingUnavailable, probe
 from reskin import io
 from tests.faults.harness import NOT_RUN, SCENE, Checkout, Result, Row, fault, judge
 
@@ -124,7 +124,7 @@ def _served(at: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]:
             try:
                 probe(f"http://127.0.0.1:{port}")
                 break
-            except TrackingAway:
+            except TrackingUnavailable:
                 time.sleep(0.2)
         yield server
     finally:
