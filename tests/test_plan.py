@@ -83,7 +83,7 @@ def test_report_rejects_a_plan_without_an_experiment(tmp_path, monkeypatch):
     tiny = settings(scene_with("lobo", "baselines"))
     assert planned_scene(tiny).experiments == ("lobo", "baselines")
     Path(PLAN).write_text("scenes: {tiny: [lobo]}\n")
-    with pytest.raises(ParamsError, match="baselines only in one. Try: reskin scenes use tiny"):
+    with pytest.raises(ParamsError, match="baselines only in one of them. Try: reskin scenes use tiny"):
         planned_scene(tiny)
 
 

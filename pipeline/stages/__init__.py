@@ -1,7 +1,7 @@
 """The stages of the pipeline: thin functions that read inputs, call the library, and write outputs.
 
-dvc.yaml runs one by `python -m pipeline STAGE --scene NAME ...`. The stage of an experiment is the function of its name
-in its module of `pipeline.experiments`.
+dvc.yaml runs a stage by `python -m pipeline STAGE --scene NAME ...`. The stage of an experiment in
+`pipeline.experiments` is the function in its module that has its name.
 """
 
 from importlib import import_module
@@ -22,7 +22,7 @@ EXPERIMENTS = "pipeline.experiments"
 
 
 def is_stage(name: str) -> bool:
-    """Tell whether a stage or an experiment has this name."""
+    """Return whether a stage or an experiment has this name."""
     return name in MODULES or name in experiment_files()
 
 

@@ -1,8 +1,8 @@
 """Stage code: write the digests of all modules that each stage imports to data/code/<stage>.
 
-Every other stage depends on its file there, so that an edit of the code runs the stages again that import it. Comments
-and docstrings are not part of a digest. `pipeline.report` and the YAML files of experiments, which hold captions, are
-part of the digests of stages that show results only.
+Every other stage depends on its file there, so that after an edit DVC reruns the stages that import the edited module.
+Comments and docstrings are not part of a digest. `pipeline.report` and the YAML files of experiments, which contain
+captions, are part of the digests only of stages that show results.
 """
 
 from pathlib import Path
@@ -31,7 +31,7 @@ def digests_of(stage: str) -> dict[str, str]:
 
 
 def write_digests(digests: Path) -> None:
-    """Write a file per stage, with one line per module: its digest and its name."""
+    """Write a file for each stage, with one line per module: its digest and its name."""
     for stage in all_stages():
         lines = [f"{found}  {name}\n" for name, found in digests_of(stage).items()]
         io.write_text(digests / stage, "".join(lines))

@@ -34,7 +34,7 @@ def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
 
 
 def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
-    """Read every capture of one simulated protocol like recorded ones."""
+    """Read every capture of one simulated protocol in the same way as recorded captures."""
     with io.replacing(indentations) as folder:
         folder.mkdir()
         for capture in sorted(child for child in raw.iterdir() if child.is_dir()):
@@ -42,7 +42,7 @@ def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
 
 
 def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -> None:
-    """Read the captures of a recorded scene with many of them; one DVC stage each would cost more than the reading.
+    """Read all captures of a recorded scene that has many: one DVC stage per capture would cost more than reading it.
 
     Captures that were read before, with the same bytes, code and settings, come from a cache (docs/growth.md).
     """
@@ -60,7 +60,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
                 before[key], read_n = fresh.rename(cache / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
             shutil.copyfile(
                 before[key], folder / f"{name}.parquet"
-            )  # no link: an edit of one must not change the other
+            )  # not a link: an edit of one must not change the other
             used.add(before[key])
     for file in set(cache.glob("*.parquet")) - used:
         io.remove(file)
@@ -78,7 +78,7 @@ def _is_whole(cached: Path) -> bool:
 
 
 def _cache_key(capture: Path, rest_on: bytes) -> str:
-    """Digest what readings of a capture depend on: its name and bytes, the code, the settings."""
+    """Return a digest of what the readings of a capture depend on: its name and bytes, the code, the settings."""
     digest = hashlib.sha256(rest_on + capture.name.encode())
     for file in sorted(file for file in capture.rglob("*") if file.is_file()):
         digest.update(f"{file.relative_to(capture)} {io.sha256(file)}\n".encode())
@@ -108,7 +108,7 @@ def split(settings: Settings, section: Split, indentations: Path, folds: Path) -
     captures = settings.captures_in(indentations)
     if not settings.held_out:
         io.write_json(folds, render_folds(captures, NO_ROWS, []))
-        return say(f"{settings.scene}: no experiment on {len(captures)} captures holds rows out")
+        return say(f"{settings.scene}: {len(captures)} captures; no experiment holds rows out")
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], settings.section(Selection, "selection"))
     drawn = draw_folds(rows, settings.held_out, section, settings.seed)
     io.write_json(folds, render_folds(captures, rows, drawn))

@@ -56,7 +56,7 @@ from reskin.numerics import device as trained_on
 
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
-    """Write table 2 of the paper and its figure as soon as its networks are trained; the report shows them again."""
+    """Write table 2 of the paper and its figure as soon as its networks are trained; the report contains them too."""
     source, name = settings["source"], settings.scene
     scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
@@ -92,7 +92,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
         figures |= of_experiments.result()
         costs = of_costs.result()
     io.write_texts(reports / "figures", figures)
-    # Seconds, commit and machine differ between equal runs: they are in a folder that is no output of DVC.
+    # Seconds, commit and machine differ between equal runs, so this folder is not an output of the DVC stage.
     io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
     io.write_text(reports / "index.html", page(shared, tables, figures))
     write_index(reports.parent)
@@ -103,7 +103,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the stage report reads: results of trainings and experiments by name, and accounts of captures."""
+    """What stage report reads: results of training runs and experiments by name, and counts of captures."""
 
     cards: list[dict[str, Any]]
     points: dict[str, Any]
@@ -176,10 +176,10 @@ def write_index(reports: Path) -> None:
 
 
 def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
-    """Write every training of a scene and its report to MLflow once; if the server is away, warn and go on."""
+    """Write every training run of a scene and its report to MLflow once; warn if the server does not answer."""
     scene, name = planned_scene(settings), settings.scene
     folders = {stage: models / stage for stage in scene.model_stages}
-    experiment = f"{name} (dvc exp)" if is_experiment() else name  # next to the checkout's own results
+    experiment = f"{name} (dvc exp)" if is_experiment() else name  # apart from the checkout's own results
     try:
         counts = write_runs(folders, read_curves(scene, results), reports, scene=experiment, root=home())
         say(f"{experiment}: MLflow runs {counts}")
@@ -205,9 +205,9 @@ def planned_scene(settings: Settings) -> Scene:
     planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
     if list(scene.experiments) != list(planned):
         differing = ", ".join(sorted(set(scene.experiments) ^ set(planned))) or "another order"
-        remedy = f"Try: reskin scenes use {settings.scene}, beside the others that run."
+        remedy = f"Try: reskin scenes use {settings.scene}, with the names of the other scenes that run."
         raise ParamsError(
-            f"{settings.where}: experiments differ from those of {PLAN}: {differing} only in one. {remedy}"
+            f"{settings.where}: experiments differ from those in {PLAN}: {differing} only in one of them. {remedy}"
         )
     return scene
 

@@ -24,7 +24,7 @@ from reskin.models.recipe import HEADLINE
 
 
 class PokesSweep(Strict):
-    """Section sweep_pokes: numbers of unlabelled indentations (0: not adapted); the last `boards_n` boards held out."""
+    """Section sweep_pokes: numbers of unlabelled indentations (0: no adaptation); the last `boards_n` boards test."""
 
     pokes_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     boards_n: Annotated[int, Field(ge=1)]
@@ -33,7 +33,7 @@ class PokesSweep(Strict):
 def sweep_pokes(
     settings: Settings, section: PokesSweep, indentations: Path, folds: Path, pretrained: Path, scores: Path
 ) -> None:
-    """Adapt with every number of unlabelled indentations and score (paper figure 6a)."""
+    """Adapt networks with each number of unlabelled indentations, and score them (paper figure 6a)."""
     preload_training()
     data, networks = read_data(settings, indentations, folds), read_pretrained(pretrained)
     recipe = settings.section(Adaptations, "adapt").recipes[HEADLINE]
@@ -80,10 +80,10 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         "multi": settings.section(Training, "train_multi").recipes[HEADLINE],
         "triplet": settings.section(Training, "train_triplet").recipes[adaptation.base],
     }
-    # Most training skins first: finished trainings are cached by their whole stack, and only in this order do the
-    # folds of all skins form the stacks of `train_multi`.
+    # Most training skins first: networks are trained in stacks, and a stack is cached as a whole. Only in this order do
+    # the folds with all training skins form the same stacks as in `train_multi`.
     draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
-    # The draw is part of the fold's name, and so of the generator's: one seed for each draw.
+    # The draw is part of the fold's name, and so of the random generator's: one seed per draw is enough.
     jobs = [
         TrainingJob("sensors", HEADLINE, recipe, fold.name, settings.seed, 0, fold.train, fold.test, what=method)
         for method, recipe in recipes.items()

@@ -1,4 +1,4 @@
-"""Stages that train on the folds of a scene: networks of one skin, of many skins, adapted ones, classical methods."""
+"""Stages that train on a scene's folds: networks of one skin and of many skins, adapted networks, classical methods."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +35,7 @@ NO_LABELS = np.zeros(0, np.int64)
 def train_single(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
     """Train on one skin at a time: splits within a skin, and transfer to other skins (paper sections 4 and 5.1).
 
-    Also scores how well a place is known before the contact, on the folds within one skin.
+    Also scores places predicted without the contact's signal, on the folds within one skin.
     """
     preload_training()
     data = read_data(settings, indentations, folds)
@@ -65,7 +65,7 @@ def train_triplet(settings: Settings, section: Training, indentations: Path, fol
 def adapt(
     settings: Settings, section: Adaptations, indentations: Path, folds: Path, pretrained: Path, models: Path
 ) -> None:
-    """Adapt the networks with triplet loss to each held-out skin by its unlabelled indentations (paper section 5)."""
+    """Adapt the networks of train_triplet to each held-out skin with its unlabelled indentations (paper section 5)."""
     preload_training()
     data = read_data(settings, indentations, folds)
     networks = read_pretrained(pretrained)

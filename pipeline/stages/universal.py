@@ -1,4 +1,4 @@
-"""Stages that score methods on a held-out board with no, a few and more of its labels: few_labels, universal."""
+"""Stages that score methods on a held-out board with several numbers of its labels: few_labels, universal."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,7 +65,7 @@ def universal(
 ) -> None:
     """Score the universal model on every held-out board, with every number of labels, on the rows of few_labels.
 
-    The map alone, and with networks; knowing the other boards of the rig, and simulated skins alone.
+    The map alone and the map with networks are scored, made from the other boards of the rig or from simulated skins.
     """
     known = read_known_boards(settings, indentations, folds)
     variants = make_variants(known, section)

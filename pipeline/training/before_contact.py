@@ -1,8 +1,8 @@
-"""Scores of places that are estimated without the contact, on the folds within one skin, by 2 neighbours.
+"""Scores of places that 2 nearest neighbours predict without the contact's signal, on the folds within one skin.
 
-Inputs are the no-load field alone, or the row's number in the scan: an accuracy that they reach, a network may have
-learnt from the scan rather than from contacts. The hover control predicts the place of a tip that hovers, from models
-of contacts: chance for a tip that the skin does not sense, better for a magnet on it.
+The input is the no-load field alone, or the number of the indentation in its pass. A network may have learnt whatever
+accuracy these reach from the scan rather than from contacts. The hover control predicts the place of a hovering tip
+with models that were trained on contacts. Its accuracy is that of chance, unless the chips sense the tip itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,19 +28,19 @@ NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
 PLACE = ("accuracy_pct", "mse_xy_mm2")
 LENGTHS = ("hover_uT", "touch_uT")  # median |dB| of rows that hover, and of contacts of about 1 N
 TOUCH_N = (0.8, 1.2)
-BY_TIME = "single_temporal"  # whose tested passes are not in training
+BY_TIME = "single_temporal"  # tests passes that are not in training
 
 
 @dataclass(frozen=True)
 class Scan:
-    """The no-load field of the rows that `gather` stacks, and the number of the indentation in its pass."""
+    """For each training row, the no-load field and the number of the indentation in its pass."""
 
     noload_uT: Float32[np.ndarray, "f ch"]
     scan_i: Int64[np.ndarray, " f"]
 
 
 def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
-    """Stack what is known before each contact, in the order of `gather`."""
+    """Stack what is known before each contact, in the order of the scene's rows."""
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
@@ -71,10 +71,10 @@ class Hover:
 
 
 def gather_hover(captures: Sequence[Readings]) -> Hover:
-    """Stack the rows without force between the contacts of a pass, each at the place of the contact that comes next.
+    """Stack the rows without force between the contacts of a pass, each with the place of the next contact.
 
-    A tip that descends on a place in steps hovers over it first. Rows before the first contact of a pass are its
-    no-load reading, and rows after the last have no place.
+    A tip that descends on a place in steps first hovers over it. Rows before the first contact of a pass are its
+    no-load reading, and rows after the last contact have no place.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     passes_n: dict[str, int] = {}
@@ -97,9 +97,9 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
 def score_before_contact(
     data: SceneData, indentations: Path, captures: list[str], networks: Mapping[str, Sequence[Network]]
 ) -> pa.Table:
-    """Score places by the no-load field alone, by the number in the scan alone, and of a tip that hovers.
+    """Score places predicted from the no-load field alone, from the number in the pass alone, and of a hovering tip.
 
-    networks: by fold, for the hover control beside 2 neighbours. Returns a row for each fold and input.
+    networks: by fold, for the hover control in addition to 2 neighbours. Returns one row for each fold and input.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))

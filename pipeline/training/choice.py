@@ -1,12 +1,12 @@
-"""Choose settings on the boards of a study, from the cards of its trainings.
+"""Choose settings on the boards of a study, from the cards of its models.
 
 The criterion is the mean squared error of places over the boards held out in turn, of networks with the paper's inputs.
 The number of steps is a scene's budget: every candidate is tried with the same budgets, and its errors are averaged
-over them, so that no setting wins by training longer. Settings with which a training collapsed are not chosen. Settings
-of adaptation are chosen together with the triplet weight of the network that they start from: alone, the triplet term
-only costs.
+over them, so that no setting wins by training longer. Settings with a collapsed training run are not chosen. Settings
+of adaptation are chosen together with the triplet weight of the network that they start from, because the triplet term
+by itself only increases the error.
 
-The record of a choice holds a fingerprint of the simulated skin: audits compare it with today's.
+The record of a choice has a fingerprint of the simulated skin, which audits compare with that of the current code.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ VARIED = (
     "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
     "unlabelled_weight",
 )  # fmt: skip
-BUDGET = ("steps_n", "base")  # a scene's budget of steps, and the name of a base, are no settings of the method
+BUDGET = ("steps_n", "base")  # not settings of the method: a scene's number of steps, the name of a base
 WHERE = "choice of settings"
 
 Card = Mapping[str, Any]
@@ -40,7 +40,7 @@ Cards = Sequence[Card]
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     """Choose settings for every stage: `recipe_name`, `settings`, `by` (the criterion), `candidates` with scores.
 
-    The control of adaptation, which it has to beat, is fine-tuned as long from the same network, without the pokes.
+    The control of adaptation, which adaptation must beat, is the same network fine-tuned as long without the pokes.
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
@@ -84,7 +84,7 @@ def settings_of(card: Card) -> dict[str, Any]:
 
 
 def trimmed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out the budget, which is no setting of the method."""
+    """Leave out the budget, which is not a setting of the method."""
     return {name: value for name, value in settings.items() if name not in BUDGET}
 
 
@@ -92,12 +92,12 @@ def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, 
     """Find the eligible card with the smallest error; return it, the choice, and the errors by recipe."""
     what = f"candidates of {stage}"
     if not eligible:
-        raise ParamsError(f"{WHERE}: no {what}. Run lobo, triplet, adapt.")
+        raise ParamsError(f"{WHERE}: no {what}. Run experiments lobo, triplet and adapt.")
     _check_budgets(cards, stage)
     collapsed = [_key(card) for card in cards if _has_collapsed(card)]
     stable = [card for card in eligible if _key(card) not in collapsed]
     if not stable:
-        raise ParamsError(f"{WHERE}: all {what} have a collapsed training. Try lower rates.")
+        raise ParamsError(f"{WHERE}: all {what} have a collapsed training run. Try lower rates.")
     candidates = _candidates(cards)
     errors = _errors(cards, candidates)
     best = min(stable, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
@@ -110,7 +110,7 @@ def _has_collapsed(card: Card) -> bool:
 
 
 def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Average the error over budgets, by recipe: recipes that differ in their budget only share it."""
+    """Average the error over budgets, by recipe; recipes that differ only in their budget get the same value."""
     settings = {card["recipe_name"]: (_key(card), _budget(card)) for card in cards}
     errors = {candidate["recipe_name"]: candidate[BY]["mean"] for candidate in candidates}
 
@@ -132,7 +132,7 @@ def _check_budgets(cards: Cards, stage: str) -> None:
 
 
 def _key(card: Card) -> dict[str, Any]:
-    """Return the settings without their budget; of an adaptation with those of the network that it starts from."""
+    """Return the settings without their budget; for an adaptation, with those of the network that it starts from."""
     return trimmed(card["recipe"]) | (trimmed(settings_of(card)) if "tuning" in card else {})
 
 
@@ -152,9 +152,9 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     ]
 
 
-# --- A fingerprint of the simulation: equal as long as equal indentations give equal fields and forces ---
+# --- A fingerprint of the simulation: unchanged as long as equal indentations give equal fields and forces ---
 
-RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as in scene quick
 BOARD = BoardDesign(
     chips_xy_mm=((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0)),
     chips_turn_deg=(0.0, 180.0, 270.0, 90.0, 0.0),

@@ -1,7 +1,7 @@
-"""Experiment labels: methods on a new board with no, a few and more labelled indentations.
+"""Experiment labels: methods on a new board with no labelled indentations, with a few, and with more.
 
-Networks are trained, adapted by unlabelled indentations, and fine-tuned on labelled ones; classical methods are fitted
-with them. This module lists the trainings; `pipeline.stages.universal` runs and scores them.
+Networks are trained, adapted with unlabelled indentations, and fine-tuned on labelled ones. Classical methods are
+fitted with the labelled ones. This module lists the training jobs; `pipeline.stages.universal` runs and scores them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 class FewLabels(SectionWithRows):
     """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
 
-    adapted: recipes that are also adapted by unlabelled indentations, with the settings `adapting`.
+    adapted: recipes that are also adapted with unlabelled indentations; their settings are `adapting`.
     """
 
     labels_n: Labels
@@ -53,7 +53,7 @@ class FewLabels(SectionWithRows):
     @model_validator(mode="after")
     def _adapts_what_it_trains(self) -> "FewLabels":
         if unknown := set(self.adapted) - set(self.recipes):
-            raise ValueError(f"adapted names recipes of few_labels, not {sorted(unknown)}")
+            raise ValueError(f"adapted must name recipes of few_labels, not {sorted(unknown)}")
         return self
 
 
@@ -69,7 +69,7 @@ class Study:
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry of the table: a method on a fold with a number of labels."""
+    """An entry of the table of results: a method on a fold with a number of labels."""
 
     method: str
     inputs: str
@@ -81,7 +81,7 @@ Done = tuple[Entry, TrainingJob, TrainingResult]
 
 
 def network_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
-    """List the training of every recipe on every fold."""
+    """List the jobs that train every recipe on every fold."""
     return [
         (
             Entry(name, recipe.inputs, 0, fold),
@@ -93,7 +93,7 @@ def network_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, Traini
 
 
 def adaptation_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
-    """List the adaptation of the named recipes by all indentations of the pool, unlabelled."""
+    """List the jobs that adapt the recipes in `adapted` with all indentations of the pool, unlabelled."""
     pairs = []
     for entry, job, trained in done:
         if job.recipe_name in study.settings.adapted:
@@ -105,7 +105,7 @@ def adaptation_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, Tra
 
 
 def fine_tuning_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
-    """List the fine-tuning of every network on every number of labelled indentations."""
+    """List the jobs that fine-tune every network on every number of labelled indentations."""
     pairs = []
     for entry, job, trained in done:
         for labels_n, row in _labelled_rows(study, entry.fold).items():
@@ -118,7 +118,7 @@ def fine_tuning_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, Tr
 
 
 def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
-    """List the fit of every classical method with every number of labelled indentations."""
+    """List the jobs that fit every classical method with every number of labelled indentations."""
     most_n = study.settings.rows_max_n
     return [
         (
@@ -132,7 +132,7 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 
 
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
-    """Draw labelled indentations of the pool, the fewer among the more; return their rows by number."""
+    """Draw labelled indentations from the pool; each set contains the smaller ones. Return rows by number of labels."""
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     order = labelling_order(study.rows, fold, study.seed)
     if max(labels_n) > len(order):

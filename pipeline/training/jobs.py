@@ -1,4 +1,4 @@
-"""Trainings of one scene: read its rows and folds, make and run training jobs, write models with their cards."""
+"""Training for one scene: read its rows and folds, make and run training jobs, write models with their cards."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -30,7 +30,7 @@ from reskin.models.trained import FORMAT
 from reskin.seeds import rng_for
 
 TRAINING_MODULE = "reskin.models.train"
-CACHE = ".reskin/cells"  # finished trainings: a cache, and no output
+CACHE = ".reskin/cells"  # finished training runs; a cache, not an output
 
 PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe, fold and seed
 
@@ -51,7 +51,7 @@ class SceneData:
 
 @dataclass(frozen=True)
 class AdaptationPokes:
-    """Unlabelled pokes along lines that adapt one network to one skin; `experiment` and `what` name the job."""
+    """Unlabelled pokes along lines, to adapt one network to one skin; `experiment` and `what` name the job."""
 
     experiment: str
     skin: str
@@ -146,7 +146,7 @@ def adaptation_jobs(
     experiment: str,
     pokes_n: int,
 ) -> Iterator[TrainingJob]:
-    """Adapt every network of a fold to each of its held-out skins, by `pokes_n` indentations of the skin's pool."""
+    """Make the jobs that adapt a fold's networks to each held-out skin with `pokes_n` indentations of its pool."""
     for skin in np.unique(data.rows.skin[fold.test]):
         for seed_i in select_pretrained(pretrained, named[1].base, fold):
             lines = pool_lines(data, fold, str(skin), pokes_n=pokes_n, seed_i=seed_i)
@@ -161,7 +161,7 @@ def adaptation_job(
     pretrained: PretrainedNetworks,
     pokes: AdaptationPokes,
 ) -> TrainingJob:
-    """Adapt the fold's network of one seed to one skin, and test it on that skin's rows of the fold's test side."""
+    """Make the job that adapts the fold's network of one seed to one skin and tests it on that skin's test rows."""
     name, settings = named
     test = fold.test[data.rows.skin[fold.test] == pokes.skin]
     start = select_pretrained(pretrained, settings.base, fold)[pokes.seed_i]
@@ -173,7 +173,7 @@ def adaptation_job(
 
 
 def pool_lines(data: SceneData, fold: Fold, skin: str, *, pokes_n: int, seed_i: int) -> Lines:
-    """Draw `pokes_n` indentations of a skin's pool, and index them along the robot's grid."""
+    """Draw `pokes_n` indentations from a skin's pool, and order them in lines of the robot's grid."""
     pool = fold.pool[data.rows.skin[fold.pool] == skin]
     rng = rng_for(data.settings.seed, "pokes", skin, seed_i)
     return grid_lines(data.rows, take_pokes(data.rows, pool, pokes_n, rng))
@@ -204,7 +204,7 @@ def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> 
 
 
 def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list[TrainingResult]:
-    """Run the jobs that are not in the cache, record what they cost, and warn of trainings that diverged."""
+    """Run the jobs that are not in the cache, record their costs, and warn of training runs that diverged."""
     start_s, prefix = time.monotonic(), f"{data.scene} {stage}"
     with make_executor(imports=TRAINING_MODULE) as executor:
         results = run_jobs(
@@ -218,7 +218,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
     record_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
     for job, result in zip(jobs, results, strict=True):
         if result.stopped_step is not None:
-            say(f"warning: {prefix}: {job.name} diverged by step {result.stopped_step}: kept as it was before")
+            say(f"warning: {prefix}: {job.name} diverged by step {result.stopped_step}; its earlier weights are kept")
     return results
 
 
@@ -228,7 +228,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> None:
-    """Write models, cards and predictions; the times, which differ between equal runs, stand beside the outputs."""
+    """Write models, cards and predictions; write times, which differ between equal runs, outside the outputs."""
     code = code_version_of(imported(module_name(stage)))
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
     with io.replacing(models) as folder:
@@ -242,7 +242,7 @@ def write_models(
 
 
 def model_card(job: TrainingJob, result: TrainingResult, rows: Rows, scene: str) -> ModelCard:
-    """Describe a trained network; scores are added where the truth is known."""
+    """Describe a trained network, without its scores."""
     card = ModelCard(
         format=FORMAT,
         scene=scene,
@@ -304,19 +304,19 @@ def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float3
 
 
 def sweep_point(data: SceneData, job: TrainingJob, result: TrainingResult, method: str) -> dict[str, Any]:
-    """Return the point of a training on the curve of a sweep: scores, without weights and predictions."""
+    """Return the scores of a training run as a point on the curve of a sweep, without weights and predictions."""
     card: dict[str, Any] = {**scored_card(data, job, result)}
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores", "collapsed", "collapsed_before_n")
     return {name: card[name] for name in kept} | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
 
 
 def collapse_record(result: TrainingResult) -> dict[str, Any]:
-    """Return whether a training collapsed, and how often the same job did before, with other draws."""
+    """Return whether training collapsed, and how often earlier attempts with other random draws did."""
     return {"collapsed": result.collapsed, "collapsed_before_n": result.collapsed_before_n}
 
 
 def write_timings(scene: str, stage: str, jobs: Sequence[_Named], results: Sequence[_Timed]) -> None:
-    """Write the seconds of each training, and of one prediction, beside the pipeline."""
+    """Write the seconds that each training run and one prediction took, outside the outputs of stages."""
     took = [
         {"name": job.name, "train_s": result.seconds, "one_reading_s": result.one_reading_s}
         for job, result in zip(jobs, results, strict=True)
@@ -325,7 +325,7 @@ def write_timings(scene: str, stage: str, jobs: Sequence[_Named], results: Seque
 
 
 def _predictions(jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], rows: Rows) -> pa.Table:
-    """One row for each job and test row: the truth and the prediction."""
+    """Tabulate the truth and the prediction, one row for each job and test row."""
     tables = []
     for job, result in zip(jobs, results, strict=True):
         names = {"question": job.experiment, "recipe": job.recipe_name, "fold": job.fold, "seed_i": job.seed_i}

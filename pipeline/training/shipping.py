@@ -1,7 +1,7 @@
-"""Make the universal model that `reskin` ships: `python -m pipeline.training.shipping`, a few minutes on one core.
+"""Make the universal model that `reskin` ships: `python -m pipeline.training.shipping` (a few minutes on one core).
 
 Writes reskin/universal/universal.safetensors and its card. The network has the training settings and the seed of scene
-lab, which tests it as `universal, simulated alone`. The likelihood powers are calibrated on simulated skins.
+lab, where it is tested as `universal, simulated alone`. The likelihood powers are calibrated on simulated skins.
 """
 
 import time
@@ -36,7 +36,7 @@ from reskin.universal.population import Population
 from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
 
 PRESSES_N = (0, 12, FULL_SET_N)  # unlabelled; `reskin live` asks for a dozen
-WAYS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses, and whether they lie evenly
+WAYS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses, and whether they are evenly spread
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "name": "universal, simulated alone",
@@ -75,9 +75,9 @@ def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int]
 def calibrate(
     model: Universal, skins: Population, i: int, counts: tuple[int, int], *, even: bool, seed: int
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]:
-    """Calibrate a model to a simulated skin by so many presses and labels of its pool.
+    """Calibrate a model to a simulated skin with the given numbers (presses, labels) of its pool.
 
-    Returns readings to test it on, along the chips' axes, and their places as labels.
+    Returns readings to test it on, in the chips' axes, and their places in the frame of labels.
     """
     (presses_n, labels_n), (pool, tested) = counts, split_presses(skins, i, seed)
     rest_uT, pool_uT, tested_uT = (to_chips(db_uT) for db_uT in (skins.rest_uT[i][None], pool.db_uT, tested.db_uT))
@@ -94,7 +94,7 @@ def calibrate(
 def _coverages(
     model: Universal, b_uT: Float[np.ndarray, "m ch"], place_mm: Float[np.ndarray, "m 2"]
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each power, twice: `best_powers` takes pairs."""
+    """Return the coverage of 90 % intervals for each power, in two equal columns, because `best_powers` takes pairs."""
     by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
     powers = [lower_by_residuals(*one) for one in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
     found = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
@@ -112,7 +112,7 @@ class Inputs:
 
 
 def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
-    """Read the nominal skin, placed on the paper's board, and the training settings of a scene."""
+    """Read the nominal skin, for the paper's board, and the training settings of a scene."""
     design = parse(SkinDesign, defaults.nominal("skin"), f"{defaults.NOMINAL}: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
     settings = read_yaml(scene)
@@ -126,7 +126,7 @@ def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
 
 
 def make() -> None:
-    """Make the model anew and overwrite its file and card."""
+    """Make the model and overwrite its file and card."""
     inputs = read_inputs()
     times_s = [time.process_time()]
     tables = tabulate(NOMINAL, NOMINAL_SPREADS, inputs.prior.setup)

@@ -26,7 +26,7 @@ from reskin.universal.model import CalibratedModel, Evaluation, PressCalibration
 from reskin.universal.population import PLACES_N, Population, draw_population
 from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, SkinPrior, add_error
 
-EXPERIMENT = "labels"  # whose folds are scored
+EXPERIMENT = "labels"  # its folds are scored
 METHODS = ("universal map, ", "universal, ")  # the map alone; map and networks
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
 REACH = 1.645  # standard deviations to either side of a 90 % interval
@@ -34,7 +34,7 @@ BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidates, calibrated on ot
 NOMINAL_POWERS = tuple(
     np.geomspace(0.1, 1.6, 13).tolist()
 )  # candidates at a misfit of 1, calibrated on simulated skins
-ASSUMED_POWER = 0.5  # of the map's estimates, and where none is calibrated: as if channels erred in pairs
+ASSUMED_POWER = 0.5  # of the map's estimates if none is calibrated, as if the channels' errors were equal in pairs
 FORCE_MIN_N = float(FORCES_N[0])  # of a labelled press: the map is not tabulated below
 
 
@@ -54,7 +54,7 @@ class Estimates(NamedTuple):
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What all folds share.
+    """The data, model and likelihood powers that all folds share.
 
     board_powers: by board and number of labels. nominal_powers: by number of labels, at a misfit of 1.
     """
@@ -67,7 +67,7 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class PoolCalibration:
-    """A model calibrated to a board's no-load field and to its pool of presses, of which the first may be labelled."""
+    """A model calibrated to a board's no-load field and its pool of presses; the first presses may serve as labels."""
 
     presses: PressCalibration
     pool: LabelledPresses
@@ -75,7 +75,7 @@ class PoolCalibration:
     misfit: float  # median over the pool
 
     def with_labels(self, labels_n: int) -> CalibratedModel:
-        """Condition on the first presses of the pool as labels."""
+        """Condition the model on the labels of the first `labels_n` presses of the pool."""
         labels = self.pool[:labels_n]
         force_N = np.maximum(labels.force_N, FORCE_MIN_N)
         skin = condition_on_labels(self.presses.skin, labels.place_mm, force_N, labels.db_uT)
@@ -83,27 +83,27 @@ class PoolCalibration:
         return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
     def nominal_powers(self, powers: Powers) -> Powers:
-        """Lower the powers of the model of simulated skins alone, by the misfit of the unlabelled presses."""
+        """Lower the powers of the nominal variant, according to the misfit of the unlabelled presses."""
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
     def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":
         """Put some of the pool's presses first."""
         order = np.concatenate([first, np.setdiff1d(np.arange(len(self.pool)), first)])
         pool = self.pool[order]
-        # The networks are conditioned again: their sums run in the order of the pool, which moves the last bits.
+        # The networks are conditioned again, because the order of the pool changes their sums in the last bits.
         presses = replace(self.presses, data=CalibrationData(self.presses.data.rest_uT, pool.db_uT, pool.db_uT))
         return replace(self, presses=presses, pool=pool, pool_mm=self.pool_mm[order])
 
 
 def calibrate(model: PriorModel, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses) -> PoolCalibration:
-    """Calibrate a model to what a board gives without labels: its no-load field, and presses evenly over the skin."""
+    """Calibrate a model to a board without labels: to its no-load field, and to presses spread evenly over the skin."""
     presses = model.calibrate(CalibrationData(rest_uT, pool.db_uT, pool.db_uT))
     misfit = float(np.median(presses.skin.evaluator.evaluate(pool.db_uT).misfit())) if len(pool) else 1.0
     return PoolCalibration(presses, pool, presses.even_mm, misfit)
 
 
 def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[Powers]) -> list[Estimates]:
-    """Estimate places and forces, once for each pair of powers: only standard deviations depend on them."""
+    """Estimate places and forces for each pair of powers, on which only the standard deviations depend."""
 
     def by_powers(evaluation: Evaluation) -> list[Estimate]:
         assumed = evaluation.by_map(ASSUMED_POWER)
@@ -115,12 +115,12 @@ def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: S
 
 
 def with_deviation_of(estimate: Estimate, other: Estimate) -> Estimate:
-    """Return an estimate with the standard deviations of another one about its places."""
+    """Return an estimate whose standard deviations are the rms errors about its places under another estimate."""
     return replace(estimate, sd_mm=np.hypot(other.sd_mm, other.place_mm - estimate.place_mm))
 
 
 def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequence[Powers]) -> list[Powers]:
-    """Lower powers by the variance inflation of cross-validated labels."""
+    """Lower powers according to the variance inflation of cross-validated labels."""
     by_map: list[HeldOut] = []
     combined: list[HeldOut] = []
     for kept, held_out in folds_of_labels(min(labels_n, len(calibration.pool))):
@@ -141,9 +141,9 @@ def score_fold(
     """Score both variants on one fold, by the map alone and with networks, for every number of labels."""
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
-    if board not in known.presses:  # they are named by board and skin if a board has several
+    if board not in known.presses:  # if a board has several skins, they are named by board and skin
         what = f"boards of one skin each are needed; got {', '.join(known.presses)}"
-        raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene's.")
+        raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene.")
     pool, rest_uT = pool_of(known, fold), known.presses[board].rest_uT.ravel()
     test_uT = known.frame.field(data.rows.db_uT[fold.test])
     points = []
@@ -165,20 +165,20 @@ def score_fold(
 
 
 def coverage(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
-    """Return the share of coordinates that lie in their 90 % intervals."""
+    """Return the share of coordinates that are inside their 90 % intervals."""
     return float((np.abs(estimate.place_mm - place_mm) <= REACH * estimate.sd_mm).mean())
 
 
 def coverages(
     calibration: PoolCalibration, tested: LabelledPresses, labels_n: int, powers: Sequence[Powers]
 ) -> Float[np.ndarray, "t 2"]:
-    """Return the coverage of 90 % intervals for each pair of powers, of the map alone and with networks."""
+    """Return the coverage of 90 % intervals for each pair of powers, for the map alone and with networks."""
     found = estimate(calibration.with_labels(labels_n), tested.db_uT, powers)
     return np.array([[coverage(one, tested.place_mm) for one in pair] for pair in found])
 
 
 def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate: Estimate) -> dict[str, Any]:
-    """Score estimates as every method's, and the coverage of their 90 % intervals."""
+    """Score estimates by the metrics of all methods, and by coverage and half width of their 90 % intervals."""
     label_mm = known.frame.label(estimate.place_mm)
     predicted = np.column_stack([label_mm, estimate.force_N]).astype(np.float32)
     scores = score_test(known.data, test, predicted)
@@ -190,7 +190,7 @@ def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate:
 
 
 def pool_rows(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
-    """Return the rows of each press of the pool, in the order in which experiment labels takes them as labels."""
+    """Return the rows of each press of the pool, in the order in which experiment `labels` labels the presses."""
     indentation = data.rows.indentation[fold.pool]
     return [fold.pool[indentation == one] for one in labelling_order(data.rows, fold, data.settings.seed)]
 
@@ -203,14 +203,14 @@ def pool_of(known: KnownBoards, fold: Fold) -> LabelledPresses:
     return LabelledPresses(known.frame.place(target[:, :2]), target[:, 2], known.frame.field(db_uT))
 
 
-CALIBRATION_SKINS_N = 24  # simulated, with each error of the law, for the powers of the nominal variant
+CALIBRATION_SKINS_N = 24  # simulated skins per kind of error of the law, for the powers of the nominal variant
 
-Coverages = Float[np.ndarray, "t 2"]  # by power; of the map alone, and with networks
-LawError = Callable[[Population, np.random.Generator], np.ndarray]  # changes of field with errors of the law
+Coverages = Float[np.ndarray, "t 2"]  # by power; for the map alone, and with networks
+LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns changes of field with errors of the law
 
 
 def law_error(times: float = 1.0) -> LawError:
-    """Return errors of the law that are as large as in training, or so many times larger."""
+    """Return a function that adds errors of the law, `times` as large as in training."""
     least, most = ERROR_OF_NOMINAL
 
     def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
@@ -219,12 +219,12 @@ def law_error(times: float = 1.0) -> LawError:
     return add
 
 
-AS_TRAINED = "further"  # names are part of seeds
+AS_TRAINED = "further"  # the names of errors are part of seeds
 LAW_ERRORS = {AS_TRAINED: law_error(), "further, missed twice": law_error(2.0)}
 
 
 def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[str, dict[int, Powers]]:
-    """Choose powers for each held-out board, as is best on the other boards."""
+    """Choose powers for each held-out board: those that are best on the other boards."""
     by_board = {board: _board_coverages(benchmark, board, labels_n) for board in benchmark.known.presses}
     return {
         board: {
@@ -238,9 +238,9 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
     """Choose powers at a misfit of 1, by number of labels, on simulated skins.
 
-    A board's powers are these over its misfit (Birge's ratio) and over the variance inflation of its labels. The law's
-    errors on these skins are as in training; with labels, skins with errors twice as large count too, as residuals of
-    labels are to tell the size of the errors.
+    The powers used for a board are these, divided by its misfit (Birge's ratio) and by the variance inflation of its
+    labels. The law's errors on the simulated skins are as large as in training. With labels, skins with errors twice as
+    large are added, because the residuals of labels should show the size of the errors.
     """
     found: dict[int, list[Coverages]] = {n: [] for n in labels_n}
     for name, error in LAW_ERRORS.items():
@@ -253,7 +253,7 @@ def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int)
 
 
 def best_powers(candidates: Sequence[float], found: Sequence[Coverages]) -> Powers:
-    """Choose the powers whose 90 % intervals cover 90 %, on the mean over skins."""
+    """Choose the powers whose 90 % intervals have a coverage closest to 90 %, averaged over skins."""
     of_map, combined = np.abs(np.mean(found, axis=0) - 0.9).argmin(axis=0)
     return Powers(candidates[of_map], candidates[combined])
 
@@ -276,7 +276,7 @@ def calibrate_to_simulated(
 
 
 def split_presses(skins: Population, i: int, seed: int) -> tuple[LabelledPresses, LabelledPresses]:
-    """Split the presses of a simulated skin at random into a pool and those to test on."""
+    """Split the presses of a simulated skin at random into a pool and presses to test on."""
     order = rng_for(seed, "universal", "pool", i).permutation(skins.db_uT.shape[1])
     parts = (skins.place_mm, skins.force_N, skins.db_uT)
     presses = LabelledPresses(*(part[i][order].astype(float) for part in parts))
@@ -289,7 +289,7 @@ def _simulated_coverages(calibration: PoolCalibration, tested: LabelledPresses, 
 
 
 def _board_coverages(benchmark: Benchmark, board: str, labels_n: Sequence[int]) -> dict[int, Coverages]:
-    """Return coverages of the nominal variant on a board, with a third of its presses as pool, on the others."""
+    """Return the coverages of the nominal variant on a board: a third of its presses is the pool, the others test."""
     own = benchmark.known.presses[board]
     order = rng_for(benchmark.known.data.settings.seed, "universal", board).permutation(len(own.recorded))
     db_uT = own.db_uT.reshape(len(order), -1)

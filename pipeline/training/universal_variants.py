@@ -1,6 +1,7 @@
-"""The universal model before calibration to a held-out board: train it on other boards and simulated skins, or read it.
+"""The universal model before calibration to a held-out board: train it or read it.
 
-Two variants: `rig` is made from the recorded boards that are not held out, `nominal` from simulated skins alone.
+There are two variants: `rig` is made from the recorded boards that are not held out, `nominal` from simulated skins
+alone.
 """
 
 from collections.abc import Mapping
@@ -37,23 +38,23 @@ FORMAT = "reskin-universal-1"
 
 @dataclass(frozen=True)
 class Frame:
-    """How boards lie under their labels: chips' axes, and labels' middle and direction of y."""
+    """The frame of boards relative to their labels: the chips' axes, and the labels' middle and direction of y."""
 
     turn: Float[np.ndarray, "k 3 3"]
     middle_mm: tuple[float, float]
     mirrored: bool
 
     def field(self, b_uT: Float[np.ndarray, "n ch"]) -> Float[np.ndarray, "n ch"]:
-        """Turn readings from the chips' axes to the board's."""
+        """Rotate readings from the chips' axes to the board's axes."""
         of_chips = b_uT.astype(float).reshape(len(b_uT), -1, 3)
         return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(len(b_uT), -1)
 
     def place(self, label_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Turn labels to places in the board's frame."""
+        """Convert labels to places in the board's frame."""
         return (label_mm - self.middle_mm) * (1, -1 if self.mirrored else 1)
 
     def label(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Turn places in the board's frame to labels."""
+        """Convert places in the board's frame to labels."""
         return place_mm * (1, -1 if self.mirrored else 1) + self.middle_mm
 
 
@@ -76,7 +77,7 @@ class Variant:
 
 
 class Variants(NamedTuple):
-    """The variant of simulated skins alone; by held-out board, the variant that also saw the other boards."""
+    """The variant made from simulated skins alone; for each held-out board, the variant made from the other boards."""
 
     nominal: Variant
     rig: Mapping[str, Variant]
@@ -96,7 +97,7 @@ def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
 
 
 def read_variants(known: KnownBoards, models: Path) -> Variants:
-    """Read the networks that `write_networks` wrote; fit laws and tabulate maps anew."""
+    """Read the networks that `write_networks` wrote; fit laws and tabulate maps again."""
     with make_executor(imports="reskin.universal.map") as executor:
         priors = _priors(known, executor)
         tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
@@ -108,7 +109,7 @@ def read_variants(known: KnownBoards, models: Path) -> Variants:
 
 
 def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
-    """Return the nominal prior, and for each board the prior when it is held out."""
+    """Return the nominal prior, and for each board the prior for holding it out."""
     boards, setup = known.presses, known.setup
     laws = dict(
         zip(boards, executor.map(fit, boards.values(), [setup] * len(boards), [TEN] * len(boards)), strict=True)
@@ -127,7 +128,7 @@ def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> Sk
 
 
 def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], setup: Setup) -> Residual:
-    """Fit the residual to the laws' errors on the boards that they were fitted to."""
+    """Fit the residual to the errors of each law on the board that it was fitted to."""
     errors = []
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
@@ -139,7 +140,7 @@ def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], 
 
 
 def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
-    """Select a board's readings for training: equally many of each press with a force."""
+    """Select a board's readings for training: the same number for each press with a force."""
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
     each = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]  # the readings of a press are adjacent

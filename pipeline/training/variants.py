@@ -26,7 +26,7 @@ from reskin.models.recipe import AdaptationWithBase
 from reskin.numerics import device
 
 FORCE = 2  # column
-BEFORE, AFTER, CONTROL = "before", "after", "control"  # the control trains as long, without the skin's pokes
+BEFORE, AFTER, CONTROL = "before", "after", "control"  # the control trains as long but without the skin's pokes
 Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # of true and predicted x_mm, y_mm, F_N
 
 
@@ -60,7 +60,7 @@ def predict_before(
 def adapt_and_predict(
     data: SceneData, jobs: Sequence[tuple[str, TrainingJob]], stage: str
 ) -> tuple[list[VariantPrediction], dict[str, int]]:
-    """Run (variant, job) pairs; return their predictions of the test rows, and the counts of collapsed trainings."""
+    """Run (variant, job) pairs; return predictions for the test rows, and the counts of collapsed training runs."""
     adapted = [job for _, job in jobs]
     trained = train_jobs(data, adapted, stage)
     write_timings(data.scene, stage, adapted, trained)
@@ -72,16 +72,17 @@ def adapt_and_predict(
 
 
 def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
-    """Bias of the predicted force in newtons and in percent of the mean force."""
+    """Compute the bias of the predicted force in newtons and in percent of the mean force."""
     true_N = true[:, FORCE].astype(float)
     over_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
     return {"bias_f_N": over_N, "bias_f_pct": 100 * over_N / float(true_N.mean())}
 
 
 def summarise_variants(predictions: Sequence[VariantPrediction], metric: Metric = score) -> dict[str, dict[str, Any]]:
-    """Summarise every metric over boards, for each variant; a board is the mean of its skins, a skin of its seeds.
+    """Summarise every metric over boards, for each variant.
 
-    `sd_seeds` is the standard deviation over the networks of one skin, mean over skins.
+    The value of a board is the mean over its skins, and that of a skin the mean over its seeds. `sd_seeds` is the
+    standard deviation over the networks of one skin, averaged over skins.
     """
     variants = _tidy(predictions, metric).groupby("method", sort=False)
     return {
@@ -101,9 +102,9 @@ def force_biases(predictions: Sequence[VariantPrediction]) -> dict[str, dict[str
 
 
 def compare_variants(predictions: Sequence[VariantPrediction], of: str, over: str) -> dict[str, Any]:
-    """Compare two variants skin by skin, `of` less `over`: over boards, and `by_board`.
+    """Summarise the difference `of` minus `over` of two variants, skin by skin, over boards and `by_board`.
 
-    `sd_seeds` is that of the differences: networks of equal seeds start from the same weights.
+    `sd_seeds` is that of the differences, because networks with equal seeds start from the same weights.
     """
     rows = _tidy(predictions, score)
     sides = [statistics.select(rows, method=variant) for variant in (of, over)]

@@ -144,7 +144,7 @@ def test_steps_and_base_are_no_settings():
     ids=["nothing", "nothing pooled", "nothing adapted", "a control alone"],
 )
 def test_missing_candidates_are_an_error(cards, stage):
-    with pytest.raises(ParamsError, match=f"no candidates of {stage}. Run lobo"):
+    with pytest.raises(ParamsError, match=f"no candidates of {stage}. Run experiments lobo"):
         choose(cards)
 
 

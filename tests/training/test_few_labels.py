@@ -251,7 +251,7 @@ def test_adaptation_uses_only_the_order_along_lines():
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"adapted": ["network"]}, r"adapted names recipes of few_labels, not \['network'\]"),
+        ({"adapted": ["network"]}, r"adapted must name recipes of few_labels, not \['network'\]"),
         ({"labels_n": []}, "labels_n must"),
         ({"labels_n": [-1]}, "labels_n.0 must be greater than or equal to 0; got -1"),
         ({"rows_max_n": 0}, "rows_max_n must be greater than or equal to 1; got 0"),
