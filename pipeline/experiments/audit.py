@@ -137,17 +137,17 @@ def audit_fold(
     copies: 1 of 1 captures compared; s2 like s1: 0.0 % of 1 indentations: True
     """
     _check_experiment(sides)
-    checks = [_readings(sides)]
+    checks = [_check_readings(sides)]
     if sides.experiment in SKINS_UNSEEN:
-        checks += [_apart("boards", labels.board, sides), _apart("skins", labels.skin, sides)]
-        checks += [_apart("indentations", labels.indentation, sides), _copies(sides, labels, db_uT, rng)]
+        checks += [_check_disjoint("boards", labels.board, sides), _check_disjoint("skins", labels.skin, sides)]
+        checks += [_check_disjoint("indentations", labels.indentation, sides), _check_copies(sides, labels, db_uT, rng)]
     elif sides.experiment in SKIN_SHARED:
         rule = "apart; the skin is shared by design"
-        checks.append(_apart("indentations", labels.indentation, sides, rule=rule))
+        checks.append(_check_disjoint("indentations", labels.indentation, sides, rule=rule))
     else:
         rule = "apart, but for the paper's own protocol; the skin is shared by design"
-        checks.append(_apart("indentations", labels.indentation, sides, rule=rule, known=True))
-    return checks + (_pool(sides, labels) if len(sides.pool) else [])
+        checks.append(_check_disjoint("indentations", labels.indentation, sides, rule=rule, known=True))
+    return checks + (_check_pool(sides, labels) if len(sides.pool) else [])
 
 
 def _check_experiment(sides: Sides) -> None:
@@ -162,21 +162,21 @@ def _check_experiment(sides: Sides) -> None:
         raise ParamsError(f"fold {sides.where}: one side of the fold has no rows: {got}. Split again.")
 
 
-def _readings(sides: Sides) -> Check:
+def _check_readings(sides: Sides) -> Check:
     seen = np.isin(sides.test, np.concatenate([sides.train, sides.pool]))
     found = f"{int(seen.sum())} of {len(sides.test)} test readings trained on or adapted to"
     return Check("readings", sides.where, "on one side only", found, holds=not seen.any())
 
 
-def _apart(what: str, label: np.ndarray, sides: Sides, *, rule: str = "apart", known: bool = False) -> Check:
+def _check_disjoint(what: str, label: np.ndarray, sides: Sides, *, rule: str = "apart", known: bool = False) -> Check:
     """Check that no label is on both sides; with `known`, shared labels count as a known leak."""
     own = np.unique(label[sides.test])
     shared = own[np.isin(own, np.unique(label[sides.train]))]
-    found = f"{len(shared)} of {len(own)} on both sides{_some(shared)}"
+    found = f"{len(shared)} of {len(own)} on both sides{_first_names(shared)}"
     return Check(what, sides.where, rule, found, holds=len(shared) == 0, known=known and len(shared) > 0)
 
 
-def _copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Generator) -> Check:
+def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Generator) -> Check:
     """Check that no test capture is a copy of a training skin under another name."""
     test, train = (
         strong_indentations(name[side], labels.indentation[side], db_uT[side])
@@ -186,7 +186,7 @@ def _copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Gene
     captures, skins = labels.capture[sides.test], labels.skin[sides.test]
     weak = np.setdiff1d(skins, skins[np.isin(captures, test.name)])
     if len(weak) or not len(train.name):
-        found = f"undecidable: fields within the noise{_some(weak)}"
+        found = f"undecidable: fields within the noise{_first_names(weak)}"
         return Check("copies", sides.where, rule, found, holds=False)
     closest = most_alike(test, train, rng=rng)
     most = max(closest, key=lambda one: one.share)
@@ -197,21 +197,21 @@ def _copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Gene
     return Check("copies", sides.where, rule, found, holds=most.share < COPIED_SHARE_MAX)
 
 
-def _pool(sides: Sides, labels: Labels) -> list[Check]:
+def _check_pool(sides: Sides, labels: Labels) -> list[Check]:
     """Check that the unlabelled pokes are of held-out skins, and that none of them is a test indentation."""
     pokes, tested = (np.unique(labels.indentation[side]) for side in (sides.pool, sides.test))
     shared = pokes[np.isin(pokes, tested)]
     skins = np.unique(labels.skin[sides.pool])
     foreign = np.setdiff1d(skins, labels.skin[sides.test])
-    overlap = f"{len(shared)} of {len(pokes)} unlabelled also tested{_some(shared)}"
-    not_held_out = f"{len(foreign)} of {len(skins)} are not held out{_some(foreign)}"
+    overlap = f"{len(shared)} of {len(pokes)} unlabelled also tested{_first_names(shared)}"
+    not_held_out = f"{len(foreign)} of {len(skins)} are not held out{_first_names(foreign)}"
     return [
         Check("pool indentations", sides.where, "apart from the test", overlap, holds=len(shared) == 0),
         Check("pool skins", sides.where, "skins of the test", not_held_out, holds=len(foreign) == 0),
     ]
 
 
-def _some(names: np.ndarray) -> str:
+def _first_names(names: np.ndarray) -> str:
     """List the first few names."""
     if len(names) == 0:
         return ""

@@ -89,7 +89,7 @@ def test_last_indentations_are_held_out(pokes_n, test_fraction):
 
 @pytest.mark.parametrize("test_fraction", [0.05, 0.99])
 def test_empty_side_is_an_error(test_fraction):
-    with pytest.raises(ParamsError, match="would be held out: a side is empty"):
+    with pytest.raises(ParamsError, match="would be held out: one side is empty"):
         hold_out_last(rows_of(9), test_fraction)
 
 

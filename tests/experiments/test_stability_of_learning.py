@@ -106,7 +106,7 @@ def test_batches_that_ignore_the_seed_are_detected(monkeypatch):
         return prepared, scaler
 
     monkeypatch.setattr(train, "prepare", prepare_without_seed)
-    assert not learning._again(JOB, ROWS).holds
+    assert not learning._same_seed(JOB, ROWS).holds
 
 
 def test_folds_of_too_few_groups_are_detected(monkeypatch):

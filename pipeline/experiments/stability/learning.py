@@ -50,14 +50,14 @@ def scaling_cases(seed: int) -> list[Case]:
 def triplet_cases(seed: int) -> list[Case]:
     """Run cases of triplets of identical readings, and of equidistant places."""
     job, rows = _job(seed), _rows(seed)
-    return [_alike(job, rows), *_tied(job, rows)]
+    return [_identical(job, rows), *_equidistant(job, rows)]
 
 
 def loop_cases(seed: int) -> list[Case]:
     """Run cases of overflowing rates and weights, a dead network, very few rows, and the same seed twice."""
     job, rows = _job(seed), _rows(seed)
     overflow = [_explodes(job, rows, 1e1), _explodes(job, rows, 1e10), _beside_one_that_overflows(job, rows)]
-    return [*overflow, _collapsed(job, rows), *_few(job, rows), _again(job, rows)]
+    return [*overflow, _collapsed(job, rows), *_few_rows(job, rows), _same_seed(job, rows)]
 
 
 def fold_cases() -> list[Case]:
@@ -91,23 +91,23 @@ def _constant(job: TrainingJob, rows: TrainingData, channels: list[int], case: s
     trained = _train(job, replace(rows, db_uT=db_uT))
     scaler = trained.scaler
     seen = float(np.abs(scaler.encode(db_uT)[:, channels]).max())
-    happened = f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {seen:g} seen; {_words(trained)}"
+    happened = f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {seen:g} seen; {_outcome(trained)}"
     return error_case(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=happened,
                       error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
 
 
-def _alike(job: TrainingJob, rows: TrainingData) -> Case:
+def _identical(job: TrainingJob, rows: TrainingData) -> Case:
     same = replace(rows, db_uT=np.full_like(rows.db_uT, CONSTANT_uT))
-    plain, pulled = (_train(_changed(job, triplet_weight=weight), same) for weight in (0.0, 1e3))
-    apart = _apart(plain.weights, pulled.weights)
-    happened = f"weights {apart:g} apart from those without triplets after {STEPS_N} steps; {_words(pulled)}"
+    plain, pulled = (_train(_with(job, triplet_weight=weight), same) for weight in (0.0, 1e3))
+    apart = _distance(plain.weights, pulled.weights)
+    happened = f"weights {apart:g} apart from those without triplets after {STEPS_N} steps; {_outcome(pulled)}"
     should = "loss 0 and a finite gradient of 0: whatever its weight, it pulls nowhere"
     return error_case(AREA, "triplets of identical readings, weighed 1000", should=should, happened=happened,
                       error=apart if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
 
 
-def _tied(job: TrainingJob, rows: TrainingData) -> list[Case]:
-    job = _changed(job, triplet_weight=0.1)
+def _equidistant(job: TrainingJob, rows: TrainingData) -> list[Case]:
+    job = _with(job, triplet_weight=0.1)
     target = rows.target.copy()
     target[:, :2] = MIDDLE[:2]
     attempts = {
@@ -135,8 +135,8 @@ def _beside_one_that_overflows(job: TrainingJob, rows: TrainingData) -> Case:
     sound, broken = (_tuned(job, _start(job, rows, scale)) for scale in (1.0, 1e30))
     alone = _train(sound, rows)
     beside, overflowing = train_stack([sound, broken], rows)
-    apart = _apart(alone.weights, beside.weights)
-    happened = f"{_words(overflowing)}; its neighbour: {_words(beside)}, {apart:g} from what it becomes alone"
+    apart = _distance(alone.weights, beside.weights)
+    happened = f"{_outcome(overflowing)}; its neighbour: {_outcome(beside)}, {apart:g} from what it becomes alone"
     return error_case(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
                       happened=happened, limit=ROUNDING,
                       error=apart if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
@@ -149,7 +149,7 @@ def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:
     )
     spread = float(np.ptp(dead.predicted, axis=0).max())
     happened = (
-        f"{_words(dead)}, which differ by {spread:.1g}; explains {dead.explained_min:.2g} of its training rows, "
+        f"{_outcome(dead)}, which differ by {spread:.1g}; explains {dead.explained_min:.2g} of its training rows, "
         f"{'counted as collapsed' if dead.collapsed else 'taken as sound'}; the same network alive: "
         f"{alive.explained_min:.2g}, {'counted as collapsed' if alive.collapsed else 'taken as sound'}"
     )
@@ -158,18 +158,18 @@ def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:
                           holds=_is_sound(dead) and dead.collapsed and not alive.collapsed)  # fmt: skip
 
 
-def _few(job: TrainingJob, rows: TrainingData) -> list[Case]:
+def _few_rows(job: TrainingJob, rows: TrainingData) -> list[Case]:
     single = _train(replace(job, train=job.train[:1], test=job.train[:1]), rows)
     error = float(np.abs(single.predicted - rows.target[job.train[:1]]).max())
-    by_one = _train(_changed(job, batch_n=1), rows)
+    by_one = _train(_with(job, batch_n=1), rows)
     return [
-        condition_case(AREA, "batches of one row", should="trained as ever", happened=_words(by_one),
+        condition_case(AREA, "batches of one row", should="trained as ever", happened=_outcome(by_one),
                        holds=_is_sound(by_one)),
         error_case(AREA, "one training row", should="answers that row's place and force",
-                   happened=f"off by {error:.1e} (mm, mm, N); {_words(single)}",
+                   happened=f"off by {error:.1e} (mm, mm, N); {_outcome(single)}",
                    error=error if _is_sound(single) else np.inf, limit=ROUNDING),
         rejection_case(AREA, "one training row, with triplets", should="refused: no triplet is in it",
-                       attempt=partial(_train, _changed(replace(job, train=job.train[:1]), triplet_weight=0.1), rows)),
+                       attempt=partial(_train, _with(replace(job, train=job.train[:1]), triplet_weight=0.1), rows)),
     ]  # fmt: skip
 
 
@@ -179,8 +179,8 @@ def _label_scales(job: TrainingJob, rows: TrainingData) -> list[Case]:
     cases = []
     for power in SCALE_POWERS:
         scale = 2.0**power
-        trained = _train(job, replace(rows, target=_times(rows.target, scale)))
-        back = score(true, _times(trained.predicted, 1 / scale))
+        trained = _train(job, replace(rows, target=_scale(rows.target, scale)))
+        back = score(true, _scale(trained.predicted, 1 / scale))
         error = max(abs(back[name] / as_ever[name] - 1) for name in METRICS)
         happened = ", ".join(f"{name} {back[name]:.4g}, was {as_ever[name]:.4g}" for name in METRICS)
         cases.append(error_case(AREA, f"labels times 2^{power}", should="taken back to mm and N: exactly as ever",
@@ -188,15 +188,15 @@ def _label_scales(job: TrainingJob, rows: TrainingData) -> list[Case]:
     return cases
 
 
-def _again(job: TrainingJob, rows: TrainingData) -> Case:
-    job = _changed(job, triplet_weight=0.1)
+def _same_seed(job: TrainingJob, rows: TrainingData) -> Case:
+    job = _with(job, triplet_weight=0.1)
     first, again = (_train(job, rows) for _ in range(2))
     pairs = [
         (first.predicted, again.predicted),
         *((first.weights[name], again.weights[name]) for name in again.weights),
     ]
     same_n = sum(value.tobytes() == twin.tobytes() for value, twin in pairs)
-    away = _apart(first.weights, _train(replace(job, seed_i=1), rows).weights)
+    away = _distance(first.weights, _train(replace(job, seed_i=1), rows).weights)
     happened = f"{same_n} of {len(pairs)} arrays identical bit for bit; another seed's weights {away:.2g} away"
     return condition_case(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
                 happened=happened, holds=same_n == len(pairs) and away > 0)  # fmt: skip
@@ -206,7 +206,7 @@ def _train(job: TrainingJob, rows: TrainingData) -> TrainingResult:
     return train_stack([job], rows)[0]
 
 
-def _changed(job: TrainingJob, **settings: float | int) -> TrainingJob:
+def _with(job: TrainingJob, **settings: float | int) -> TrainingJob:
     return replace(job, recipe=RECIPE.model_copy(update=settings))
 
 
@@ -227,11 +227,11 @@ def _tuned(
     return replace(job, tuning=FineTuning(start, settings, job.test[:20]))
 
 
-def _times(target: Float32[np.ndarray, "f 3"], scale: float) -> Float32[np.ndarray, "f 3"]:
+def _scale(target: Float32[np.ndarray, "f 3"], scale: float) -> Float32[np.ndarray, "f 3"]:
     return (target.astype(np.float64) * scale).astype(np.float32)
 
 
-def _apart(weights: Mapping[str, np.ndarray], others: Mapping[str, np.ndarray]) -> float:
+def _distance(weights: Mapping[str, np.ndarray], others: Mapping[str, np.ndarray]) -> float:
     return max(float(np.abs(others[name] - weights[name]).max()) for name in others)
 
 
@@ -239,7 +239,7 @@ def _is_sound(trained: TrainingResult) -> bool:
     return trained.stopped_step is None and bool(np.isfinite(trained.predicted).all())
 
 
-def _words(trained: TrainingResult) -> str:
+def _outcome(trained: TrainingResult) -> str:
     if trained.stopped_step is not None:
         return f"not finite at step {trained.stopped_step}"
     finite_n = int(np.isfinite(trained.predicted).all(axis=1).sum())
