@@ -147,11 +147,11 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
         ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),
         (
             {"input": CARD["input"] | {"channels_n": 12}},
-            "inputs raw give 12 inputs, but the weights take 15",
+            "inputs raw give 12 inputs, but the weights are for 15",
         ),
         (
             {"recipe": {"inputs": "shape", "architecture": "paper"}},
-            "inputs shape give 16 inputs, but the weights take 15",
+            "inputs shape give 16 inputs, but the weights are for 15",
         ),
         ({"recipe": {"inputs": "spectrum", "architecture": "paper"}}, "recipe.inputs must be 'raw' or 'shape'"),
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture is missing"),

@@ -1,1 +1,1 @@
-"""Datasets: rows that a model sees, no-load baselines, splits."""
+"""Datasets: rows for training and tests, no-load baselines, and splits."""

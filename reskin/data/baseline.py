@@ -1,4 +1,4 @@
-"""Baselines: the no-load reading that is subtracted from each reading, by policy (paper section 4)."""
+"""Baselines by policy: which no-load reading is subtracted from each reading (paper section 4)."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -7,14 +7,14 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Shaped
 
-# These three were chosen on one recording (scene eflesh), on all its passes: another recording tests them.
-STATES_N = 10  # last states that are compared: five touches, with the free states between them
-ALIKE_N = 4  # similar states, itself included, that make a state free of contact
-SAME = 2.0  # times the median distance between no-load readings of a calibration: readings nearer than this are alike
+# These three were chosen on all passes of one recording (scene eflesh); only another recording can test them.
+STATES_N = 10  # number of last states to compare with: five touches, and the free states between them
+ALIKE_N = 4  # a state is free of contact if this many states, including itself, are alike
+SAME = 2.0  # readings are alike within this multiple of the median distance between no-load readings of a calibration
 
 
 def subtract(b_uT: Float32[np.ndarray, "f ch"], noload_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
-    """Return the change of field against a no-load reading (paper section 4)."""
+    """Return the field change relative to a no-load reading (paper section 4)."""
     return b_uT - noload_uT
 
 
@@ -51,7 +51,7 @@ def free(
 ) -> Float32[np.ndarray, "f ch"]:
     """Use the first no-load reading, then the last reading that `follow_free` detects as free of contact.
 
-    A board sends, for each indentation, its no-load reading and then its rows.
+    The order of the readings is that of a board: for each indentation, its no-load reading, then its rows.
     """
     rank_i = rank(indentation)
     begins = np.concatenate([[True], rank_i[1:] != rank_i[:-1]])
@@ -59,16 +59,16 @@ def free(
         part for row_i in range(len(b_uT)) for part in ([noload_uT[row_i]] if begins[row_i] else []) + [b_uT[row_i]]
     ]
     zeros = list(follow_free(order, within_uT))
-    sent_i = np.arange(len(b_uT)) + np.cumsum(begins)  # place of each row in the order of sending
+    sent_i = np.arange(len(b_uT)) + np.cumsum(begins)  # index of each row in `order`
     return np.stack([zeros[i - 1] for i in sent_i])
 
 
 def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Float[np.ndarray, " ch"]]:
     """Yield the baseline after each reading, detected from the fields alone; the first reading is free of contact.
 
-    Consecutive readings that are alike are one state, however long it lasts, such as a press that is held. A state that
-    resembles enough of the last states is free of contact, because presses differ from each other. During a contact
-    that never ends, such as a sliding finger, the baseline stays.
+    Consecutive readings that are alike form one state, however long it lasts, such as a press that is held. A state
+    that resembles enough of the last states is free of contact, because presses differ from each other. During a
+    contact that does not end, such as a sliding finger, the baseline stays the same.
     """
     states: deque[np.ndarray] = deque(maxlen=STATES_N)
     zero: np.ndarray | None = None
@@ -84,7 +84,7 @@ def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Fl
 
 
 def alike_within_uT(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> float:
-    """Return the distance within which readings are alike: `SAME` times the median between no-load readings."""
+    """Return the distance within which readings are alike: `SAME` times the median between consecutive ones at rest."""
     _, first_i = np.unique(rank(indentation), return_index=True)
     rest_uT = noload_uT[first_i].astype(np.float64)
     return SAME * float(np.median([_distance_uT(a, b) for a, b in pairwise(rest_uT)]))

@@ -1,7 +1,7 @@
-"""Pokes along lines: the only labels of an unlabelled recording.
+"""Pokes along lines: the order along the lines is the only label of an otherwise unlabelled recording.
 
-The paper's way (section 5): "indent in a straight line and incrementally index these points". Places are used here to
-index the robot's grid, and are not passed on: `Lines` hold row, line and index.
+The paper's method (section 5): "indent in a straight line and incrementally index these points". Here, places of a
+robot's grid are used to find the index, and are not passed on: `Lines` contains only row, line and index.
 """
 
 from collections.abc import Sequence
@@ -16,31 +16,32 @@ from reskin.data.rows import TARGETS, Rows, stack
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-PLACE_STEP_MM = 0.1  # assumed: nearer places are the same place
-PLACES_MIN_N = 2  # one place orders nothing
+PLACE_STEP_MM = 0.1  # assumed: places that are nearer are the same place
+PLACES_MIN_N = 2  # a line with one place has no order
 X, Y = TARGETS.index("x_mm"), TARGETS.index("y_mm")
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Pokes by line and index, without place and force. A row may lie on two lines (a grid's row and column).
+    """Pokes by line and index, without place and force. A row may belong to two lines (a grid's row and column).
 
     Sorted by line, then index, then row.
     """
 
     row: Int64[np.ndarray, " p"]  # row numbers
     line_i: Int32[np.ndarray, " p"]  # 0.., unique over skins
-    order_i: Int32[np.ndarray, " p"]  # index along its line; readings and visits of one place share it
+    order_i: Int32[np.ndarray, " p"]  # index along the line; the same for all readings and visits of one place
 
     def __len__(self) -> int:
         return len(self.row)
 
 
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
-    """Index chosen rows along the rows and the columns of each skin's grid, as the robot's operator does.
+    """Index the chosen pokes along the rows and columns of each skin's grid.
 
-    Uses skins and commanded places. The index is the rank of a coordinate among the distinct ones of the skin's chosen
-    rows, so a place that one line lacks leaves a gap. A line of one place orders nothing and is left out.
+    Uses skins and commanded places. The index is the rank of a coordinate among the distinct coordinates of the skin's
+    chosen pokes, so a place that is missing on one line leaves a gap. A line with one place has no order and is left
+    out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
@@ -55,10 +56,10 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
 
 
 def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, " f"]) -> Lines:
-    """Index the readings of one capture by hand: a pass is a line, the indentation counts along it.
+    """Index the readings of a capture of pokes by hand: each pass is a line, along which indentations are counted.
 
-    `row` is the reading's number in the capture. An indentation that was lost leaves a
-    gap; a line of one indentation orders nothing and is left out.
+    `row` is the reading's number in the capture. A lost indentation leaves a gap. A line with one indentation has no
+    order and is left out.
     """
     order_i = indentation.astype(np.int64)
     for line in np.unique(pass_i):
@@ -67,9 +68,9 @@ def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, "
 
 
 def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
-    """Make rows of pokes by hand, whose places and forces are unknown, and index each skin's along its lines.
+    """Make rows of pokes by hand, whose places and forces are unknown, and index the pokes of each skin along lines.
 
-    The lines name rows of the returned stack.
+    The lines contain row numbers of the returned stack.
     """
     parts: list[Rows] = []
     lines: dict[str, Lines] = {}
@@ -95,18 +96,18 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
 
 
 def shifted(lines: Lines, rows_n: int) -> Lines:
-    """Return the lines of rows that are stacked below `rows_n` others."""
+    """Return the lines after their rows were stacked below `rows_n` others."""
     return replace(lines, row=lines.row + rows_n)
 
 
 def take_pokes(
     rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " d"]:
-    """Choose indentations of one skin's pool, every place equally often; return all their rows, sorted.
+    """Choose indentations from one skin's pool, all places equally often; return all their rows, sorted.
 
-    Uses the place of each indentation (that of its first row) alone. The visits of a place (depths or passes) come in
-    random order: one of every place first, then a second; the remainder is at random places. From the same state of
-    `rng`, a smaller choice is part of a larger one.
+    Only the place of each indentation (that of its first row) is used. One visit (depth or pass) is drawn for each
+    place, then a second one, and so on; the last round covers random places. For the same state of `rng`, a smaller
+    choice is a subset of a larger one.
     """
     _check_pool(rows, pool, indentations_n)
     indentations, first = np.unique(rows.indentation[pool], return_index=True)
@@ -118,7 +119,7 @@ def take_pokes(
 
 
 def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
-    """Count the visits of each place in their order.
+    """Number the visits of each place in order.
 
     >>> _visit_numbers(np.array([1, 0, 1, 1, 0]))
     array([0, 0, 1, 2, 1])
@@ -135,7 +136,7 @@ def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:
 
 
 def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], order_i: Int64[np.ndarray, " p"]) -> Lines:
-    """Drop lines of one place, number the others from 0, and sort."""
+    """Drop lines with one place, number the others from 0, and sort."""
     line_i = np.unique(line, axis=0, return_inverse=True)[1].ravel()
     places = np.unique(np.stack([line_i, order_i], axis=1), axis=0)
     ordering = np.bincount(places[:, 0]) >= PLACES_MIN_N
@@ -149,7 +150,7 @@ def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) 
     skins, pool_n = np.unique(rows.skin[pool]), len(np.unique(rows.indentation[pool]))
     if len(skins) > 1:
         raise ParamsError(
-            f"the pool of pokes is of several skins: {', '.join(skins)}. Choose pokes of one skin at a time."
+            f"the pool has pokes of several skins: {', '.join(skins)}. Choose pokes of one skin at a time."
         )
     if indentations_n > pool_n:
         rule = f"at most the {pool_n} indentations of its pool"

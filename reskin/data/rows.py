@@ -19,7 +19,7 @@ SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # of dragged lines (pa
 
 
 class Selection(Strict):
-    """Which readings count as a contact: those with a known place and, where it is known, at least this force."""
+    """Which readings count as a contact: those with a known place and a force of at least `force_min_N` or unknown."""
 
     force_min_N: float
 
@@ -28,9 +28,9 @@ class Selection(Strict):
 class Rows:
     """Stacked rows of a scene, captures in order of name.
 
-    `db_uT` is the change of field against the no-load reading of the same indentation; `target` holds x_mm, y_mm and
-    Fz_N (NaN where a recording has no force), unless others were gathered; `pass_i` counts on over the captures of one
-    skin; `indentation` counts on over the captures of the scene, and the readings of one indentation share it.
+    `db_uT` is the field change relative to the no-load reading of the same indentation. `target` is x_mm, y_mm and Fz_N
+    (NaN if a recording has no force), unless `gather` was given other targets. `pass_i` is numbered consecutively over
+    the captures of a skin, `indentation` over the captures of the scene; readings of one indentation share its number.
     """
 
     capture: np.ndarray
@@ -47,7 +47,7 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Make rows without readings, one an indentation, in one pass unless given; for examples of folds."""
+        """Make rows without readings, one per indentation, for examples of folds; `pass_i` is 0 if not given."""
         f = len(boards)
         empty, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
         labels = np.array(["c"] * f), np.array(boards), np.array(skins)
@@ -60,7 +60,7 @@ def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
 
 
 def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
-    """Stack the contacts of a scene's captures, and count dropped rows; `targets` name columns of `Readings`."""
+    """Stack the contacts of a scene's captures, and count dropped rows; `targets` are columns of `Readings`."""
     if not captures:
         raise ParamsError("the scene has no captures. Add one with `reskin add`.")
     _check_one_kind(captures)
@@ -94,7 +94,7 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
 
 
 def stack(above: Rows, below: Rows) -> Rows:
-    """Stack rows below others, which keep their numbers; indentations below are numbered after those above."""
+    """Stack rows below others, whose row numbers do not change; indentations below are numbered after those above."""
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
         above_n, below_n = above.db_uT.shape[1], below.db_uT.shape[1]
         raise ParamsError(

@@ -1,7 +1,7 @@
 """Folds: which boards, skins, readings, indentations or passes are held out, and the file `folds.json`.
 
-The drawing is scikit-learn's; this module names the groups, and checks that no skin or board is on both sides of a fold
-between skins.
+Random splits are drawn by scikit-learn. For folds that hold out skins, this module checks that no skin or board is on
+both sides.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -20,7 +20,7 @@ from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for, seed_for
 
 WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}  # and units
-SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that test on the skin that was learnt on
+SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that test on the skin that was trained on
 ONE_SKIN = {"transfer", *SAME_SKIN}  # experiments whose networks are trained on one skin
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
@@ -39,15 +39,15 @@ class Split(Strict):
     transfer_skins_n: Count | None = None
     sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
     sensors_draws_n: Count | None = None
-    pool_passes_n: Count | None = None  # of each held-out skin, its first ones
-    labels_pool_n: Count | None = None  # indentations of each held-out skin that may be labelled, of all depths
+    pool_passes_n: Count | None = None  # first passes of each held-out skin
+    labels_pool_n: Count | None = None  # number of indentations of each held-out skin that may be labelled
     labels_draws_n: Count | None = None
 
     @field_validator("sensors_skins_n")
     @classmethod
     def _sensors_differ(cls, skins_n: tuple[int, ...] | None) -> tuple[int, ...] | None:
         if skins_n is not None and len(set(skins_n)) < len(skins_n):
-            raise ValueError(f"sensors_skins_n names each number of skins once, not {list(skins_n)}")
+            raise ValueError(f"sensors_skins_n must list each number of skins once, not {list(skins_n)}")
         return skins_n
 
 
@@ -55,7 +55,7 @@ class Split(Strict):
 class Fold:
     """Row numbers (of `Rows`) of the train side, the test side, and the pool of pokes on the held-out skins.
 
-    Adaptation may use the pool. Nothing is scored there, so that every method is scored on the same rows.
+    Adaptation may use the pool. The pool is never scored, so that all methods are scored on the same rows.
     """
 
     experiment: str
@@ -66,12 +66,12 @@ class Fold:
 
     @property
     def board(self) -> str:
-        """The board that a fold of experiment labels holds out."""
+        """The board that is held out, for a fold of experiment `labels`."""
         return self.name.rpartition(DRAW)[0]
 
     @property
     def draw_i(self) -> int:
-        """The draw of the pool of a fold of experiment labels."""
+        """The number of the draw of the pool, for a fold of experiment `labels`."""
         return int(self.name.rpartition(DRAW)[2])
 
 
@@ -85,7 +85,7 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
     >>> [(fold.name, fold.train.tolist(), fold.test.tolist()) for fold in draw_folds(rows, ["lobo"], Split(), 0)]
     [('b1', [2], [0, 1]), ('b2', [0, 1], [2])]
 
-    With a pool, the first passes of each held-out skin are adapted on, and its later ones tested:
+    With a pool, the first passes of each held-out skin are for adaptation, and its later passes for the test:
 
     >>> rows = Rows.of_labels(["b1"] * 3 + ["b2"] * 2, ["s1"] * 3 + ["s2"] * 2, pass_i=[0, 1, 2, 0, 1])
     >>> def show(folds):
@@ -95,7 +95,7 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
     b1 [3 4] [0] [1 2]
     b2 [0 1 2] [3] [4]
 
-    Fewer sensors: every board is held out in turn, and each draw adds skins to those that it had:
+    Fewer sensors: every board is held out in turn, and within a draw, a larger number of skins adds to a smaller one:
 
     >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3"], ["s1", "s2", "s3", "s4"])
     >>> show(draw_folds(rows, ["sensors"], Split(sensors_skins_n=(1, 2), sensors_draws_n=1), 0))
@@ -110,7 +110,7 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
 
 
 def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """One fold a board: train on all other boards, test on its skins (paper section 5.1)."""
+    """Make one fold per board: train on all other boards, test on the board's skins (paper section 5.1)."""
     boards = np.unique(rows.board)
     if len(boards) < 2:
         remedy = "Add another board's recording, or remove lobo from the scene's experiments."
@@ -123,10 +123,11 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on k skins of all boards but one, test on that board; one fold a board, k and draw (paper figure 6b).
+    """Train on k skins of all boards but one, test on that board; one fold per board, k and draw (paper figure 6b).
 
-    Every board is held out in turn and has draws of its own. Within a draw, the skins of a smaller k are among those of
-    a larger one. All of them are the fold of `lobo`, drawn once and named as there, so that its trainings are reused.
+    Every board is held out in turn and has its own draws. Within a draw, the skins of a smaller k are a subset of those
+    of a larger one. If k is the number of all skins, there is one draw: the fold of `lobo`, with the same name, so that
+    its training runs are reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None
@@ -148,9 +149,10 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Hold a board out as in `lobo`, a random pool of its indentations to be labelled; one fold a board and draw.
+    """Hold a board out as in `lobo`, with a random pool of its indentations for labels; one fold per board and draw.
 
-    The pool is not tested, whether its labels are used or not, so that all numbers of labels have equal tests.
+    The pool is never in the test, whether its labels are used or not, so that the test is the same for all numbers of
+    labels.
     """
     assert split.labels_pool_n is not None
     assert split.labels_draws_n is not None
@@ -174,17 +176,18 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
-    """Draw the order in which the indentations of a fold's pool are labelled: n labels are those of the first n."""
+    """Draw the order in which the indentations of a fold's pool are labelled; n labels are for the first n of them."""
     return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on one skin, test on skins of other boards; one fold a training skin.
+    """Train on one skin, test on skins of other boards; one fold per training skin.
 
-    Where others adapt, the pool is left out of the tests here too, so that all are scored on the same rows.
+    If other experiments adapt to a pool, the pool is left out of the test here too, so that all are scored on the same
+    rows.
 
-    The paper trains on 3 skins, one at a time, and tests on 9 others: with 6 boards of 3 skins, the training skins
-    are the first of the first three boards and the tests all skins of the other three.
+    The paper trains on 3 skins, one at a time, and tests on 9 others. Here, with 6 boards of 3 skins each, the training
+    skins are the first skins of the first three boards, and the test skins are all skins of the other three.
     """
     assert split.transfer_skins_n is not None
     boards, train_n = np.unique(rows.board), split.transfer_skins_n
@@ -202,7 +205,7 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
-    """Make a fold of train and held-out rows; with `pool_passes_n`, each held-out skin's first passes are its pool."""
+    """Make a fold from train and held-out rows; `pool_passes_n` first passes of each held-out skin are the pool."""
     train, held = sides
     pooled = np.zeros(len(held), bool)
     if split.pool_passes_n is not None:
@@ -220,9 +223,10 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
 
 
 def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -> list[Fold]:
-    """Hold out random readings, indentations or passes of the first skin, repeatedly; at least one.
+    """Hold out random readings, indentations or passes of the first skin, repeatedly; at least one of them.
 
-    Readings are the paper's way (section 4): those of one indentation fall on both sides, which flatters the model.
+    The paper holds out readings (section 4). Readings of one indentation are then on both sides, which flatters the
+    model.
     """
     assert split.random_test_fraction is not None
     assert split.random_repeats_n is not None
@@ -237,14 +241,14 @@ def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -
 
 
 def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on the first passes of a skin, test on its last; one fold a skin."""
+    """Train on the first passes of a skin, test on its last passes; one fold per skin."""
     assert split.temporal_test_fraction is not None
     folds = []
     for skin in np.unique(rows.skin):
         skin_rows = np.flatnonzero(rows.skin == skin)
         captures = np.unique(rows.capture[skin_rows])
         if len(captures) > 1:
-            what = f"no clock orders the {len(captures)} captures of skin {skin}: {', '.join(captures)}"
+            what = f"the order in time of the {len(captures)} captures of skin {skin} is unknown: {', '.join(captures)}"
             remedy = "Record the passes in one capture, or run single_random instead."
             raise ParamsError(f"experiment single_temporal: {what}. {remedy}")
         pass_i = rows.pass_i[skin_rows]
@@ -258,11 +262,11 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
 def draw_sides(
     group: Shaped[np.ndarray, " f"], *, test_fraction: float, repeats_n: int, state: int, what: str, where: str
 ) -> list[Sides]:
-    """Draw test groups, repeatedly: rows of equal `group` stay together; one group at least is tested.
+    """Draw test groups, repeatedly: rows of equal `group` stay together; the test has at least one group.
 
     `what` names the groups and `where` their setting, for error messages.
     """
-    from sklearn.model_selection import GroupShuffleSplit  # late: it takes a second, and most stages draw nothing
+    from sklearn.model_selection import GroupShuffleSplit  # imported late: it takes a second, and few stages need it
 
     groups_n = len(np.unique(group))
     test_n = _test_n(groups_n, max(test_fraction, 1 / groups_n), what, where)
@@ -271,7 +275,7 @@ def draw_sides(
 
 
 def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
-    """Round the number held out to the nearest; both sides need one at least."""
+    """Return the rounded number of held-out groups; raise unless both sides have at least one."""
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         remedy = "Record more, change the fraction, or remove the experiment from the scene's."

@@ -1,6 +1,6 @@
-"""Windows of captures in order of time, under several no-load policies (paper section 4, drift).
+"""Windows of captures in order of time, for several baseline policies (paper section 4, drift).
 
-A window is a range of units (indentations or passes); a part is one window of one skin under one policy.
+A window is a range of units (indentations or passes); a part is one window of one skin with one policy.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,13 +13,13 @@ from reskin.data.rows import Rows, Selection, gather
 from reskin.errors import ParamsError
 from reskin.schema import LABELS, Readings
 
-Policy = Callable[[Readings], np.ndarray]  # -> the no-load field of each row
+Policy = Callable[[Readings], np.ndarray]  # returns the baseline of each row
 TRAIN = -1
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Half-open ranges of units for training and for each test; a window that is cut short is left out."""
+    """Half-open ranges of units for training and for each test; incomplete windows are left out."""
 
     train: tuple[int, int]
     tests: tuple[tuple[int, int], ...]
@@ -28,23 +28,23 @@ class Windows:
 
 @dataclass(frozen=True)
 class Part:
-    """A window's rows in the stack of all; window `TRAIN` is the one trained on."""
+    """The rows of a window, and their position in the stack of all parts; window `TRAIN` is the training window."""
 
     policy: str
     window_i: int
     readings: Readings
     rows: Rows
-    noload_off_uT: float  # rms over rows and channels: the policy's no-load field minus that read before the contact
+    noload_off_uT: float  # rms over rows and channels of baseline minus no-load reading before the contact
     first_row_i: int
 
     @property
     def row_i(self) -> Int64[np.ndarray, " f"]:
-        """The numbers of its rows in the stack."""
+        """Row numbers in the stack."""
         return np.arange(self.first_row_i, self.first_row_i + len(self.rows))
 
 
 def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
-    """Train on the first `train_n` units, and test on `test_n` units after every `every_n`, as far as all captures go.
+    """Train on the first `train_n` units, test on `test_n` units after every `every_n`, up to the shortest capture.
 
     `units_n` is the length of each capture, in units.
 
@@ -69,13 +69,13 @@ def take(readings: Readings, rows: Bool[np.ndarray, " f"]) -> Readings:
 
 
 def check_one_each(captures: Sequence[Readings]) -> None:
-    """Raise if a skin has several captures: no clock orders them."""
+    """Raise if a skin has several captures, because their order in time is unknown."""
     names: dict[str, list[str]] = {}
     for readings in captures:
         names.setdefault(readings.skin, []).append(readings.capture)
     for skin, of_skin in names.items():
         if len(of_skin) > 1:
-            what = f"no clock orders the {len(of_skin)} captures of skin {skin}: {', '.join(of_skin)}"
+            what = f"the order in time of the {len(of_skin)} captures of skin {skin} is unknown: {', '.join(of_skin)}"
             remedy = "Record its contacts in one capture, or give each skin its own name."
             raise ParamsError(f"experiment drift: {what}. {remedy}")
 
@@ -87,9 +87,9 @@ def make_parts(
     windows: Windows,
     selection: Selection,
 ) -> list[Part]:
-    """Make the part of every capture, policy and window; each capture comes with the unit of each of its rows.
+    """Make the part of every capture, policy and window; captures are given with the unit number of each row.
 
-    A policy sees the whole capture, including rows that windows and selection leave out.
+    A policy is applied to the whole capture, including rows that windows and selection leave out.
     """
     parts: list[Part] = []
     next_i = 0
@@ -106,7 +106,7 @@ def make_parts(
 
 
 def stack(parts: Sequence[Part]) -> Rows:
-    """Stack the rows of all parts; dropped rows are counted for one policy, because all policies drop the same."""
+    """Stack the rows of all parts; dropped rows are counted for one policy, because all policies drop the same rows."""
     arrays = [field.name for field in fields(Rows) if field.name != "dropped"]
     stacked = {name: np.concatenate([getattr(part.rows, name) for part in parts]) for name in arrays}
     dropped = [part.rows.dropped for part in parts if part.policy == parts[0].policy]

@@ -1,7 +1,7 @@
 """The web server of `reskin live`: the page, and one websocket for each board on it.
 
-It listens on this machine only, unless asked otherwise; then a token is needed. A request names a board by its index
-and a button, nothing else: no path, name or number from a client reaches a file.
+By default it listens on this machine only; for other addresses, a token is required. A request can name only the index
+of a board and a button: no path, name or number from a client reaches a file.
 """
 
 import asyncio
@@ -55,12 +55,12 @@ class Server:
         return app
 
     def check(self, request: web.Request) -> None:
-        """Raise `HTTPForbidden` for a request without the token, or one that another web site made."""
+        """Raise `HTTPForbidden` for a request without the token, or from another web site."""
         token = request.query.get("token") or request.cookies.get(COOKIE, "")
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
-            raise web.HTTPForbidden(text="this page needs its token: use the address that was printed\n")
-        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # a foreign name may resolve to this machine
+            raise web.HTTPForbidden(text="this page needs its token: use the address that reskin live printed\n")
+        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # another host name may resolve to this machine
             raise web.HTTPForbidden(text="this page is served as localhost and 127.0.0.1 only\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page accepts no requests from other sites\n")
@@ -78,7 +78,7 @@ class Server:
             raise web.HTTPNotFound(text="there is no such board\n")
         session, sockets = self._sessions[int(index)], self._sockets[int(index)]
         if len(sockets) >= PAGES_MAX_N:
-            raise web.HTTPServiceUnavailable(text=f"{PAGES_MAX_N} pages are open; close one\n")
+            raise web.HTTPServiceUnavailable(text=f"{PAGES_MAX_N} pages are open already; close one of them\n")
         socket = web.WebSocketResponse(max_msg_size=REQUEST_BYTES_MAX_N, heartbeat=HEARTBEAT_S, compress=False)
         sockets.add(socket)
         try:
@@ -94,7 +94,7 @@ class Server:
         return socket
 
     async def _send(self, session: Session, socket: web.WebSocketResponse) -> None:
-        """Send what is new, at most 30 times a second; a slow page gets less, and nothing is queued."""
+        """Send new data, at most 30 times per second; a slow page gets fewer messages, and nothing is queued."""
         after_bin, sent, next_state_s, clock = 0, "", 0.0, asyncio.get_running_loop().time
         with suppress(ConnectionError):
             while not socket.closed:
@@ -116,7 +116,7 @@ class Server:
 
 
 def receive(session: Session, text: str) -> None:
-    """Handle a message of a page: a button that was pressed, or the number of a message that is on the screen."""
+    """Handle a message from a page: a button that was pressed, or the number of a message that was drawn."""
     with suppress(ValueError, RecursionError):
         message = json.loads(text)
         if isinstance(message, dict):
@@ -125,7 +125,7 @@ def receive(session: Session, text: str) -> None:
 
 
 def serve(sessions: Sequence[Session], *, host: str, http_port: int, say: Callable[[str], None]) -> None:
-    """Show the page of one board or more until Ctrl-C."""
+    """Serve the page of one or more boards until Ctrl-C."""
     token = "" if host in LOCAL else secrets.token_urlsafe(16)
     for session in sessions:
         session.start()
@@ -134,7 +134,9 @@ def serve(sessions: Sequence[Session], *, host: str, http_port: int, say: Callab
         say(f"{', '.join(map(str, sessions))}: open {address}; Ctrl-C ends it")
         web.run_app(Server(sessions, token).application(), host=host, port=http_port, print=None, handle_signals=True)
     except OSError as error:
-        raise ParamsError(f"--http-port: cannot listen on {http_port}: {error.strerror}. Choose another.") from None
+        raise ParamsError(
+            f"--http-port: cannot listen on {http_port}: {error.strerror}. Choose another port."
+        ) from None
     finally:
         for session in sessions:
             session.stop()

@@ -1,4 +1,4 @@
-"""One board on the page of `reskin live`: the thread that estimates, what pages are sent, and what their buttons do."""
+"""One board on the page of `reskin live`: the thread that estimates, the messages to pages, and the buttons."""
 
 import re
 import struct
@@ -22,23 +22,24 @@ from reskin.recordings.stream_recorder import CaptureWriter
 from reskin.seeds import rng_for
 
 POLL_S = 0.1
-# Over which frames of several boards are gathered: estimating them together costs less, and no page draws faster.
+# With several boards, frames are collected over this time: estimating them together is cheaper, and pages do not draw
+# more often.
 GATHER_S = 0.02
 
 WINDOW_S, BIN_S = 10.0, 0.02  # as in page/trace.js
 BINS_N = round(WINDOW_S / BIN_S)
 LATENCIES_N = 4000  # the last frames: ten seconds at 400 Hz
-UNCONFIRMED_MAX_N = 64  # messages that may be on their way to a screen
-HEAD = struct.Struct("<IHHd")  # message number, chips, bins, time of the last reading since the start
+UNCONFIRMED_MAX_N = 64  # messages sent to a screen and not yet confirmed
+HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins, time of the last reading since start
 NUMBERS_N = 12  # x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, and four latencies in ms
 
 PRESSES_N = 12
 GUIDED_MM = CENTRE_MM + 3.0 * np.array([-1.5, -0.5, 0.5, 1.5])  # places shown to the user, along x and along y
-READINGS_MIN_N = 4  # in a press; a shorter contact is a knock
+READINGS_MIN_N = 4  # readings in a press; shorter contacts are ignored
 
 
 class Traces:
-    """The last ten seconds, as pages draw them: least and greatest values in bins of 20 ms, in a ring buffer."""
+    """The last ten seconds, as pages draw them: minimum and maximum in bins of 20 ms, in a ring buffer."""
 
     def __init__(self, layout: Layout, start_s: float) -> None:
         self._layout, self._start_s = layout, start_s
@@ -71,7 +72,7 @@ class Traces:
             self._high[i] = np.fmax(self._high[i], np.fmax.reduce(rows))
 
     def message(self, after_bin: int, *, rate_hz: float, lost_bytes_n: int) -> bytes:
-        """Return the last reading and the bins from `after_bin` on, which may have grown; empty before any reading."""
+        """Return the last reading and the bins from `after_bin` on, whose first may have changed; empty at first."""
         last = self._last
         if last is None:
             return b""
@@ -93,7 +94,7 @@ class Traces:
             np.array(now),
             *latencies_ms,
             change_uT.ravel(),
-            numbers * BIN_S - t_s,  # relative: in float32, days since the start would be rounded to more than a bin
+            numbers * BIN_S - t_s,  # relative, because float32 cannot resolve a bin days after the start
             self._low[i].ravel(),
             self._high[i].ravel(),
         ]
@@ -107,12 +108,12 @@ class Traces:
 
 
 class Presses:
-    """Collects the strongest reading of each contact, until there are enough to adapt to."""
+    """Collects the strongest reading of each contact, until there are enough to calibrate to."""
 
     def __init__(self, presses_n: int = PRESSES_N) -> None:
         self.presses_n = presses_n
         self._strongest_uT: list[Float64[np.ndarray, " ch"]] = []
-        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # strongest so far of the contact that lasts
+        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # strongest reading so far of the current contact
         self._readings_n = 0
 
     def __len__(self) -> int:
@@ -124,12 +125,12 @@ class Presses:
 
     @property
     def instruction(self) -> str:
-        """What the user has to do next."""
+        """What the user must do next."""
         return f"press {len(self) + 1} of {self.presses_n}, anywhere"
 
     @property
     def next_mm(self) -> list[float] | None:
-        """The place to press, if it matters."""
+        """The place to press next; None for any place."""
         return None
 
     @property
@@ -137,7 +138,7 @@ class Presses:
         return np.array(self._strongest_uT)
 
     def add(self, estimates: Estimates) -> None:
-        """Add the next readings; one with a fault does not end a contact."""
+        """Add the next readings; a faulty reading does not end a contact."""
         known = np.isfinite(estimates.db_uT).all(axis=1)
         for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
             if contact:
@@ -151,7 +152,7 @@ class Presses:
 
 
 class GuidedPresses(Presses):
-    """Presses at places that the page shows, a grid in random order; every other one is held out to test the model."""
+    """Presses at places that the page shows: a grid in random order. Every other press is held out for the test."""
 
     def __init__(self) -> None:
         grid_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2)
@@ -175,7 +176,7 @@ ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # by button
 
 
 class Session:
-    """A board that is polled on a thread of its own, with its traces, recording and adaptation."""
+    """A board that is polled on a thread of its own, with its traces, recording and calibration."""
 
     def __init__(
         self, port: str, models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True
@@ -205,7 +206,7 @@ class Session:
         self.skin.reader.stop()
 
     def run(self) -> None:
-        """Estimate until `stop`; an error ends it and becomes an alarm on the page."""
+        """Estimate until `stop` is called; an error ends this and becomes an alarm on the page."""
         try:
             while not self._stop.is_set():
                 estimates = self.skin.poll(POLL_S)
@@ -219,11 +220,11 @@ class Session:
                     self._stop.wait(GATHER_S)
         except ReskinError as error:
             self._error = str(error)
-        except Exception as error:  # of a model
+        except Exception as error:  # in a model
             self._error = f"estimates ended: {error!r}"
 
     def _adapt(self, estimates: Estimates) -> None:
-        """Collect presses if a button asked for it, and adapt the model; the reader keeps frames meanwhile."""
+        """Collect presses if a button requested it, and then calibrate; the reader keeps frames meanwhile."""
         presses, estimator = self._presses, self.skin.estimator
         if presses is not None and isinstance(estimator, UniversalEstimator):
             presses.add(estimates)
@@ -235,7 +236,7 @@ class Session:
                 self._presses = None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
-        """Return the next binary message for a page that has the bins before `after_bin`, and the newest bin in it."""
+        """Return the next binary message for a page that has the bins before `after_bin`, and its newest bin."""
         with self._lock:
             if self.traces is None:
                 return b"", 0
@@ -275,7 +276,7 @@ class Session:
                 self.traces.confirm(message_i, self.skin.reader.unix_s())
 
     def press(self, button: object) -> None:
-        """Do what a button of the page stands for; ignore anything else."""
+        """Perform the action of a button of the page; ignore unknown buttons."""
         with self._button_lock:
             if button == "zero":
                 self.skin.zero()
@@ -287,9 +288,9 @@ class Session:
                 self._begin_recording()
 
     def _begin_recording(self) -> None:
-        """Write the stream from now on into a new capture."""
+        """Start to write the stream into a new capture."""
         folder, detected = new_folder(), self.skin.detected
-        if not self._alone:  # other boards may begin theirs in the same second
+        if not self._alone:  # recordings of several boards may begin in the same second
             folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', detected.port).strip('-')}")
         try:
             part, header = begin_capture(
@@ -314,6 +315,6 @@ class Session:
 def open_sessions(
     ports: Sequence[str], models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY
 ) -> list[Session]:
-    """Make a session for each port; they share the models' weights and nothing else."""
+    """Make a session for each port; the sessions share only the models' weights."""
     check_ports(ports, models, "--port")
     return [Session(port, models, source, fault_policy, alone=len(ports) == 1) for port in ports]

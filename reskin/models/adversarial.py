@@ -1,8 +1,8 @@
 """Domain-adversarial training (Ganin et al., JMLR 2016), a reference method for adaptation.
 
-A second network, the discriminator, infers from features whether a reading is of the known skins or of the new one,
-and the features are trained to mislead it. With a weight of 0 it is the control. It has a loop of its own, because its
-batches and its second network are no term of the loss in `train`.
+A second network, the discriminator, decides from the features whether a reading is from the known skins or from the new
+one, and the features are trained to mislead it. Weight 0 is the control. The training loop is separate from that of
+`train`, because the batches and the second network cannot be written as a loss term there.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,10 @@ from reskin.models.recipe import Schedule
 from reskin.models.train import AdamW, clip_gradients, one_cycle
 
 DISCRIMINATOR_WIDTH = 64  # assumed
-MOMENTUM = 0.5  # with more, two opposing networks oscillate (Radford et al., ICLR 2016)
-RAMP_RATE = 10.0  # weight after a part p of the training: 2 / (1 + exp(-10 p)) - 1, as in the paper
+MOMENTUM = 0.5  # with more, the two opposing networks oscillate (Radford et al., ICLR 2016)
+RAMP_RATE = (
+    10.0  # after a part p of the training, the weight is multiplied by 2 / (1 + exp(-10 p)) - 1, as in the paper
+)
 # The third layer is as wide as the features of any `Stack`.
 DISCRIMINATOR_WIDTHS = (FEATURES_N, DISCRIMINATOR_WIDTH, DISCRIMINATOR_WIDTH, FEATURES_N, 1)
 DISCRIMINATOR = tuple(Layer(in_n, out_n, out_n > 1) for in_n, out_n in pairwise(DISCRIMINATOR_WIDTHS))
@@ -68,7 +70,7 @@ def reverse_gradient(values: Float[torch.Tensor, "m b d"], weight: float) -> Flo
 
 
 def ramp(part: float) -> float:
-    """Return the share of the weight after a part of the training: 0 at first, so that features may form.
+    """Return the factor of the weight after a part of the training: 0 at first, so that features can form.
 
     >>> [round(ramp(part), 2) for part in (0.0, 0.1, 1.0)]
     [0.0, 0.46, 1.0]

@@ -1,7 +1,7 @@
-"""Alignment of two skins by a linear map in closed form, reference methods for adaptation.
+"""Alignment of two skins by a linear map in closed form: reference methods for adaptation.
 
-Means and deviations of channels, or their covariance (CORAL), need no labels; direct standardisation needs pairs of
-readings at the same places.
+Matching the means and standard deviations of channels, or their covariance (CORAL), needs no labels; direct
+standardisation needs pairs of readings at the same places.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from jaxtyping import Float
 
 CORAL_RIDGE = 1.0  # added to every variance of standardised inputs (Sun, Feng & Saenko, AAAI 2016)
 SD_MIN = 1e-6  # a constant channel is shifted, not scaled
-RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # of the mean square of a channel, times the number of pairs
+RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # in units of a channel's mean square times the number of pairs
 Inputs = Float[np.ndarray, "n c"]
 
 
 @dataclass(frozen=True)
 class Map:
-    """Inputs less `before`, times `matrix`, plus `after`."""
+    """The affine map (inputs - before) @ matrix + after."""
 
     before: Float[np.ndarray, " c"]
     matrix: Float[np.ndarray, "c c"]
@@ -34,9 +34,10 @@ def match_channels(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"]) -
 
 
 def coral(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"], ridge: float = CORAL_RIDGE) -> Map:
-    """Whiten inputs and colour them with the other skin's covariance, means matched too (CORAL).
+    """Whiten inputs and colour them with the other skin's covariance, and match the means (CORAL).
 
-    In units of the first skin's deviations: C_of^-1/2 C_to^1/2, each C plus `ridge` times the identity.
+    In units of the first skin's standard deviations, the matrix is C_of^-1/2 C_to^1/2, where `ridge` times the identity
+    is added to each covariance C.
     """
     scale = _sd(of)
     covariances = [np.cov(side / scale, rowvar=False) + ridge * np.eye(of.shape[1]) for side in (of, to)]
@@ -45,10 +46,10 @@ def coral(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"], ridge: flo
 
 
 def direct(of: Float[np.ndarray, "p c"], to: Float[np.ndarray, "p c"], ridge: float) -> Map:
-    """Fit the linear map from a few inputs to their pairs (direct standardisation, Wang & Kowalski 1991).
+    """Fit the linear map from a few inputs to the paired inputs (direct standardisation, Wang & Kowalski 1991).
 
-    Ridge regression of the differences of the pairs, so that directions without data are left unchanged; no constant,
-    because no contact is no change of field on any skin.
+    This is ridge regression of the differences within pairs, so that directions without data are left unchanged. There
+    is no constant term, because without contact the field change is zero on any skin.
     """
     none = np.zeros(of.shape[1])
     gain = np.linalg.solve(of.T @ of + _penalty(of, ridge), of.T @ (to - of))

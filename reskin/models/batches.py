@@ -1,4 +1,4 @@
-"""Training data of a stack of networks: scaled rows, first weights, and the batches of every step."""
+"""Training data of a stack of networks: scaled rows, initial weights, and the batches of every step."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class LabelledRows:
 class UnlabelledRows:
     """Scaled inputs of which only the order along lines is known.
 
-    A row may lie on two lines, so `row` names the row of each point.
+    `points` are points on lines. A row may be on two lines, so `row` is the row number of each point.
     """
 
     inputs: Float32[np.ndarray, "p c"]
@@ -40,7 +40,7 @@ class UnlabelledRows:
 
 @dataclass(frozen=True)
 class PreparedJob:
-    """One network of a stack: its first weights, its generator, and its scaled rows.
+    """One network of a stack: its initial weights, its generator, and its scaled rows.
 
     `unlabelled` and `few_labels` are rows of a new skin, for adaptation and for fine-tuning.
     """
@@ -53,20 +53,20 @@ class PreparedJob:
 
 
 def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
-    """Scale the rows of a job and draw its first weights.
+    """Scale the rows of a job and draw its initial weights.
 
-    The scaler is fitted on the training rows; fine-tuning takes scaler and weights of the network that it starts from.
+    The scaler is fitted on the training rows. Fine-tuning uses scaler and weights of the network that it starts from.
     """
     recipe, target = job.recipe, data.target[job.train]
-    # The recipe is no part of the name: recipes are compared from equal first weights on equal batches.
+    # The recipe is not part of the name, so that recipes are compared with equal initial weights and equal batches.
     retry = ("again", job.attempt_i) if job.attempt_i else ()
     rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
     if job.tuning is None:
         view = VIEW[recipe.inputs](data.db_uT[job.train])
         scaler = FIT[recipe.scaling](view, target)
         layers = LAYERS[recipe.architecture](view.shape[1], target.shape[1])
-        # Where the output has a ReLU (the released network), a random bias leaves some target dead from the start in
-        # about every third network, and a dead output never learns. So the bias is the mean of every scaled target.
+        # If the output has a ReLU (the released network), a random output bias makes an output dead from the start in
+        # about every third network, and a dead output never learns. So the output bias is the mean scaled target.
         known = ~np.isnan(target).all(axis=0)
         mean = np.zeros(target.shape[1], np.float32)
         mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
@@ -77,7 +77,7 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     unlabelled = few_labels = None
     if job.loss_weights.unlabelled:
         assert isinstance(job.tuning, Adaptation)
-        lines = job.tuning.lines  # the change of field and the order along lines are all that adaptation sees
+        lines = job.tuning.lines  # adaptation uses only field changes and the order along lines
         row, point_row = np.unique(lines.row, return_inverse=True)
         view = VIEW[recipe.inputs](data.db_uT[row])
         points = triplet_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
@@ -110,7 +110,7 @@ def virtual_boards(
 ) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
     """Copy all rows `copies_n` times, each copy of a skin as another board would read it.
 
-    Each copy of a skin has random gains for each channel and tilts for each chip; noise is random for each reading.
+    Each copy of a skin has its own random gains of channels and tilts of chips; each reading has its own noise.
 
     Returns
     -------
@@ -136,18 +136,18 @@ def virtual_boards(
 
 
 Batch = dict[str, torch.Tensor]
-# Tensors of a batch, and the rows that each is gathered from.
+# For each tensor of a batch, the rows that it is gathered from.
 _SOURCE = {
     "inputs": "inputs", "targets": "targets", "positive": "inputs", "negative": "inputs",
     "unlabelled": "unlabelled", "unlabelled_positive": "unlabelled", "unlabelled_negative": "unlabelled",
     "few_labels": "few_labels", "few_labels_targets": "few_labels_targets",
 }  # fmt: skip
-# A generator for each kind of draw: one more term of the loss leaves all other batches as they are.
+# One generator for each kind of draw, so that a further loss term does not change the other batches.
 _STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
 
 
 class BatchSampler:
-    """The rows of a stack on the device, one network's below the other's, and batches drawn from them."""
+    """The rows of a stack on the device, concatenated over its networks, and batches drawn from them."""
 
     def __init__(self, jobs: Sequence[PreparedJob], batch_n: int, device: str) -> None:
         self.jobs, self.batch_n, self.device = jobs, batch_n, device
@@ -167,9 +167,9 @@ class BatchSampler:
     def sample(self, steps_n: int) -> Iterator[Batch]:
         """Draw the batches of `steps_n` steps; each tensor is [m b ...].
 
-        `inputs` and `targets` are labelled rows, `positive` and `negative` complete their triplets. With unlabelled
-        rows: `unlabelled` (the anchors), `unlabelled_positive`, `unlabelled_negative`. With a few labelled rows of the
-        new skin: `few_labels`, `few_labels_targets`.
+        `inputs` and `targets` are labelled rows; `positive` and `negative` complete their triplets. With unlabelled
+        rows, there are also `unlabelled` (the anchors), `unlabelled_positive` and `unlabelled_negative`; with a few
+        labelled rows of the new skin, `few_labels` and `few_labels_targets`.
         """
         shape = (steps_n, self.batch_n)
         drawn = [_draw_rows(job, shape, rngs) for job, rngs in zip(self.jobs, self.rngs, strict=True)]

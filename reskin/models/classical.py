@@ -32,7 +32,7 @@ class _Method(Strict):
 
 
 class Ridge(_Method):
-    """Linear least squares; `alpha` weighs the penalty against squared errors summed over rows, all standardised."""
+    """Linear ridge regression; `alpha` weights the penalty against the sum of squared errors, all standardised."""
 
     title: ClassVar[str] = "ridge"
     method: Literal["ridge"]
@@ -40,7 +40,7 @@ class Ridge(_Method):
 
 
 class CubicRidge(_Method):
-    """Ridge on all products of up to three inputs: 815 of 15 inputs, 968 of 16."""
+    """Ridge on all products of up to three inputs: 815 products of 15 inputs, 968 of 16."""
 
     title: ClassVar[str] = "cubic ridge"
     method: Literal["cubic_ridge"]
@@ -48,7 +48,7 @@ class CubicRidge(_Method):
 
 
 class Neighbours(_Method):
-    """Mean of the nearest training rows, weighted by row weight over distance."""
+    """Mean over the nearest training rows, weighted by row weight / distance."""
 
     title: ClassVar[str] = "k nearest neighbours"
     method: Literal["knn"]
@@ -56,7 +56,7 @@ class Neighbours(_Method):
 
 
 class RbfRidge(_Method):
-    """Kernel ridge with exp(-gamma d^2) around at most `rows_max_n` rows; d^2 is on average 2 for each input."""
+    """Kernel ridge with exp(-gamma d^2) around at most `rows_max_n` rows; on average, d^2 is 2 per input."""
 
     title: ClassVar[str] = "RBF kernel ridge"
     method: Literal["rbf_ridge"]
@@ -66,7 +66,7 @@ class RbfRidge(_Method):
 
 
 class Boosting(_Method):
-    """Gradient-boosted trees, one model a target; without early stopping, whose hold-out would split indentations."""
+    """Gradient-boosted trees, one model per target; no early stopping, whose hold-out would split indentations."""
 
     title: ClassVar[str] = "gradient boosting"
     method: Literal["boosting"]
@@ -96,7 +96,7 @@ class FittedRegressor:
 
     @property
     def rows_n(self) -> int:
-        """Number of training rows, of the target that is known in most of them."""
+        """Number of training rows of the target that is known in most rows."""
         return max(part.rows_n for part in self.parts)
 
     def predict(self, inputs: Float32[np.ndarray, "f c"]) -> Float32[np.ndarray, "f 3"]:
@@ -144,13 +144,13 @@ def fit(
 
 
 def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
-    """Scale inputs that are constant in training to 0: at the floor of the scale they would dominate all others."""
+    """Scale inputs that are constant in training to 0; with the smallest scale, they would dominate all others."""
     constant = scaler.input_scale <= SCALE_FLOOR
     return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
 
 
 def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
-    """Group the targets that are known in the same rows, with these rows."""
+    """Group the targets that are known in the same rows; return these rows with each group."""
     known = ~np.isnan(target)
     together: dict[bytes, list[int]] = {}
     for i in np.flatnonzero(known.any(axis=0)):
@@ -163,8 +163,8 @@ def _thin(
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
     """Draw `most_n` of more rows without replacement.
 
-    Rows above the least weight are all kept: they are the few labelled rows of a new skin. Their weight is reduced as
-    the number of the others is, so that they keep their share.
+    All rows with more than the least weight are kept: they are the few labelled rows of a new skin. Their weight is
+    reduced in proportion to the number of the other rows, so that their share of the total weight stays the same.
     """
     if weight is None:
         return np.sort(rng.choice(rows_n, most_n, replace=False)), None
@@ -173,7 +173,7 @@ def _thin(
     left_n = most_n - int(heavy.sum())
     if left_n < 1:
         raise TrainingError(
-            "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} rows of greater weight", most_n, "Increase it."
+            "rbf_ridge", "rows_max_n", f"more than the {heavy.sum()} labelled rows of the skin", most_n, "Increase it."
         )
     kept = np.sort(np.concatenate([np.flatnonzero(heavy), rng.choice(light, left_n, replace=False)]))
     return kept, np.where(heavy, weight * left_n / len(light), weight)[kept]
@@ -191,12 +191,12 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
         raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")
 
 
-BLOCK_ROWS_N = 4096  # computed at once, to bound memory: their kernel with 6000 rows is 200 MB
-_THREADS = ThreadpoolController()  # made once: finding the libraries takes 3 ms, limiting them 15 us
+BLOCK_ROWS_N = 4096  # rows computed at once, to bound memory: their kernel with 6000 rows takes 200 MB
+_THREADS = ThreadpoolController()  # created once: finding the libraries takes 3 ms, limiting them 15 us
 
 
 def one_thread() -> Any:
-    """Context in which linear algebra uses one thread."""
+    """Return a context in which linear algebra uses one thread."""
     return _THREADS.limit(limits=1)
 
 
@@ -208,7 +208,8 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
         case CubicRidge():
             return _BlockwiseCubicRidge(settings.alpha)
         case Neighbours(neighbours_n=k):
-            # A k-d tree: readings lie near few of the 15 directions. scikit-learn's default is brute force from 16 on.
+            # A k-d tree is fast, as readings vary along few directions. By default, scikit-learn uses brute force from
+            # 16 inputs on.
             return _WeightedNeighbours(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
         case RbfRidge():
             return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
@@ -224,11 +225,11 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
 
 
 class _BlockwiseCubicRidge:
-    """Ridge on products, summed block by block: all products of the paper's rows would be 5 GB."""
+    """Ridge on products, with sums accumulated block by block: all products of the paper's rows would take 5 GB."""
 
     def __init__(self, alpha: float) -> None:
         self.alpha = alpha
-        self.lift = PolynomialFeatures(3)  # the first product is 1, and its factor is not penalised
+        self.lift = PolynomialFeatures(3)  # the first product is 1, the intercept, which is not penalised
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
         c = self.lift.fit(inputs[:1]).n_output_features_
@@ -246,7 +247,7 @@ class _BlockwiseCubicRidge:
 
 @dataclass(frozen=True)
 class _WeightedNeighbours:
-    """scikit-learn has no weights here: sum(w y / d) / sum(w / d) is the ratio of two of its predictions."""
+    """Nearest neighbours with row weights, which scikit-learn lacks: the ratio of its means of w y and of w."""
 
     neighbours: KNeighborsRegressor
 
@@ -266,9 +267,9 @@ def blocks(rows_n: int) -> list[slice]:
 
 @dataclass(frozen=True)
 class ClassicalJob:
-    """A method on one fold, on at most `rows_max_n` training rows, drawn at random.
+    """A method on one fold, with at most `rows_max_n` training rows, drawn at random.
 
-    `few_labels` are labelled rows of a new skin, which together weigh as much as all others.
+    `few_labels` are labelled rows of a new skin, whose total weight is that of all other rows.
     """
 
     name: str
@@ -282,7 +283,7 @@ class ClassicalJob:
 
 @dataclass(frozen=True)
 class ClassicalResult:
-    """Predictions (mm, mm, N) of the test rows, number of training rows, and seconds of fit and of one prediction."""
+    """Predictions (mm, mm, N) for the test rows, number of training rows, times of the fit and of one prediction."""
 
     predicted: Float32[np.ndarray, "b 3"]
     rows_n: int

@@ -1,6 +1,6 @@
-"""Inputs of the models: views of the change of field, and scalers between uT, mm, N and the numbers of a network.
+"""Inputs of the models: views of the field change, and scalers between uT, mm, N and the scaled values of a network.
 
-A view is a fixed function of one row; a scaler is fitted on training rows only, so that no test row leaks into it.
+A view is a fixed function of one row; a scaler is fitted on training rows only, so that test rows do not leak into it.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed: least |dB|, below the noise (3 uT of one channel, some 15 uT of fifteen). Its log is 0, so that no change of
-# field gives zeros throughout.
+# Assumed: least |dB|, below the noise (3 uT in one channel, some 15 uT in fifteen). Its log is 0, so that a zero field
+# change gives zeros in all inputs.
 DB_FLOOR_uT = 1.0
-# Least scale, for a channel that is constant in training.
+# Least scale, used for a channel that is constant in training.
 SCALE_FLOOR = np.float32(1e-6)
 RELEASED_INPUT_SDS = np.float32(5.0)  # the released weights divide by about five standard deviations
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
@@ -34,7 +34,7 @@ VIEW: Mapping[str, Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "
 
 @dataclass(frozen=True)
 class Scaler:
-    """`(db - input_shift) / input_scale` goes in, `out * target_scale + target_shift` is x_mm, y_mm and force in N."""
+    """The input is `(db - input_shift) / input_scale`; `out * target_scale + target_shift` is x_mm, y_mm and F_N."""
 
     input_shift: Float32[np.ndarray, " ch"]
     input_scale: Float32[np.ndarray, " ch"]

@@ -1,6 +1,6 @@
-"""Training jobs: a recipe on one fold with one seed, or a trained network fine-tuned on a new skin.
+"""Training jobs: a recipe on one fold with one seed, or fine-tuning of a trained network on a new skin.
 
-`JobKeys` names the result of a job by a digest of everything that decides it; finished trainings are cached by it.
+`JobKeys` makes the key under which a job's result is cached: a digest of everything that the result depends on.
 """
 
 import hashlib
@@ -21,7 +21,7 @@ from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe, Sch
 from reskin.numerics import device, signature
 
 COLLAPSED = 0.05  # explained variance of a target on training rows; sound networks explain more than 0.9
-# The modules whose code decides the result of a training (tests/models/test_job.py compares them with the imports).
+# The modules whose code the result of training depends on (tests/models/test_job.py compares them with the imports).
 CODE_MODULES = (
     "reskin.seeds",
     *(f"reskin.models.{name}" for name in ("batches", "inputs", "job", "losses", "network", "reproducible", "train")),
@@ -34,9 +34,9 @@ Weights = Mapping[str, np.ndarray]
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the loss terms beside the squared error on labelled rows.
+    """Weights of the loss terms that are added to the squared error on labelled rows.
 
-    triplet: triplet loss of labelled rows. unlabelled: triplet loss of unlabelled pokes of the new skin. few_labels:
+    triplet: triplet loss on labelled rows. unlabelled: triplet loss on unlabelled pokes of the new skin. few_labels:
     squared error on labelled pokes of the new skin.
     """
 
@@ -47,7 +47,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Changes of field, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row, for triplets."""
+    """Field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row, for triplets."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     target: Float32[np.ndarray, "f t"]
@@ -56,13 +56,13 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """A finished training.
+    """The result of a training run.
 
-    key: name of the result in the cache. curve: mean squared error of every block of steps. predicted: x, y in mm and
-    F in N for the test rows. stopped_step: step at which the training diverged; the weights are those before.
-    explained_min: least explained variance (R2) of a target on training rows; None for a short training. seconds: time
-    of the training, its share of the stack's. one_reading_s: median time of a prediction for one reading. reused:
-    finished by an earlier run. collapsed_before_n: trainings of the same job that collapsed before this one.
+    key: name of the result in the cache. curve: mean squared error in each block of steps. predicted: x, y in mm and
+    F in N for the test rows. stopped_step: step at which the training diverged; the weights are those before it.
+    explained_min: explained variance (R2) on training rows of the worst target; None for a short training run. seconds:
+    time of the training run, its share of the stack's time. one_reading_s: median time of a prediction for one reading.
+    reused: whether an earlier run computed it. collapsed_before_n: earlier training runs of this job, which collapsed.
     """
 
     key: str
@@ -79,7 +79,7 @@ class TrainingResult:
 
     @property
     def collapsed(self) -> bool:
-        """Whether the network predicts nearly the same for any input, for at least one target."""
+        """Whether the network predicts nearly the same value for any input, for at least one target."""
         return self.explained_min is not None and self.explained_min < COLLAPSED
 
 
@@ -96,7 +96,7 @@ class Pretrained:
 class Adaptation:
     """Self-supervised fine-tuning on unlabelled pokes of a new skin (paper section 5).
 
-    Of the rows of `lines`, only the change of field is used.
+    Only the field changes of the rows in `lines` are used.
     """
 
     start: Pretrained
@@ -115,10 +115,10 @@ class FineTuning:
 
 @dataclass(frozen=True)
 class TrainingJob:
-    """One training.
+    """One training run.
 
-    experiment: what the training is for, such as `lobo` (leave one board out). train, test: row numbers. skin: the skin
-    that is adapted to. what: a further part of the name. attempt_i: trainings of this job that collapsed before.
+    experiment: the experiment that it is for, such as `lobo` (leave one board out). train, test: row numbers. skin: the
+    skin to adapt to. what: a further part of the name. attempt_i: number of earlier training runs that collapsed.
     """
 
     experiment: str
@@ -155,7 +155,7 @@ class TrainingJob:
 
 
 class JobKeys:
-    """Keys of the results of jobs on the same data: digests of rows, recipe, seed, start, code and libraries."""
+    """Keys of results, for jobs on the same data: digests of rows, recipe, seed, start, code and libraries."""
 
     def __init__(self, data: TrainingData) -> None:
         self.data = data
@@ -177,7 +177,7 @@ class JobKeys:
         return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()[:32]
 
     def data_digest(self) -> str:
-        """Return a digest of all rows: fields, targets, and which rows are of one skin."""
+        """Return a digest of all rows: fields, targets, and the grouping of rows by skin."""
         return _digest(self.data.db_uT, self.data.target, np.unique(self.data.skin, return_inverse=True)[1])
 
     def _train_digest(self, train: np.ndarray) -> str:
@@ -197,7 +197,7 @@ def _digest(*arrays: np.ndarray) -> str:
 
 
 def median_call_s(call: Callable[[], object]) -> float:
-    """Return the median time of a call in s, of `REPEATS_N` after one that warms the caches."""
+    """Return the median time in s of `REPEATS_N` calls, after one call to warm the caches."""
     call()
     times_s = []
     for _ in range(REPEATS_N):

@@ -1,7 +1,7 @@
 """Training losses: the squared error, and the triplet loss of the paper (section 5) with the sampling of its triplets.
 
-A triplet is an anchor, a positive and a negative of one group (a skin, or a line of pokes), the positive strictly
-nearer to the anchor than the negative.
+A triplet is an anchor, a positive and a negative from one group (a skin, or a line of pokes), where the positive is
+strictly nearer to the anchor than the negative.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int64, Shaped
 
 from reskin.errors import TrainingError
 
-MAX_DRAWS_N = 100  # with half of the draws tied, 1e-30 of the anchors are left after so many
-TIE_RTOL = 1e-5  # of the sum of both squared distances; places are float32 numbers, equal distances differ by 1e-6
-COMPARED_PLACES_N = 64  # of a group; a place from which so many are equally far is not used as an anchor
+MAX_DRAWS_N = 100  # if half of the draws are ties, a share of 1e-30 of the anchors is left after this many
+TIE_RTOL = 1e-5  # relative to the sum of both squared distances; by float32 rounding, equal distances differ by 1e-6
+COMPARED_PLACES_N = 64  # places per group; a place with equal distances to all of these is not used as an anchor
 
 Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
 
@@ -27,7 +27,7 @@ def squared_error(
     An unknown target (NaN) has no gradient.
     """
     known = ~torch.isnan(truth)
-    # Masked before it is squared: NaN times zero is NaN, in the gradient too.
+    # Masked before squaring, because NaN times zero is NaN, also in the gradient.
     difference = torch.where(known, predicted - truth, 0.0)
     return (difference**2).sum((1, 2)) / known.sum((1, 2))
 
@@ -37,7 +37,7 @@ def triplet_loss(
 ) -> Float[torch.Tensor, " m"]:
     """Batch mean of max(0, |a - p|^2 - |a - n|^2): squared distances of features, without a margin (section 5).
 
-    Squares, not roots: the gradient of identical points is 0 and finite.
+    With squared distances, the gradient of identical points is 0 and finite.
     """
     positive_d2 = ((anchor - positive) ** 2).sum(-1)
     negative_d2 = ((anchor - negative) ** 2).sum(-1)
@@ -46,9 +46,9 @@ def triplet_loss(
 
 @dataclass(frozen=True)
 class TripletPoints:
-    """Points sorted by group: group g has `order[start[g] : start[g] + count[g]]`.
+    """Points sorted by group: the points of group g are `order[start[g] : start[g] + count[g]]`.
 
-    A point is an anchor if some other points of its group are nearer to it than others.
+    A point is an anchor if the other points of its group are not all at the same distance from it.
     """
 
     place: Float[np.ndarray, "n d"]
@@ -71,7 +71,7 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 
     Raises
     ------
-    TrainingError : all points of a group lie at one place, or no point is an anchor
+    TrainingError : all points of a group are at one place, or no point is an anchor
     """
     names, codes = np.unique(group, return_inverse=True)
     order = np.argsort(codes, kind="stable")
@@ -94,8 +94,8 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
     """Draw a positive and a negative for each anchor.
 
-    Both are drawn uniformly from the other points of the anchor's group; ties are drawn again. A point that is not an
-    anchor gets itself twice, so its loss and gradient are 0.
+    Both are drawn uniformly from the other points of the anchor's group; ties are drawn again. For a point that is not
+    an anchor, both are the point itself, so its loss and gradient are 0.
     """
     positive, negative = anchor.copy(), anchor.copy()
     left = np.flatnonzero(points.is_anchor[anchor])
@@ -120,7 +120,7 @@ def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.G
 
 
 def _find_anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Mark the points that have others at two different distances, among `COMPARED_PLACES_N` places of the group."""
+    """Mark the points that have points at two different distances, among `COMPARED_PLACES_N` places of the group."""
     places, index, points_n = _unique_places(place)
     others = places[:COMPARED_PLACES_N].astype(np.float64)
     d2 = ((places[:, None].astype(np.float64) - others) ** 2).sum(axis=2)  # [places others]
@@ -134,7 +134,7 @@ def _unique_places(
 ) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
     """Return the sorted unique places, the index of each point's place, and the number of points at each place.
 
-    As `np.unique(place, axis=0, ...)`, which compares rows as records and takes three times as long.
+    Like `np.unique(place, axis=0, ...)`, which compares rows as records and takes three times as long.
 
     >>> _unique_places(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
     (array([1, 0, 1]), array([1, 2]))

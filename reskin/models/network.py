@@ -1,7 +1,7 @@
-"""The networks of the paper and of its authors' release: architecture, first weights, and stacks of many networks.
+"""The networks of the paper and of its authors' release: architecture, initial weights, and stacks of many networks.
 
-A stack of m networks holds one tensor a layer, so that one batched product replaces m small ones: for networks of this
-size, calls cost more than sums.
+A stack of m networks has one tensor per layer, so that one batched product replaces m small products. For networks of
+this size, the overhead of calls is larger than the cost of the arithmetic.
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ from reskin.models.job import Weights
 from reskin.models.reproducible import affine
 
 HIDDEN_N = 200
-FEATURES_N = 40  # width of the bottleneck, on which the triplet loss acts (paper section 4)
+FEATURES_N = 40  # width of the bottleneck, where the triplet loss is applied (paper section 4)
 FEATURE_LAYERS_N = 3
 OUTPUTS_N = 3  # x, y, F; five with shear: x, y, Fx, Fy, Fz
-BLOCK_ROWS_N = 65_536  # predicted at once, to bound memory
+BLOCK_ROWS_N = 65_536  # rows predicted at once, to bound memory
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]
 
 
 def released_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """The network that the authors released: with a ReLU after layer 2 and one on the output, too."""
+    """The network that the authors released, which also has a ReLU after layer 2 and on the output."""
     return _layers(inputs_n, outputs_n, relus=(True, True, False, True, True, True))
 
 
@@ -46,7 +46,7 @@ LAYERS = {"paper": paper_layers, "released": released_layers}
 
 
 def draw_weights(layers: Sequence[Layer], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw first weights as PyTorch does for linear layers: uniform within 1/sqrt(fan in)."""
+    """Draw initial weights as PyTorch does for linear layers: uniform within 1/sqrt(fan in)."""
     weights = {}
     for i, layer in enumerate(layers, 1):
         limit = layer.in_n**-0.5
@@ -68,12 +68,12 @@ class Stack(nn.Module):
         self.relus = [layer.relu for layer in layers]
         self.members_n = len(members)
         numbers = range(1, len(layers) + 1)
-        # Contiguous: for a transposed view, autograd and AdamW would copy the gradients.
+        # Contiguous, because autograd and AdamW would copy the gradients of a transposed view.
         self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").mT.contiguous() for i in numbers)
         self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 
     def features(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 40"]:
-        """Output of the first three layers, on which the triplet loss acts."""
+        """Output of the first three layers, where the triplet loss is applied."""
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
     def head(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:

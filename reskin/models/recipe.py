@@ -1,4 +1,4 @@
-"""Recipes: the settings of a training, an adaptation or a fine-tuning."""
+"""Recipes: the settings of training, adaptation and fine-tuning."""
 
 from typing import Annotated, Literal
 
@@ -15,7 +15,7 @@ Weight = Annotated[float, Field(ge=0)]
 class Schedule(Strict):
     """Optimisation: AdamW under a one-cycle learning rate with peak `rate_max`.
 
-    Gradients (all weights of a network as one vector, scaled units) are clipped to a norm of `gradient_norm_max`.
+    The gradient (of all weights of a network as one vector, in scaled units) is clipped to norm `gradient_norm_max`.
     """
 
     steps_n: Annotated[int, Field(ge=1)]
@@ -28,10 +28,10 @@ class Schedule(Strict):
 class Recipe(Schedule):
     """How a network is trained, including what the paper leaves open.
 
-    architecture: that of the paper's text, or of the released network (ReLU after layer 2 and on the output). inputs:
-    the change of field as it is, or its direction and the logarithm of its length. scaling: per-channel
-    standardisation, or that of the released network (5 sd without mean; x/16, y/16, F/3). triplet_weight: weight of the
-    triplet loss; with 0 no triplet is drawn.
+    architecture: that of the paper's text, or that of the released network (with ReLU after layer 2 and on the output).
+    inputs: the field change as it is, or its direction and the logarithm of its length. scaling: standardisation of
+    each channel, or the scaling of the released network (divide by 5 sd, without mean; x/16, y/16, F/3).
+    triplet_weight: weight of the triplet loss; with 0, no triplets are drawn.
     """
 
     architecture: Literal["paper", "released"]
@@ -41,7 +41,7 @@ class Recipe(Schedule):
 
 
 class Augmentation(Strict):
-    """Copies of every training skin as other boards would read it; standard deviations of the boards' differences."""
+    """Copies of every training skin as other boards would read it; standard deviations between boards."""
 
     copies_n: Annotated[int, Field(ge=1, le=100)]
     gain_sd: Weight  # of each channel
@@ -56,9 +56,9 @@ class AugmentedRecipe(Recipe):
 
 
 class AdaptationRecipe(Schedule):
-    """Adaptation to a new skin: the recipe's loss, and the triplet loss of unlabelled pokes along lines (section 5).
+    """Adaptation to a new skin: the recipe's loss plus the triplet loss on unlabelled pokes along lines (section 5).
 
-    unlabelled_weight: weight of that triplet loss; with 0 it is the control.
+    unlabelled_weight: weight of that triplet loss; 0 for the control.
     """
 
     unlabelled_weight: Weight
@@ -71,6 +71,6 @@ class FineTuningRecipe(Schedule):
 
 
 class AdaptationWithBase(AdaptationRecipe):
-    """Adaptation of the networks that train_triplet trained by recipe `base`."""
+    """Adaptation of the networks that stage train_triplet trained with recipe `base`."""
 
     base: Name

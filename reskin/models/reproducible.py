@@ -1,10 +1,10 @@
-"""Differentiable operations whose results are the same bits on every x86-64 processor with AVX2.
+"""Differentiable operations whose results are bit-identical on every x86-64 processor with AVX2.
 
-On a CPU, PyTorch hands matrix products, `exp`, `log`, `sqrt` and `erf` to MKL, which computes them differently on AMD
-and Intel processors whatever MKL_CBWR says, and training amplifies a difference in the last bit to millimetres. Here
-products go through NumPy's OpenBLAS with the kernels that `reskin.numerics` selects, which is as fast for
-layers of this size; `exp` uses `exp2`, which is PyTorch's own. Other operations that the networks use (sums, ReLU,
-sigmoid, AdamW) are PyTorch's own code already; logarithms of inputs are taken in NumPy.
+On a CPU, PyTorch passes matrix products, `exp`, `log`, `sqrt` and `erf` to MKL, which computes them differently on AMD
+and Intel processors, even if MKL_CBWR is set, and training amplifies a difference in the last bit to millimetres. Here,
+products are computed by NumPy's OpenBLAS with the kernels that `reskin.numerics` selects, which is as fast for layers
+of this size; `exp` uses `exp2`, which PyTorch implements itself. PyTorch also implements the other operations of the
+networks (sums, ReLU, sigmoid, AdamW); logarithms of inputs are computed in NumPy.
 """
 
 import math
@@ -20,7 +20,7 @@ def affine(
 ) -> Float[torch.Tensor, "*n b o"]:
     """Return `values @ weight + bias`.
 
-    The layer is either one for all rows (`weight` has two dimensions) or one for each network of a stack (three).
+    `weight` has two dimensions for one layer for all rows, or three for one layer per network of a stack.
     """
     if weight.ndim == 2 and values.ndim > 2:
         rows = affine(values.flatten(end_dim=-2), weight, bias)
@@ -32,7 +32,7 @@ def affine(
 
 
 def exp(values: Float[torch.Tensor, "*s"]) -> Float[torch.Tensor, "*s"]:
-    """Return e to the power of each value; `torch.exp` is MKL's."""
+    """Return e to the power of each value, without `torch.exp`, which uses MKL."""
     return torch.exp2(values * math.log2(math.e))
 
 
@@ -55,5 +55,5 @@ class _Affine(torch.autograd.Function):
 
 
 def _product(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    with np.errstate(all="ignore"):  # as PyTorch: what overflows becomes inf, and the training loop looks for that
+    with np.errstate(all="ignore"):  # as in PyTorch: an overflow gives inf, which the training loop checks for
         return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))

@@ -1,8 +1,8 @@
-"""Run many training jobs in parallel, with a cache of finished trainings.
+"""Run many training jobs in parallel, with a cache of finished training runs.
 
-Jobs of equal settings and seed are trained as one stack. The place of a network in a stack shows in the last bits of
-its sums, so stacks are made of all jobs that are requested, finished or not, and a result is cached by the keys of all
-members of its stack. A stage that was killed goes on with the stacks that are not complete.
+Jobs of equal settings and seed are trained as one stack. The position of a network in its stack affects the last bits
+of its weights. Therefore stacks are made from all requested jobs, finished or not, and a result is cached under the
+keys of all members of its stack. A stage that was killed continues with the stacks that are not complete.
 """
 
 import hashlib
@@ -22,13 +22,12 @@ from reskin.models.inputs import Scaler
 from reskin.models.job import JobKeys, TrainingData, TrainingJob, TrainingResult
 from reskin.numerics import device
 
-MAX_ATTEMPTS_N = (
-    3  # trainings of one job; one that collapses in all of them is kept, recorded, and refused by `predict`
-)
-STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU more gain nothing, and two processes share
-NO_ROWS = np.zeros(0, np.int64)  # stands for row numbers that lie in the shared file
+# Training runs per job. A network that collapses in all of them is kept and recorded as such, and `predict` refuses it.
+MAX_ATTEMPTS_N = 3
+STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU, larger stacks are not faster
+NO_ROWS = np.zeros(0, np.int64)  # placeholder for row numbers that are in the shared file
 
-RemoteJob = tuple[TrainingJob, str, str]  # a job without its row numbers, and the names of those of `train` and `test`
+RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers, and the names of its `train` and `test` arrays
 FoldRows = Mapping[int, tuple[str, np.ndarray]]  # by id of the array: its name in the shared file, and the array
 
 
@@ -41,9 +40,9 @@ def run_jobs(
 
     Parameters
     ----------
-    data : rows that the jobs name by number
+    data : rows that the jobs refer to by number
     executor : where stacks are trained
-    cache : folder of finished trainings
+    cache : folder of finished training runs
     log : receives one line for each finished stack, and warnings
     """
     results = _run_once(jobs, data, executor, cache, log)
@@ -51,7 +50,7 @@ def run_jobs(
         collapsed = [i for i, result in enumerate(results) if result.collapsed]
         if not collapsed:
             break
-        log(f"{len(collapsed)} of {len(jobs)} trainings collapsed: once more with other draws")
+        log(f"{len(collapsed)} of {len(jobs)} training runs collapsed: training again with other draws")
         retries = [replace(jobs[i], attempt_i=attempt_i) for i in collapsed]
         for i, result in zip(collapsed, _run_once(retries, data, executor, cache, log), strict=True):
             seconds = results[i].seconds + result.seconds
@@ -69,11 +68,11 @@ def _run_once(
     missing = [(stack, files) for stack, files in planned if not all([_is_intact(file, log) for file in files])]
     fresh = {key for stack, _ in missing for key in stack}
     if len(fresh) < len(unique):
-        log(f"{len(unique) - len(fresh)} of {len(unique)} trainings were finished before")
+        log(f"{len(unique) - len(fresh)} of {len(unique)} training runs were finished before")
     if missing:
         shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"  # one for each process
         work = [([unique[key] for key in stack], files) for stack, files in missing]
-        # Row numbers are named by their content: a worker reads a set once, and no call carries 8 bytes a row.
+        # Arrays of row numbers are named by their content, so that a worker reads each once and calls stay small.
         sets = {id(rows): rows for stack, _ in work for job in stack for rows in (job.train, job.test)}
         folds = {i: (hashlib.sha256(rows.tobytes()).hexdigest()[:32], rows) for i, rows in sets.items()}
         skin = np.unique(data.skin, return_inverse=True)[1].astype(np.int64)
@@ -127,7 +126,7 @@ def _run_stacks(
 
 def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Sequence[Path]) -> None:
     """Train a stack in a worker, and write the result of each job to its file."""
-    from reskin.models.train import train_stack  # imports torch: only a process that trains needs it
+    from reskin.models.train import train_stack  # imported late: imports torch, which only workers need
 
     jobs = [
         replace(job, train=_read_rows(shared_file, train), test=_read_rows(shared_file, test))
@@ -136,7 +135,7 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
     try:
         results = train_stack(jobs, _read_data(shared_file))
     except RuntimeError as error:
-        if "out of memory" in str(error) or "allocate memory" in str(error):  # torch has no error of its own on a CPU
+        if "out of memory" in str(error) or "allocate memory" in str(error):  # on a CPU, torch raises only RuntimeError
             raise MemoryError(str(error)) from None
         raise
     for job, file, result in zip(jobs, files, results, strict=True):
@@ -150,13 +149,13 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
 
 
 def _is_intact(file: Path, log: Callable[[str], None]) -> bool:
-    """Return whether a result is in the cache; delete one that is damaged."""
+    """Return whether a result is in the cache and intact; delete a damaged file."""
     if not file.exists():
         return False
     try:
         io.read_tensors(file)
     except SchemaError as error:
-        log(f"warning: a finished training is damaged and is trained again ({str(error).partition('. ')[0]})")
+        log(f"warning: a cached result is damaged and is trained again ({str(error).partition('. ')[0]})")
         io.remove(file)
         return False
     return True

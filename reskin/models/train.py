@@ -20,10 +20,10 @@ from reskin.models.network import LAYERS, Predictor, Stack
 from reskin.models.recipe import Schedule
 from reskin.numerics import device
 
-BLOCK_STEPS_N = 50  # batches drawn at once, and steps between two looks at the loss
-DIVERGED = 1e8  # mean squared error of a network that is lost, where predicting the mean has 1; few come back from it
-CHECKED_STEPS_N = 200  # a shorter training from random weights may not have left its start
-CHECKED_ROWS_N = 2000  # of the training rows, evenly spaced
+BLOCK_STEPS_N = 50  # steps whose batches are drawn together, and between two checks of the loss
+DIVERGED = 1e8  # mean squared error from which a network hardly ever recovers; predicting the mean has 1
+CHECKED_STEPS_N = 200  # after fewer steps from random weights, a network may not have learned anything yet
+CHECKED_ROWS_N = 2000  # evenly spaced training rows
 
 # Defaults of torch.optim.lr_scheduler.OneCycleLR and torch.optim.AdamW.
 WARM_UP = 0.3  # of all steps
@@ -36,8 +36,8 @@ BETA2, EPS = 0.999, 1e-8
 class Outcome:
     """A trained network, and the mean squared error of every block of steps (scaled units).
 
-    `stopped_step` is set if a loss or a weight stopped being finite, or the loss passed `DIVERGED`; the weights are
-    then the last ones before.
+    `stopped_step` is set if a loss or a weight was not finite, or the loss exceeded `DIVERGED`; the weights are then
+    the last ones before this.
     """
 
     weights: Weights
@@ -47,7 +47,7 @@ class Outcome:
 
 def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[TrainingResult]:
     """Train jobs of equal settings side by side, and predict their test rows."""
-    torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
+    torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
     start_s, on, first = time.monotonic(), device(), jobs[0]
     if on == "cuda" and not torch.cuda.is_available():
         raise TrainingError("RESKIN_DEVICE=cuda, but torch finds no CUDA device. Unset it to train on the CPU.")
@@ -72,9 +72,9 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
 def train(
     jobs: Sequence[PreparedJob], architecture: str, schedule: Schedule, loss_weights: LossWeights, device: str
 ) -> list[Outcome]:
-    """Minimise the squared error and the weighted terms beside it.
+    """Minimise the squared error plus the weighted loss terms.
 
-    The paper names neither optimiser nor schedule: AdamW under torch's one-cycle rate and momentum are our choice.
+    The paper names neither optimiser nor schedule; AdamW with torch's one-cycle rate and momentum are our choice.
     """
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
     net = Stack(layers, [job.initial_weights for job in jobs]).to(device)
@@ -98,8 +98,8 @@ def train(
                 predicted = net(batch["few_labels"])
                 loss = loss + loss_weights.few_labels * squared_error(predicted, batch["few_labels_targets"])
             net.zero_grad()
-            loss.sum().backward()  # of a sum, each network's gradient is its own
-            clip_gradients(net, schedule.gradient_norm_max)  # one step too long can leave all ReLUs of a layer dead
+            loss.sum().backward()  # each network's gradient depends on its own term only
+            clip_gradients(net, schedule.gradient_norm_max)  # a single large step can make all ReLUs of a layer dead
             optimizer.step(*one_cycle(step_i, schedule.steps_n, schedule.rate_max))
             total += error.detach()
         if not monitor.check(total / steps_n, first_step + steps_n):
@@ -108,12 +108,12 @@ def train(
 
 
 def clip_gradients(net: Stack, norm_max: float) -> None:
-    """Scale down the gradient of each network, all its weights as one vector, to a norm of at most `norm_max`."""
+    """Scale the gradient of each network (of all its weights as one vector) to a norm of at most `norm_max`."""
     gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
     norm = torch.linalg.vector_norm(
         torch.stack([torch.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]), dim=0
     )
-    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # of a gradient of 0, 1
+    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # 1 for a gradient of 0
     for gradient in gradients:
         gradient.mul_(scale)
 
@@ -121,7 +121,7 @@ def clip_gradients(net: Stack, norm_max: float) -> None:
 def one_cycle(step_i: int, steps_n: int, rate_max: float) -> tuple[float, float]:
     """Return the learning rate and the first momentum of a step: two half cosines.
 
-    The rate rises to its peak, then falls to nearly nothing; the momentum falls meanwhile, then rises.
+    The rate rises to its peak, then falls to nearly zero; the momentum falls first, then rises.
 
     >>> [round(one_cycle(i, 10, 25.0)[0], 4) for i in (0, 2, 9)]
     [1.0, 25.0, 0.0001]
@@ -143,8 +143,8 @@ def _cosine(start: float, end: float, part: float) -> float:
 class AdamW:
     """torch's fused AdamW with rate and momentum given at each step.
 
-    Through the functional interface: the first `torch.optim.AdamW` of a process imports torch's compiler, a second of
-    CPU time. The bits are the same.
+    It uses the functional interface, because the first `torch.optim.AdamW` of a process imports torch's compiler, which
+    takes a second of CPU time. The results are bit-identical.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], weight_decay: float) -> None:
@@ -173,7 +173,7 @@ class Monitor:
         self.stopped_step: dict[int, int] = {}
 
     def check(self, error: Float[torch.Tensor, " m"], step: int) -> bool:
-        """Record the mean errors of a block; return whether any network of the stack still trains."""
+        """Record the mean errors of a block; return whether any network of the stack is still training."""
         is_sound = (self.net.is_finite() & (error <= DIVERGED)).tolist()  # a comparison with NaN is false
         for i in set(range(len(is_sound))) - set(self.stopped_step):
             if is_sound[i]:
@@ -191,7 +191,7 @@ class Monitor:
 def _explained_min(
     job: TrainingJob, data: TrainingData, network: Callable[[np.ndarray], np.ndarray], scaler: Scaler
 ) -> float | None:
-    """Return the least explained variance (R2) of the known targets on training rows; None for a short training."""
+    """Return the least explained variance (R2) of the known targets on training rows; None for a short training run."""
     if job.schedule.steps_n < CHECKED_STEPS_N:
         return None
     rows = job.train[:: -(-len(job.train) // CHECKED_ROWS_N)]

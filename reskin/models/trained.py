@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class CardRecipe(Strict, extra="ignore"):
-    """The part of a model's recipe that its use depends on."""
+    """The part of a model's recipe that predictions depend on."""
 
     architecture: Literal["paper", "released"]
     inputs: Literal["raw", "shape"]
@@ -42,7 +42,7 @@ class CardInput(Strict, extra="ignore"):
 
 
 class Card(Strict, extra="ignore"):
-    """The part of a model's card that its use depends on; the rest says where it comes from."""
+    """The part of a model's card that predictions depend on; the rest is provenance."""
 
     format: str
     recipe: CardRecipe
@@ -53,7 +53,7 @@ class Card(Strict, extra="ignore"):
 
 @dataclass(frozen=True)
 class Network:
-    """A trained network with its card: changes of field in uT -> x, y in mm and F in N."""
+    """A trained network with its card: field changes in uT -> x, y in mm and F in N."""
 
     card: Mapping[str, Any]
     tensors: Mapping[str, np.ndarray]
@@ -65,15 +65,15 @@ class Network:
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        """Built once: a controller predicts for every frame."""
-        from reskin.models.network import Predictor  # imports torch: only a process that predicts needs it
+        """The predictor, built once, because a controller predicts for every frame."""
+        from reskin.models.network import Predictor  # imported late: imports torch
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
         return Predictor(weights, self.card["recipe"]["architecture"], device())
 
 
 def read_network(model: Path) -> Network:
-    """Read a trained network and the card beside it.
+    """Read a trained network and its card, from the same folder.
 
     Raises
     ------
@@ -107,14 +107,14 @@ def read_network(model: Path) -> Network:
     if inputs_n != weights_n:
         raise SchemaError(
             f"{card_file}: {card.input.channels_n} channels with inputs {card.recipe.inputs} give {inputs_n} inputs, "
-            f"but the weights take {weights_n}. Is this the card of this model?"
+            f"but the weights are for {weights_n}. Is this the card of this model?"
         )
     require("torch", model)
     return Network(content, tensors)
 
 
 def _find_models(missing: Path) -> str:
-    """Return how to get a missing model file; stages write them to data/models/SCENE/STAGE."""
+    """Return how to get a missing model file; stages write model files to data/models/SCENE/STAGE."""
     if found := sorted(file.name for file in missing.parent.glob("*.safetensors")):
         return f"Models in its folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
     if missing.parts[-5:-3] != ("data", "models"):
@@ -124,7 +124,7 @@ def _find_models(missing: Path) -> str:
 
 
 def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
-    """Read the networks of train_multi with this board held out, one a seed."""
+    """Read the networks of stage train_multi with this board held out, one per seed."""
     found = []
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -137,7 +137,7 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
 
 
 def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Read the networks of an experiment by fold, one a seed; empty if the scene does not run it."""
+    """Read the networks of an experiment by fold, one per seed; empty if the scene does not run the experiment."""
     found: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -203,7 +203,7 @@ def _raw() -> Iterator[Node]:
 
 
 def _shape() -> Iterator[Node]:
-    """The direction and the natural log of the length, as `reskin.models.inputs.shape`."""
+    """Direction and natural log of the length, like `reskin.models.inputs.shape`."""
     yield "ReduceL2", (INPUT,), "length_uT"
     yield "Max", ("length_uT", "floor_uT"), "floored_uT"
     yield "Div", (INPUT, "floored_uT"), "direction"

@@ -203,7 +203,7 @@ def test_boards_draw_their_skins_independently():
 
 
 def test_repeated_number_of_sensors_is_refused():
-    with pytest.raises(ParamsError, match="names each number of skins once"):
+    with pytest.raises(ParamsError, match="must list each number of skins once"):
         parse(Split, {"sensors_skins_n": [3, 3]}, "scene")
 
 
@@ -307,7 +307,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
             poked(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
             "skin b0_s0: pokes to choose must be at most the 10 indentations of its pool; got 11",
         ),
-        (TWO_CAPTURES, "single_temporal", TEMPORAL, "no clock orders the 2 captures of skin s0: run10, run2"),
+        (TWO_CAPTURES, "single_temporal", TEMPORAL, "captures of skin s0 is unknown: run10, run2"),
     ],
 )  # fmt: skip
 def test_impossible_folds_are_refused(table, experiment, split, message):

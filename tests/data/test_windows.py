@@ -61,7 +61,7 @@ def test_parts_are_whole_rows():
 
 
 def test_two_captures_of_one_skin_are_refused():
-    with pytest.raises(ParamsError, match="no clock orders the 2 captures of skin s0: c0, c1"):
+    with pytest.raises(ParamsError, match="the order in time of the 2 captures of skin s0 is unknown: c0, c1"):
         check_one_each([readings("c0"), readings("c1")])
     check_one_each([readings("c0"), readings("c1", skin="s1")])
 

@@ -264,7 +264,7 @@ def test_rbf_keeps_rows_of_greater_weight():
 def test_rbf_refuses_too_many_weighted_rows():
     db_uT, target = rows(n=300)
     weight = np.where(np.arange(300) < 50, 20, 1).astype(np.float32)
-    with pytest.raises(TrainingError, match="rows_max_n must be more than the 50 rows of greater weight; got 50"):
+    with pytest.raises(TrainingError, match="rows_max_n must be more than the 50 labelled rows of the skin; got 50"):
         fit_to("rbf_ridge", db_uT, target, weight, rows_max_n=50)
 
 

@@ -134,7 +134,7 @@ def test_damaged_result_is_reported_and_retrained(tmp_path, damage):
     content[-5] ^= 1  # one bit of a weight, which the file format does not detect
     file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
     again = run(jobs(), tmp_path, log=log)
-    assert [line.startswith("warning: a finished training is damaged") for line in log[:2]] == [True, False]
+    assert [line.startswith("warning: a cached result is damaged") for line in log[:2]] == [True, False]
     assert all(alike(a, b) for a, b in zip(first, again, strict=True))
 
 
@@ -159,7 +159,7 @@ def test_finished_jobs_are_not_trained_again(tmp_path):
     first = run(jobs(), tmp_path)
     again = run(jobs(), tmp_path, InlineExecutor(die_after=0), log)
     assert all(alike(a, b) for a, b in zip(first, again, strict=True))
-    assert log == ["3 of 3 trainings were finished before"]
+    assert log == ["3 of 3 training runs were finished before"]
 
 
 @pytest.mark.parametrize(

@@ -390,7 +390,7 @@ def test_killed_stage_keeps_finished_folds(story):
     assert not models.exists()
     environment |= ENVIRONMENT  # the other trainings run in this process
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
-    assert f"{finished_n} of 6 trainings were finished before" in again.stderr
+    assert f"{finished_n} of 6 training runs were finished before" in again.stderr
     assert len(list(models.glob("*.safetensors"))) == 6
 
 

@@ -1,10 +1,10 @@
-// Draws what session.py sends: binary messages (Traces.message) as numbers, board and traces; JSON (Session.state) as text.
-// Each board has a socket, a state and canvases of its own: one that is unplugged leaves the others as they are.
+// Draws the messages of session.py: binary ones (Traces.message) as numbers, board and traces; JSON (Session.state) as text.
+// Each board has its own socket, state and canvases, so that an unplugged board does not affect the others.
 "use strict";
 const NUMBERS_N = 12, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;
-const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a change of field of this is an arrow as long, a large one twice: few leave the canvas
+const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a field change of ARROW_UT is an arrow of ARROW_MM; no arrow exceeds twice that
 const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // force, chips
-const style = getComputedStyle(document.documentElement); // as it is now, whenever it is asked
+const style = getComputedStyle(document.documentElement); // live: follows changes of the colour scheme
 const colour = (name) => style.getPropertyValue(name);
 const ink = (j) => { const name = COLOURS[j ? 1 + (j - 1) % (COLOURS.length - 1) : 0]; return name.startsWith("--") ? colour(name) : name; };
 const number = (value, digits, unit) => value === undefined || Number.isNaN(value) ? "–" : `${value.toFixed(digits)} ${unit}`;
@@ -45,12 +45,12 @@ class Board {
     const [x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50, screen99] = values;
     this.last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50,
       screen99, change: values.slice(NUMBERS_N, first)};
-    if (bins) { // the last bin that we have may have grown: it comes again
+    if (bins) { // the last bin may have changed, so it is sent again
       const low = first + bins, high = low + bins * width, t = view.getFloat64(8, true), bin = (i) => Math.round((t + values[first + i]) / BIN_S);
       while (this.rows.length && this.rows[this.rows.length - 1].n >= bin(0)) this.rows.pop();
       for (let i = 0; i < bins; i++) this.rows.push({n: bin(i), low: values.slice(low + i * width, low + (i + 1) * width),
         high: values.slice(high + i * width, high + (i + 1) * width)});
-      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // from where a line comes in on the left
+      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // a line may enter the window from this bin
       this.rows = this.rows.slice(Math.max(this.rows.findIndex(({n}) => n >= oldest), 0));
       this.changed = Math.min(this.changed, bin(0));
     }
@@ -60,8 +60,8 @@ class Board {
   show(next) {
     const state = this.state = next;
     this.say("what", state.waiting ? `${state.what || ""}: waiting for data` : state.what);
-    this.say("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "Places of its chips are not known: drawn in a row. "}` +
-      (state.model ? `Model: ${state.model}.` : "No model: neither place nor force; try --model."));
+    this.say("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "The places of its chips are unknown: they are drawn in a row. "}` +
+      (state.model ? `Model: ${state.model}.` : "No model, so no place or force; try --model."));
     this.list("alarms", state.alarms);
     this.list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n}, within ${s} s`));
     this.parts.zero.disabled = this.parts.record.disabled = state.waiting;
@@ -80,9 +80,9 @@ class Board {
   chosen(state) { return state.next_mm ? "places" : "adapt"; }
 
   drawBoard() {
-    const {state, last} = this; // of a silent board the last reading says nothing about now
+    const {state, last} = this; // if the board is silent, the last reading is out of date and not drawn
     const [wide, high] = state.skin_mm || [20, 20], [left, bottom] = state.corner_mm || [-2, -2], margin = MARGIN_PX;
-    const scale = Math.max(Math.min((this.parts.board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high), .1); // a hidden window is 0 high
+    const scale = Math.max(Math.min((this.parts.board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high), .1); // a hidden window has height 0
     const [pen] = penOn(this.parts.board, high * scale + 2 * margin);
     const at = (x, y) => [margin + (x - left) * scale, margin + (bottom + high - y) * scale];
     pen.fillStyle = colour("--skin"); pen.strokeStyle = colour("--line");
@@ -91,7 +91,7 @@ class Board {
     pen.lineWidth = 2;
     state.chips_mm.forEach(([x, y], i) => {
       const [px, py] = at(x, y), side = Math.max(1.5 * scale, 8);
-      pen.strokeStyle = ink(i + 1); pen.strokeRect(px - side / 2, py - side / 2, side, side); // as its trace
+      pen.strokeStyle = ink(i + 1); pen.strokeRect(px - side / 2, py - side / 2, side, side); // in the colour of its trace
       pen.fillStyle = colour("--soft"); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
       if (last && !state.silent && last.chips === state.chips_mm.length) arrow(pen, px, py, last.change.subarray(3 * i, 3 * i + 3), scale);
     });
@@ -124,11 +124,11 @@ class Board {
     this.say("screen", `${number(last.screen50, 0, "ms")} (median), ${number(last.screen99, 0, "ms")} (99 %)`);
     if (document.hidden || last === this.drawn) return;
     this.drawn = last;
-    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // drawn by then
+    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // it has been drawn by then
   }
 }
 
-function penOn(canvas, high) { // a pen in CSS pixels, on a canvas that is as sharp as the screen and empty
+function penOn(canvas, high) { // clears a canvas, sets it to the screen's resolution, and returns a context in CSS pixels
   const ratio = devicePixelRatio || 1, wide = canvas.clientWidth, size = [Math.floor(wide * ratio), Math.floor(high * ratio)];
   if (canvas.width !== size[0] || canvas.height !== size[1]) { [canvas.width, canvas.height] = size; canvas.style.height = `${high}px`; }
   const pen = canvas.getContext("2d");
@@ -136,7 +136,7 @@ function penOn(canvas, high) { // a pen in CSS pixels, on a canvas that is as sh
   return [pen, wide, ratio];
 }
 
-function arrow(pen, px, py, [bx, by, bz], scale) { // in the plane; a ring is the part along z
+function arrow(pen, px, py, [bx, by, bz], scale) { // an arrow for x and y; a ring for z
   const size = 2 * ARROW_MM * scale / (ARROW_UT + Math.hypot(bx, by, bz)), dx = bx * size, dy = -by * size, long = Math.hypot(dx, dy), turn = Math.atan2(dy, dx);
   pen.strokeStyle = colour("--ink");
   pen.beginPath(); pen.arc(px, py, Math.abs(bz) * size, 0, 7); pen.setLineDash(bz < 0 ? [3, 3] : []); pen.stroke(); pen.setLineDash([]);
@@ -149,7 +149,7 @@ function arrow(pen, px, py, [bx, by, bz], scale) { // in the plane; a ring is th
 function draw() {
   while (boards.length < Math.max(boards[0].state.boards_n || 0, 1)) boards.push(new Board(boards.length));
   document.getElementById("boards").classList.toggle("single", boards.length === 1);
-  const end_ms = performance.now() + DRAWING_MS; // boards take turns where a screen's time is too short for all
+  const end_ms = performance.now() + DRAWING_MS; // boards take turns if one frame's time is too short for all
   for (let i = 0; i < boards.length && performance.now() < end_ms; i++) boards[next++ % boards.length].draw();
   requestAnimationFrame(draw);
 }

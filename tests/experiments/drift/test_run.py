@@ -117,7 +117,7 @@ def test_recordings_have_no_added_walk(scene, tmp_path):
 @pytest.mark.parametrize(
     ("captures", "sentence"),
     [
-        ([capture("c0"), capture("c1")], "no clock orders the 2 captures of skin s0"),
+        ([capture("c0"), capture("c1")], "the order in time of the 2 captures of skin s0 is unknown"),
         (
             [capture("c0", pokes_n=129)],
             "the shortest capture must be at least drift.every_n . test_n = 130 long; got 129",
