@@ -14,24 +14,24 @@ from reskin.errors import SchemaError
 from reskin.universal.map import Estimate
 from reskin.universal.network import FULL_SET_N
 
-CHANNELS_N = 15  # of five chips, three axes each
-FIELD_MAX_uT = 1e6  # 20 times the range of a chip: no press, and its square fits single precision
-LABELS_MAX_N = 2000  # memory grows with their square, time faster
+CHANNELS_N = 15  # five chips with three axes each
+FIELD_MAX_uT = 1e6  # 20 times the range of a chip, so no press exceeds it; its square fits single precision
+LABELS_MAX_N = 2000  # memory grows with the square of the number, time even faster
 
 
 def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Return one reading or several as rows; raise SchemaError on those of another board."""
+    """Return one or several readings as rows; raise SchemaError if they have another number of channels."""
     rows_uT = np.atleast_2d(np.asarray(b_uT, float))
     if rows_uT.ndim != 2 or rows_uT.shape[1] != CHANNELS_N:
         shape = np.shape(b_uT)
         raise SchemaError(
-            f"fields of shape {shape} do not have the {CHANNELS_N} channels of five chips. Load a model of such boards."
+            f"fields of shape {shape} do not have the {CHANNELS_N} channels of five chips. Use a model for such boards."
         )
     return rows_uT
 
 
 def check_readings(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Return calibration readings as rows; raise SchemaError on values that are not finite or out of range."""
+    """Return calibration readings as rows; raise SchemaError for values that are not finite or out of range."""
     rows_uT = check_shape(b_uT)
     _need("fields", "calibration readings", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
     rule = f"at most {FIELD_MAX_uT:,.0f} uT in size"
@@ -45,9 +45,9 @@ def check_labels(
     rows_n: int,
     reach_mm: Float[np.ndarray, "2 2"],
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, " m"]]:
-    """Return labels as arrays; raise SchemaError on places outside `reach_mm` or forces of 0 N or less.
+    """Return labels as arrays; raise SchemaError for places outside `reach_mm` or forces of 0 N or less.
 
-    There are as many as readings, at most LABELS_MAX_N.
+    There must be as many labels as readings, and at most LABELS_MAX_N.
     """
     places_mm, forces_N = np.atleast_2d(place_mm), np.atleast_1d(force_N)
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n}, {CHANNELS_N})"
@@ -57,7 +57,7 @@ def check_labels(
             f"{CHANNELS_N}]."
         )
     if rows_n > LABELS_MAX_N:
-        raise SchemaError(f"labels: {rows_n} are too many, at most {LABELS_MAX_N} can be used. Take some of them.")
+        raise SchemaError(f"labels: {rows_n} are too many, at most {LABELS_MAX_N} can be used. Use some of them.")
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
     _need("labels", "places", f"on the skin, {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
@@ -73,20 +73,20 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, holds: Bool[np.ndar
 
 
 FORMAT = "reskin-skin-1"
-SHAPES: Mapping[str, tuple[int, ...]] = {  # of the arrays, after the number of presses
+SHAPES: Mapping[str, tuple[int, ...]] = {  # shapes of the arrays, without the first axis (presses)
     "pokes_uT": (CHANNELS_N,),
     "even_uT": (CHANNELS_N,),
     "labelled_mm": (2,),
     "labelled_N": (),
     "labelled_uT": (CHANNELS_N,),
 }
-FILE_BYTES_MAX_N = 2**20  # a full set of presses and LABELS_MAX_N labels take a third of it
-REMEDY = "Take a file that `save` wrote."
+FILE_BYTES_MAX_N = 2**20  # three times the size of a full set of presses and LABELS_MAX_N labels
+REMEDY = "Give a file that `save` wrote."
 
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Presses at known places (from the board's middle) under known forces, and their changes of field."""
+    """Presses at known places (relative to the board's centre) with known forces, and their field changes."""
 
     place_mm: Float[np.ndarray, "m 2"]
     force_N: Float[np.ndarray, " m"]
@@ -110,10 +110,10 @@ def no_labels() -> LabelledPresses:
 
 @dataclass(frozen=True)
 class CalibrationData:
-    """All that is known of one skin, along the board's axes.
+    """All calibration data of one skin, along the board's axes.
 
-    rest_uT: its no-load field. presses_uT: changes of field of presses at unknown places, at most a full set. even_uT:
-    those of them that lie evenly over the skin. labels: presses at known places.
+    rest_uT: no-load field. presses_uT: field changes for presses at unknown places, at most a full set. even_uT: the
+    same for presses that are evenly spread over the skin. labels: presses at known places.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -123,19 +123,19 @@ class CalibrationData:
 
 
 def write_calibration(data: CalibrationData, file: Path) -> None:
-    """Write calibration data as safetensors; the model is not in the file."""
+    """Write calibration data, without the model, as safetensors."""
     labels = data.labels
     values = (data.presses_uT, data.even_uT, labels.place_mm, labels.force_N, labels.db_uT)
     io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
 
 
 def is_calibration(file: Path) -> bool:
-    """Tell whether `write_calibration` wrote a file; raise SchemaError on a damaged small file."""
+    """Return whether `write_calibration` wrote a file; raise SchemaError for a small file that is damaged."""
     return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") == FORMAT
 
 
 def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
-    """Read calibration data; raise SchemaError on places that are not within `reach_mm` of the middle."""
+    """Read calibration data; raise SchemaError for places outside `reach_mm`, which is relative to the centre."""
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(
             f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
@@ -159,19 +159,20 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
     return CalibrationData(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], labels)
 
 
-FOLDS_N = 5  # of the cross-validation over labels
-PRIOR_N = 40.0  # coordinates with a variance inflation of 1 that labels are weighed against (docs/learning.md)
-NORMAL_MEAN = math.sqrt(2 / math.pi)  # of |z|
+FOLDS_N = 5  # folds of the cross-validation over labels
+PRIOR_N = 40.0  # prior weight of a variance inflation of 1, in numbers of coordinates (docs/learning.md)
+NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| for a standard normal z
 
 HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]  # estimates for each power, and true places in mm
 
 
 @dataclass(frozen=True)
 class LikelihoodPowers:
-    """Likelihood powers at a misfit of 1, measured on simulated skins: by numbers of unlabelled presses and of labels.
+    """Likelihood powers for a misfit of 1, measured on simulated skins, by numbers of unlabelled presses and labels.
 
-    anywhere: presses at unknown places, first key their number. even: presses that lie evenly over the skin. Powers
-    are interpolated between numbers of labels; for presses the next smaller number counts.
+    anywhere: by number of presses at unknown places, then by number of labels. even: by number of labels, for presses
+    that are evenly spread over the skin. Powers are interpolated between numbers of labels; for a number of presses,
+    the next smaller number in the table is used.
     """
 
     anywhere: Mapping[int, Mapping[int, float]]
@@ -184,7 +185,7 @@ class LikelihoodPowers:
         return float(np.exp(np.interp(labels_n, known_n, np.log([known[n] for n in known_n]))))
 
     def are_enough(self, presses_n: int) -> bool:
-        """Tell whether so many presses are enough for their misfit to count."""
+        """Return whether this number of presses is enough for their misfit to be used."""
         return any(0 < n <= presses_n for n in self.anywhere)
 
     def to_card(self) -> dict[str, dict[str, Any]]:
@@ -213,18 +214,18 @@ def lower_by_misfit(power: float, misfit: float) -> float:
 
 
 def lower_by_residuals(power: float, inflation: float) -> float:
-    """Lower a power by the variance inflation that held-out labels show; at most 1."""
+    """Lower a power by the variance inflation of held-out labels; at most 1."""
     return min(1.0, power / inflation)
 
 
 def folds_of_labels(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " l"]]]:
-    """Split labels for cross-validation, every fifth into one fold: indices kept, indices held out."""
+    """Split labels for cross-validation, every fifth in the same fold; return indices kept and indices held out."""
     fold = np.arange(labels_n) % FOLDS_N
     return [(np.flatnonzero(fold != i), np.flatnonzero(fold == i)) for i in range(min(FOLDS_N, labels_n))]
 
 
 def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
-    """Return by what factor squared errors of held-out labels exceed the estimated variances, for each power."""
+    """Return for each power the factor by which squared errors of held-out labels exceed the estimated variances."""
     found = []
     for i in range(powers_n):
         off = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
@@ -233,5 +234,5 @@ def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
 
 
 def variance_inflation(off: Float[np.ndarray, "m 2"]) -> float:
-    """Return the factor from absolute errors in standard deviations, by their mean (an outlier is not squared)."""
+    """Return the factor from the mean absolute error in standard deviations, so that outliers are not squared."""
     return ((PRIOR_N + float(off.sum()) / NORMAL_MEAN) / (PRIOR_N + off.size)) ** 2

@@ -1,7 +1,8 @@
-"""Physics inversion, a reference method: fit a law to one skin alone, then search it for each reading.
+"""Physics inversion, a reference method: fit a law to one skin alone, then search the best place for each reading.
 
 The law is fitted by least squares to the no-load field and to presses at unknown places, from nominal parameters. The
-residual of a search is large on a skin that the law does not describe. Places in the board's frame, fields in its axes.
+residual of a search is large on a skin that the law does not describe. Places are in the board's frame, fields along
+its axes.
 """
 
 from dataclasses import dataclass
@@ -13,21 +14,21 @@ from scipy.optimize import least_squares
 from reskin.universal.law import PRIOR, STEP, Law, OFFSET_uT, Setup, at_rest_uT, inside, simulate_uT, with_parameters
 from reskin.universal.map import FORCES_N, NOMINAL, lattice_mm
 
-# Stiffness and labels' offset stay nominal: fields do not tell them without known forces and places.
+# Stiffness and offset of the labels stay nominal: fields without known forces and places do not determine them.
 PARAMETERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "away_um_mm", "give_x_um", "give_y_um")
-LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin lies above its chips
-PRIOR_WEIGHT = 0.5  # assumed: that of `law.fit` was chosen on recorded boards
-ROUNDS_N = 3  # of searching places under a law, then fitting parameters and places together
-EVALUATIONS_MAX_N = 8  # of all derivatives, in a round
-STEP_MM, STEP_LOG_N = 0.05, 0.03  # of differences by place and by log force
+LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin is above its chips
+PRIOR_WEIGHT = 0.5  # assumed; the weight in `law.fit` was chosen on recorded boards
+ROUNDS_N = 3  # rounds of searching places with a law, then fitting parameters and places together
+EVALUATIONS_MAX_N = 8  # evaluations of all derivatives per round
+STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of finite differences in place and log force
 REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # bounds of places and forces
-CELL = 1.0  # most steps of the lattice from the nearest point to the result of a search
-BLOCK_N = 500  # readings at a time, to bound memory
+CELL = 1.0  # maximum distance between the nearest point and the result of a search, in steps of the lattice
+BLOCK_N = 500  # readings searched at once, to bound memory
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Fields of a law at a lattice of places and forces, and their slopes per step of the lattice."""
+    """Fields of a law on a lattice of places and forces, and their slopes per step of the lattice."""
 
     place_mm: Float[np.ndarray, "h 2"]
     log_N: Float[np.ndarray, " h"]
@@ -46,7 +47,7 @@ class Found:
 
 
 def chart(law: Law, setup: Setup) -> Chart:
-    """Simulate a law at every place and force of the lattice: some 2,900 presses, a second."""
+    """Simulate a law at every place and force of the lattice: about 2,900 presses in a second."""
     axis_mm, log_N = lattice_mm(), np.log(FORCES_N)
     at = np.stack(np.meshgrid(axis_mm, axis_mm, log_N, indexing="ij"), axis=-1)
     flat = at.reshape(-1, 3)
@@ -64,7 +65,7 @@ def search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
 
 
 def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
-    far_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T  # less |dB|^2, equal for all points
+    far_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T  # without |dB|^2, which is constant
     at = far_uT2.argmin(axis=1)
     off_uT, slope_uT = db_uT - known.field_uT[at], known.slope_uT[at]
     square = slope_uT.transpose(0, 2, 1) @ slope_uT
@@ -78,7 +79,7 @@ def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
 
 
 def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, " ch"], setup: Setup) -> Law:
-    """Fit a law to unlabelled presses and the no-load field, from nominal parameters: some 6 s for 65 presses."""
+    """Fit a law to unlabelled presses and the no-load field, from nominal parameters: about 6 s for 65 presses."""
     law = NOMINAL
     for _ in range(ROUNDS_N):
         law = _JointFit(law, setup, db_uT, rest_uT).solve(search(chart(law, setup), db_uT))
@@ -116,7 +117,7 @@ class _JointFit:
         return np.concatenate([each.ravel(), rest, held])
 
     def slopes(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "r p"]:
-        # A press's coordinates change its own rows alone: three simulations of all presses give all their columns.
+        # A press's coordinates affect only its own rows, so three simulations of all presses give all these columns.
         n, channels_n = self.db_uT.shape
         first, parameters_n = self.residuals(values), len(PARAMETERS)
         columns = np.zeros((len(first), len(values)))

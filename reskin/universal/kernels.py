@@ -1,8 +1,8 @@
 """Compiled loops of the map: likelihoods of hypotheses given readings, and means over hypotheses.
 
-A hypothesis is a place and a force; forces run within places. Its Gaussian is held as the inverse root W of the
-covariance and W times the mean, so that chi^2 = |W d - W m|^2. Likelihoods are in single precision: chi^2 is off by
-less than 0.01 where a reading is likely.
+A hypothesis is a place and a force; the force index varies fastest. Its Gaussian is stored as the inverse root W of the
+covariance and W times the mean m, so that chi^2 = |W d - W m|^2 for a reading d. Likelihoods are in single precision:
+the error of chi^2 is below 0.01 for hypotheses under which a reading is likely.
 """
 
 import math
@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 from numba import njit
 
-LANES_N = 64  # Gaussians in a block, axis `l`: a row of vector instructions each
+LANES_N = 64  # Gaussians per block, axis `l`, for vector instructions
 
 
 @dataclass(frozen=True)
 class LinearMeans:
-    """Means of Gaussians that are linear in some parameters, in blocks; the last Gaussian fills up its block."""
+    """Means of Gaussians that are linear in some parameters, in blocks; copies of the last Gaussian fill its block."""
 
     mean: Float32[np.ndarray, "k ch l"]
     slope: Float32[np.ndarray, "k ch t l"]
@@ -26,7 +26,7 @@ class LinearMeans:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Whitened Gaussians: for each channel W m and W's row up to it, and the log determinant of the covariance."""
+    """Whitened Gaussians: for each channel, W m and the row of W up to it; log determinants of covariances."""
 
     row: Float32[np.ndarray, "f h"]
     log_det: Float32[np.ndarray, " h"]
@@ -41,7 +41,7 @@ class Gaussians:
 
 
 def in_blocks(mean: Float32[np.ndarray, "h ch"], slope: Float32[np.ndarray, "h ch t"]) -> LinearMeans:
-    """Lay Gaussians out in blocks."""
+    """Arrange Gaussians in blocks."""
     blocks_n = -(-len(mean) // LANES_N)
     of_lane = np.minimum(np.arange(blocks_n * LANES_N), len(mean) - 1).reshape(blocks_n, LANES_N)
     return LinearMeans(*(np.ascontiguousarray(np.moveaxis(part[of_lane], 1, -1)) for part in (mean, slope)))
@@ -138,7 +138,7 @@ def _cov(s, var, error_cov, noise_var, a):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _root(a, log_det):
-    # Cholesky's root L in place of the lower triangle; its diagonal holds 1/L.
+    # Replace the lower triangle by the Cholesky factor L, with 1/L on the diagonal.
     _clear(log_det)
     for j in range(len(a)):
         for p in range(j):
@@ -154,7 +154,7 @@ def _root(a, log_det):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _inverse(a, b):
-    # The inverse of the root L in `a`, also lower.
+    # The inverse of the factor L in `a`, also lower triangular.
     for j in range(len(a)):
         b[j, j] = a[j, j]
         for i in range(j + 1, len(a)):
@@ -178,7 +178,7 @@ def _write(b, m, log_det, row):
     row[f] = log_det[:n]
 
 
-# Loops over lanes are written out, as expressions of arrays are not vectorised.
+# Loops over lanes are written out, because array expressions are not vectorised.
 @njit(inline="always")
 @no_type_check
 def _add(total, one, other):
@@ -214,20 +214,20 @@ def _clear(value):
         value[lane] = np.float32(0)
 
 
-CELL_SD_MM = 0.2  # least standard deviation of a place: its position within a cell of the lattice
-TINY = float(np.finfo(np.float32).tiny)  # least probability of a place by the map
+CELL_SD_MM = 0.2  # least standard deviation of a place, because of its position within a cell of the lattice
+TINY = float(np.finfo(np.float32).tiny)  # least probability of a place in the map
 LEAST = math.log(TINY)
-FARTHEST = 200.0  # below the largest log likelihood: smaller ones are raised to this
+FARTHEST = 200.0  # log likelihoods are raised to at least the largest one minus this
 
 
 class Lattice(NamedTuple):
-    """Places of the hypotheses, and the logarithms of forces at each."""
+    """Places of the hypotheses, and the logarithms of the forces at each place."""
 
     place_mm: Float[np.ndarray, "p 2"]
     log_N: Float[np.ndarray, " q"]
 
 
-Normals = Float[np.ndarray, "n 6"]  # means of x and y, their standard deviations; mean of log F and its own
+Normals = Float[np.ndarray, "n 6"]  # means of x and y, their standard deviations; mean and sd of log F
 Moments = tuple[np.ndarray, np.ndarray, np.ndarray]  # x and y [n 2], their standard deviations [n 2], force in N [n]
 
 
@@ -236,7 +236,7 @@ def means(
 ) -> Moments:
     """Return means over all hypotheses, weighted by a power of their likelihoods.
 
-    deviance: -2 log likelihoods less a constant. best: the likeliest hypothesis of each reading.
+    deviance: -2 log likelihood, up to a constant. best: the most likely hypothesis of each reading.
     """
     found = np.empty((len(deviance), 5))
     _means(deviance, best, tuple(lattice), 0.5 * power, found)
@@ -247,9 +247,9 @@ def products(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
     map_power: float, power: float,
 ) -> Moments:  # fmt: skip
-    """Return means over hypotheses of the map's probabilities times normals, of places and of forces separately.
+    """Return moments of the map's probabilities times normal distributions, for places and forces separately.
 
-    map_power: power of the map's likelihoods. power: of the product, for standard deviations alone.
+    map_power: power of the map's likelihoods. power: power of the product, for standard deviations only.
     """
     found = np.empty((len(deviance), 5))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), found)
@@ -328,7 +328,7 @@ def _margins(likely, of_place, of_force):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _moments(log, place_mm, about_mm, power, likely):
-    # Means of x and y, and of their squares about a place, of a power of the probabilities; `likely` is working memory.
+    # Moments of a power of the probabilities: means of x and y, mean squares about a place; `likely` is working memory.
     most, sum_, x, y, xx, yy = _most(log), 0.0, 0.0, 0.0, 0.0, 0.0
     for p in range(len(log)):
         likely[p] = _exp(power * (log[p] - most))

@@ -1,4 +1,4 @@
-"""The law of a skin: ten parameters and a rotation that give the change of field at any place and force.
+"""The law of a skin: ten parameters and a rotation that determine the field change for any place and force.
 
 Also fits the law to the presses of one board. Units: uT, mm, N.
 """
@@ -18,28 +18,30 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
 from reskin.universal.presses import RecordedPresses, lengths_uT
 
-MARGIN_MM = 0.4  # beyond the outermost places of the paper's grid
-HALF_MM, CORNER_MM = 8.0, 12.0  # of that grid: |x| and |y|, |x| + |y|
+MARGIN_MM = 0.4  # margin around the outermost places of the paper's grid
+HALF_MM, CORNER_MM = 8.0, 12.0  # largest |x| or |y|, and largest |x| + |y|, of that grid
 
 
 def inside(place_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Return which places lie on the octagon of the paper's grid, with a margin around it."""
+    """Return which places are within the octagon of the paper's grid, with a margin around it."""
     x_mm, y_mm = np.abs(place_mm).T
     return (np.maximum(x_mm, y_mm) <= HALF_MM + MARGIN_MM) & (x_mm + y_mm <= CORNER_MM + 1.5 * MARGIN_MM)
 
 
-RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as scene quick: the cheapest under 2 % of dB (experiment runtime)
+RULE = Quadrature(
+    cell_m=0.8e-3, layers_n=5
+)  # as in scene quick: the cheapest with an error below 2 % of dB (`runtime`)
 
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of one skin on its board: the first seven may differ between boards, the others are of the rig."""
+    """Parameters of one skin on its board: the first seven may differ between boards, the others belong to the rig."""
 
-    seat_x_mm: float  # the skin's middle, seen from the board's
+    seat_x_mm: float  # the skin's centre relative to the board's centre
     seat_y_mm: float
-    rotation_deg: float  # of the skin about z
-    gap_mm: float  # from the chips to the skin, as fitted: it trades off against the amplitude
-    amplitude: float  # of the magnetisation, relative to nominal
+    rotation_deg: float  # rotation of the skin about z
+    gap_mm: float  # fitted distance from the chips to the skin, which trades off against the amplitude
+    amplitude: float  # magnetisation relative to nominal
     label_x_mm: float  # from the label to the tip, along the board's axes
     label_y_mm: float
     modulus_MPa: float
@@ -47,11 +49,11 @@ class Law:
     give_x_um: float
     give_y_um: float
     # Not fitted.
-    lets_go_N: float = 8.0  # force at which the slide towards the middle ends: chosen on both boards of scene lab
+    lets_go_N: float = 8.0  # force at which the slide towards the centre ends; chosen on both boards of scene lab
     grip_N_mm: float = 8.75  # springs of 7 N/mm over a friction of 0.8 (nominal.yaml: skin.hold)
-    tilt_x_deg: float = 0.0  # of the skin over the board
+    tilt_x_deg: float = 0.0  # tilt of the skin over the board
     tilt_y_deg: float = 0.0
-    label_rotation_deg: float = 0.0  # of the labels' axes about the board's middle
+    label_rotation_deg: float = 0.0  # rotation of the labels' axes about the board's centre
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Setup:
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # every field has the opposite sign: a checkerboard skin turned by 90 degrees
+    skin_flipped: bool  # all fields have the opposite sign, as for a checkerboard skin rotated by 90 degrees
     tip_radius_mm: float
     rule: Quadrature = RULE
 
@@ -76,7 +78,7 @@ class Setup:
 
     @cached_property
     def rest(self) -> deformation.RestingDipoles:
-        """Dipoles of the magnetised skin, its middle at the origin."""
+        """Dipoles of the magnetised skin, whose centre is at the origin."""
         nodes = place_nodes(self.thickness_m, self.rule, sides_m=self.sides_m)
         cubes_n = (magnet.cubes_along(self.sides_m[0]), magnet.cubes_along(self.sides_m[1]))
         b_T = magnet.array_field(nodes.nodes_m, self.thickness_m, self.design.polarity, cubes_n=cubes_n)
@@ -87,7 +89,7 @@ class Setup:
         )
 
     def table(self, tip_radius_mm: float) -> deformation.DeformationMap:
-        """Tabulate the sliding flow under a tip, as deep as forces are followed."""
+        """Tabulate the sliding flow under a tip, to the greatest depth for which forces are computed."""
         deepest_m = slide.DEEPEST * self.thickness_m
         heights = self.rest.heights
         return deformation.tabulate(
@@ -95,7 +97,7 @@ class Setup:
         )
 
     def chips_under(self, law: Law) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "3 3"]]:
-        """Return the chips' places in the skin's frame, in m, and the rotation from the skin to the board."""
+        """Return the chips' positions in the skin's frame, in m, and the rotation from the skin to the board."""
         angles_deg = [law.rotation_deg, law.tilt_y_deg, law.tilt_x_deg]
         turn = Rotation.from_euler("zyx", angles_deg, degrees=True).as_matrix()
         seat_mm = (law.seat_x_mm, law.seat_y_mm)
@@ -118,7 +120,7 @@ def simulate_uT(
     force_N: Float[np.ndarray, " n"],
     rest: deformation.RestingDipoles | None = None,
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the change of field at the chips, in the board's axes, of presses at labelled places of the board.
+    """Return the field changes at the chips, in the board's axes, for presses at labelled places of the board.
 
     `rest` replaces the setup's dipoles, at the same nodes, for a skin with uneven filler.
     """
@@ -139,7 +141,7 @@ def simulate_uT(
 def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the same for the designed skin: nothing fitted, no slide, force by the elastic layer."""
+    """Return the field changes for the nominal skin: nothing is fitted, no slide, force from the elastic layer."""
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
@@ -148,7 +150,7 @@ def nominal_uT(
 
 
 def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
-    """Count presses with a force beyond the range of a law, or of the nominal skin if there is none."""
+    """Count presses with a force beyond the range of a law, or of the nominal skin if no law is given."""
     if law is None:
         known_N, _ = _nominal_curve(setup)
         return int((force_N > known_N[-1]).sum())
@@ -163,7 +165,7 @@ def _layer(law: Law, setup: Setup) -> dict[str, float]:
 
 
 def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    """Return forces on the designed skin and their depths, as deep as fields are tabulated."""
+    """Return forces on the nominal skin and their depths, to the greatest depth for which fields are tabulated."""
     curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
     known_N = layer.force(
         curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
@@ -190,17 +192,18 @@ def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, 
     return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))
 
 
-# Start of a fit and centre of its priors; standard deviations of the priors; sizes of a step. Assumed.
+# Start of a fit and mean of its priors; standard deviations of the priors; step sizes. Assumed.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
 PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
-SEVEN = (*OF_BOARD, "rotation_deg")  # what may differ between boards, the rest taken from another one
-PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab: with twice as much, one of four fits explains 0.796
-GROWTH_WEIGHT = 10.0  # of errors of log|dB| by group less their mean: growth with force
-OFFSET_uT = 200.0  # of a chip (spreads.chip_offset_uT): standard deviation of the no-load field
-EVALUATIONS_MAX_N = 10  # of all derivatives; the fits of scene lab take 5, and a tenth of ftol changes 0.0001 of cosine
+SEVEN = (*OF_BOARD, "rotation_deg")  # parameters that may differ between boards; the others come from another board
+PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with twice this weight, one of four fits explains only 0.796
+GROWTH_WEIGHT = 10.0  # weight of the errors of log|dB| by group minus their mean, that is, of the growth with force
+OFFSET_uT = 200.0  # standard deviation of the no-load field by a chip's offset (spreads.chip_offset_uT)
+# Evaluations of all derivatives. The fits of scene lab take 5; a tenth of ftol changes the cosine by 0.0001.
+EVALUATIONS_MAX_N = 10
 
 
 @dataclass(frozen=True)
@@ -230,7 +233,7 @@ def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: La
         return np.concatenate([each.ravel(), rest.ravel(), held, GROWTH_WEIGHT * (by_group - by_group.mean())])
 
     first = np.array([getattr(start, name) for name in names])
-    # Fields have kinks at the steps of the flow's table: smaller differences would see them.
+    # Fields have kinks at the steps of the flow's table, which would disturb smaller finite differences.
     found = least_squares(
         residuals, first, x_scale=step, diff_step=1e-3, ftol=1e-3, max_nfev=EVALUATIONS_MAX_N, bounds=_limits(names)
     )
@@ -238,7 +241,7 @@ def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: La
 
 
 def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:
-    # Bounds: the skin lies above its chips and is elastic.
+    # The skin is above its chips and is elastic.
     least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01}
     return [least.get(name, -np.inf) for name in names], [np.inf] * len(names)
 
@@ -248,12 +251,12 @@ TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
 
 
 def to_board(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-    """Turn readings from the chips' axes to the board's."""
+    """Rotate readings from the chips' axes to the board's axes."""
     return b_uT @ _turn()
 
 
 def to_chips(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f ch"]:
-    """Turn readings from the board's axes to the chips'."""
+    """Rotate readings from the board's axes to the chips' axes."""
     return b_uT @ _turn().T
 
 

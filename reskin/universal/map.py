@@ -1,6 +1,7 @@
-"""The map: a Gaussian model of the readings of one skin at every place under every force, conditioned on its data.
+"""The map: a Gaussian model of the readings of one skin for every place and force, conditioned on the skin's data.
 
-Prior: tables of simulated fields, linear in the skin's parameters, and the error of the law as a Gaussian process.
+Its prior consists of tables of simulated fields, linear in the skin's parameters, and of a Gaussian process for the
+error of the law.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,11 +16,11 @@ from reskin.errors import SchemaError
 from reskin.universal.kernels import Lattice, LinearMeans, in_blocks, means, whiten
 from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT, with_parameters
 
-PITCH_MM, STEPS_N = 0.8, 22  # of the lattice of places, along x and y
+PITCH_MM, STEPS_N = 0.8, 22  # pitch and number of places of the lattice, along x and y
 FORCES_N = np.exp(np.linspace(np.log(0.05), np.log(9.5), 9))  # from a light touch to the hardest recorded press
-LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spreads are of the logarithm
-# Standard deviations of a skin's parameters about those of boards of the same rig, and about the nominal ones where no
-# board is known. Assumed, wider than two recorded boards differ.
+LOGARITHMIC = ("amplitude", "modulus_MPa")  # parameters whose spreads are those of the logarithm
+# Standard deviations of a skin's parameters: about those of boards of the same rig, or about the nominal ones if no
+# board is known. Assumed, and larger than the difference of two recorded boards.
 RIG_SPREADS = {
     "seat_x_mm": 0.4, "seat_y_mm": 0.4, "rotation_deg": 1.0, "gap_mm": 0.25, "amplitude": 0.2, "label_x_mm": 0.25,
     "label_y_mm": 0.25, "modulus_MPa": 0.2, "away_um_mm": 2.0, "give_x_um": 15.0, "give_y_um": 15.0,
@@ -29,19 +30,19 @@ NOMINAL_SPREADS = RIG_SPREADS | {
     "gap_mm": 0.45, "amplitude": 0.3, "label_x_mm": 0.5, "label_y_mm": 0.5, "modulus_MPa": 0.25, "away_um_mm": 2.5,
     "give_x_um": 40.0, "give_y_um": 40.0,
 }  # fmt: skip
-# From recorded boards: the form of the law and the middle of its slide, nothing else. Modulus: Dragon Skin 10 with
-# filler, 150 to 230 kPa.
+# Only the form of the law and the mean of its slide come from recorded boards. The modulus is that of Dragon Skin 10
+# with filler, 150 to 230 kPa.
 NOMINAL = Law(0.0, 0.0, 0.0, 1.6, 1.4, 0.0, 0.0, 0.19, 7.0, 0.0, 0.0)
-STEP = 0.4  # spreads, over which slopes are taken
+STEP = 0.4  # step of the finite differences for slopes, in spreads
 
 
 @dataclass(frozen=True)
 class Tables:
-    """Fields of presses at places (board's frame) under forces: at the centre, and slopes per spread of a parameter."""
+    """Fields of presses by place (board's frame) and force, for the central law, and their slopes by parameter."""
 
     names: tuple[str, ...]
     spreads: Float[np.ndarray, " t"]
-    axis_mm: Float[np.ndarray, " a"]  # of the lattice, along x and along y
+    axis_mm: Float[np.ndarray, " a"]  # places of the lattice along x, and along y
     force_N: Float[np.ndarray, " q"]
     mean_uT: Float[np.ndarray, "a a q ch"]
     slope_uT: Float[np.ndarray, "a a q ch t"]
@@ -50,14 +51,14 @@ class Tables:
 
 
 def lattice_mm() -> Float[np.ndarray, " a"]:
-    """Return the places of the lattice along one axis, from the board's middle."""
+    """Return the places of the lattice along one axis, relative to the board's centre."""
     return PITCH_MM * (np.arange(STEPS_N) - (STEPS_N - 1) / 2)
 
 
 def tabulate(
     centre: Law, spreads: Mapping[str, float], setup: Setup, forces_N: Float[np.ndarray, " q"] = FORCES_N
 ) -> Tables:
-    """Simulate every place and force at the centre and with each parameter moved: 50,000 presses, half a minute."""
+    """Simulate every place and force for a central law, and with each parameter changed: 50,000 presses, 30 s."""
     axis_mm = lattice_mm()
     places_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     place_mm = np.repeat(places_mm, len(forces_N), axis=0)
@@ -77,7 +78,7 @@ def tabulate(
 
 
 def mean_law(laws: list[Law]) -> Law:
-    """Return the prior's centre for a further board of a rig: means of the fitted laws, seat and turn as designed."""
+    """Return the prior mean for a further board of a rig: means of the fitted laws, nominal seat and rotation."""
     by_name = {name: np.array([asdict(law)[name] for law in laws]) for name in asdict(laws[0])}
     means = {
         name: float(np.exp(np.log(values).mean()) if name in LOGARITHMIC else values.mean())
@@ -87,21 +88,21 @@ def mean_law(laws: list[Law]) -> Law:
 
 
 def perturb(centre: Law, name: str, by: float) -> Law:
-    """Change one parameter of a law, in its unit, or in its logarithm where its spread is of that."""
+    """Add to one parameter of a law, or to its logarithm if its spread is that of the logarithm."""
     value = asdict(centre)[name]
     return with_parameters(centre, (name,), np.array([value * np.exp(by) if name in LOGARITHMIC else value + by]))
 
 
-Relative = Float[np.ndarray, "n ch"]  # parts of |dB|
+Relative = Float[np.ndarray, "n ch"]  # relative to |dB|
 LENGTH_MM, LENGTH_LOG_N = 3.0, 1.2  # length scales of the errors: a correlation of 0.74 at 2 mm and 0.2 at 6 mm
 NOISE = 0.1  # part of the variance that differs between presses at one place
-SHARED = 0.55  # part of the variance that boards share
-EVEN = 0.5  # part of the covariance that is equal for all channels: a few boards do not determine it
+SHARED = 0.55  # part of the variance that boards have in common
+EVEN = 0.5  # weight of a covariance that is equal for all channels, as few boards do not determine the covariance
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Relative errors of the law expected on a further board, from those of known boards (a Gaussian process)."""
+    """Relative errors of the law that are expected on a further board, from known boards (a Gaussian process)."""
 
     place_mm: Float[np.ndarray, "m 2"]
     log_N: Float[np.ndarray, " m"]
@@ -110,7 +111,7 @@ class Residual:
     noise: float
 
     def at(self, place_mm: Float[np.ndarray, "n 2"], log_N: Float[np.ndarray, " n"]) -> Relative:
-        """Return the errors expected at places under forces."""
+        """Return the errors expected for these places and forces."""
         return SHARED * kernel(place_mm, self.place_mm, log_N, self.log_N) @ self.solved
 
 
@@ -125,9 +126,9 @@ def fit_residual(
     force_N: Sequence[Float[np.ndarray, " b"]],
     errors: Sequence[Float[np.ndarray, "b ch"]],
 ) -> Residual:
-    """Fit a Gaussian process to the law's relative errors on known boards: a shared part and each board's own.
+    """Fit a Gaussian process to the law's relative errors on known boards, with a common part and a part per board.
 
-    After one board it expects `SHARED` of that board's errors on a further one; after many, nearly their mean.
+    From one board, it expects `SHARED` of that board's errors on a further board; from many boards, nearly their mean.
     """
     board_i = np.repeat(np.arange(len(errors)), [len(one) for one in errors])
     at_mm, log_N, off = np.concatenate(place_mm), np.log(np.concatenate(force_N)), np.concatenate(errors)
@@ -155,15 +156,15 @@ NOISE_uT = 4.5  # standard deviation of a reading, per channel
 
 @dataclass(frozen=True)
 class Information:
-    """What an unlabelled press adds to the parameters' Gaussian in information form, for each hypothesis."""
+    """The information about the parameters that an unlabelled press adds under each hypothesis."""
 
     matrix: Float32[np.ndarray, "h tt"]
-    per_uT: Float32[np.ndarray, "h ch t"]  # of the information vector, per deviation of a channel
+    per_uT: Float32[np.ndarray, "h ch t"]  # information vector per deviation of a channel
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Places of the lattice under the tabulated forces (forces run within places), with their expected fields."""
+    """Places of the lattice with the tabulated forces (the force index varies fastest), and their expected fields."""
 
     place_mm: Float[np.ndarray, "p 2"]
     log_N: Float[np.ndarray, " q"]
@@ -179,7 +180,7 @@ class Hypotheses:
 
     @cached_property
     def linear(self) -> LinearMeans:
-        """Means and slopes, laid out for the compiled loops."""
+        """Means and slopes, arranged for the compiled loops."""
         return in_blocks(self.mean_uT, self.slope_uT)
 
     @cached_property
@@ -194,12 +195,12 @@ class Hypotheses:
 
     @cached_property
     def expected_uT(self) -> Float32[np.ndarray, "h ch"]:
-        """Fields expected before conditioning, with the residual of known boards."""
+        """Fields expected before conditioning, including the residual from known boards."""
         return self.mean_uT + np.linalg.norm(self.mean_uT, axis=1, keepdims=True) * self.residual
 
 
 def lattice(tables: Tables, residual: Residual) -> Hypotheses:
-    """Return the hypotheses: the tables' places that can be pressed, under each force."""
+    """Return the hypotheses: the places of the tables that can be pressed, with each force."""
     place_mm = np.stack(np.meshgrid(tables.axis_mm, tables.axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     taken = inside(place_mm)
     log_N, channels_n = np.log(tables.force_N), len(tables.rest_uT)
@@ -216,17 +217,17 @@ def with_noise(cov_uT2: Float[np.ndarray, "h ch ch"]) -> Float[np.ndarray, "h ch
     return cov_uT2 + NOISE_uT**2 * np.eye(cov_uT2.shape[1])
 
 
-OFFSET_uT = 320.0  # of the no-load field: a chip's offset (200) and the law's own error (250)
-SHARE_MIN = 0.03  # of the law's variance that remains however many labels there are
-PRESS_WEIGHT = 0.2  # of an unlabelled press: the law's errors at neighbouring places are not independent
-ROUNDS_N = 3  # of expectation maximisation
-EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses about the labels' middle
-WEIGHT_MIN = 1e-9  # relative to the likeliest hypothesis: below, single precision holds no information
+OFFSET_uT = 320.0  # standard deviation of the no-load field: a chip's offset (200) and the law's own error (250)
+SHARE_MIN = 0.03  # share of the law's variance that remains with any number of labels
+PRESS_WEIGHT = 0.2  # weight of an unlabelled press, as the law's errors at neighbouring places are not independent
+ROUNDS_N = 3  # rounds of expectation maximisation
+EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses about the labels' centre
+WEIGHT_MIN = 1e-9  # relative to the largest weight; hypotheses below this are lost in single precision
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimates of readings: place and its standard deviation, force, and the misfit of the likeliest hypothesis."""
+    """Estimates for readings: place and standard deviation, force, and the misfit of the most likely hypothesis."""
 
     place_mm: Float[np.ndarray, "n 2"]
     sd_mm: Float[np.ndarray, "n 2"]
@@ -243,15 +244,15 @@ def concatenate(parts: Sequence[Estimate]) -> Estimate:
 
 @dataclass(frozen=True)
 class Likelihoods:
-    """Likelihoods of hypotheses given readings; forces run within places."""
+    """Likelihoods of hypotheses given readings."""
 
     chi2: Float32[np.ndarray, "n h"]
-    deviance: Float32[np.ndarray, "n h"]  # -2 log likelihood less a constant
-    best: Int64[np.ndarray, " n"]  # the likeliest hypothesis
+    deviance: Float32[np.ndarray, "n h"]  # -2 log likelihood, up to a constant
+    best: Int64[np.ndarray, " n"]  # the most likely hypothesis
     channels_n: int
 
     def misfit(self) -> Float[np.ndarray, " n"]:
-        """Return chi^2 per channel of each reading's likeliest hypothesis."""
+        """Return chi^2 per channel of each reading's most likely hypothesis."""
         return self.chi2[np.arange(len(self.chi2)), self.best] / self.channels_n
 
     def probabilities(self) -> Float[np.ndarray, "n h"]:
@@ -262,7 +263,7 @@ class Likelihoods:
 
 @dataclass(frozen=True)
 class Labelled:
-    """Presses at known places under known forces, and the law's errors there (a Gaussian process, solved)."""
+    """Presses with known places and forces, and the solved Gaussian process of the law's errors there."""
 
     place_mm: Float[np.ndarray, "m 2"]
     log_N: Float[np.ndarray, " m"]
@@ -272,7 +273,7 @@ class Labelled:
 
 @dataclass(frozen=True)
 class SkinMap:
-    """Posterior of one skin: its parameters, in spreads about the tables' centre, and the law's errors."""
+    """Posterior of one skin: its parameters, as deviations from the central law in spreads, and the law's errors."""
 
     tables: Tables
     residual: Residual
@@ -293,7 +294,7 @@ class SkinMap:
 
 
 class MapEvaluator:
-    """A map prepared for readings: the mean and covariance of every hypothesis, whitened."""
+    """A map prepared for readings: the whitened Gaussian of every hypothesis."""
 
     def __init__(self, skin: SkinMap) -> None:
         self._hypotheses = skin.hypotheses
@@ -307,7 +308,7 @@ class MapEvaluator:
             raise SchemaError(f"a map of a skin: {what}. Take the no-load reading again.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
-        """Return the law's expected errors, and the share of their variance that remains after the labels."""
+        """Return the law's expected errors, and the share of their variance that remains given the labels."""
         expected, labelled = skin.hypotheses.residual, skin.labelled
         if labelled is None:
             return expected, np.ones(len(expected), np.float32)
@@ -333,7 +334,7 @@ class MapEvaluator:
 
 
 def new_map(tables: Tables, residual: Residual | None = None) -> SkinMap:
-    """Return the prior map; `residual` holds the law's errors on other boards of the rig."""
+    """Return the prior map; `residual` is the error of the law from other boards of the rig."""
     t, expected = len(tables.names), residual or no_residual(tables.mean_uT.shape[-1])
     return SkinMap(tables, expected, lattice(tables, expected), np.zeros(t), np.eye(t))
 
@@ -345,7 +346,7 @@ def condition_on_noload(skin: SkinMap, noload_uT: Float[np.ndarray, " ch"]) -> S
 
 
 def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds_n: int = ROUNDS_N) -> SkinMap:
-    """Condition on presses at unknown places, by expectation maximisation over the place and force of each."""
+    """Condition on presses at unknown places, by expectation maximisation over their places and forces."""
     information, expected_uT, found = skin.hypotheses.information, skin.hypotheses.expected_uT, skin
     for _ in range(rounds_n):
         weight = PRESS_WEIGHT * found.evaluator.evaluate(db_uT).probabilities()
@@ -360,7 +361,7 @@ def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds
 
 
 def condition_on_even_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -> SkinMap:
-    """Condition on presses at unknown places lying evenly over the skin: their mean place is the labels' middle."""
+    """Condition on presses that are evenly spread over the skin, whose mean place is the labels' centre."""
     label = [skin.tables.names.index(name) for name in ("label_x_mm", "label_y_mm")]
     spread_mm = skin.tables.spreads[label]
     row = np.zeros((2, len(skin.mean)))
@@ -434,10 +435,10 @@ def interpolate(
 def expected_gain(
     skin: SkinMap, place_mm: Float[np.ndarray, "c 2"], force_N: Float[np.ndarray, " c"]
 ) -> Float[np.ndarray, " c"]:
-    """Return by how much a labelled press at each place is expected to reduce the variance of fields over the skin.
+    """Return how much a labelled press at each place is expected to reduce the variance of fields over the skin.
 
-    Relative to |dB|, all channels together, the mean over places under the middle one of the map's forces. Errors of
-    the law that earlier labels have shown are known.
+    The variance is relative to |dB|, summed over channels, and averaged over places at the median of the map's forces.
+    It is conditional on earlier labels.
     """
     hypotheses, error_cov, gains = skin.hypotheses, skin.error_cov, []
     every = slice(len(hypotheses.log_N) // 2, None, len(hypotheses.log_N))
@@ -461,7 +462,7 @@ def _remaining_errors(
     skin: SkinMap, a_mm: Float[np.ndarray, "n 2"], a_log_N: Float[np.ndarray, " n"], b_mm: Float[np.ndarray, "m 2"],
     b_log_N: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, "n m"]:  # fmt: skip
-    """Return the covariance of the law's errors at two sets of presses, given the labels."""
+    """Return the covariance between the law's errors at two sets of presses, given the labels."""
     prior, labelled = kernel(a_mm, b_mm, a_log_N, b_log_N), skin.labelled
     if labelled is None:
         return prior

@@ -2,9 +2,9 @@
 
 `PriorModel` is a map and networks made from simulated skins. Calibration conditions both on the data of one skin:
 `PressCalibration` on its no-load field and on presses at unknown places, `CalibratedModel` on labelled presses too.
-These work in the board's frame and axes, for any board. `Universal` is the model that comes with the project, of the
-paper's board with five chips turned as on recorded boards. Its readings are along the chips' axes; its places are
-labels, with the board's middle at (8, 8) mm.
+These work in the board's frame and axes, for any board. `Universal` is the model that comes with the project, for the
+paper's board with five chips, oriented as on the recorded boards. Its readings are along the chips' axes; its places
+are in the frame of the labels, with the board's centre at (8, 8) mm.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -54,23 +54,25 @@ from reskin.universal.map import (
 )
 from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weights, shift_places
 
-MAP_POWER = 0.6  # of the map's likelihoods beside the networks', as errors of channels correlate; not fitted to a board
+# Power of the map's likelihoods when they are combined with the networks'. Below 1, because the errors of channels are
+# correlated; not fitted to any board.
+MAP_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of a network's estimates
-FADES_PER_LABEL = 0.15  # of the centring of the networks' places: labels tell the middle better
-OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # of a constant error of the networks' places; of single errors about it
-BLOCK_N = 200  # readings at a time, to bound memory
+FADES_PER_LABEL = 0.15  # how fast the centring of the networks' places fades, as labels determine the centre better
+OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the constant error of the networks' places; sd of single errors about it
+BLOCK_N = 200  # readings evaluated at once, to bound memory
 
-FILE = Path(__file__).with_name("universal.safetensors")  # its card beside it, .json
+FILE = Path(__file__).with_name("universal.safetensors")  # the card has the same name, .json
 FORMAT = "reskin-universal-3"
-REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # of places, about the middle
-CHOICE_EVERY_N = 3  # of the lattice's places, one is a candidate for the next press
+REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # range of places, relative to the centre
+CHOICE_EVERY_N = 3  # every third place of the lattice is a candidate for the next press
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Readings evaluated by map and networks: estimates follow for any likelihood power.
+    """Readings evaluated by map and networks, from which estimates for any likelihood power can be computed.
 
-    The power changes standard deviations; places and forces of `by_map` too.
+    The power affects standard deviations, and in `by_map` also places and forces.
     """
 
     evaluator: MapEvaluator
@@ -78,7 +80,7 @@ class Evaluation:
     network: NetworkEstimate
 
     def by_map(self, power: float) -> Estimate:
-        """Estimate by the map alone: means over its hypotheses."""
+        """Estimate by the map alone, as means over its hypotheses."""
         return self.evaluator.mean(self.likelihoods, power)
 
     def by_network(self, power: float) -> Estimate:
@@ -90,7 +92,8 @@ class Evaluation:
     def combined(self, power: float) -> Estimate:
         """Multiply the map's probabilities of places and of forces with the networks' normal distributions.
 
-        Both read the same field, so their errors correlate: standard deviations are those of a power of the product.
+        Both use the same field, so their errors are correlated. Therefore the standard deviations are those of a power
+        of the product.
         """
         normals = np.empty((len(self.network.log_N), 6))
         normals[:, :2], normals[:, 4] = self.network.place_mm, self.network.log_N
@@ -103,14 +106,14 @@ class Evaluation:
 
 @dataclass(frozen=True)
 class CalibratedModel:
-    """Map and networks, calibrated to one skin. `offsets_mm` are added to the networks' places, one after the other."""
+    """Map and networks, calibrated to one skin. `offsets_mm` are added to the networks' places, in this order."""
 
     skin: SkinMap
     networks: Sequence[Layers]
     offsets_mm: Sequence[Float[np.ndarray, "2"]]
 
     def with_offsets_in_biases(self) -> "CalibratedModel":
-        """Add the offsets to the networks' last biases instead: faster, in single precision."""
+        """Return the same model with the offsets added to the networks' last biases: faster, in single precision."""
         by_mm = sum(self.offsets_mm, np.zeros(2))
         return CalibratedModel(self.skin, [shift_places(layers, by_mm) for layers in self.networks], ())
 
@@ -121,7 +124,7 @@ class CalibratedModel:
     def estimate_by(
         self, method: Callable[[Evaluation], Sequence[Estimate]], db_uT: Float[np.ndarray, "n ch"]
     ) -> list[Estimate]:
-        """Estimate places and forces in one or several ways, block by block."""
+        """Estimate places and forces by one or several methods, block by block."""
         starts = range(0, max(len(db_uT), 1), BLOCK_N)
         by_block = [method(self.evaluate(db_uT[i : i + BLOCK_N])) for i in starts]
         return [concatenate(parts) for parts in zip(*by_block, strict=True)]
@@ -149,12 +152,12 @@ class PressCalibration:
 
     @cached_property
     def layers(self) -> list[Layers]:
-        """The networks, conditioned."""
+        """The conditioned networks."""
         return [network.condition(weights, self.data.rest_uT, self.data.presses_uT) for weights in self.networks]
 
     @cached_property
     def even_mm(self) -> Float[np.ndarray, "e 2"]:
-        """Where the networks place the presses that lie evenly over the skin."""
+        """The networks' places of the presses that are evenly spread over the skin."""
         return network.evaluate(self.layers, self.data.even_uT).place_mm
 
     def with_labels(self, labels: LabelledPresses) -> CalibratedModel:
@@ -178,7 +181,7 @@ class PriorModel:
 
 
 def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinMap:
-    """Condition a map on presses at unknown places, then on those that lie evenly over the skin."""
+    """Condition a map on presses at unknown places, then on those that are evenly spread over the skin."""
     skin = noload_map
     if len(data.presses_uT):
         skin = condition_on_presses(skin, data.presses_uT)
@@ -190,10 +193,11 @@ def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinM
 def network_offsets_mm(
     even_mm: Float[np.ndarray, "e 2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return two corrections of the networks' places, to be added one after the other.
+    """Return two corrections of the networks' places, to be added in this order.
 
-    The first centres presses that lie evenly over the skin (`even_mm`) on the middle; it fades with labels. The second
-    is the mean error of labelled presses, estimated at `estimated_mm`, with a Gaussian prior about zero.
+    The first moves the mean of presses that are evenly spread over the skin (`even_mm`) to the centre; it fades with
+    the number of labels. The second is the mean error of labelled presses, estimated at `estimated_mm`, with a Gaussian
+    prior of zero mean.
     """
     centre_mm = -even_mm.mean(axis=0) / (1 + FADES_PER_LABEL * len(place_mm)) if len(even_mm) else np.zeros(2)
     off_mm = place_mm - (estimated_mm + centre_mm)
@@ -202,10 +206,10 @@ def network_offsets_mm(
 
 @dataclass
 class Universal:
-    """The model of the paper's board that comes with the project; it is calibrated while it is used.
+    """The model for the paper's board that comes with the project; it can be calibrated during use.
 
-    Call `zero` with readings without contact, `see` with presses at unknown places, `label` with presses at known
-    ones, in any order and as often as wanted; `predict` at any time. Fields are in uT along the chips' axes.
+    Call `zero` with readings without contact, `see` with presses at unknown places, and `label` with presses at known
+    places, in any order and any number of times; call `predict` at any time. Fields are in uT along the chips' axes.
 
     Parameters
     ----------
@@ -231,7 +235,7 @@ class Universal:
 
     @property
     def card(self) -> dict[str, Any]:
-        """The model's JSON card: what it was made from, and what it must not be used for."""
+        """The model's JSON card: how it was made, and what it must not be used for."""
         return io.read_json(FILE.with_suffix(".json"))
 
     @property
@@ -241,26 +245,26 @@ class Universal:
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
-        """The no-load field that changes are taken from, along the chips' axes; zeros before `zero`."""
+        """The no-load field that is subtracted from readings, along the chips' axes; zeros before `zero`."""
         return np.zeros(CHANNELS_N) if self._noload_uT is None else self._noload_uT
 
     @property
     def presses_n(self) -> int:
-        """Number of presses that it is calibrated by, labelled or not."""
+        """Number of presses that it is calibrated to, labelled or not."""
         return len(self._data.presses_uT) + len(self._data.labels)
 
     @property
     def misfit(self) -> float:
-        """Median chi^2 per channel of unlabelled presses: about 1 on a skin of the prior; 1 if they are too few."""
+        """Median chi^2 per channel of unlabelled presses: about 1 for skins as in the prior; 1 for too few presses."""
         return float(np.median(self._misfits)) if self.powers.are_enough(len(self._misfits)) else 1.0
 
     @property
     def power(self) -> float:
         """Power of the combined likelihood, from the misfit of unlabelled presses and cross-validated labels.
 
-        1: both are trusted fully. Smaller: standard deviations are larger.
+        With 1, map and networks are trusted fully; a smaller power gives larger standard deviations.
         """
-        if self._power is None:  # cross-validation takes long: once for each set of data, where it is needed
+        if self._power is None:  # cross-validation takes long, so it runs once for each set of data, when needed
             data = self._data
             tabulated = self.powers.of(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
             power = lower_by_misfit(tabulated, self.misfit)
@@ -272,11 +276,11 @@ class Universal:
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and condition the map on it.
 
-        Earlier presses are forgotten; with `keep` they stay, for the same skin after drift.
+        Earlier presses are discarded, unless `keep` is set: use this for the same skin after drift.
 
         Raises
         ------
-        SchemaError : no reading, or one that is not finite, out of range or of another board
+        SchemaError : there is no reading, or one is not finite, out of range or from another board
         """
         noload_uT = check_readings(b_uT)
         if not len(noload_uT):
@@ -287,10 +291,10 @@ class Universal:
         return self._restart(condition_on_noload(self._prior_map, rest_uT), data)
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
-        """Calibrate by presses at unknown places, one reading each: dozens all over the skin, or more as they come.
+        """Calibrate to presses at unknown places, one reading each: dozens all over the skin, in one or several calls.
 
-        The first set is passed over several times, later ones once. Say `even` if these and all before lie evenly over
-        the skin (a grid, each place once): their mean place is then the skin's middle.
+        The first set is used in several rounds, later sets in one. Set `even` if these and all earlier presses are
+        evenly spread over the skin (a grid, each place once), so that their mean place is the skin's centre.
         """
         db_uT, data = self._change(check_readings(b_uT)), self._data
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
@@ -309,13 +313,14 @@ class Universal:
         *,
         keep: bool = False,
     ) -> "Universal":
-        """Calibrate by one or several presses at known places under known forces.
+        """Calibrate to one or several presses at known places with known forces.
 
-        Earlier labels are forgotten; with `keep` they stay.
+        Earlier labels are discarded, unless `keep` is set.
 
         Raises
         ------
-        SchemaError : a place off the skin, a force of 0 N or less, too many labels; the model is unchanged
+        SchemaError : a place is off the skin, a force is 0 N or less, or there are too many labels; the model is
+            unchanged
         """
         readings_uT = check_readings(b_uT)
         places_mm, forces_N = check_labels(
@@ -329,27 +334,27 @@ class Universal:
             )  # fmt: skip
             check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # together they may be too many
         data, press_map = replace(self._data, labels=labels), self._calibration.skin
-        if len(before):  # fit unlabelled presses anew, so that the result does not depend on the order of calls
+        if len(before):  # condition on unlabelled presses again, so that the order of calls does not matter
             press_map = condition_on_unlabelled(self._noload_map, data)
         return self._set(press_map, data)
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
-        """Return the place, in mm, where a labelled press of about this force would tell most about the skin."""
+        """Return the place, in mm, where a labelled press of about this force would be most informative."""
         place_mm = self.skin.hypotheses.place_mm[::CHOICE_EVERY_N]
         gain = expected_gain(self.skin, place_mm, np.full(len(place_mm), force_N))
         return place_mm[gain.argmax()] + CENTRE_MM
 
     def predict(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f 3"]:
-        """Return x_mm, y_mm and the normal force in N of readings in contact."""
+        """Predict x_mm, y_mm and the normal force in N for readings in contact."""
         found = self.estimate(b_uT)
         return np.column_stack([found.place_mm, found.force_N])
 
     def estimate(self, b_uT: Float[np.ndarray, "*f ch"]) -> Estimate:
-        """Return places with standard deviations, forces and misfits: far above 1, this is no known skin."""
+        """Estimate places with standard deviations, forces and misfits; far above 1, the skin is unlike the prior."""
         return self.estimates(b_uT, [self.power])[0]
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Return `estimate` for several likelihood powers: only standard deviations differ."""
+        """Return `estimate` for several likelihood powers; only the standard deviations differ."""
         found = self._model.estimate(self._change(b_uT), powers)
         return [replace(one, place_mm=one.place_mm + CENTRE_MM) for one in found]
 
@@ -368,13 +373,13 @@ class Universal:
         write_calibration(self._data, Path(file))
 
     def remember(self, file: Path | str) -> "Universal":
-        """Replace all data of the skin by those that `save` wrote; then call `zero(b_uT, keep=True)`."""
+        """Replace all data of the skin by the data in a file of `save`; afterwards, call `zero(b_uT, keep=True)`."""
         data = read_calibration(Path(file), REACH_MM)
         self._noload_uT = to_chips(data.rest_uT[None])[0]
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
-        """Predict from changes of field, as a trained network does."""
+        """Predict from field changes, as a trained network does."""
         return self.predict(check_shape(db_uT) + self.noload_uT).astype(np.float32)
 
     @property
@@ -382,19 +387,19 @@ class Universal:
         return self._calibration.data
 
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
-        """Return changes of field along the board's axes."""
+        """Return field changes along the board's axes."""
         return to_board(check_shape(b_uT) - self.noload_uT)
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Calibrate by all data, starting from a map that is conditioned on the no-load field alone."""
+        """Calibrate to all data, starting from a map that is conditioned on the no-load field alone."""
         self._noload_map = noload_map
         self._misfits = np.full(len(data.presses_uT), np.nan)
         return self._set(condition_on_unlabelled(noload_map, data), data)
 
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Take a map that is conditioned on the unlabelled presses of the data, and condition on the labels."""
+        """Use a map that is conditioned on the unlabelled presses of the data, and condition it on the labels."""
         new = np.isnan(self._misfits)
-        if new.any():  # presses keep the misfit to the map that was first conditioned on them
+        if new.any():  # the misfit of a press is that of the first map that was conditioned on it
             self._misfits[new] = press_map.evaluator.evaluate(data.presses_uT[new]).misfit()
         self._calibration = PressCalibration(press_map, self.networks, data)
         self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
@@ -403,7 +408,7 @@ class Universal:
 
 
 def load_universal(calibration: Path | str | None = None, *, file: Path = FILE) -> Universal:
-    """Load the model that comes with the project; with a file that `save` wrote, calibrated to that skin."""
+    """Load the model that comes with the project, calibrated to a skin if a file that `save` wrote is given."""
     model = Universal(*_read_parts(file))
     return model if calibration is None else model.remember(calibration)
 
@@ -414,7 +419,7 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
     card = io.read_json(card_file)
     form = card.get("format") if isinstance(card, dict) else None
     if form != FORMAT:
-        remedy = "Take file and card of this version, or make them again: python -m pipeline.training.shipping"
+        remedy = "Use the files of this version, or make them again: python -m pipeline.training.shipping"
         raise SchemaError(card_file, "format", FORMAT, form, remedy)
     parts, _ = io.read_tensors(file, digest_needed=True)
     of_map = {one.name: parts.pop(one.name).astype(float) for one in fields(Tables) if one.name != "names"}
@@ -425,7 +430,7 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
 def write(
     tables: Tables, networks: Sequence[Weights], powers: LikelihoodPowers, about: Mapping[str, Any], file: Path = FILE
 ) -> None:
-    """Write the map's prior in single precision, the networks, and a card: how they were made, powers, spreads."""
+    """Write the map's prior (in single precision), the networks, and a card: origin, powers and spreads."""
     parts = [one.name for one in fields(tables) if one.name != "names"]
     of_map = {name: getattr(tables, name).astype(np.float32) for name in parts}
     io.write_tensors(file, of_map | network.to_tensors(networks), {})

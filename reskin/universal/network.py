@@ -1,4 +1,4 @@
-"""The network of the universal model, evaluated in NumPy: a set encoder gives a code of the skin, a regressor reads it.
+"""The network of the universal model, evaluated in NumPy: a set encoder, whose code of the skin conditions a regressor.
 
 `reskin.universal.training` trains its weights with PyTorch.
 """
@@ -15,11 +15,11 @@ from numba import njit
 Weights = Mapping[str, np.ndarray]
 
 LAYERS_N = 3
-DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # bring inputs to about 1: dB/|dB|, log|dB|, field at rest
-LENGTH_MIN_uT = 1.0  # shorter changes of field have no direction
+DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # scale inputs to about 1: dB/|dB|, log|dB|, field at rest
+LENGTH_MIN_uT = 1.0  # smaller field changes have no direction
 PLACE_MM, LOG_N = 8.0, 3.0  # scales of the output
-LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviation, of scaled outputs
-FULL_SET_N = 65  # most unlabelled presses in training
+LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviation of scaled outputs
+FULL_SET_N = 65  # maximum number of unlabelled presses in training
 
 
 class Layers(NamedTuple):
@@ -31,7 +31,7 @@ class Layers(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkEstimate:
-    """Estimates of readings by networks: places and logarithms of forces, and their standard deviations."""
+    """Networks' estimates for readings: places and logarithms of forces, with standard deviations."""
 
     place_mm: Float[np.ndarray, "n 2"]
     sd_mm: Float[np.ndarray, "n 2"]
@@ -40,7 +40,7 @@ class NetworkEstimate:
 
 
 def condition(weights: Weights, rest_uT: Float[np.ndarray, " ch"], presses_uT: Float[np.ndarray, "c ch"]) -> Layers:
-    """Condition a network on a skin's no-load field and on unlabelled presses (none will do)."""
+    """Condition a network on a skin's no-load field and on unlabelled presses, of which there may be none."""
     rest = (rest_uT / REST_uT).astype(np.float32)
     code, reading_n = _encode(weights, rest, presses_uT), len(rest) + 1
     each_weight, each_bias = [], []
@@ -57,7 +57,7 @@ def condition(weights: Weights, rest_uT: Float[np.ndarray, " ch"], presses_uT: F
 
 
 def evaluate(networks: Sequence[Layers], db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
-    """Estimate places and forces; of several networks, the mean, whose spread adds to the uncertainty."""
+    """Estimate places and forces: the mean over networks, whose spread adds to the standard deviations."""
     found = np.empty((len(networks), len(db_uT), 6))
     for layers, of_one in zip(networks, found, strict=True):
         _forward(db_uT, *layers, of_one)
@@ -80,7 +80,7 @@ def predict(
 
 
 def shift_places(layers: Layers, by_mm: Float[np.ndarray, "2"]) -> Layers:
-    """Shift all places that a network estimates, by its last bias (single precision)."""
+    """Shift all places that a network estimates, by changing its last bias (in single precision)."""
     *biases, last = layers.bias
     by = np.zeros_like(last)
     by[:2] = by_mm / PLACE_MM
@@ -123,7 +123,7 @@ def _linear(weights: Weights, name: str) -> tuple[np.ndarray, np.ndarray]:
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _fill_inputs(db_uT, values):
-    # Direction and log length of a change of field, scaled to about 1.
+    # Direction and log length of a field change, scaled to about 1.
     length2 = 0.0
     for i in range(len(db_uT)):
         length2 += db_uT[i] ** 2

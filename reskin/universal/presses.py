@@ -1,4 +1,4 @@
-"""Presses of a recorded board: mean changes of field and noise; agreement with a simulation, growth and memory."""
+"""Presses of a recorded board: mean field changes and noise; agreement with a simulation, growth and memory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,16 +9,18 @@ from jaxtyping import Bool, Float, Int
 from reskin.errors import SchemaError
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
-DRIFT_DEGREE = 4  # of the polynomial for drift; on lab a memory by degree 8 is a tenth less, by 12 half: it fits memory
-SERIES_MIN_N = 20  # presses of a capture, for its memory
-SPREAD_MIN = 0.2  # range of log F at a place, for its growth
+# Degree of the polynomial for drift. On scene lab, degree 8 gives a memory that is a tenth smaller, and degree 12 half
+# of it, because the polynomial fits the memory.
+DRIFT_DEGREE = 4
+SERIES_MIN_N = 20  # least number of presses in a capture, to estimate the memory
+SPREAD_MIN = 0.2  # least range of log F at a place, to estimate the growth
 
 
 @dataclass(frozen=True)
 class RecordedPresses:
     """Presses of one skin on its board, each the mean of its readings; fields in the chips' axes.
 
-    group_i: index of the group, a capture or a depth in it where depths are known.
+    group_i: index of the group, which is a capture or, if depths are known, one depth of a capture.
     """
 
     board: str
@@ -37,7 +39,7 @@ class RecordedPresses:
 
 
 def pool(captures: Sequence[Readings]) -> RecordedPresses:
-    """Pool the captures of one skin on one board, press by press, in their order."""
+    """Pool the presses of all captures of one skin on one board, in order."""
     parts = [_means(one) for one in captures]
     capture_i = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
     groups, group_i = np.unique(np.concatenate([part[0] for part in parts]), return_inverse=True)
@@ -46,7 +48,7 @@ def pool(captures: Sequence[Readings]) -> RecordedPresses:
     )
     known = np.isfinite(place_mm).all(axis=1) & (force_N > 0)
     if not known.any():
-        what = f"board {captures[0].board} has no press with place and force"
+        what = f"board {captures[0].board} has no press with a known place and force"
         raise SchemaError(f"experiment compare: {what}. Record both, or remove the experiment from the scene's.")
     return RecordedPresses(
         board=captures[0].board, groups=tuple(groups.tolist()), group_i=group_i.ravel()[known],
@@ -57,7 +59,7 @@ def pool(captures: Sequence[Readings]) -> RecordedPresses:
 
 
 def _means(one: Readings) -> tuple[np.ndarray, ...]:
-    """Return by press: group, place, force, change of field, no-load field, variance of a reading."""
+    """Return for each press: group, place, force, field change, no-load field, variance of a reading."""
     _, first, press_i, counts = np.unique(one.indentation, return_index=True, return_inverse=True, return_counts=True)
     chips = (len(first), one.chips_n, AXES_PER_CHIP_N)
 
@@ -68,7 +70,7 @@ def _means(one: Readings) -> tuple[np.ndarray, ...]:
 
     b_uT, noload_uT = one.b_uT.astype(float), one.noload_uT[first].astype(float)
     mean_uT = mean(b_uT)
-    with np.errstate(divide="ignore", invalid="ignore"):  # one reading has no variance
+    with np.errstate(divide="ignore", invalid="ignore"):  # a single reading has no variance
         var_uT2 = mean((b_uT - mean_uT[press_i.ravel()]) ** 2) * (counts / (counts - 1))[:, None]
     depths_mm = one.depth_mm[first]
     group = [one.capture + (f" {mm:g} mm" if np.isfinite(mm) else "") for mm in depths_mm]
@@ -83,7 +85,7 @@ def lengths_uT(db_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
 
 
 def cosines(one_uT: Float[np.ndarray, "n k 3"], other_uT: Float[np.ndarray, "n k 3"]) -> Float[np.ndarray, " n"]:
-    """Return for each press the cosine between two changes of field over all channels."""
+    """Return for each press the cosine between two field changes over all channels."""
     return (one_uT * other_uT).sum(axis=(1, 2)) / (lengths_uT(one_uT) * lengths_uT(other_uT))
 
 
@@ -93,7 +95,7 @@ def explained(simulated_uT: Float[np.ndarray, "n k 3"], recorded_uT: Float[np.nd
 
 
 def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float | None:
-    """Return d log|dB| / d log F at a place, the median over places; None if force does not vary at any."""
+    """Return the median over places of d log|dB| / d log F; None if the force does not vary at any place."""
     log_F, log_uT = np.log(presses.force_N), np.log(lengths_uT(db_uT))
     slopes = []
     for place in np.unique(presses.place_mm.round(2), axis=0):
@@ -107,9 +109,10 @@ def growth(presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"]) -> float
 def memory(
     presses: RecordedPresses, db_uT: Float[np.ndarray, "n k 3"], noload_uT: Float[np.ndarray, "n k 3"]
 ) -> float | None:
-    """Return the part of a press's change that remains in the next no-load reading; None if series are too short.
+    """Return the part of a press's field change that remains in the next no-load reading, as the mean over captures.
 
-    By least squares, beside the change of the following press and a polynomial for drift; the mean over captures.
+    Least squares with the field change of the following press and a polynomial for drift as further regressors. None if
+    all captures are too short.
     """
     found = []
     for capture_i in np.unique(presses.capture_i):

@@ -1,6 +1,6 @@
-"""Train the networks of the universal model on simulated skins, and on recorded boards beside them.
+"""Train the networks of the universal model on simulated skins and, if given, on recorded boards.
 
-Every step draws some skins, an error of the law for each, and how many of its presses the network is conditioned on.
+Every step draws some skins and, for each, an error of the law and the number of presses for conditioning.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ from reskin.universal.network import (
 )
 from reskin.universal.population import PLACES_N, PRESSES_N, Population, draw_population
 
-FILM_SD = 0.02  # of initial weights: a code changes little at first
+FILM_SD = 0.02  # standard deviation of initial FiLM weights, small so that the code has little effect at first
 OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
 
 
@@ -51,7 +51,7 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b c ch"], rest_uT: Float[torch.Tensor, "b ch"],
         kept: Float[torch.Tensor, "b c"],
     ) -> Float[torch.Tensor, "b 64"]:  # fmt: skip
-        """Return the code of each skin from its kept presses (`kept` is 1 or 0); without any, zeros are pooled."""
+        """Return the code of each skin from its kept presses (`kept` is 1 or 0); without any, the pooled value is 0."""
         each = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
         each = torch.relu(self._linear("set2", each)) * kept[..., None]
         kept_n = kept.sum(1, keepdim=True)
@@ -75,7 +75,7 @@ class Network(nn.Module):
 
 
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
-    """Return direction and log length of each change of field, and the skin's no-load field; scaled to about 1.
+    """Return direction and log length of each field change, and the skin's no-load field, scaled to about 1.
 
     Computed in NumPy, as `torch.log` differs between processors; gradients do not reach the readings.
     """
@@ -87,7 +87,7 @@ def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b
 
 
 def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw initial weights as PyTorch does for linear layers: uniform within 1/sqrt(fan in); FiLM starts near zero."""
+    """Draw initial weights as PyTorch does for linear layers (uniform within 1/sqrt(fan in)); FiLM starts near zero."""
     inputs_n = 2 * channels_n + 1
     shapes = {"set1": (SET_WIDTH, inputs_n), "set2": (SET_WIDTH, SET_WIDTH), "code": (CODE_WIDTH, SET_WIDTH + 1)}
     shapes |= {f"layer{i}": (WIDTH, WIDTH if i else inputs_n) for i in range(LAYERS_N)}
@@ -103,20 +103,20 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
     return weights
 
 
-SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # skins in all; of these recorded, where boards are known
+SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # all skins; recorded skins among them, if boards are known
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
-NO_PRESSES = 0.25  # share of skins without a press to condition on; the others have 1 to 65
+NO_PRESSES = 0.25  # share of skins without presses for conditioning; the others have 1 to 65
 NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading, by axis
-RESIDUAL_SCALE_MAX = 2.0  # of the residual of known boards, drawn from 0
-# Relative rms error of the law, where boards are known and where none is; of recorded boards, what else may differ.
+RESIDUAL_SCALE_MAX = 2.0  # the residual of known boards is multiplied by a factor between 0 and this
+# Ranges of the law's relative rms error: with known boards, without, and for variations of the recorded boards.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
-ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # length scales of these errors; cosines they are made from
-NOMINAL_NAME = "nominal"  # of the prior without a known board
+ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # length scales of these errors; number of cosines
+NOMINAL_NAME = "nominal"  # name of the prior without a known board
 
 
 class TrainingSettings(Strict):
-    """Simulated skins, steps of training and networks."""
+    """Numbers of simulated skins, of training steps, and of networks."""
 
     skins_n: Annotated[int, Field(ge=1, le=100_000)]
     steps_n: Annotated[int, Field(ge=2, le=1_000_000)]
@@ -125,7 +125,7 @@ class TrainingSettings(Strict):
 
 @dataclass(frozen=True)
 class RecordedBoard:
-    """Readings of the presses of a known board, equally many of each, in the board's frame and axes."""
+    """Readings of a known board, the same number for each press, in the board's frame and axes."""
 
     db_uT: Float32[np.ndarray, "m r ch"]
     rest_uT: Float32[np.ndarray, " ch"]
@@ -137,8 +137,8 @@ class RecordedBoard:
 class SkinPrior:
     """Distribution of the skins that networks are trained on.
 
-    Simulated skins about a centre; where boards of the rig are known, these and the law's errors on them (`residual`).
-    follows_law: skins follow the law exactly, as those of a simulated scene.
+    Skins are simulated around a central law. If boards of the rig are known, `recorded` has these boards and `residual`
+    the law's errors on them. follows_law: whether skins follow the law exactly, as those of a simulated scene do.
     """
 
     name: str
@@ -152,7 +152,10 @@ class SkinPrior:
 
 @dataclass(frozen=True)
 class Batch:
-    """Skins of one step: the first `PLACES_N` presses of each condition the network (if `kept`), others are read."""
+    """Skins of one step.
+
+    The network is conditioned on the `kept` ones of the first `PLACES_N` presses, and trained on the other presses.
+    """
 
     db_uT: Float32[np.ndarray, "b m ch"]
     rest_uT: Float32[np.ndarray, "b ch"]
@@ -161,7 +164,7 @@ class Batch:
 
 
 def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> list[dict[str, np.ndarray]]:
-    """Draw skins and train networks on them, one after the other; return their weights."""
+    """Draw skins, train networks on them one by one, and return the networks' weights."""
     rng = rng_for(seed, "universal", prior.name, "skins")
     skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng)
     names = ("universal", prior.name, "network")
@@ -170,7 +173,7 @@ def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> l
 
 def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """Train one network; return its weights."""
-    torch.set_num_threads(1)  # sums in the same order, however many processes run beside this one
+    torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
     network = Network(draw_weights(skins.rest_uT.shape[1], rng))
     optimizer = torch.optim.AdamW(network.parameters(), RATE_MAX, weight_decay=WEIGHT_DECAY, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE_MAX, total_steps=steps_n, pct_start=WARM_UP)
@@ -186,19 +189,19 @@ def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Gene
 
 
 def loss_of(network: Network, batch: Batch) -> torch.Tensor:
-    """Return the loss: Huber loss of the estimates, and the Gaussian likelihood of their standard deviations."""
+    """Return the loss: Huber loss of the estimates plus the Gaussian negative log likelihood."""
     db_uT, rest_uT = torch.from_numpy(batch.db_uT), torch.from_numpy(batch.rest_uT)
     target, kept = torch.from_numpy(batch.target), torch.from_numpy(batch.kept)
     set_n = kept.shape[1]
     mean, log_sd = network(db_uT[:, set_n:], rest_uT, network.encode(db_uT[:, :set_n], rest_uT, kept))
     error = HUBER_WEIGHT * huber_loss(mean, target, delta=HUBER_DELTA)
-    # Standard deviations learn from errors, not the reverse: the Gaussian likelihood alone gives up hard presses.
+    # Errors affect standard deviations, but not the reverse: with the likelihood alone, hard presses are not learned.
     off = (mean - target).detach()
     return error + SD_WEIGHT * (log_sd + 0.5 * off**2 * exp(-2 * log_sd)).mean()
 
 
 class Batches:
-    """Draws the batches of a training."""
+    """Draws the batches of a training run."""
 
     def __init__(self, skins: Population, prior: SkinPrior) -> None:
         self.skins, self.recorded = skins, prior.recorded
@@ -209,7 +212,7 @@ class Batches:
             self.error = 0.0, 0.0
 
     def draw(self, rng: np.random.Generator) -> Batch:
-        """Draw simulated skins, and recorded ones where there are any, with noise and errors of the law."""
+        """Draw simulated skins, and recorded skins if there are any, with noise and errors of the law."""
         recorded_n = RECORDED_PER_STEP_N if self.recorded else 0
         parts = [self._simulated(SKINS_PER_STEP_N - recorded_n, rng)]
         if recorded_n:
@@ -234,14 +237,14 @@ class Batches:
 
 
 def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw one reading of each of 130 presses of a known board; if there are fewer, some repeat."""
+    """Draw one reading for each of 130 presses of a known board; with fewer presses, some repeat."""
     press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
     reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
     return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
 
 
 def draw_kept(n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n c"]:
-    """Draw which presses of each skin the network is conditioned on: none of some skins, 1 to 65 of others."""
+    """Draw which presses of each skin the network is conditioned on: none for some skins, 1 to 65 for the others."""
     kept_n = np.where(rng.random(n) < NO_PRESSES, 0, rng.integers(1, PLACES_N + 1, n))
     rank = rng.random((n, PLACES_N)).argsort(axis=1).argsort(axis=1)
     return (rank < kept_n[:, None]).astype(np.float32)
@@ -254,9 +257,10 @@ def add_error(
     size: tuple[float, float],
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "b m ch"]:
-    """Add an error of the law, smooth over place and log F, half in proportion to |dB| of the chip, half of all chips.
+    """Add an error of the law that is smooth over place and log F.
 
-    size: bounds of its relative rms, drawn for each skin.
+    Half of it is proportional to |dB| at the chip, half to |dB| over all chips. size: bounds of its relative rms, which
+    is drawn for each skin.
     """
     skins_n, _, channels_n = db_uT.shape
     part = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)
@@ -274,7 +278,7 @@ def add_error(
 
 
 def residual_uT(skins: Population, residual: Residual) -> Float32[np.ndarray, "s m ch"]:
-    """Return what the expected errors of the law add to every press of a population."""
+    """Return the expected errors of the law for every press of a population, in uT."""
     added = np.empty_like(skins.db_uT)
     for i in range(len(skins)):
         relative: Float[np.ndarray, "m ch"] = residual.at(skins.place_mm[i], np.log(skins.force_N[i]))

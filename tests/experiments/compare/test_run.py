@@ -196,7 +196,7 @@ def test_presses_are_means_of_readings_with_force():
     assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # rows 0, 1, 2 and 3, 4
     assert pokes.excluded_n == 1
     assert pokes.groups == ("c0 1 mm",)
-    with pytest.raises(SchemaError, match="experiment compare: board .* has no press with place and force"):
+    with pytest.raises(SchemaError, match="experiment compare: board .* has no press with a known place and force"):
         pool([readings(Fz_N=np.full(6, np.nan, np.float32))])
     with pytest.raises(ParamsError, match="1 chips were recorded, but compare.design has 5"):
         to_board_axes(pokes, SECTION)
