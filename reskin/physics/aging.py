@@ -13,7 +13,7 @@ from reskin.errors import ParamsError
 
 @dataclass(frozen=True)
 class Prony:
-    """Prony series of the relaxation function, 1 - sum of share (1 - exp(-t / tau))."""
+    """Prony series of the relaxation function, 1 - sum over terms of share (1 - exp(-t / tau))."""
 
     tau_s: Float[np.ndarray, " p"]
     share: Float[np.ndarray, " p"]
@@ -41,10 +41,11 @@ class Relaxation(Strict):
 class Memory(Strict):
     """Hysteresis of the field: dB creeps while an indentation is held, and decays after it.
 
-    The part of dB left in the next no-load reading is as recorded (5 to 8 %); its distribution over times is assumed.
+    The part of dB that remains in the next no-load reading is as recorded (5 to 8 %); its distribution over time
+    constants is assumed.
     """
 
-    share: tuple[Annotated[float, Field(ge=0, le=1)], ...]  # of dB, added by an indentation that is held forever
+    share: tuple[Annotated[float, Field(ge=0, le=1)], ...]  # share of dB that a very long indentation adds
     tau_s: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
     contact_s: Annotated[float, Field(ge=0, le=1e4)]  # duration of an indentation, until the end of its readings
     rest_s: Annotated[float, Field(ge=0, le=1e4)]  # from there to the next no-load reading
@@ -62,13 +63,13 @@ def field_memory(
     """Return the hysteresis of the field in T, from dB at the stops of every indentation.
 
     Each state follows q' = (share dB - q) / tau during an indentation and q' = -q / tau after it, integrated exactly;
-    q = 0 before the first. A stop has no known time: the indentation counts as held for `contact_s` at the mean dB of
-    its stops so far.
+    q = 0 before the first. The times of stops are not known: at each stop, the indentation is assumed to have been held
+    for `contact_s` at the mean dB of its stops so far.
 
     Returns
     -------
-    before_T : what earlier indentations add to each no-load reading.
-    added_T : what each stop adds to the no-load reading of its indentation.
+    before_T : hysteresis in each no-load reading, from earlier indentations.
+    added_T : hysteresis at each stop, relative to that in the no-load reading of its indentation.
     """
     so_far_T = change_T.cumsum(axis=1) / np.arange(1, change_T.shape[1] + 1)[:, None, None]
     before_T, added_T = np.zeros_like(change_T[:, 0]), np.zeros_like(change_T)
@@ -84,7 +85,7 @@ def field_memory(
 
 
 def relaxed_share(how: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
-    """Return the force when an indentation is read, relative to that of an elastic skin."""
+    """Return the force at the readings of an indentation, relative to that of an elastic skin."""
     elastic = np.array([0.0, 1.0, 1.0])
     return float(relax(np.cumsum([0.0, how.approach_s, how.hold_s]), elastic, prony)[-1])
 
@@ -92,8 +93,8 @@ def relaxed_share(how: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
 def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: Prony) -> Float[np.ndarray, " p"]:
     """Integrate q' = -q / tau + share e' over `dt_s`, for e that grows linearly by `change`; exact for any dt / tau.
 
-    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). dt = 0 is a jump:
-    without change the state stays the same.
+    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). dt = 0 is a jump of
+    e; without a change, the state stays the same.
     """
     if not (np.isfinite(dt_s) and dt_s >= 0):
         rule = "0 s or more and finite"
@@ -117,7 +118,7 @@ def relax(time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], pro
 
 
 def _mean_decay(x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    # (1 - exp(-x)) / x; without expm1 it is 11 % off at x = 1e-16.
+    # (1 - exp(-x)) / x; without expm1 the error is 11 % at x = 1e-16.
     return np.where(x > 0, -np.expm1(-x) / np.where(x > 0, x, 1.0), 1.0)
 
 
@@ -126,17 +127,17 @@ REMANENCE_PER_K = -0.12e-2  # NdFeB powder: Br falls by 0.12 % for each kelvin
 
 
 class Temperature(Strict):
-    """Course of the temperature, and how the chips' sensitivity depends on it."""
+    """Temperature over time, and how the chips' sensitivity depends on it."""
 
     warming_K: Annotated[float, Field(ge=0, le=40)]  # from switching on to thermal equilibrium
     warming_s: Annotated[float, Field(gt=0, le=1e5)]
-    swing_K: Annotated[float, Field(ge=0, le=20)]  # of the room, up and down
+    swing_K: Annotated[float, Field(ge=0, le=20)]  # amplitude of the room temperature
     swing_s: Annotated[float, Field(gt=0, le=1e6)]
     chip_sensitivity_per_K: Annotated[float, Field(ge=0, le=0.01)]  # sd between chips
 
 
 def temperature_rise_K(time_s: Float[np.ndarray, "..."], how: Temperature) -> Float[np.ndarray, "..."]:
-    """Return the temperature over that at the start: warming (1 - exp(-t / tau)) + swing sin(2 pi t / period)."""
+    """Return the temperature rise since the start: warming (1 - exp(-t / tau)) + swing sin(2 pi t / period)."""
     warming = -how.warming_K * np.expm1(-time_s / how.warming_s)
     return warming + how.swing_K * np.sin(2 * np.pi * time_s / how.swing_s)
 
@@ -156,7 +157,7 @@ class Ageing(Strict):
     settling: Annotated[float, Field(ge=0, le=0.5)]  # force lost in the first contacts
     ageing: Annotated[float, Field(ge=0, le=0.1)]  # force lost with each decade of contacts
     fading_per_decade: Annotated[float, Field(ge=0, le=0.1)]  # of the no-load field
-    wandering_uT: Annotated[float, Field(ge=0, le=10)]  # sd a contact and channel
+    wandering_uT: Annotated[float, Field(ge=0, le=10)]  # sd per contact and channel
 
 
 def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: float) -> Float[np.ndarray, " n"]:

@@ -1,7 +1,7 @@
 """Ambient fields: the earth's, and that of an iron ball. SI units.
 
-The ball is magnetised by a uniform field (one dipole) and by nearby dipoles (image sources). Its effect on what
-magnetises it is neglected.
+The ball is magnetised by a uniform field (one dipole) and by nearby dipoles (image sources). Its effect on these
+sources is neglected.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """The circuit board: design, drawn boards, and the spreads between boards and between skins.
 
-Each board is drawn by a random generator of its name: board 7 stays the same when board 8 is added.
+Each board is drawn from its own random generator, seeded by its name: board 7 stays the same when board 8 is added.
 """
 
 from dataclasses import dataclass
@@ -34,10 +34,10 @@ class Tiles(Strict):
 
 
 class BoardDesign(Strict):
-    """Positions of the chips from the centre of the board, and the rotation of each about z.
+    """Positions of the chips relative to the centre of the board, and the rotation of each chip about z.
 
-    The scenes' rotations are those that recordings show (tests/recordings/test_lab_frames.py), not those of a board
-    file. With `tiles`, this is one board of many; chips are then numbered board by board.
+    The rotations in the scenes were found from recordings (tests/recordings/test_lab_frames.py), not from a board
+    file. With `tiles`, this is the design of each of several boards; chips are then numbered board by board.
     """
 
     chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
@@ -55,7 +55,7 @@ class BoardDesign(Strict):
 
     @property
     def places_mm(self) -> list[tuple[float, float]]:
-        """Positions of all chips of all boards, from the centre of the skin."""
+        """Positions of all chips of all boards, relative to the centre of the skin."""
         boards_mm = [(0.0, 0.0)] if self.tiles is None else self.tiles.centres_mm
         return [(x + chip_x, y + chip_y) for x, y in boards_mm for chip_x, chip_y in self.chips_xy_mm]
 
@@ -66,13 +66,13 @@ class BoardDesign(Strict):
 
 
 class Spreads(Strict):
-    """Standard deviations between boards and between skins: all of them assumptions.
+    """Standard deviations between boards and between skins.
 
     Factors are drawn as exp(sd * normal), so that they stay positive; everything else is normal around the design.
     """
 
     board_gap: Share  # of the gap between skin and chips
-    board_uneven: Share  # of the gap over the outermost chips: a base that tilts along x or y, or bows
+    board_uneven: Share  # of the gap over the outermost chips, because the base tilts along x or y, or bows
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
@@ -119,7 +119,7 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
 
 
 def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # Tilt and bow of the base over its board, 1 at the outermost chip; the skin itself is taken as flat.
+    # Tilt and bow of the base over its board, 1 at the outermost chip; the skin itself is assumed to be flat.
     places_mm = np.array(design.chips_xy_mm)
     away_mm = np.hypot(*places_mm.T)
     share = places_mm / max(away_mm.max(), 1e-12)

@@ -42,7 +42,7 @@ def steps_uT(gain_sel: int) -> Float[np.ndarray, " 3"]:
 def read_field(
     b_T: Float[np.ndarray, "f k 3"], board: Board, *, design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f ch"], Overruns]:
-    """Read the field with the board's chips, each in its own axes; count the values out of range."""
+    """Read the field with the board's chips, each along its own axes; count the values out of range."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     seen_T = np.einsum("kij,fkj->fki", to_chip, b_T)
     clipped_n = int(np.count_nonzero(np.abs(seen_T) > FIELD_MAX_T))
@@ -72,7 +72,7 @@ CONVERSION_S = 1.84e-3  # MLX90393 at OSR 0, DIG_FILT 2 (data sheet)
 def last_conversions(
     frame_s: Float[np.ndarray, " f"], phase_s: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "f k"], Int[np.ndarray, "f k"]]:
-    """Return the age in s of each chip's conversion at each frame, and the first frame that carries the same one."""
+    """Return for each frame and chip the age of the conversion in s, and the first frame with the same conversion."""
     conversion = np.floor((frame_s[:, None] - phase_s) / CONVERSION_S)
     age_s = frame_s[:, None] - phase_s - conversion * CONVERSION_S
     fresh = np.ones(conversion.shape, bool)
@@ -84,7 +84,7 @@ def last_conversions(
 def sample_at_conversion(
     value: Float[np.ndarray, "f k a"], age_s: Float[np.ndarray, "f k"], rate_hz: float
 ) -> Float[np.ndarray, "f k a"]:
-    """Interpolate each chip's field linearly to its conversion, `age_s` before the frame."""
+    """Interpolate each chip's field linearly to the time of its conversion, `age_s` before the frame."""
     frames_n, chips_n = age_s.shape
     place = np.maximum(np.arange(frames_n)[:, None] - age_s * rate_hz, 0.0)
     before = np.minimum(place.astype(np.intp), max(frames_n - 2, 0))

@@ -1,9 +1,9 @@
-"""Finite deformation of the skin under a tip: material followed in small steps, and tables of it. SI units.
+"""Finite deformation of the skin under a tip: material followed in small steps, and tables of the result. SI units.
 
-The linear solution of `layer` holds for small depths only. Here the tip sinks in small steps (12 to 24 over the usual
-depths); in each, the pressure change that keeps the deformed surface on the sphere displaces all material. The result
-is axisymmetric and, in units of the thickness, depends on R/h alone: a few tables over R/h serve skins of any
-thickness, and an indentation only interpolates them.
+The linear solution of `layer` is valid for small depths only. Here the tip sinks in small steps (12 to 24 over the
+usual depths). In each step, the pressure change that keeps the deformed surface on the sphere displaces all material.
+The result is axisymmetric and, in units of the thickness, depends only on R/h. A few tables over R/h therefore serve
+skins of any thickness, and an indentation only interpolates them.
 """
 
 from dataclasses import asdict, dataclass
@@ -23,19 +23,20 @@ from reskin.physics import layer
 from reskin.physics.layer import Displacement, IndentedLayer, Waves, contact_of_radius, displacement, waves
 from reskin.physics.magnet import Dipoles
 
-STEP = 0.025  # of `depth_scale`: 0.05 mm in a skin of 2 mm; half of it changes dB by 0.3 % (slipping), 0.6 % (bonded)
-# Depths at which the flow is stepped, whatever depths are requested. The first step is cut in four and in two: there
-# the contact radius grows as the root of the depth.
+# In units of `depth_scale`: 0.05 mm in a skin of 2 mm. Halving it changes dB by 0.3 % (slipping) and 0.6 % (bonded).
+STEP = 0.025
+# Depths of the steps, which do not depend on the requested depths. The first step is divided, because there the contact
+# radius grows as the square root of the depth.
 LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
-RIM_MAX = 1.2  # of the thickness: waves that end at the surface grow as exp(kz) above it
-MARKERS_N = 48  # on the surface, closer towards the axis
-PRESSURES_N = 6  # 4 and 8 move the markers by less than 0.03 mm at 1.2 mm
+RIM_MAX = 1.2  # of the thickness; above the surface, the waves grow as exp(kz)
+MARKERS_N = 48  # on the surface, denser towards the axis
+PRESSURES_N = 6  # with 4 or 8, the markers move by less than 0.03 mm at 1.2 mm
 DAMPING = 1e-3
 
 
 @dataclass(frozen=True)
 class Material:
-    """Current positions of material points, and the gradient F of the map from rest; its other entries are zero."""
+    """Current positions of material points, and the deformation gradient F, whose entries not listed are zero."""
 
     r_m: Float[np.ndarray, " s"]
     z_m: Float[np.ndarray, " s"]
@@ -48,8 +49,8 @@ def follow(
 ) -> list[Material]:
     """Follow material points from rest through increasing depths; one `Material` for each depth.
 
-    Markers on the surface are followed too. A pressure that fits the surface at rest would leave the deformed surface
-    0.3 mm behind the tip at 1.2 mm; so each step solves for the pressure that brings the markers onto the sphere.
+    Markers on the surface are followed too. With a pressure that fits the surface at rest, the deformed surface would
+    be 0.3 mm off the tip at 1.2 mm. Therefore each step solves for the pressure that moves the markers onto the sphere.
     """
     path = [with_markers(r_m, z_m, press)]
     for depth_m in map(float, depths_m[1:]):
@@ -58,12 +59,12 @@ def follow(
 
 
 def depth_scale(size: float) -> float:
-    """Return a smooth bound of all depths, in thicknesses, below the lesser of thickness and tip radius (`size`)."""
+    """Return the greatest depth in thicknesses, a smooth function below the lesser of 1 and `size`, which is R/h."""
     return size / (1 + size**4) ** 0.25
 
 
 def depth_steps(depths_m: tuple[float, ...], press: IndentedLayer) -> Float[np.ndarray, " d"]:
-    """List the depths to step through: 0, those of `LADDER` above the deepest requested one, and all requested ones."""
+    """List the depths of the steps: 0, those of `LADDER` that are less than the deepest one, and all requested ones."""
     ladder_m = press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m) * LADDER
     return np.unique(np.append(ladder_m[ladder_m < max(depths_m)], depths_m))
 
@@ -74,17 +75,18 @@ def undeformed(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Ma
 
 
 def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: IndentedLayer) -> Material:
-    """Return material at rest, surface markers first; they reach as far as the widest possible contact."""
+    """Return material at rest, with surface markers first; the markers extend to the widest possible contact."""
     widest = press.contact(press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m))
     r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKERS_N) ** 2, r_m)
     return undeformed(r_m, np.append(np.full(MARKERS_N, press.thickness_m), z_m))
 
 
 def pressure_change(material: Material, depth_m: float, press: IndentedLayer) -> Waves:
-    """Solve for the pressure change that brings the markers (first in `material`) to a greater depth.
+    """Solve for the pressure change that moves the markers (first in `material`) to a greater depth.
 
-    The pressure is a sum of those of spheres on smaller contacts. Its weights bring all markers inside the contact from
-    their current positions to the tip, by damped least squares, as waves shorter than the depth do not reach them.
+    The pressure is a weighted sum of the pressures of spheres with smaller contacts. The weights move all markers
+    inside the contact from their current positions to the tip, by least squares. Damping is needed because waves shorter than
+    the depth do not reach the markers.
     """
     contact = press.contact(depth_m)
     inside = np.flatnonzero(material.r_m[:MARKERS_N] < contact.radius_m)
@@ -105,9 +107,9 @@ def pressure_change(material: Material, depth_m: float, press: IndentedLayer) ->
 
 
 def displace(material: Material, change: Waves, depth_m: float, press: IndentedLayer) -> Material:
-    """Displace material by a pressure change: midpoint rule, with F by the chain rule through the midpoint.
+    """Displace material by a pressure change, with the midpoint rule; F follows from the chain rule at the midpoint.
 
-    `depth_m` is the depth that the change leads to, for the error message.
+    `depth_m` is the depth after the change, for the error message.
     """
     first = displacement(material.r_m, material.z_m, change)
     half_r_m, half_z_m = material.r_m + first.r_m / 2, material.z_m + first.z_m / 2
@@ -131,31 +133,32 @@ def rotation_angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
     return np.arctan2(f[:, 0, 1] - f[:, 1, 0], f[:, 0, 0] + f[:, 1, 1])
 
 
-# In thicknesses, past the contact. Material farther away does not move on a bonded base (a reach of 4 from the axis
-# costs up to 17 % of dB); on a sliding base it moves outward as one, up to waves that decay as exp(-pi r / h).
+# In thicknesses beyond the contact. On a bonded base, material farther away does not move (with a reach of 4 from the
+# axis, the error of dB is up to 17 %). On a sliding base, it moves outward as a whole, apart from waves that decay as
+# exp(-pi r / h).
 REACH = 5.0
-SIZE_STEP = 0.2  # of ln(R/h) between tables; interpolating between them costs less than 0.3 % of dB (test_skin)
+SIZE_STEP = 0.2  # step of ln(R/h) between tables; the interpolation error of dB is below 0.3 % (test_skin)
 STENCIL_N = 4  # cubic interpolation, between tables and between depths
 DET_F_ERROR_MAX = 0.1
-COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which the flow is computed, over the reach
-FINE_R = np.linspace(0, 1, 512)  # radii at which it is tabulated, so that linear interpolation is enough
-PACKAGE = Path(__file__).parent  # tables are cached beside the sources that determine them
+COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which the flow is computed, relative to the reach
+FINE_R = np.linspace(0, 1, 512)  # radii at which it is tabulated, fine enough for linear interpolation
+PACKAGE = Path(__file__).parent  # tables are cached in this package, whose sources determine them
 
 
 @dataclass(frozen=True)
 class DeformationMap:
-    """Displacement of material at given heights and depths, in units of the thickness, over equal steps in r."""
+    """Displacement of material by depth, height and radius (in equal steps), in units of the thickness."""
 
     thickness_m: float
     reach_m: float
     depth_m: Float[np.ndarray, " d"]  # from 0 on
-    moved: Float[np.ndarray, "d l i 3"]  # outward, up, tan(angle / 2) with the angle from z towards r
+    moved: Float[np.ndarray, "d l i 3"]  # outward, up, and tan(angle / 2), where the angle is from z towards r
     base: layer.Base
 
 
 @dataclass(frozen=True)
 class RestingDipoles:
-    """Dipoles at rest, and which of the few heights (in thicknesses) each of them has."""
+    """Dipoles at rest, and for each the index of its height among the few `heights` (in thicknesses)."""
 
     nodes_m: Float[np.ndarray, "s 3"]
     moments_A_m2: Float[np.ndarray, "s 3"]
@@ -165,7 +168,7 @@ class RestingDipoles:
 
 @dataclass(frozen=True)
 class MovedDipoles:
-    """The dipoles within reach of an indentation, by their index, before and after it."""
+    """The dipoles within reach of an indentation: their indices, and their states before and after it."""
 
     i: Int[np.ndarray, " m"]
     before: Dipoles
@@ -175,8 +178,8 @@ class MovedDipoles:
 def group_by_height(
     nodes_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], thickness_m: float
 ) -> RestingDipoles:
-    """Group a skin's nodes by height; a quadrature rule has few, and the map is tabulated for each."""
-    # Rounded, so that skins of any thickness share the heights of their rule.
+    """Group a skin's nodes by height; a quadrature rule has few heights, and the map is tabulated for each."""
+    # Rounded, so that skins of any thickness have the same heights for a rule.
     heights, height_i = np.unique(np.round(nodes_m[:, 2] / thickness_m, 12), return_inverse=True)
     return RestingDipoles(
         np.asfortranarray(nodes_m), np.asfortranarray(moments_A_m2), height_i, tuple(heights.tolist())
@@ -184,7 +187,7 @@ def group_by_height(
 
 
 def reach(size: float, base: layer.Base) -> float:
-    """Return how far from the axis, in thicknesses, a tip of R/h = `size` deforms material, at any depth."""
+    """Return the distance from the axis, in thicknesses, to which a tip of R/h = `size` deforms material."""
     depth = layer.VERIFIED_DEPTH * depth_scale(size)
     return REACH + IndentedLayer(1.0, size, base).contact(depth).radius_m
 
@@ -204,13 +207,13 @@ def tabulate(
     Raises
     ------
     ParamsError
-        If the layer is impossible, or the depth is not followed (see `depth_scale`).
+        If the layer is impossible, or the depth is beyond the greatest depth (see `depth_scale`).
     """
     layer.check_layer(np.array([deepest_m]), thickness_m, tip_radius_m)
     size = tip_radius_m / thickness_m
     depth_m = thickness_m * depth_scale(size) * LADDER
     if not 0 < deepest_m <= depth_m[-1]:
-        rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the deepest that is followed"
+        rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the deepest that can be computed"
         raise ParamsError("poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Poke less deep.")
     rungs_n = 1 + max(int(np.searchsorted(depth_m, deepest_m)), STENCIL_N - 1)
     return _tabulate(thickness_m, tip_radius_m, rungs_n, heights, base)
@@ -227,18 +230,19 @@ def _tabulate(
     share = _lagrange(tables_i.astype(float), at)
     parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
     coarse = sum(weight * part for weight, part in zip(share, parts, strict=True))
-    # Contiguous, or each indentation would copy its part.
+    # Contiguous, because otherwise each indentation would copy its part.
     moved = np.ascontiguousarray(CubicSpline(COARSE_R, coarse, axis=2)(FINE_R))
-    # Material on the base keeps its height and, where that is bonded, its place; it may turn.
+    # Material on the base keeps its height and, if bonded, its place; it may rotate.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
     return DeformationMap(thickness_m, thickness_m * reach(size, base), depth_m, moved, base)
 
 
 def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
-    """Interpolate the map at one depth: exact at tabulated depths, cubic in the root of the depth between them.
+    """Interpolate the map at one depth: exact at tabulated depths, cubic in the square root of the depth between them.
 
-    In that root the tip's depth is a square and a far point's displacement nearly a cube. Below the first tabulated
-    depth (about 10 um on a skin of 2 mm) the map is proportional to that cube, as the force of a light touch is.
+    In terms of this root, the tip's depth is its square, and the displacement of a far point nearly its cube. Below the
+    first tabulated depth (about 10 um on a skin of 2 mm), the map is proportional to the cube, like the force of a
+    light touch.
     """
     if not -np.inf < depth_m <= table.depth_m[-1]:
         rule = f"finite and at most {1e3 * table.depth_m[-1]:.4g} mm, the deepest that is tabulated"
@@ -254,14 +258,14 @@ def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"
 
 
 def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Float[np.ndarray, "3"]) -> MovedDipoles:
-    """Move and turn the dipoles within reach of an indentation (x, y, depth); on a sliding base all of them.
+    """Move and rotate the dipoles within reach of an indentation (x, y, depth); on a sliding base, all dipoles.
 
-    Moments turn with the material: R m, not F m, as magnetisation is independent of stretch (Danas & Reis 2024).
+    Moments rotate with the material: R m, not F m, because magnetisation is independent of stretch (Danas & Reis 2024).
     """
     found = np.empty(0, np.intp), np.empty((6, 0)), np.empty((6, 0))
     here = at_depth(table, float(indentation_m[2]))
     if indentation_m[2] > 0:
-        # Past the reach nothing is lost, so that r^2 grows by the same everywhere.
+        # Beyond the reach, the volume of the layer is conserved, so r^2 grows by the same amount everywhere.
         edge_m = table.reach_m + table.thickness_m * here[:, -1, 0].mean()
         grown_m2 = float(edge_m**2 - table.reach_m**2) if table.base == "slipping" else 0.0
         tip = np.append(indentation_m[:2], (table.reach_m, table.thickness_m, grown_m2))
@@ -286,7 +290,7 @@ def _displaced(
 def _follow_ladder(
     table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
 ) -> Float[np.ndarray, "d l p 3"]:
-    # Each depth from the one above it, so that a deeper indentation later only adds to the ladder. In thicknesses.
+    # Each depth starts from the one before, so that a deeper indentation only extends the ladder. In thicknesses.
     size = _size(table_i)
     at = rest = undeformed(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
     parts = np.zeros((rungs_n, 3, len(rest.r_m)))
@@ -294,7 +298,7 @@ def _follow_ladder(
         depth = depth_scale(size) * float(LADDER[rung_i])
         at = displace(at, _pressure_change(table_i, rung_i, base), depth, IndentedLayer(1.0, size, base))
         if not np.abs(np.linalg.det(at.f) * at.hoop - 1).max() <= DET_F_ERROR_MAX:
-            rule = f"such that material keeps its volume within {DET_F_ERROR_MAX:.0%}"
+            rule = f"such that the volume of the material is conserved within {DET_F_ERROR_MAX:.0%}"
             raise ParamsError("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep.")
         parts[rung_i] = at.r_m - rest.r_m, at.z_m - rest.z_m, np.tan(rotation_angle(at.f) / 2)
     return np.moveaxis(parts, 1, 2).reshape(rungs_n, len(heights), len(COARSE_R), 3)
@@ -302,7 +306,7 @@ def _follow_ladder(
 
 @lru_cache(maxsize=1024)
 def _pressure_change(table_i: int, rung_i: int, base: layer.Base) -> Waves:
-    # From one depth to the next: the same for material of all heights.
+    # From one depth to the next; the same for material at all heights.
     size = _size(table_i)
     depth = depth_scale(size) * float(LADDER[rung_i])
     return pressure_change(_markers(table_i, rung_i - 1, base), depth, IndentedLayer(1.0, size, base))
@@ -346,7 +350,7 @@ def _move(nodes, moments, height_i, table, tip):
         s = i[m]
         dx, dy = nodes[0, s] - x, nodes[1, s] - y
         r = sqrt(dx * dx + dy * dy)
-        # On the axis nothing moves sideways or turns, so no direction is needed there.
+        # On the axis, nothing moves sideways or rotates, so no direction is needed.
         over_r = 1 / r if r > 0 else 0.0
         cos, sin = dx * over_r, dy * over_r
         outward, up, tan = sqrt(r * r + grown_m2) - r, 0.0, 0.0

@@ -1,8 +1,8 @@
 """An incompressible elastic layer under a spherical tip: contact, force and linear displacements. SI units.
 
 The layer is bonded to a rigid base or slips on it. Fields are Hankel integrals over waves J0(kr) of the pressure; kh
-and kz are the wave number times the thickness and the height, primes are derivatives by kz. For a bonded base
-W = a (sinh z' - z' cosh z') + b z' sinh z' and U = -W'/k, z' = kz.
+and kz are the wave number times the thickness and the height, primes are derivatives with respect to kz. For a bonded
+base, W = a (sinh z' - z' cosh z') + b z' sinh z' and U = -W'/k, z' = kz.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from reskin.errors import ParamsError
 
 Base = Literal["bonded", "slipping"]
 
-VERIFIED_DEPTH = 0.6  # of the thickness: up to here Long et al. 2011 compared with finite elements
+VERIFIED_DEPTH = 0.6  # of the thickness: Long et al. 2011 compared with finite elements up to this depth
 CURVE_N = 48  # contact radii of the force curve
 
 
@@ -74,7 +74,7 @@ def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1), A = kh, with numerator and denominator divided by exp(2A) / 2 to avoid
     overflow.
     """
-    double = np.minimum(2 * kh, 1e3)  # there it is 1, and squares stay finite
+    double = np.minimum(2 * kh, 1e3)  # the compliance is 1 there, and squares stay finite
     fade = np.exp(-double)
     s = double**2
     series = 2 * fade * double * s / 6 * (1 + s / 20 * (1 + s / 42 * (1 + s / 72 * (1 + s / 110))))
@@ -120,7 +120,7 @@ def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float,
         here = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
         return here.depth_m - depth_m
 
-    # A thick layer has a^2 = R d; a thin one, whose material can only flow aside, 4 R d.
+    # A thick layer has a^2 = R d; a thin layer, whose material can only flow sideways, has a^2 = 4 R d.
     top_m = min(2.1 * np.sqrt(tip_radius_m * depth_m), 0.999 * tip_radius_m)
     radius_m = float(brentq(miss_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
     return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
@@ -159,7 +159,7 @@ def force(
     Raises
     ------
     ParamsError
-        If layer, tip or modulus are impossible, or the depth reaches the lesser of thickness and tip radius.
+        If layer, tip or modulus is impossible, or if the depth reaches the lesser of thickness and tip radius.
     """
     check_layer(depth_m, thickness_m, tip_radius_m)
     if not (np.isfinite(modulus_Pa) and modulus_Pa >= 0):
@@ -198,7 +198,7 @@ def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], of:
 def depth_profile(
     kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"], base: Base = "bonded"
 ) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
-    """Return g = k W 2G / p^ at height z, and its first two derivatives by kz; g(kh) is the surface compliance."""
+    """Return g = k W 2G / p^ at height z and its first two derivatives in kz; g(kh) is the surface compliance."""
     of_all, of_one = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
     found = [[of_one(z, h, of_all(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
     g, slope, bend = np.array(found).transpose(2, 0, 1)
@@ -207,7 +207,8 @@ def depth_profile(
 
 @lru_cache(maxsize=64)
 def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
-    # F / (E d^1.5) over sqrt(d): smooth, and Hertz's 16/9 sqrt(R) at 0, where the contact is small against the layer.
+    # F / (E d^1.5) over sqrt(d) is smooth. At 0, where the contact is small compared with the layer, it is Hertz's
+    # 16/9 sqrt(R).
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
     widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]
@@ -242,7 +243,7 @@ def _bonded_factors(kh):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _bonded_wave(kz, kh, of):
-    """Return g of one wave at height z of a bonded layer, and its first two derivatives by kz.
+    """Return g of one wave at height z of a bonded layer, and its first two derivatives with respect to kz.
 
     g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2), A = kh, z' = kz, t = A - z'.
     Numerator and denominator are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
@@ -268,10 +269,10 @@ def _slipping_factors(kh):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _slipping_wave(kz, kh, of):
-    """Return g of one wave at height z of a slipping layer, and its first two derivatives by kz.
+    """Return g of one wave at height z of a slipping layer, and its first two derivatives with respect to kz.
 
-    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A): the odd solution, since at the base
-    both W and the shear W'' + W vanish. Numerator and denominator are multiplied by 4 exp(-2A), so that no exponent is
+    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A): the odd solution, because both W and
+    the shear W'' + W vanish at the base. Numerator and denominator are multiplied by 4 exp(-2A), so that no exponent is
     positive inside the layer.
     """
     size, first, second = of
@@ -298,7 +299,7 @@ def _between(table, low, share):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_waves(r_m, z_m, waves, slipping, table):
-    """Sum waves [k, kh, amplitude; w] at places [s]; rows: u_r, hoop, u_z, squeeze, du_r/dz, du_z/dr."""
+    """Sum waves [k, kh, amplitude; w] at places [s]; return rows u_r, hoop, u_z, squeeze, du_r/dz, du_z/dr."""
     sums = np.zeros((6, len(r_m)))
     for w in range(waves.shape[1]):
         k, kh, amplitude = waves[0, w], waves[1, w], waves[2, w]
@@ -316,7 +317,7 @@ def _sum_waves(r_m, z_m, waves, slipping, table):
             sums[5, s] += steep * g * j1_
     for s in range(len(r_m)):
         if r_m[s] > 0:
-            sums[1, s] = sums[0, s] / r_m[s]  # on the axis: its limit
+            sums[1, s] = sums[0, s] / r_m[s]  # on the axis, the limit above
     return sums
 
 

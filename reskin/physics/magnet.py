@@ -15,7 +15,7 @@ from reskin.config import Strict
 from reskin.errors import ParamsError
 
 CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
-CUBES_N = (4, 4)  # along x and along y, under the authors' skin of 20 x 20 mm
+CUBES_N = (4, 4)  # along x and y, for the authors' skin of 20 x 20 mm
 ARRAY_BELOW_M = 0.50e-3  # from the skin's base down to the lower cubes' faces, authors' CAD
 ARRAY_ABOVE_M = 0.25e-3  # from the skin's top up to the upper cubes' faces, authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
@@ -44,18 +44,18 @@ def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
     """Return the contribution of one corner of a cuboid to its field, times 4 pi / J."""
     x, y, z = from_m.T
     xx, yy, zz = x * x, y * y, z * z
-    # asinh(y / hypot(x, z)) is log(y + r) less a term common to both ends, and keeps its digits where y < 0.
+    # asinh(y / hypot(x, z)) is log(y + r) minus a term common to both ends, and is accurate also for y < 0.
     along_x, along_y = -np.arcsinh(y / np.sqrt(xx + zz)), -np.arcsinh(x / np.sqrt(yy + zz))
     return np.stack([along_x, along_y, np.arctan(x * y / (z * np.sqrt(xx + yy + zz)))], axis=1)
 
 
 def cubes_along(side_m: float) -> int:
-    """Number of magnet cubes along a side of a skin: enough to cover it, as the authors' four do (else assumed)."""
+    """Return the number of magnet cubes that cover a side of a skin: four for the authors' skin, assumed for others."""
     return ceil(side_m / CUBE_SIDE_M - 1e-9)
 
 
 def seams_m(side_m: float) -> tuple[float, ...]:
-    """Positions along a side where two cubes touch, from the skin's centre: kinks of the magnetisation."""
+    """Return the positions along a side where two cubes touch, which are kinks of the magnetisation."""
     n = cubes_along(side_m)
     return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
 
@@ -63,15 +63,15 @@ def seams_m(side_m: float) -> tuple[float, ...]:
 def array_field(
     nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity, *, cubes_n: tuple[int, int] = CUBES_N
 ) -> Float[np.ndarray, "s 3"]:
-    """Return the field in T, inside the skin, of the magnetising array: `cubes_n` cubes below it and as many above.
+    """Return the field in T inside the skin of the magnetising array: `cubes_n` cubes below it and as many above.
 
-    Adjacent cubes share corners: each corner is computed once, weighted by the sum of its cubes' signs.
+    Adjacent cubes share corners, so each corner is computed once, weighted by the sum of its cubes' signs.
     """
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
         raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
     signs = np.ones(cubes_n) if polarity == "same" else (-1.0) ** np.add.outer(*map(np.arange, cubes_n))
-    # The right corner of a cube counts +, the left one -; likewise along y and z.
+    # The right corner of a cube has sign +, the left corner -; likewise along y and z.
     weights = -np.diff(-np.diff(np.pad(signs, 1), axis=0), axis=1)
     below_m, above_m = -ARRAY_BELOW_M, thickness_m + ARRAY_ABOVE_M
     faces_m = {below_m: 1, below_m - CUBE_SIDE_M: -1, above_m + CUBE_SIDE_M: 1, above_m: -1}
@@ -119,9 +119,8 @@ class Quadrature:
     layers_n: int
 
 
-DEFAULT_QUADRATURE = Quadrature(
-    cell_m=0.5e-3, layers_n=6
-)  # 42 x 42 x 6 nodes; dB within 2 % of cells half as wide (test_skin)
+# 42 x 42 x 6 nodes; dB is within 2 % of that with cells of half the width (test_skin).
+DEFAULT_QUADRATURE = Quadrature(cell_m=0.5e-3, layers_n=6)
 
 
 @dataclass(frozen=True)
@@ -181,10 +180,10 @@ def field_of_each(
 
 
 def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Return the change of field in T of dipoles (positions in m, moments in A m^2) that move and turn.
+    """Return the field change in T due to dipoles (positions in m, moments in A m^2) that move and rotate.
 
-    The sum of K(x) m' - K(X) m, dipole by dipole: the difference of the two total fields would lose digits. Columns
-    that are contiguous in memory (Fortran order, as `deformation.move_dipoles` gives them) are not copied.
+    K(x) m' - K(X) m is summed dipole by dipole, because the difference of the two total fields would lose digits.
+    Columns that are contiguous in memory (Fortran order, as from `deformation.move_dipoles`) are not copied.
     """
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
@@ -193,8 +192,8 @@ def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray
     return change_T
 
 
-# The loop over nodes sums nothing, so it is vectorised without fastmath; dipoles that stay change exactly nothing.
-# error_model: a division by zero gives infinity, as in NumPy, which the caller checks for, not the loop.
+# The loop over nodes has no sums, so it is vectorised without fastmath; dipoles that do not move contribute exactly 0.
+# With this error_model, a division by zero gives infinity, as in NumPy. The caller checks for it, not the loop.
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_of_changes(nodes, moments, moved, moved_moments, observers):

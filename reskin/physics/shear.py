@@ -24,7 +24,7 @@ class Friction(Strict):
 
 @dataclass(frozen=True)
 class DragForce:
-    """Tangential force at each place of a path; the material under the tip rested at path - elastic."""
+    """Tangential force at each place of a path; the rest position of the material under the tip is path - elastic."""
 
     force_N: Float[np.ndarray, "t 2"]  # on the skin, so along the tip's motion
     elastic_m: Float[np.ndarray, "t 2"]
@@ -42,7 +42,7 @@ def drag_force(
 
     Return mapping (Simo & Hughes 1998): an elastic trial step, whose force is scaled back radially to Coulomb's disc
     |Q| <= mu F by slip. A step sticks or slides only if both its ends are in contact; otherwise the spring is released,
-    as the place where the tip lifted or touched is not known.
+    because the place where the tip lifted or touched is unknown.
 
     Parameters
     ----------
@@ -86,13 +86,13 @@ def _check_drag(
         raise ParamsError("drag", "friction", "0 or more and finite", f"{friction}", "Check the scene.")
 
 
-REACH = 5.0  # in thicknesses, past the contact, as in `deformation`: material beyond does not move
-WIDEST = 3.0  # contact radius in thicknesses: `layer.WAVES_KH` does not sample waves for more
-RIM_MAX = 1.2  # of the thickness, as in `deformation`; a rim above the thickness moves as the surface does
-STEP = 0.75  # largest half curl of one step: on the skin, one step to 0.6 mm and mu 0.8
+REACH = 5.0  # in thicknesses beyond the contact, as in `deformation`: material farther away does not move
+WIDEST = 3.0  # largest contact radius in thicknesses; `layer.WAVES_KH` does not sample the waves of larger contacts
+RIM_MAX = 1.2  # of the thickness, as in `deformation`; a rim above the thickness moves like the surface
+STEP = 0.75  # largest half curl per step: on the nominal skin, one step suffices to 0.6 mm with mu 0.8
 STEEPEST = 1.5  # largest half curl that was compared with finer steps: mu 0.8 at 1.2 mm
-TABLE_R_N, TABLE_Z_N = 512, 80  # linear interpolation is enough
-DEPTH_STEP_M = 10e-6  # between tabulated depths: stiffness differs by 1 %, dB by 0.1 uT
+TABLE_R_N, TABLE_Z_N = 512, 80  # fine enough for linear interpolation
+DEPTH_STEP_M = 10e-6  # between tabulated depths; stiffness changes by 1 % per step, dB by 0.1 uT
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,10 @@ class Traction:
 
 @dataclass(frozen=True)
 class WaveResponse:
-    """Response of the layer to a wave of tangential traction T, as functions of kz; primes are derivatives by kz.
+    """Response of the layer to a wave of tangential traction T as a function of kz; primes are derivatives in kz.
 
-    In the plane of the wave T / 2Gk gives w' along it and -i w up; across it T / Gk gives v.
+    In the plane of the wave, the displacement in units of T / 2Gk is w' along the wave and -i w upwards; across the
+    wave, it is v in units of T / Gk.
     """
 
     w: Float[np.ndarray, "z k"]
@@ -120,7 +121,7 @@ class WaveResponse:
 
 @dataclass(frozen=True)
 class ShearMap:
-    """Displacement and half curl at (r, z) of a force Q along x, divided by Q / G; equal steps in r and in z.
+    """Displacement and half curl at (r, z) for a force Q along x, divided by Q / G; equal steps in r and in z.
 
     Parts A, B, C in 1/m: displacement A + B cos 2f, B sin 2f, C cos f along x, y, z at the angle f from x.
     Parts D, E, S in 1/m^2: half curl -E sin 2f, D + E cos 2f, S sin f.
@@ -142,18 +143,19 @@ class ShearDisplacement:
 
 
 def slip_traction(contact: layer.Contact) -> Traction:
-    """Return the traction of a sliding tip: Coulomb's q = mu p, so the shape of the pressure.
+    """Return the traction of a sliding tip: Coulomb's q = mu p, which has the shape of the pressure.
 
-    It is used for the whole drag, which slides except for its first millimetre or two: its k_t is 19 to 20 % below that
-    of `stick_traction` on the skin at 0.2 to 1.2 mm, 1/6 on a thick layer.
+    It is used for a whole drag, which slides except for its first millimetre or two. Its k_t is below that of
+    `stick_traction` by 19 to 20 % on the nominal skin at 0.2 to 1.2 mm, and by 1/6 on a thick layer.
     """
     return Traction(contact.radius_m, contact.x_m, contact.weights_m2 / contact.weights_m2.sum())
 
 
 def stick_traction(radius_m: float, thickness_m: float) -> Traction:
-    """Return the traction of a sticking tip: the axisymmetric one that moves its contact rigidly, apart from B.
+    """Return the traction of a sticking tip: the axisymmetric traction that moves the contact rigidly, apart from B.
 
-    chi - K chi = 1 (see `layer.contact_of_radius`); chi is constant for a thick layer: Mindlin's (a^2 - r^2)^(-1/2).
+    chi - K chi = 1 (see `layer.contact_of_radius`). For a thick layer chi is constant, which is Mindlin's traction
+    (a^2 - r^2)^(-1/2).
     """
     x_m, weights_m = radius_m * layer.CONTACT_X, radius_m * layer.CONTACT_W
     kernel = _kernel(x_m, thickness_m) * weights_m
@@ -162,9 +164,10 @@ def stick_traction(radius_m: float, thickness_m: float) -> Traction:
 
 
 def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
-    """Return k_t / G, the force over the mean displacement along it, weighted with the traction (as work is).
+    """Return k_t / G: the force divided by the mean displacement along it, weighted with the traction, as for work.
 
-    Parseval: 8 pi / integral of q^2 (w' + 2v) dk at the surface, whose half-space part 3 is in closed form.
+    By Parseval's theorem it is 8 pi / integral of q^2 (w' + 2v) dk at the surface; the part for a half-space, with 3
+    for the bracket, is in closed form.
     """
     chi = traction.weights / (traction.radius_m * layer.CONTACT_W)
     held = _kernel(traction.x_m, thickness_m) @ traction.weights
@@ -175,7 +178,7 @@ def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
 def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
     """Tabulate the shear under a tip that slides at this depth, out to the reach at the deepest verified depth.
 
-    `base` determines the contact only: sideways the base is held, or no force could act on the layer.
+    `base` affects only the contact. Sideways the base is always fixed; otherwise no force could act on the layer.
     """
     layer.check_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
@@ -188,7 +191,7 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
 def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
     """Interpolate the map linearly between tabulated depths, so that it is continuous in the depth.
 
-    Below the first of them (`DEPTH_STEP_M`), where the force is close to zero, it is the first.
+    Below the first tabulated depth (`DEPTH_STEP_M`), where the force is close to zero, it is the map of that depth.
     """
     at = max(depth_m / DEPTH_STEP_M, 1.0)
     first, share = int(at), at - int(at)
@@ -206,7 +209,7 @@ def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: l
 
 
 def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = None) -> ShearMap:
-    """Tabulate the shear of a traction, by default to `REACH` thicknesses past the contact."""
+    """Tabulate the shear due to a traction, by default to `REACH` thicknesses beyond the contact."""
     if not 0 < traction.radius_m <= WIDEST * thickness_m < np.inf:
         rule, got = f"above 0 m and at most {WIDEST} thicknesses", f"{traction.radius_m} m on {thickness_m} m"
         raise ParamsError("drag", "contact radius", rule, got, "Press less deep.")
@@ -215,11 +218,10 @@ def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = Non
     r_m = np.linspace(0, reach_m, TABLE_R_N)
     z_m = np.linspace(0, thickness_m, TABLE_Z_N)
     parts = evaluate_map(traction, r_m, z_m, thickness_m=thickness_m)
-    parts[:, 0, :3] = 0.0  # the base is held, though the material on it shears and so turns
+    parts[:, 0, :3] = 0.0  # the base is fixed, but the material on it shears and therefore rotates
     d, e, s = np.moveaxis(parts[..., 3:], 2, 0)
-    steepest_per_m2 = max(
-        np.abs(d + e).max(), np.hypot(d - e, s).max()
-    )  # at f = 0 and 90 degrees; in between it is smaller
+    # Values at f = 0 and 90 degrees; in between it is smaller.
+    steepest_per_m2 = max(np.abs(d + e).max(), np.hypot(d - e, s).max())
     return ShearMap(r_m, z_m, parts, tangential_stiffness_m(traction, thickness_m), float(steepest_per_m2))
 
 
@@ -228,8 +230,8 @@ def evaluate_map(
 ) -> Float[np.ndarray, "i j 6"]:
     """Return the parts of `ShearMap` on a grid: Hankel integrals with J0, J2, J1, as matrix products.
 
-    A traction q along x is q cos f along a wave of direction f and -q sin f across it; integrals over f give Bessel
-    functions.
+    A traction q along x has the components q cos f along a wave of direction f and -q sin f across it; the integrals
+    over f are Bessel functions.
     """
     k_per_m = layer.WAVES_KH / thickness_m
     window = np.cos(np.pi * np.maximum(layer.WAVES_KH / layer.WAVES_KH[-1] - 0.5, 0)) ** 2  # avoids ringing
@@ -251,10 +253,11 @@ def evaluate_map(
 
 
 def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> WaveResponse:
-    """Return the response of the layer, held at its base, to a wave of tangential traction on top.
+    """Return the response of the layer, fixed at its base, to a wave of tangential traction on top.
 
     w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z': the W of
-    `layer` with W''' = 3 W' at the top. Divided by exp(2A) / 4, so that no exponent is positive inside the layer.
+    `layer` with W''' = 3 W' at the top. Numerators and denominators are divided by exp(2A) / 4, so that no exponent is
+    positive inside the layer.
     """
     t = kh - kz
     top, low, high = np.exp(-t), np.exp(-2 * kz), np.exp(-2 * t)
@@ -278,7 +281,7 @@ def shear_displacement(
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
 ) -> ShearDisplacement:
-    """Return the linear displacement and half curl by a force around `centre_m`; the modulus is Young's, 3 G."""
+    """Return the linear displacement and half curl due to a force around `centre_m`; the modulus is Young's, 3 G."""
     lowest_m, highest_m = places_m[:, 2].min(initial=0.0), places_m[:, 2].max(initial=0.0)
     if not (0 <= lowest_m and highest_m <= RIM_MAX * of.z_m[-1]):
         rule, got = f"0 to {RIM_MAX} of the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
@@ -298,8 +301,8 @@ def shear_in_steps(
     """Return the finite shear of nodes that `deformation` has moved, in midpoint steps.
 
     `centre_m` is the rest position of the material under the tip, where `deformation` is centred too: the tip's place
-    less Q / k_t (`DragForce.elastic_m`). At mu 0.8, dB is within 1.2 % of 24 steps down to 0.8 mm and within 3 % at
-    1.2 mm; a single `shear_displacement` of the nodes at rest is 13 to 90 % off.
+    minus Q / k_t (`DragForce.elastic_m`). With mu 0.8, dB differs from that with 24 steps by up to 1.2 % down to 0.8 mm
+    and 3 % at 1.2 mm; with a single `shear_displacement` of the nodes at rest, by 13 to 90 %.
     """
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     steepest = of.steepest_per_m2 * float(np.hypot(*shear_m2))
@@ -315,7 +318,7 @@ def shear_in_steps(
         half_m = at_m + first.displacement_m / 2
         middle = shear_displacement(of, half_m, there_m + ahead_m / 2, force_N=part_N, modulus_Pa=modulus_Pa)
         moved_m += middle.displacement_m
-        half_curl += middle.half_curl  # additive in simple shear, as F is
+        half_curl += middle.half_curl  # additive in simple shear, like F
     return ShearDisplacement(moved_m, half_curl)
 
 
@@ -323,7 +326,7 @@ def rotation_from_curl(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.nd
     """Return angle and axis of R in F = R U: the arc tangent of the half curl, exact in plane strain."""
     size = np.sqrt((half_curl**2).sum(axis=1))
     axis = half_curl / np.where(size > 0, size, 1.0)[:, None]
-    axis[size == 0] = (1.0, 0.0, 0.0)  # without rotation any axis serves
+    axis[size == 0] = (1.0, 0.0, 0.0)  # without rotation, any axis will do
     return np.arctan(size), axis
 
 
@@ -353,7 +356,7 @@ def _at_places(parts, steps, places, centre, force):
             far = parts[j + 1, k, p] + share_z * (parts[j + 1, k + 1, p] - parts[j + 1, k, p])
             at[p] = near + share_r * (far - near)
         a, b, c, d, e, s = at
-        # On the axis the parts that depend on a direction are zero, so any direction serves.
+        # On the axis, the parts that depend on the direction are zero, so any direction will do.
         cos, sin = (x / r, y / r) if r > 0 else (1.0, 0.0)
         along, across = fx * cos + fy * sin, fx * sin - fy * cos
         twice_x, twice_y = 2 * along * cos - fx, 2 * along * sin - fy
@@ -363,7 +366,8 @@ def _at_places(parts, steps, places, centre, force):
 
 
 def _kernel(x_m: Float[np.ndarray, " q"], thickness_m: float) -> Float[np.ndarray, "q q"]:
-    # 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk: the base's part of a half-space's 3.
+    # 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk: the effect of the base, relative to the 3 of
+    # a half-space.
     at = wave_response(layer.KERNEL_KH[None], layer.KERNEL_KH)
     missing = layer.KERNEL_W / thickness_m * (1 - (at.w_slope[0] + 2 * at.v[0]) / 3)
     waves = np.cos(np.outer(x_m, layer.KERNEL_KH / thickness_m))

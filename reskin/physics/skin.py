@@ -1,7 +1,7 @@
-"""A magnetised skin: its design, drawn skins, and the change of field and the force of indentations. SI units.
+"""A magnetised skin: its design, drawn skins, and the field change and force for indentations. SI units.
 
-Each skin is drawn by a random generator of its name: skin 7 stays the same when skin 8 is added. Indentations are true
-places and commanded depths in the board's frame.
+Each skin is drawn from its own random generator, seeded by its name: skin 7 stays the same when skin 8 is added.
+Indentations are true places and commanded depths in the board's frame.
 """
 
 from collections.abc import Iterator
@@ -27,11 +27,11 @@ class SkinDesign(Strict):
     """Section `skin`: what all skins of a scene have in common, and the tip that presses them."""
 
     polarity: magnet.Polarity
-    flipped: bool  # the opposite sign: a checkerboard skin that is turned by 90 degrees
+    flipped: bool  # opposite sign of the magnetisation, as for a checkerboard skin rotated by 90 degrees
     base: layer.Base
-    hold: slide.HoldDesign | None  # of a finite skin that slides rigidly; None: infinite, with the force of `layer`
+    hold: slide.HoldDesign | None  # for a finite skin that slides rigidly; None: infinite, with the force of `layer`
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # phi Br: volume fraction times remanence of the powder
-    half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of that
+    half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of saturation_T
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
     modulus_kPa: Annotated[float, Field(ge=0, le=1e6)]
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
@@ -39,7 +39,7 @@ class SkinDesign(Strict):
     @model_validator(mode="after")
     def _only_what_slides_is_held(self) -> "SkinDesign":
         if self.hold is not None and self.base == "bonded":
-            raise ValueError("hold is of a skin that slides (base: slipping); of a bonded one it is null")
+            raise ValueError("hold must be null for a bonded skin; it needs a skin that slides (base: slipping)")
         return self
 
 
@@ -71,7 +71,7 @@ def draw_skin(
 ) -> Skin:
     """Draw the skin of this name, as it sits on its board; any quadrature rule discretises the same skin.
 
-    Skins of other sides are magnetised by an array of magnets that covers them.
+    A skin with other side lengths is magnetised by an array of magnets that covers it.
     """
     rng = rng_for(seed, "skin", name)
     amplitude, thickness, modulus = np.exp(
@@ -108,14 +108,14 @@ def draw_skin(
 def changes_of_field(
     board: Board, skin: Skin, indentations_m: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
-    """Return the no-load field, and its change by each indentation (x, y, depth), at the chips in T.
+    """Return the no-load field at the chips in T, and its change for each indentation (x, y, depth).
 
     Without contact (true depth of 0 or less) the change is exactly zero.
 
     Raises
     ------
     ParamsError
-        If an indentation is beside the skin or too deep.
+        If an indentation is off the skin or too deep.
     """
     # Chip by chip, to bound memory: a large skin over many chips has millions of pairs.
     rest_T = np.concatenate([magnet.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
@@ -128,14 +128,14 @@ def changes_of_field(
 def moved_dipoles(
     skin: Skin, indentations_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[tuple[int, Dipoles, Dipoles]]:
-    """Yield index, dipoles at rest and dipoles moved (those within reach), of each indentation in contact.
+    """Yield for each indentation in contact its index, and the dipoles within reach at rest and displaced.
 
-    `slid` is the share of the rigid motion of each press that takes place (default: all of it). Further displacements
-    may be applied to the moved dipoles before `change_of_field`.
+    `slid` is the share of the rigid motion that takes place in each press (default: all of it). The caller may displace
+    the dipoles further before `change_of_field`.
     """
     true_m = indentations_m + np.array([0.0, 0.0, skin.depth_zero_m])
     _check_on_skin(true_m, skin)
-    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # a NaN depth goes on, to be refused
+    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # includes NaN depths, which `tabulate` refuses
     if not contacts.size:
         return
     rest = deformation.group_by_height(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
@@ -154,8 +154,8 @@ def moved_dipoles(
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
     """Return the rigid motion of the skin under presses (x, y, true depth), as far as the tip's friction allows.
 
-    The displacement towards the centre depends on the depth, whatever the modulus; the bound of friction on the force
-    in N.
+    The displacement towards the centre depends on the depth but not on the modulus; the limit by friction depends on
+    the force in N.
     """
     places_m = true_m[:, :2] - skin.seat_m
     relative_m2 = slide.force_at(
@@ -182,25 +182,25 @@ def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " 
 
 
 def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the shear modulus of the layer under the tip at commanded depths: E / 3 (incompressible), stiffened."""
+    """Return the shear modulus of the layer under the tip at commanded depths: E / 3 (incompressible) x stiffening."""
     if skin.hold is None:
         return np.full(len(depth_m), skin.modulus_Pa / 3)
     return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
 
 
 def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
-    # The model's layer is infinite: past the skin's edge the tip would press on material that is not there.
+    # The layer of the model is infinite: beyond the skin's edge, the tip would press on material that does not exist.
     half_m = np.array(skin.sides_m) / 2
     off = ~(np.abs(indentations_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
     if off.any():
         x_mm, y_mm = indentations_m[np.argmax(off), :2] / milli
-        rule = "on the skin, within {:.4g} and {:.4g} mm of its middle along x and y".format(*half_m / milli)
+        rule = "on the skin, within {:.4g} and {:.4g} mm of its centre along x and y".format(*half_m / milli)
         remedy = "Poke elsewhere, or lower skin_seat_mm."
         raise ParamsError(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy)
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:
-    # A smooth random factor as a sum of plane waves: independent of the nodes, so finer ones sample the same skin.
+    # A smooth random factor as a sum of plane waves. It does not depend on the nodes: finer nodes sample the same skin.
     waves = rng.standard_normal((FILLER_WAVES_N, 2)) / (spreads.skin_filler_length_mm * milli)
     phases = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     uneven = np.sqrt(2 / FILLER_WAVES_N) * np.cos(xy_m @ waves.T + phases).sum(axis=1)

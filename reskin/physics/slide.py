@@ -4,9 +4,9 @@ The base holds the whole skin by evenly distributed, isotropic springs. The disp
 or the force there, therefore determines the rigid motion of the skin, for pressing and for dragging. Friction between
 tip and skin bounds the slide (`limit_by_friction`), which goes to zero with the normal force.
 
-The force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2): the layer stiffens as it thins, by 1.2
-at 0.2 mm and 4.0 at 1.2 mm for a skin of 2 mm. This factor and how a press displaces the skin are empirical: chosen on
-two recorded boards (scene lab), which the elastic layer alone does not fit.
+The force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2): the layer stiffens as it thins, by a
+factor of 1.2 at 0.2 mm and 4.0 at 1.2 mm for a skin of 2 mm. This factor and the displacement by a press are empirical:
+they were chosen on two recorded boards (scene lab), which the elastic layer alone does not fit.
 """
 
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ from reskin.errors import ParamsError
 from reskin.physics import layer
 from reskin.physics.magnet import Dipoles
 
-STIFFENING = 1.5  # exponent, chosen with both boards in view; 1.25 to 2 explain them as well
+STIFFENING = 1.5  # exponent, chosen on both recorded boards; values from 1.25 to 2 explain them equally well
 DEEPEST = 0.72  # of the thickness: larger forces are treated as the force at this depth
 CENTRE_M = np.zeros(2)
-CURVE_N = 2000  # depths of the inverse force curve; between them d is linear in F^(2/3), as Hertz's is
+CURVE_N = 2000  # depths of the inverse force curve; between them d is linear in F^(2/3), as in Hertz contact
 
 
 class HoldDesign(Strict):
@@ -35,7 +35,7 @@ class HoldDesign(Strict):
 
     give_um: tuple[float, float]  # compliance of the rig: displacement of arm and skin under a press, x and y
     away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement towards the skin's centre, per distance from it
-    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force over Young's modulus at which that displacement is gone
+    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force over Young's modulus at which that displacement is zero
     springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base: screws, clips, friction
     friction: Annotated[float, Field(gt=0, le=10)]  # coefficient of the tip on the skin
 
@@ -83,9 +83,9 @@ def press_displacement_m(
 ) -> Float[np.ndarray, "n 2"]:
     """Return the displacement of the material under a tip that grips it: give - away (1 - load) p.
 
-    p is the place from the skin's centre: the second term points towards the centre, so the skin evades the tip towards
-    the opposite side. `load` is the force over the force at which that term vanishes. A light press reaches only a
-    share of the displacement, see `limit_by_friction`.
+    p is the place relative to the skin's centre. The second term points towards the centre, so the skin moves away from
+    the tip to the opposite side. `load` is the force divided by the force at which this term vanishes. A light press
+    causes only a share of the displacement, see `limit_by_friction`.
     """
     return np.array(give_m) - away * (1 - load)[:, None] * places_m
 
@@ -97,10 +97,10 @@ def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], gri
     1 - exp(-mu F / (k |u|)), respects the bound, k |u| share <= mu F, and tends to 1 under a firm press.
     `grip_N_per_m` is k / mu.
     """
-    with np.errstate(invalid="ignore"):  # inf * 0: no motion, no friction
+    with np.errstate(invalid="ignore"):  # inf * 0, for no motion without friction
         needed_N = grip_N_per_m * np.hypot(*motion.move_m.T)
     moves = needed_N > 0
-    with np.errstate(over="ignore"):  # a slide so small that any force holds it
+    with np.errstate(over="ignore"):  # for a slide so small that any force suffices
         share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
     return motion.scaled(share)
 
@@ -108,7 +108,7 @@ def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], gri
 def compliance_m_per_N(
     places_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float], springs_N_per_m: float
 ) -> Float[np.ndarray, "n 2 2"]:
-    """Return the displacement of a place per force there: (I + q q^T / rho^2) / k, see `rigid_motion`."""
+    """Return the displacement at a place per force at this place: (I + q q^T / rho^2) / k, see `rigid_motion`."""
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     spun = q_m[:, :, None] * q_m[:, None, :] / _rho2_m2(sides_m)
     return (np.eye(2) + spun) / springs_N_per_m
@@ -176,7 +176,7 @@ def force_at(
 
 
 def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Return the stiffening factor (1 - d/h)^(-3/2) of a layer that thins, for pressing and (assumed) shear alike."""
+    """Return the stiffening factor (1 - d/h)^(-3/2) of a thinning layer, for pressing and (assumed) also for shear."""
     return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
 
 
@@ -192,7 +192,7 @@ def count_clipped(
 def depth_at(
     force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> Float[np.ndarray, " n"]:
-    """Return the depth of normal forces, clipped to `DEEPEST` thicknesses (see `count_clipped`)."""
+    """Return the depths for normal forces, clipped to `DEEPEST` thicknesses (see `count_clipped`)."""
     if not modulus_Pa > 0:
         raise ParamsError("layer", "modulus", "above 0 Pa", f"{modulus_Pa}", "Check its unit.")
     curve_m, curve_m2 = _curve(thickness_m, tip_radius_m)
@@ -207,7 +207,7 @@ def _deepest_m(thickness_m: float, tip_radius_m: float) -> float:
 
 @lru_cache(maxsize=64)
 def _curve(thickness_m: float, tip_radius_m: float) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    # Depths, and (F / E)^(2/3) there.
+    # Depths, and (F / E)^(2/3) at these depths.
     curve_m = np.linspace(0, _deepest_m(thickness_m, tip_radius_m), CURVE_N)
     known_m2 = force_at(curve_m, modulus_Pa=1.0, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return curve_m, np.cbrt(known_m2**2)

@@ -350,7 +350,7 @@ def test_force_on_a_held_skin():
 
 
 def test_bonded_skin_is_not_held():
-    with pytest.raises(ValueError, match="hold is of a skin that slides"):
+    with pytest.raises(ValueError, match="hold must be null for a bonded skin"):
         skin(base="bonded", hold=HELD)
 
 
