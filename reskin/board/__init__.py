@@ -1,1 +1,1 @@
-"""Boards: bytes on the wire, ports and faulty readings."""
+"""Boards: wire formats, ports and faulty readings."""

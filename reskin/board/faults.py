@@ -1,7 +1,7 @@
 """Detect the faults of a board: failed reads, stuck or reset chips, values out of range, repeated or missing frames.
 
-The functions say how each fault looks; `FaultDetector` finds all of them in a stream that comes in portions. What
-becomes of faulty readings is decided elsewhere: `recordings.fault_policy` for recordings, `live.health` live.
+Each function detects one fault; `FaultDetector` finds all of them in a stream that arrives in portions. What is done
+about faulty readings is decided in `recordings.fault_policy` for recordings, and in `live.health` for live boards.
 """
 
 from typing import NamedTuple
@@ -12,42 +12,45 @@ from jaxtyping import Bool, Float, Float64, Int
 from reskin.board.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from reskin.board.wire import Frames
 
-# What the ReSkin firmware sends for a chip whose I2C read failed; seen in INI's recording AFG_flex_50.
+# Values that the ReSkin firmware sends for a chip whose I2C read failed; seen in INI's recording AFG_flex_50.
 FAILED_B_uT = (8028.16, 5194.00, 12943.36)
 FAILED_TEMPERATURE_degC = -880.49
 FAILED_TOLERANCE = 0.01  # text wires round to two decimals
 
-# The grid of a chip back at its power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
+# The steps of a chip with its power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
 RESET_LSB_XY_uT = 0.98
 RESET_LSB_Z_uT = 1.58
 LSB_TOLERANCE = 0.1  # gains of the MLX90393 are a fifth or more apart (data sheet, table 17)
 
-# A grid shows when neighbouring values often lie one step apart: 5 % or more of all gaps in the first 200 frames of 14
-# real recordings are one step. Values without a grid have one smallest gap, and by chance one or two close to it.
+# A grid is visible if neighbouring values are often one step apart: in the first 200 frames of 14 real recordings, 5 %
+# or more of all gaps are one step. Values without a grid have one smallest gap, and by chance one or two gaps close to
+# it.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
-STEP_SPREAD_MAX = 0.06  # two decimals spread a step of 0.242 uT by 0.02; gaps by chance up to 1.5 of the least, by 0.12
-SURE_STEPS_MIN_N = 20  # so many equal gaps are no accident, even of few values without noise
+# Relative standard deviation of the gaps: 0.02 for a step of 0.242 uT with two decimals; 0.12 for gaps that are by
+# chance up to 1.5 times the smallest one.
+STEP_SPREAD_MAX = 0.06
+SURE_STEPS_MIN_N = 20  # this many equal gaps do not occur by chance, even among few values without noise
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
-SAME_VALUE_uT = 1e-3  # float32 arithmetic may write one value in two ways
+SAME_VALUE_uT = 1e-3  # float32 arithmetic may represent one value in two ways
 
-# Noise moves a chip that works; it repeats itself only when it is read again before its next conversion is done
-# (1.84 ms), or where its LSB is coarse: for at most 3 frames in 14 real recordings.
+# Noise changes the readings of a working chip. They repeat only if the chip is read again before its next conversion
+# (1.84 ms), or if its LSB is coarse: for at most 3 frames in 14 real recordings.
 STUCK_FRAMES_MIN_N = 20
-OTHERS_MOVE_MIN = 0.5  # without noise a board moves only while it is pressed or released
+OTHERS_MOVE_MIN = 0.5  # without noise, readings change only while the board is pressed or released
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
 CLOCK_STEP_MAX_S = 1.0
-REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: so many of so many frames, which is a tenth of a second at 400 Hz
-MISSING_STEPS = 1.6  # of the usual step of the board's clock
+REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: this share of this many frames (a tenth of a second at 400 Hz)
+MISSING_STEPS = 1.6  # times the usual step of the board's clock
 SILENCE_S = 1.0
-SILENCE_STEPS = 50.0  # of the usual time between two frames: a slow log is not silent
-GARBAGE_FRAMES_N = 10  # so many frames' bytes in a row that are none are no torn frame
-LONG_LINE = 1.5  # of the usual length of a line of text
+SILENCE_STEPS = 50.0  # times the usual time between two frames, so that a slow log is not silent
+GARBAGE_FRAMES_N = 10  # stray bytes of more than this many frames in a row are not just a torn frame
+LONG_LINE = 1.5  # times the usual length of a line of text
 
-SCALE_FRAMES_N = 400  # every sound chip of real recordings shows its LSB in so many frames; in 200 it may not
-GRID_ROWS_N = 1000  # rows of a table in which the LSB is looked for
+SCALE_FRAMES_N = 400  # enough frames to find the LSB of every good chip in real recordings; 200 may not be enough
+GRID_ROWS_N = 1000  # rows of a table in which the LSB is searched
 
 
 def failed_reads(
@@ -60,9 +63,9 @@ def failed_reads(
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip whose three fields are exactly 0: what stands in memory that no reading was put into.
+    """Mark the readings of a chip whose three fields are exactly 0, the content of memory without a reading.
 
-    Rows of eFlashTeam7 have it on all chips. Not even the earth leaves a chip at 0 in three directions at once.
+    Some rows of eFlashTeam7 have zeros on all chips. In the earth's field, a chip cannot read 0 on three axes at once.
     """
     return np.asarray((_by_chip(b_uT) == 0).all(axis=2))
 
@@ -70,10 +73,10 @@ def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 def find_lsb(
     b_uT: Float[np.ndarray, "f ch"], *, step_min_uT: float = STEP_MIN_uT, steps_min_n: int = STEPS_MIN_N
 ) -> Float[np.ndarray, "k 2"]:
-    """Estimate the step between a chip's values, in uT, along x and y and along z; NaN where no grid shows.
+    """Estimate the step between a chip's values, in uT, along x and y, and along z; NaN if no grid is visible.
 
-    A few hundred frames show it; a chip whose settings change among them shows none. A grid is `steps_min_n` steps of
-    `step_min_uT` or more.
+    A few hundred frames are enough; no grid is visible if the settings of the chip change among them. A grid needs at
+    least `steps_min_n` gaps of one step, and a step of `step_min_uT` or more.
     """
     chips = np.moveaxis(_by_chip(b_uT), 1, 0)
     steps_uT = np.array(
@@ -85,8 +88,8 @@ def find_lsb(
 def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
     """Flag the chips whose grid is not the expected one (x and y, z).
 
-    Without an expectation: those whose grid differs from that of most chips, or is the one of a chip after a reset. A
-    chip that shows no grid is not flagged.
+    If no grid is expected, flag the chips whose grid differs from that of most chips, or is that of a chip after a
+    reset. A chip without a visible grid is not flagged.
     """
     return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
 
@@ -94,7 +97,7 @@ def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, f
 def unusual_lsb(
     lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None
 ) -> Bool[np.ndarray, " k"]:
-    """Flag chips as `reset_chips` does, from the steps that `find_lsb` gave."""
+    """Flag chips as `reset_chips` does, from the steps that `find_lsb` returned."""
     if expected_lsb_uT is not None:
         return _not_on_grid(lsb_uT, expected_lsb_uT)
     after_reset = ~_not_on_grid(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
@@ -108,16 +111,16 @@ def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 
 
 class StuckChips:
-    """Remembers since when each chip has not moved, so that a recording may come in any portions.
+    """Remembers since when the readings of each chip have not changed, so that a recording may arrive in any portions.
 
-    A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th of a run of equal ones, and other chips moved in
-    `OTHERS_MOVE_MIN` or more of the run: a board that stands still as a whole, or has no noise, is not broken.
+    A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th of a run of equal readings, and other chips changed
+    in `OTHERS_MOVE_MIN` or more of the run. A board without any changes, or without noise, is not broken.
     """
 
     def __init__(self, chips_n: int) -> None:
         self._last_uT = np.full((1, chips_n, 3), np.nan)
-        self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip's last move
-        self._moved_n = np.zeros(chips_n, np.int64)  # of these, the ones in which another chip moved
+        self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip last changed
+        self._moved_n = np.zeros(chips_n, np.int64)  # number of these in which another chip changed
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
         """Take the next readings; mark the stuck ones."""
@@ -137,9 +140,9 @@ class StuckChips:
 
 
 class ConstantChannels:
-    """Finds channels that keep one value in a whole recording while others change; it may come in any portions.
+    """Finds channels with one value in a whole recording while others change; it may arrive in any portions.
 
-    A chip of which all three channels are constant is not reported here: it is stuck.
+    A chip with three constant channels is not reported here, because it is stuck.
     """
 
     def __init__(self, chips_n: int) -> None:
@@ -148,7 +151,7 @@ class ConstantChannels:
         self._readings_n = 0
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Take the next readings of a board that did not fail."""
+        """Take the next readings, without failed ones."""
         chips = _by_chip(b_uT)
         if not len(chips):
             return
@@ -158,7 +161,7 @@ class ConstantChannels:
         self._readings_n += len(chips)
 
     def found(self) -> list[str]:
-        """Name the constant channels and their values, `Bz of chip 0 (12.5 uT)`; none in too short a recording."""
+        """Name the constant channels and their values, `Bz of chip 0 (12.5 uT)`; empty for a short recording."""
         if self._readings_n < STUCK_FRAMES_MIN_N:
             return []
         odd = ~self._changed & self._changed.any(axis=1, keepdims=True)
@@ -168,7 +171,7 @@ class ConstantChannels:
 
 
 def too_hot(temperature_degC: Float[np.ndarray, "f k"]) -> Bool[np.ndarray, "f k"]:
-    """Mark temperatures out of the chip's range; unknown ones are not."""
+    """Mark temperatures out of the chip's range; unknown temperatures (NaN) are not marked."""
     return (temperature_degC < TEMPERATURE_MIN_degC) | (temperature_degC > TEMPERATURE_MAX_degC)
 
 
@@ -178,13 +181,13 @@ def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 
 
 def wrapped(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark steps from frame to frame that int16 does not hold; of a chip whose LSB is not known, none."""
+    """Mark steps from frame to frame that exceed int16; none for a chip whose LSB is unknown."""
     wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
     return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
 
 
 def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames that repeat the one before, where many do: a loop may outrun the chips now and then."""
+    """Mark frames that repeat the previous one, if many do; a fast loop may repeat some frames."""
     same = np.asarray((step_uT == 0).all(axis=1))
     if len(same) < REPEATED_LOOK_N:
         return np.zeros(len(same), bool)
@@ -195,12 +198,12 @@ def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"
 
 
 def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark steps of the board's clock that no loop takes."""
+    """Mark steps of the board's clock that are negative or too long for a loop."""
     return np.asarray((device_step_s < 0) | (device_step_s > CLOCK_STEP_MAX_S))
 
 
 def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count the frames missing before each, by the board's clock; zeros without a clock."""
+    """Count the missing frames before each frame, by the board's clock; zeros without a clock."""
     usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
     if not usual_s > 0:
         return np.zeros(len(device_step_s), np.int64)
@@ -209,13 +212,13 @@ def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " 
 
 
 def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames before which nothing came for a second or more: unplugged, or stalled."""
+    """Mark frames before which nothing arrived for a second or more, because the board was unplugged or stalled."""
     usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
     return np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s))
 
 
 def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
-    """Count the stray bytes before each frame; text frames, of no fixed length, are compared with the usual line."""
+    """Count the stray bytes before each frame; text frames, whose length varies, are compared with the usual length."""
     length_n = np.diff(end_byte, prepend=first_byte)
     if frame_bytes_n is not None:
         return length_n - frame_bytes_n
@@ -224,7 +227,7 @@ def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: 
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
-    """Find the step of the grid on which all values of some axes lie."""
+    """Find the step of the common grid of all values of some axes; NaN if there is none."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):
@@ -248,7 +251,7 @@ def _by_chip(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f k 3"]:
 
 
 class ReadingFaults(NamedTuple):
-    """Masks of the faults that a single reading shows, [frame chip]."""
+    """Masks of the faults that are visible in a single reading, [frame chip]."""
 
     failed_read: Bool[np.ndarray, "f k"]
     zeros: Bool[np.ndarray, "f k"]
@@ -267,15 +270,15 @@ class ReadingFaults(NamedTuple):
 
 
 def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]) -> ReadingFaults:
-    """Mark the readings that are faulty by themselves, whatever came before."""
+    """Mark the faults that are visible in single readings, without earlier ones."""
     failed = failed_reads(b_uT, temperature_degC)
     return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, saturated(b_uT) & ~failed)
 
 
 class ScaleWindow(NamedTuple):
-    """The LSB of each chip in `SCALE_FRAMES_N` frames, with the first frame's number (from 1) and all their times.
+    """The LSB of each chip in `SCALE_FRAMES_N` frames, with the number of the first frame (from 1) and all times.
 
-    `unusual` chips differ from the expected LSB or the other chips, `changed` ones from their own LSB before.
+    `unusual` chips differ from the expected LSB or from the other chips, `changed` chips from their own earlier LSB.
     """
 
     first_frame: int
@@ -297,8 +300,8 @@ class Faults(NamedTuple):
     unplug: Bool[np.ndarray, " f"]
     missing_frames_n: Int[np.ndarray, " f"]  # before each frame, by the board's clock
     torn_bytes_n: Int[np.ndarray, " f"]  # before each frame
-    garbage_bytes_n: Int[np.ndarray, " f"]  # before each frame: so many bytes that the baud rate may be wrong
-    scale: tuple[ScaleWindow, ...]  # of the windows that are complete now
+    garbage_bytes_n: Int[np.ndarray, " f"]  # before each frame, if they are so many that the baud rate may be wrong
+    scale: tuple[ScaleWindow, ...]  # newly completed windows
 
 
 class FaultDetector:
@@ -308,9 +311,9 @@ class FaultDetector:
 
     Parameters
     ----------
-    chips_n : chips of a frame.
-    frame_bytes_n : length of a binary frame; None for text, whose lines vary.
-    expected_lsb_uT : LSB along x, y and along z that the header promises, if it does.
+    chips_n : number of chips.
+    frame_bytes_n : length of a binary frame; None for text, where it varies.
+    expected_lsb_uT : LSB along x and y, and along z, from the header if it has them.
     steps_min_n : how many equal gaps between neighbouring values show a chip's LSB.
     """
 
@@ -343,7 +346,7 @@ class FaultDetector:
         stuck[read] = self._stuck.feed(b_uT[read])
         stuck[~sound] = False
         if sound.any():
-            last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT  # the first repeats none
+            last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT  # the first is no repetition
             step_uT = np.diff(b_uT[sound], axis=0, prepend=last_uT)
             self._last_b_uT = b_uT[sound][-1:]
             int16_wrap[sound] = wrapped(step_uT, self._lsb_uT)
@@ -377,7 +380,7 @@ class FaultDetector:
         Bool[np.ndarray, " f"], Bool[np.ndarray, " f"], Int[np.ndarray, " f"], Int[np.ndarray, " f"],
         Int[np.ndarray, " f"],
     ]:  # fmt: skip
-        """Compare each frame's times and place in the stream with those of the frame before."""
+        """Compare each frame's times and position in the stream with those of the previous frame."""
         if not len(frames):
             return *np.zeros((2, 0), bool), *np.zeros((3, 0), np.int64)
         last_s, last_device_s, last_byte = self._last or (float(t_s[0]), float(frames.device_s[0]), 0)

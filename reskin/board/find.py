@@ -1,4 +1,4 @@
-"""Find boards among the serial ports: listen to each, and recognise format, chips, rate and scale."""
+"""Find boards among the serial ports: listen to each port, and detect wire format, number of chips, rate and scale."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -16,12 +16,12 @@ from reskin.errors import CaptureError, ParamsError
 from reskin.physics.chip import GAINS, steps_uT
 
 BAUD = 115200  # USB ports ignore it
-LISTENING_S = 1.5  # some 200 frames of the slowest board, in which the step of its chips shows
+LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the steps of its chips
 HUNTING_S = 60.0
 POLL_S = 0.2
-BOARDS_MAX_N = 16  # at once
-LSB_TOLERANCE = 0.05  # gains are a fifth or more apart
-Chunk = tuple[bytes, float]  # and when it came, in s
+BOARDS_MAX_N = 16  # at the same time
+LSB_TOLERANCE = 0.05  # gains differ by a fifth or more
+Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
 
 class DetectedBoard(NamedTuple):
@@ -32,11 +32,11 @@ class DetectedBoard(NamedTuple):
     wire: Wire = "binary"
     chips_n: int = 0
     rate_hz: float = np.nan
-    lsb_uT: tuple[float, float] = (np.nan, np.nan)  # along x and y, and z: the median chip's
+    lsb_uT: tuple[float, float] = (np.nan, np.nan)  # along x and y, and along z: medians over chips
 
     @property
     def gain_sel(self) -> int | None:
-        """GAIN_SEL of the chips, by their LSB; None if no gain has it."""
+        """GAIN_SEL of the chips, from their LSB; None if no gain has this LSB."""
         for gain_sel in range(len(GAINS)):
             xy_uT, _, z_uT = steps_uT(gain_sel)
             if np.allclose(self.lsb_uT, (xy_uT, z_uT), rtol=LSB_TOLERANCE):
@@ -59,14 +59,14 @@ class DetectedBoard(NamedTuple):
 
 
 def scan_ports(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[DetectedBoard]:
-    """Listen to ports, all at once: those given, or all of this machine."""
+    """Listen to several ports at the same time: the given ports, or all ports of this machine."""
     names = port_names() if names is None else names
     with ThreadPoolExecutor(max(len(names), 1)) as pool:
         return list(pool.map(lambda name: detect_board(name, listening_s), names))
 
 
 def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
-    """Return the board of this machine; raise `CaptureError` if there is none, or more than one."""
+    """Return the board that is connected; raise `CaptureError` if there is none, or more than one."""
     boards = find_boards(names)
     if len(boards) != 1:
         raise CaptureError(
@@ -76,7 +76,7 @@ def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
 
 
 def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
-    """Return the boards of this machine; raise `CaptureError` if there is none."""
+    """Return the boards that are connected; raise `CaptureError` if there are none."""
     found = scan_ports(names)
     boards = [each for each in found if each.problem is None]
     if not boards:
@@ -86,7 +86,7 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
 
 
 def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
-    """Listen to a port for `listening_s`; recognise the board on it."""
+    """Listen to a port for `listening_s`, and detect the board on it."""
     chunks: list[Chunk] = []
     try:
         with open_port(port, BAUD) as device:
@@ -102,17 +102,17 @@ def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
 
 
 def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
-    """Recognise a board by the bytes of its port: format, chips, rate and scale."""
+    """Detect a board from the bytes of its port: wire format, number of chips, rate and scale."""
     data = b"".join(chunk for chunk, _ in chunks)
     if not data:
-        return DetectedBoard(port, "no byte came: is the board running?")
+        return DetectedBoard(port, "no bytes arrived: is the board running?")
     fits = fitting(data)
     if not fits:
         return DetectedBoard(port, f"no frame in {len(data)} bytes: another baud rate, or another device")
     decoded = [(decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in fits]
-    # Text may have temperatures first or last; fields differ more than they do.
+    # Text may have temperatures first or last; they vary less than fields.
     frames, wire, chips_n = min(decoded, key=lambda found: float(found[0].temperature_degC.std(dtype=np.float64)))
-    with np.errstate(over="ignore"):  # any finite number may stand in a frame
+    with np.errstate(over="ignore"):  # a frame may contain any finite number
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
     return DetectedBoard(port, None, wire, chips_n, _rate_hz(frames, chunks), (lsb_uT[0], lsb_uT[1]))
 
@@ -123,7 +123,7 @@ def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
 
 
 def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
-    """Count the frames that came after the first chunk, which may have waited."""
+    """Return the rate of the frames after the first chunk, which may have been waiting in the port."""
     later_n = int((frames.end_byte > len(chunks[0][0])).sum())
     took_s = chunks[-1][1] - chunks[0][1]
     return later_n / took_s if took_s > 0 else np.nan
@@ -136,10 +136,10 @@ def find_replugged_port(
     pause: Callable[[float], None] = time.sleep,
     hunting_s: float = HUNTING_S,
 ) -> str:
-    """Ask the user to unplug and to replug a board, and return the name of the port that disappears and comes back.
+    """Ask the user to unplug and replug a board, and return the name of the port that disappears and comes back.
 
-    Waits `hunting_s` seconds for each of the two. The name may differ after replugging; the port is not read, so that
-    any serial device passes. Of several ports, the first by name is returned.
+    Waits up to `hunting_s` seconds for each of the two. The name may differ after replugging. The port is not read, so
+    any serial device is accepted. If there are several ports, the first by name is returned.
     """
     say("Unplug the board.")
     before = set(names())

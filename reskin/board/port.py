@@ -1,4 +1,4 @@
-"""Open a board's port and read the bytes that wait in it.
+"""Open a board's port and read the bytes that are waiting in it.
 
 The port is a serial port or `socket://host:port`.
 """
@@ -11,7 +11,7 @@ from serial.tools import list_ports
 
 from reskin.errors import CaptureError
 
-READ_TIMEOUT_s = 0.1  # how late a stop, a silence or the end of the duration may be noticed
+READ_TIMEOUT_s = 0.1  # maximum delay until a stop, silence or the end of the duration is noticed
 READ_BYTES_MAX_N = 65536
 SOCKET = "socket://"
 
@@ -21,12 +21,12 @@ Device = SerialBase  # an open port
 def open_port(port: str, baud: int) -> Device:
     """Open a serial port, exclusively for this process, or connect to `socket://host:port`.
 
-    Boards and force gauges are opened here. Bytes that waited in the port are discarded. A socket becomes
-    non-blocking: read from either with `read_waiting`.
+    Boards and force gauges are opened here. Bytes that were waiting in the port are discarded. A socket becomes
+    non-blocking; use `read_waiting` to read from either kind.
     """
     try:
         if "://" in port and not port.startswith(SOCKET):  # pyserial has more schemes, some of which load code
-            raise ValueError(f"of all URLs, only {SOCKET}host:port is supported")
+            raise ValueError(f"the only supported URL is {SOCKET}host:port")
         device = serial.serial_for_url(port, baud, timeout=READ_TIMEOUT_s, exclusive=None if "://" in port else True)
     except (OSError, ValueError) as error:
         raise CaptureError(f"{port}: cannot open the port: {error}. {found_ports()}") from None
@@ -36,12 +36,12 @@ def open_port(port: str, baud: int) -> Device:
 
 
 def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
-    """Return the bytes that wait, or come within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
-    if isinstance(device, serial.Serial):  # it sleeps until a byte comes; with it come others
+    """Return the bytes that are waiting or arrive within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
+    if isinstance(device, serial.Serial):  # sleep until a byte arrives, then read all that are waiting
         first = device.read(min(1, bytes_max_n))
         waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
         return first + device.read(waiting_n) if waiting_n > 0 else first
-    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket cannot say how many wait
+    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket does not tell how many bytes are waiting
     return device.read(min(READ_BYTES_MAX_N, bytes_max_n)) if ready else b""
 
 
@@ -51,6 +51,6 @@ def port_names() -> list[str]:
 
 
 def found_ports() -> str:
-    """Say which ports were found, for the remedy of an error."""
+    """Return a sentence with the ports of this machine, for error messages."""
     names = port_names()
     return f"Ports found: {', '.join(names)}." if names else "No serial port was found: is the board plugged in?"

@@ -1,4 +1,4 @@
-"""Read a port in a thread of its own; an unplugged board is opened again when it is back."""
+"""Read a port in a thread of its own; the port of an unplugged board is opened again when the board is back."""
 
 import threading
 import time
@@ -11,7 +11,7 @@ from reskin.errors import CaptureError
 
 QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz; then the oldest chunks are dropped
 RETRY_S = 0.5
-PLUGGED_IN = b""  # a chunk that marks the begin of a new stream
+PLUGGED_IN = b""  # a chunk that marks the beginning of a new stream
 
 
 class ChunkWriter(Protocol):
@@ -23,7 +23,7 @@ class ChunkWriter(Protocol):
 
 
 class Reader:
-    """Queue the chunks that come from a port, with their times; `missed_bytes_n` counts dropped bytes."""
+    """Queue the chunks that arrive at a port, with their times; `missed_bytes_n` counts dropped bytes."""
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
         self.port, self.baud = port, baud
@@ -32,14 +32,14 @@ class Reader:
         self.taken_s = 0.0  # when `take` was last called, in unix seconds
         self.writer: ChunkWriter | None = None
         self.writer_problem = ""
-        self._clock_s = time.time() - time.monotonic()  # the system's clock may be set while we read
+        self._clock_s = time.time() - time.monotonic()  # the system's clock may be adjusted during reading
         self._chunks: deque[Chunk] = deque()
         self._came = threading.Condition()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, name=f"reader of {port}", daemon=True)
 
     def start(self, *, there: bool) -> None:
-        """Begin to read; raise `CaptureError` if the port must be `there` and does not open."""
+        """Begin to read. With `there`, the port is opened at once; raise `CaptureError` if this fails."""
         self._device = open_port(self.port, self.baud) if there else None
         self._thread.start()
 
@@ -62,7 +62,7 @@ class Reader:
         return taken
 
     def write_to(self, writer: ChunkWriter | None) -> None:
-        """Write what comes from now on to another recording, or none; the one before is closed."""
+        """Write later chunks to another recording, or to none; the previous recording is closed."""
         with self._came:
             before, self.writer, self.writer_problem = self.writer, writer, ""
         if before is not None:
@@ -92,7 +92,7 @@ class Reader:
 
     def _keep(self, chunk: bytes) -> None:
         with self._came:
-            now_s = self.unix_s()  # in here, so that no chunk is older than a look that did not find it
+            now_s = self.unix_s()  # within the lock, so that no chunk is older than a `take` that missed it
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)
             while self.waiting_bytes_n > QUEUE_BYTES_MAX_N:
@@ -104,6 +104,6 @@ class Reader:
             if writer is not None:
                 try:
                     writer.write(chunk, now_s)
-                except OSError as error:  # a full disk ends the recording, and nothing else
+                except OSError as error:  # a full disk ends the recording only
                     self.writer, self.writer_problem = None, f"cannot be written any more: {error.strerror}"
                     writer.close()

@@ -1,7 +1,7 @@
 """Split a byte stream into frames, without I/O; every byte belongs to a frame or is counted as lost.
 
-No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). Frames are
-therefore located from the bytes alone; how the stream was divided into reads does not matter.
+No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). Frames are found
+from the bytes alone, so that it does not matter how the stream was divided into reads.
 """
 
 import re
@@ -21,18 +21,19 @@ CHIPS_MAX_N = 64  # as in the header
 ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n",
            "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
 
-# An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. Only where CR LF leaves two ways to lay frames do
-# these limits decide: a value outside them is no reason to drop a frame (failed reads are outside, see `faults`).
+# An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. These limits are used only if the positions of CR
+# LF allow frames in two ways. A value outside the limits is not a reason to drop a frame: failed reads are outside too,
+# see `faults`.
 TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
 B_MAX_uT = 6e4
-VALUE_MIN = 1e-3  # what is nearer to 0, in uT or degC, is below the chip's LSB
+VALUE_MIN = 1e-3  # in uT or degC; smaller values, except 0, are below the chip's LSB
 
-SEARCH_FRAMES_N = 64  # a search looks at so many frames' bytes at once
+SEARCH_FRAMES_N = 64  # a search uses the bytes of this many frames at once
 
 
 @dataclass(frozen=True)
 class _Scan:
-    """What a scan settled: frames, counts (names of `ACCOUNT`), bytes; and whether a frame is known to begin there."""
+    """Result of a scan: frames, counts (keys of `ACCOUNT`), settled bytes; and whether a frame begins after them."""
 
     frames: Frames
     count: Counter[str]
@@ -41,10 +42,11 @@ class _Scan:
 
 
 class FrameStream:
-    """Remembers the bytes that are not settled yet; returns frames as soon as they are certain.
+    """Keeps the bytes that are not settled yet; returns frames as soon as they are certain.
 
-    `_lay_frames` says which bytes are a binary frame; a text frame is a line of exactly 4 k numbers of two decimals.
-    A stream is believed to begin with a frame: a first line cut inside its first number is a frame with a wrong number.
+    `_lay_frames` defines which bytes are a binary frame. A text frame is a line of exactly 4 k numbers with two
+    decimals. A stream is assumed to begin with a frame, so a first line that was cut inside its first number is a
+    frame with a wrong number.
     """
 
     def __init__(self, wire: Wire, chips_n: int) -> None:
@@ -56,12 +58,12 @@ class FrameStream:
         self._count: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> Frames:
-        """Take the next bytes; give the frames that are now certain."""
-        assert not self._closed, "a stream that ended takes no more bytes"
+        """Take the next bytes; return the frames that are now certain."""
+        assert not self._closed, "a closed stream takes no more bytes"
         return self._advance(data, final=False)
 
     def close(self) -> Frames:
-        """Say that the stream has ended; give the frames that waited for more, and count what is left as lost."""
+        """End the stream; return the frames that waited for more bytes, and count the remaining bytes as lost."""
         self._closed = True
         return self._advance(b"", final=True)
 
@@ -91,7 +93,7 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
 
 
 def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
-    """Make the error for a stream without a frame, from its bytes or the first of them; say what fits them instead."""
+    """Make the error for a stream without frames, from its (first) bytes, with the formats that would fit them."""
     hint = " or ".join(f"{fit} with {k} chips" for fit, k in fitting(data))
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
@@ -102,9 +104,9 @@ def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
 
 
 def fitting(data: bytes) -> list[tuple[Wire, int]]:
-    """List the formats, of the fewest chips that do, in which most of the first 16 KiB of `data` is frames."""
+    """List the formats in which most of the first 16 KiB of `data` is frames, for the least number of chips."""
     data = data[:16384]
-    for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # no format has less than 16 bytes a chip
+    for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # every format has 16 bytes or more per chip
         streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
         for stream in streams.values():
             stream.feed(data)
@@ -134,12 +136,12 @@ def _scan_binary(
 def _lay_frames(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[list[Run], int, bool]:
-    """Find the runs of frames; also how many bytes are settled and whether a frame is known to begin there.
+    """Find the runs of frames; also return how many bytes are settled and whether a frame begins after them.
 
-    A frame is taken at once where the one before ended (or the stream began) and CR LF closes it, unless CR LF stands
-    in its payload too *and* its values make no sense. Then, and after a break, the next frame is searched for: CR LF
-    stands before it and closes it. If several layouts fit, the one with most plausible chips in two frames wins, then
-    the first.
+    A frame is accepted directly if it begins where the previous one ended (or the stream began) and ends with CR LF,
+    unless CR LF is also in its payload *and* its values are implausible. In this case, and after an interruption, the
+    next frame is searched: it has CR LF before it and at its end. If several positions fit, the one with the most
+    plausible chips in two frames is chosen, and among equal ones the first.
     """
     runs: list[Run] = []
     position = 0
@@ -164,7 +166,7 @@ def _lay_frames(
 
 
 def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Count the frames from the first byte on that need no look at what follows them."""
+    """Count the frames from the first byte on that can be accepted without the bytes after them."""
     sure_n, frames_n = 0, len(octets) // record.itemsize
     while sure_n < frames_n:
         block_n = min(frames_n - sure_n, BLOCK_FRAMES_N)
@@ -181,7 +183,7 @@ def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.voi
     closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
     closed_n = len(rows) if closed.all() else int(closed.argmin())
     ends = _terminators(block[: closed_n * record.itemsize])
-    if np.count_nonzero(ends) == closed_n:  # none but those that close a frame
+    if np.count_nonzero(ends) == closed_n:  # all of them are at the end of a frame
         return closed_n
     inside = np.flatnonzero(ends)
     inside = inside[inside % record.itemsize != record.itemsize - 2]
@@ -193,10 +195,10 @@ def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.voi
 def _search(
     window: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[int, bool]:
-    """Give the number of bytes to skip, and whether a frame begins there (else: more bytes must tell).
+    """Return the number of bytes to skip, and whether a frame begins after them; otherwise more bytes are needed.
 
-    If a window is searched again with more bytes, the two before the first undecided start are kept: they may close
-    a frame before it.
+    The two bytes before the first undecided start are not skipped: when the window is searched again with more bytes,
+    they may be the end of a frame.
     """
     length_n, window_n = record.itemsize, len(window)
     ended = np.zeros(window_n + 2 * length_n + 1, bool)  # a frame may have ended before this byte
@@ -206,7 +208,7 @@ def _search(
     first = int(fits.argmax())
     if not fits[first]:
         return (window_n if final else max(window_n - length_n - 1, 0)), False
-    if not final and window_n < first + 3 * length_n:  # rivals may follow
+    if not final and window_n < first + 3 * length_n:  # other candidates may follow
         return max(first - 2, 0), False
     starts = first + np.flatnonzero(fits[first : first + length_n])
     here_n, next_n = (
@@ -215,7 +217,7 @@ def _search(
     )
     best_i = int((here_n + next_n).argmax())
     start = int(starts[best_i])
-    # A frame's end behind a CR LF that ended nothing looks like a frame; the one after it is more plausible.
+    # The tail of a frame after a CR LF in its payload looks like a frame, but the frame after it is more plausible.
     is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
     return start + length_n * int(is_tail), True
 
@@ -231,7 +233,7 @@ def _plausible_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void])
 
 
 def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the chips whose values a magnetometer can give."""
+    """Mark the chips whose values are possible for the magnetometer."""
     temperature_degC, b_uT = txyz[..., 0], txyz[..., 1:]
     warm = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
     no_dust = ((txyz == 0) | (np.abs(txyz) >= VALUE_MIN)).all(axis=-1)
@@ -239,12 +241,12 @@ def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
 
 
 def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int) -> _Scan:
-    """Decode whole lines; a line longer than any frame is not waited for."""
+    """Decode whole lines; do not wait for the end of a line that is longer than any frame."""
     line_end = np.flatnonzero(octets == LF) + 1
     settled_n = int(line_end[-1]) if len(line_end) else 0
     parts: list[Frames] = []
     count: Counter[str] = Counter()
-    # What is left of a line that was not waited for may look like a frame, and is none.
+    # The rest of a line that is too long may look like a frame, but is not one.
     for first in range(0 if at_boundary else 1, len(line_end), BLOCK_LINES_N):
         base = int(line_end[first - 1]) if first else 0
         ends = line_end[first : first + BLOCK_LINES_N] - base
@@ -269,7 +271,7 @@ def _not_finite_lines(
     is_frame: Bool[np.ndarray, " lines"],
     chips_n: int,
 ) -> Bool[np.ndarray, " lines"]:
-    """Mark the lines that would be frames, had the firmware not written nan, inf or ovf for a number."""
+    """Mark the lines that would be frames if the firmware had not written nan, inf or ovf for a number."""
     line = re.compile(rb"(?:-?(?:\d{1,10}\.\d\d|nan|inf|ovf)\t?){%d}\t?\r?\n" % (wires.NUMBERS_PER_CHIP_N * chips_n))
     start = np.concatenate([[0], line_end[:-1]])
     marked = np.zeros(len(line_end), bool)

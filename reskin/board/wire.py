@@ -1,7 +1,7 @@
 """Encode and decode whole frames: binary bursts and lines of text.
 
-These are the formats of the ReSkin and AnySkin firmwares, without header, checksum or counter. `stream` finds frames
-in a byte stream; `faults` judges their values.
+These are the formats of the ReSkin and AnySkin firmwares, which have no header, checksum or counter. Module `stream`
+finds frames in a byte stream, and `faults` checks their values.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,9 +17,9 @@ TEXT_WIRES = ("text-xyzt", "text-txyz")
 NUMBERS_PER_CHIP_N = 4  # a temperature and a field
 INTEGER_DIGITS_MAX_N = 10  # Arduino's print() writes "ovf" above 4294967040
 NUMBER_BYTES_MAX_N = len("-4294967040.00\t")
-BLOCK_FRAMES_N = 4096  # a block and what is computed from it stay in the processor's cache
+BLOCK_FRAMES_N = 4096  # so that a block and the values computed from it fit into the processor's cache
 
-Run = tuple[int, int]  # first byte, number of frames that follow each other
+Run = tuple[int, int]  # first byte, number of consecutive frames
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Frames:
 
 
 def concatenate(parts: Sequence[Frames], chips_n: int) -> Frames:
-    """Join frames in order; no parts give no frames of `chips_n` chips."""
+    """Join frames in order; without parts, return zero frames of `chips_n` chips."""
     if not parts:
         return _room_for(0, chips_n)
     if len(parts) == 1:
@@ -55,12 +55,12 @@ def record_type(wire: Wire, chips_n: int) -> np.dtype[np.void]:
 
 
 def line_bytes_max_n(chips_n: int) -> int:
-    """Give the length that no text frame exceeds."""
+    """Return the maximum length of a text frame."""
     return NUMBERS_PER_CHIP_N * chips_n * NUMBER_BYTES_MAX_N + len(b"\t\r\n")
 
 
 def encode(frames: Frames, wire: Wire) -> bytes:
-    """Write frames as the firmware sends them; text keeps two decimals, and only `binary-clock` the device's time."""
+    """Encode frames as the firmware does; text has two decimals, and only `binary-clock` has the device's time."""
     frames_n, chips_n = frames.temperature_degC.shape
     b_uT = frames.b_uT.reshape(frames_n, chips_n, 3)
     if wire in TEXT_WIRES:
@@ -80,7 +80,7 @@ def _encode_lines(
     chips_n = b_uT.shape[1]
     if wire == "text-xyzt":
         values, chip = np.concatenate([b_uT, temperature_degC], axis=2), "%.2f\t%.2f\t%.2f\t%.2f\t"
-    else:  # AnySkin forgets the tab between two chips
+    else:  # AnySkin sends no tab between two chips
         values, chip = np.concatenate([temperature_degC, b_uT], axis=2), "%.2f\t%.2f\t%.2f\t%.2f"
     line = chip * chips_n + "\r\n"
     blocks = (values[first : first + BLOCK_FRAMES_N] for first in range(0, len(values), BLOCK_FRAMES_N))
@@ -90,7 +90,7 @@ def _encode_lines(
 def decode_runs(
     octets: UInt8[np.ndarray, " bytes"], runs: Sequence[Run], wire: Wire, chips_n: int
 ) -> tuple[Frames, Bool[np.ndarray, " f"]]:
-    """Decode the binary frames that stand in `runs` of `octets`; the mask marks those whose values are all finite."""
+    """Decode the binary frames at `runs` of `octets`; the mask marks frames whose values are all finite."""
     record = record_type(wire, chips_n)
     frames = _room_for(sum(frames_n for _, frames_n in runs), chips_n)
     finite = np.ones(len(frames), bool)
@@ -117,9 +117,9 @@ def decode_runs(
 def decode_lines(
     octets: UInt8[np.ndarray, " bytes"], line_end: Int64[np.ndarray, " lines"], wire: Wire, chips_n: int
 ) -> tuple[Frames, Bool[np.ndarray, " lines"]]:
-    """Decode the lines that end at `line_end` (LF included); the mask marks those that are a frame.
+    """Decode the lines that end at `line_end` (LF included); the mask marks the lines that are frames.
 
-    Every number has exactly two decimals, which is what parts `-56.7825.00` into two; tabs may be missing.
+    Tabs may be missing. Every number has exactly two decimals, so that `-56.7825.00` can be split into two numbers.
     """
     start = np.concatenate([[0], line_end[:-1]])
     dot = np.flatnonzero(octets == DOT)
@@ -141,11 +141,11 @@ def _numbers(
     line_start: Int64[np.ndarray, " f"],
     line_end: Int64[np.ndarray, " f"],
 ) -> tuple[Float64[np.ndarray, "f c"], Bool[np.ndarray, " f"]]:
-    """Read the number around each decimal point; the mask marks lines that hold nothing but numbers and tabs."""
-    # Unsigned bytes wrap around, so that what is no digit is above 9; two more, as a point may end the line.
+    """Read the number around each decimal point; the mask marks lines that consist of numbers and tabs only."""
+    # Unsigned bytes wrap around, so that other characters are above 9. Two zeros are added: a point may end the line.
     digit = np.append(octets, np.zeros(2, np.uint8)) - np.uint8(ZERO)
     stop = dot + 3
-    floor = np.column_stack([line_start, stop[:, :-1]])  # where the number before ends
+    floor = np.column_stack([line_start, stop[:, :-1]])  # where the previous number ends
     well_formed = (digit[dot + 1] <= 9) & (digit[dot + 2] <= 9)
     hundredths = digit[dot + 1] * np.int64(10) + digit[dot + 2]
     first, alive, scale = dot.copy(), np.ones(dot.shape, bool), 100
@@ -168,7 +168,7 @@ def _numbers(
 def _ends_well(
     octets: UInt8[np.ndarray, " bytes"], stop: Int64[np.ndarray, " f"], line_end: Int64[np.ndarray, " f"]
 ) -> Bool[np.ndarray, " f"]:
-    """Tell whether a line ends with its last number, then perhaps a tab, perhaps CR, and LF."""
+    """Return whether a line ends with its last number, an optional tab, an optional CR, and LF."""
     returns = (octets[line_end - 2] == CR) & (stop <= line_end - 2)
     rest_n = line_end - 1 - returns - stop
     tab = octets[np.minimum(stop, line_end - 1)] == TAB

@@ -85,8 +85,8 @@ def pressure_change(material: Material, depth_m: float, press: IndentedLayer) ->
     """Solve for the pressure change that moves the markers (first in `material`) to a greater depth.
 
     The pressure is a weighted sum of the pressures of spheres with smaller contacts. The weights move all markers
-    inside the contact from their current positions to the tip, by least squares. Damping is needed because waves shorter than
-    the depth do not reach the markers.
+    inside the contact from their current positions to the tip, by least squares. Damping is needed because waves
+    shorter than the depth do not reach the markers.
     """
     contact = press.contact(depth_m)
     inside = np.flatnonzero(material.r_m[:MARKERS_N] < contact.radius_m)

@@ -1,1 +1,1 @@
-"""Simulated captures: a protocol, a rig and the physics of a skin give the files of a recorded capture."""
+"""Simulated captures: files as of a recorded capture, from a protocol, a rig and the physics of a skin."""

@@ -1,4 +1,4 @@
-"""Simulated captures: a skin is taken through a protocol, and written in the formats of a recorded capture.
+"""Simulated captures: a skin is pressed by a protocol, and the result written in the formats of a recorded capture.
 
 Only `source: simulated` in its header distinguishes such a capture from a recorded one.
 """
@@ -37,7 +37,7 @@ from reskin.simulation.rig import (
 from reskin.simulation.settings import MAIN, SimulationSettings
 
 WIRE: Wire = "binary"
-# Each has a random generator of its name, so that a further term leaves all other draws the same.
+# Each part has its own random generator, so that a further term does not change the other draws.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 
 
@@ -56,11 +56,11 @@ class SimulatedCapture:
     marks: tuple[tuple[float, float], ...]  # (stream_s, probe_s) of the same events
     protocol: str  # description
     overruns: dict[str, int]  # counts of values out of range, by kind
-    card_rate_hz: float | None  # of frames on an SD card; None: frames came through a port
+    card_rate_hz: float | None  # frame rate on an SD card; None if frames come through a port
 
 
 def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str, str]]:
-    """List the names (board, skin) of a protocol's captures; further boards or skins leave the others unchanged."""
+    """List the names (board, skin) of a protocol's captures; more boards or skins do not change those of the others."""
     kind, skins_n = settings.boards[settings.protocols[protocol].boards], settings.protocols[protocol].skins_n
     boards = [f"{kind.letter}{board_i}" for board_i in range(kind.boards_n)]
     skins = [(board, f"{board}_s{skin_i}") for skin_i in range(kind.skins_per_board_n) for board in boards]
@@ -70,7 +70,7 @@ def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str
 def simulate_capture(
     settings: SimulationSettings, protocol: str, *, board: str, skin: str, seed: int
 ) -> SimulatedCapture:
-    """Draw the board and the skin of these names, take the skin through the protocol, and record it."""
+    """Draw the board and the skin of these names, press the skin by the protocol, and record it."""
     presses, chip, spreads = settings.protocols[protocol], settings.chip, settings.spreads
     rig, terms = rig_for(settings.rig, presses), settings.terms.only(presses.terms)
     kind = settings.boards[presses.boards]
@@ -140,7 +140,7 @@ def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[H
 
 
 def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the tip's positions in the board's frame in m; under a commanded load, the skin determines the depth."""
+    """Return the tip's positions in the board's frame in m; for a commanded load, the skin determines the depth."""
     tip_m = (actual_positions(plan, rig, rng) - (*plan.centre_mm, 0)) * milli
     if plan.weight_N is not None:
         tip_m[:, :, 2] = depths_under_load(skin, plan.weight_N)

@@ -1,6 +1,6 @@
 """Response of a skin to a tip: fields at the chips and forces at every stop of a protocol.
 
-Terms of physics that a protocol does not name are not computed (experiment neglected_effects gives the error).
+Terms of physics that a protocol does not name are not computed (experiment neglected_effects reports the error).
 """
 
 from collections.abc import Collection
@@ -40,7 +40,7 @@ from reskin.physics.skin import (
 
 
 class Terms(Strict):
-    """Section `terms`: physics that only some protocols need."""
+    """Section `terms`: terms of physics that only some protocols need."""
 
     ageing: Ageing | None = None
     friction: Friction | None = None
@@ -56,9 +56,9 @@ class Terms(Strict):
 
 
 class TangentialResponse(NamedTuple):
-    """Response to a dragged or leaning tip at every stop.
+    """Response to a dragged or tilted tip at every stop.
 
-    force_N: tangential force. change_T: dB of pressing and dragging together. slide_m: translation of the whole skin.
+    force_N: tangential force. change_T: dB due to pressing and dragging. slide_m: translation of the whole skin.
     """
 
     force_N: Float[np.ndarray, "n p 2"]
@@ -73,7 +73,7 @@ class Response:
     rest_T: Float[np.ndarray, "n k 3"]  # before each indentation
     change_T: Float[np.ndarray, "n p k 3"]
     force_N: Float[np.ndarray, "n p 3"]
-    beyond_verified_n: int  # stops beyond the depths of published solutions
+    beyond_verified_n: int  # number of stops deeper than the published solutions
 
 
 def simulate_response(
@@ -87,8 +87,8 @@ def simulate_response(
 ) -> Response:
     """Simulate the response of a fresh skin at every stop (x, y, depth in the board's frame).
 
-    `tilt` is the lean of the stylus, x and y over z. Without the term friction there is no tangential force: a tip that
-    is dragged or leans only presses.
+    `tilt` is the slope of the stylus, x and y over z. Without the term friction there is no tangential force, so that a
+    dragged or tilted tip only presses.
     """
     n, stops_n, _ = tip_m.shape
     flat_m = tip_m.reshape(-1, 3)
@@ -121,12 +121,12 @@ def simulate_response(
 def drag_tip(
     board: Board, skin: Skin, tip_m: Float[np.ndarray, "n p 3"], *, tilt: Float[np.ndarray, "n 2"], how: Friction
 ) -> TangentialResponse:
-    """Drag or lean a tip through the stops of every indentation, with Coulomb friction.
+    """Move a dragged or tilted tip through the stops of every indentation, with Coulomb friction.
 
     The tangential force shears the layer under the tip, and slides the whole skin if springs hold its base
-    (`Skin.hold`); otherwise the base is assumed fixed sideways. One coefficient of friction bounds pressing and
-    dragging together: a drag that uses a share of it leaves the rest to the press (assumed), so that a tip that slips
-    has released the skin that it displaced when it pressed.
+    (`Skin.hold`); otherwise the base is assumed to be fixed sideways. One friction limit applies to pressing and
+    dragging together. It is assumed that the drag uses its share first and the press gets the rest, so that a slipping
+    tip has released the skin from its displacement by the press.
     """
     if skin.hold is not None:
         skin = replace(skin, hold=replace(skin.hold, friction=how.coefficient))
@@ -147,7 +147,7 @@ def _drag_once(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
     )
     force_N = _clip(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
-    # Pressing and dragging are centred where the material under the tip rested.
+    # Pressing and dragging are centred at the rest position of the material under the tip.
     slid_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
     elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + slid_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
@@ -190,7 +190,7 @@ def _shear_map(skin: Skin, depth_m: float) -> shear.ShearMap:
 
 def _clip(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
     size_N = np.hypot(*force_N.T)
-    with np.errstate(over="ignore"):  # a force far below its limit
+    with np.errstate(over="ignore"):  # for a force far below its limit
         return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
 
 

@@ -13,9 +13,9 @@ from reskin.data.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, points_mm, prot
 from reskin.errors import ParamsError
 from reskin.physics.skin import Skin, forces
 
-LIFTED_MM = -1.0  # depth of a stop above the skin: no contact, and not in the robot's log
+LIFTED_MM = -1.0  # depth of a stop above the skin, which has no contact and is not in the robot's log
 DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load: 1e-8 N on a skin of 10 N/mm
-DEEPEST_SHARE = 0.999  # of the lesser of thickness and tip radius, the limit of the force model
+DEEPEST_SHARE = 0.999  # of the lesser of thickness and tip radius, which is the limit of the force model
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ Sides_mm = tuple[float, float]
 class Plan:
     """Stops in order of time: a place and a depth at which readings are taken; an indentation has p stops.
 
-    A negative depth is a stop above the skin; where a load is commanded, the depth is NaN. `tilt` is the lean of the
+    A negative depth is a stop above the skin; if a load is commanded, the depth is NaN. `tilt` is the slope of the
     stylus, x and y over z. `centre_mm` is the label of the skin's centre.
     """
 
@@ -60,21 +60,21 @@ class Plan:
 class ProtocolSettings(Strict):
     """Settings common to all protocols."""
 
-    boards: str  # the kind of board, one of `boards` of the scene
-    skins_n: Count  # the first skin of each board comes before the second of any
+    boards: str  # kind of board, a key of section `boards` of the scene
+    skins_n: Count  # number of skins: the first skin of each board, then the second of each board, ...
     terms: tuple[
         Literal["ageing", "friction", "memory", "relaxation", "temperature"], ...
     ]  # terms of physics that are simulated
-    rate_hz: Rate_hz | None = None  # default: the rig's; more chips take longer
+    rate_hz: Rate_hz | None = None  # default: the rate of the rig; more chips take longer
 
 
 class _RandomDepth(ProtocolSettings):
-    depth_mm: tuple[Depth_mm, Depth_mm]  # uniform between these
+    depth_mm: tuple[Depth_mm, Depth_mm]  # uniform between these limits
 
     @model_validator(mode="after")
     def _depths_rise(self) -> "_RandomDepth":
         if not self.depth_mm[0] <= self.depth_mm[1]:
-            raise ValueError(f"depth_mm goes from the shallower to the deeper, not {self.depth_mm}")
+            raise ValueError(f"depth_mm must list the smaller depth first, not {self.depth_mm}")
         return self
 
 
@@ -86,7 +86,7 @@ class _OnlyTemperature(ProtocolSettings):
     def _ranges_rise(self) -> "_OnlyTemperature":
         for name, value in self:
             if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
-                raise ValueError(f"{name} goes from the lower to the higher, not {value}")
+                raise ValueError(f"{name} must list the smaller value first, not {value}")
         return self
 
 
@@ -115,7 +115,7 @@ class Drag(ProtocolSettings):
     step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Drag along every row, then along every column, each line in the direction opposite to the one before."""
+        """Drag along every row, then along every column, each line opposite in direction to the line before."""
         stops_n = round(2 * CENTRE_MM / self.step_mm) + 1
         along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
         there = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
@@ -123,7 +123,7 @@ class Drag(ProtocolSettings):
         lines_n, depths_n = 2 * SIDE_POINTS_N, len(self.depths_mm)
         x_mm = np.tile(np.concatenate([there, across_mm]), (depths_n, 1))
         y_mm = np.tile(np.concatenate([across_mm, there]), (depths_n, 1))
-        # Every second pass is reversed, or the place of the tip would determine the direction of its force.
+        # Every second pass is reversed; otherwise the place of the tip would determine the direction of its force.
         turned = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
         depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
         stops = Stops(
@@ -138,16 +138,16 @@ class Drag(ProtocolSettings):
 
 
 class Hand(_RandomDepth):
-    """Indentations by hand along lines: only their order is known, not place, depth or force (section 5.2)."""
+    """Indentations by hand along lines, of which only the order is known, not place, depth or force (section 5.2)."""
 
     kind: Literal["hand"]
     lines_n: Count
     pokes_per_line_n: Annotated[int, Field(ge=2, le=1000)]
-    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # off the line, and along it
+    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # across the line and along it
     tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # of the stylus, about each axis
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Press along parallel lines over the grid; the pass counts lines."""
+        """Press along parallel lines over the grid; each line is a pass."""
         across_mm = np.linspace(0, 2 * CENTRE_MM, self.lines_n) if self.lines_n > 1 else np.array([CENTRE_MM])
         along_mm = np.linspace(0, 2 * CENTRE_MM, self.pokes_per_line_n)
         pokes_n = self.lines_n * self.pokes_per_line_n
@@ -186,10 +186,10 @@ class Scatter(_RandomDepth):
 
 
 class Load(_OnlyTemperature):
-    """A glass on the skin's centre, filled step by step (section 6); its foot is taken as the rig's round tip."""
+    """A glass on the skin's centre, filled step by step (section 6); its foot is modelled as the rig's round tip."""
 
     kind: Literal["load"]
-    # Fillings: a direction is fitted on one half of them, and tested on the other.
+    # Number of fillings; a direction is fitted on half of them, and tested on the other half.
     passes_n: Annotated[int, Field(ge=2, le=100_000)]
     force_max_N: Annotated[float, Field(gt=0, le=100)]
     step_N: Annotated[float, Field(gt=0, le=100)]
@@ -198,7 +198,7 @@ class Load(_OnlyTemperature):
     def _steps_fill_it(self) -> "Load":
         steps = self.force_max_N / self.step_N
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
-            raise ValueError(f"force_max_N is a whole number of step_N, not {steps:.4g}")
+            raise ValueError(f"force_max_N must be a whole number of step_N, not {steps:.4g}")
         return self
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
@@ -211,11 +211,11 @@ class Load(_OnlyTemperature):
 
 
 class Press(_OnlyTemperature):
-    """Half-sine presses at grid places; each frame is a stop (section 7, dynamic data), at a rate of its own."""
+    """Half-sine presses at grid places, with its own rate; each frame is a stop (section 7, dynamic data)."""
 
     kind: Literal["press"]
     presses_n: Count
-    duration_s: tuple[Duration_s, Duration_s]  # log-uniform between these
+    duration_s: tuple[Duration_s, Duration_s]  # log-uniform between these limits
     depth_mm: tuple[Depth_mm, Depth_mm]
     rate_hz: Rate_hz
 
@@ -272,7 +272,7 @@ def _upright_plan(
     weight_N: Float64[np.ndarray, "n p"] | None = None,
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM),
 ) -> Plan:
-    """Make the plan of an upright tip; one pass unless given."""
+    """Make a plan with an upright tip, in a single pass if `pass_i` is not given."""
     n = len(stops.depth_mm)
     passes = np.zeros(n, np.int32) if pass_i is None else pass_i
     return Plan(
@@ -287,12 +287,12 @@ def load_steps_N(force_max_N: float, step_N: float) -> Float64[np.ndarray, " p"]
 
 
 def depths_under_load(skin: Skin, load_N: Float[np.ndarray, "n p"]) -> Float64[np.ndarray, "n p"]:
-    """Solve for the commanded depth in m under each load; without load the tip just touches the skin.
+    """Solve for the commanded depth in m under each load; without load, the tip just touches the skin.
 
     Raises
     ------
     ParamsError
-        If the skin does not bear a load at its greatest depth.
+        If a load exceeds the force at the greatest depth.
     """
     distinct_N, index = np.unique(load_N, return_inverse=True)
     return np.array([_depth_under_load(skin, float(distinct)) for distinct in distinct_N])[index].reshape(load_N.shape)
@@ -307,7 +307,7 @@ def _depth_under_load(skin: Skin, load_N: float) -> float:
         return float(forces(skin, np.array([depth_m]))[0]) - load_N
 
     if missing_N(deepest_m) < 0:
-        rule = f"at most {missing_N(deepest_m) + load_N:.3g} N, which the skin bears at its deepest"
+        rule = f"at most {missing_N(deepest_m) + load_N:.3g} N, the force at the greatest depth"
         raise ParamsError(f"skin {skin.name}", "weight", rule, f"{load_N:.3g} N", "Lower force_max_N.")
     return float(brentq(missing_N, -skin.depth_zero_m, deepest_m, xtol=DEPTH_STEP_M))
 

@@ -1,4 +1,4 @@
-"""The simulated rig: robot, force sensor, chips, port and clocks; fields at stops become frames and a probe log."""
+"""The simulated rig: robot, force sensor, chips, port and clocks. It makes frames and a probe log from fields."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -24,13 +24,13 @@ class Rig(Strict):
     """Section `rig`: frames, repeatability of the robot, noise of the force sensor, clocks and port."""
 
     noload_frames_n: FrameCount
-    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # on the way down, and as many on the way up
-    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # at rest, before each dwell
+    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames on the way down, and as many on the way up
+    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames at rest before each dwell
     readings_n: FrameCount
     rate_hz: Rate_hz
     robot_place_sd_mm: Spread  # each axis
     robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
-    place_offset_sd_mm: Spread  # label to true place, the same for all skins of a board
+    place_offset_sd_mm: Spread  # true place minus label, the same for all skins of a board
     force_noise_N: Annotated[float, Field(ge=0, le=10)]
     chunk_frames_max_n: FrameCount
     arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean delay of a chunk, exponential
@@ -40,7 +40,7 @@ class Rig(Strict):
 
 @dataclass(frozen=True)
 class Timeline:
-    """Frames of one indentation, axis t: the stop of each, and the share of its change of field."""
+    """Frames of one indentation, axis t: the stop of each frame, and the share of the stop's field change."""
 
     stop_i: Int64[np.ndarray, " t"]
     share: Float64[np.ndarray, " t"]
@@ -52,7 +52,7 @@ class Timeline:
 
 
 def rig_for(rig: Rig, protocol: Protocol) -> Rig:
-    """Adapt the rig to a protocol: its rate; one stop per frame in presses and walks; no robot, one clock in walks."""
+    """Adapt the rig to a protocol: rate; one frame per stop for presses and walks; no robot and one clock for walks."""
     changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
     if isinstance(protocol, Press | Walk):
         changes |= {"moving_frames_n": 0, "settling_frames_n": 0, "readings_n": 1}
@@ -70,7 +70,7 @@ def rig_for(rig: Rig, protocol: Protocol) -> Rig:
 
 
 def timeline(rig: Rig, stops_n: int) -> Timeline:
-    """Lay out the frames of an indentation: settle, no-load dwell, down, settle and read at every stop, up."""
+    """Arrange the frames of an indentation: settle, no-load dwell, down, settle and read at every stop, up."""
     ramp = np.arange(1, rig.moving_frames_n + 1) / (rig.moving_frames_n + 1)
     lifted_n, dwell_n = rig.settling_frames_n + rig.noload_frames_n, rig.settling_frames_n + rig.readings_n
     share = np.concatenate([np.zeros(lifted_n), ramp, np.ones(stops_n * dwell_n), ramp[::-1]])
@@ -81,9 +81,9 @@ def timeline(rig: Rig, stops_n: int) -> Timeline:
 
 
 def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the true positions of the tip (x, y, depth in mm): one error for all stops of an indentation.
+    """Return the true positions of the tip (x, y, depth in mm), with the same error for all stops of an indentation.
 
-    A hand has no commanded places: its plan is exact.
+    Without a robot there are no commanded places, so the plan has the true positions.
     """
     planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
     if not plan.labelled:
@@ -167,7 +167,7 @@ class SimulatedFrames:
 
 @dataclass(frozen=True)
 class Readout:
-    """Readout of a board during one capture: each chip has a phase of conversion and a sensitivity to temperature."""
+    """Readout of a board during one capture; each chip has its own conversion phase and temperature sensitivity."""
 
     board: Board
     design: ChipDesign
@@ -180,7 +180,7 @@ class Readout:
 def start_readout(
     board: Board, design: ChipDesign, *, rate_hz: float, temperature: Temperature | None, rng: np.random.Generator
 ) -> Readout:
-    """Draw each chip's phase of conversion and sensitivity to temperature."""
+    """Draw each chip's conversion phase and temperature sensitivity."""
     chips_n = len(board.chips_m)
     phase_s = chip.CONVERSION_S * rng.random(chips_n)
     sd = 0.0 if temperature is None else temperature.chip_sensitivity_per_K
@@ -195,7 +195,7 @@ def read_frames(
     noise: np.random.Generator,
     warmth_noise: np.random.Generator,
 ) -> SimulatedFrames:
-    """Read every frame of every indentation, in blocks; the result does not depend on their size."""
+    """Read every frame of every indentation, in blocks; the result does not depend on the block size."""
     frame_s = (1 + np.arange(len(response.rest_T) * len(timeline))) / readout.rate_hz
     age_s, source_i = chip.last_conversions(frame_s, readout.phase_s)
     b_uT, temperature_degC, overruns = [], [], []
@@ -205,7 +205,7 @@ def read_frames(
         b_uT.append(block_uT)
         overruns.append(overrun)
         temperature_degC.append(read_temperature(chips_degC, readout.design, warmth_noise))
-    # A conversion that two frames carry is the same reading twice, noise included.
+    # Two frames with the same conversion have the same reading, including its noise.
     chip_i = np.arange(len(readout.phase_s))
     repeated_uT = np.concatenate(b_uT).reshape(len(frame_s), -1, 3)[source_i, chip_i].reshape(len(frame_s), -1)
     return SimulatedFrames(
@@ -219,7 +219,7 @@ def read_frames(
 def _field_at(
     response: Response, timeline: Timeline, readout: Readout, age_s: Float[np.ndarray, "f k"], first_i: int
 ) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
-    # The first frames of a block may carry conversions of the indentation before.
+    # The first frames of a block may have conversions from the previous indentation.
     lead_n = len(timeline) if first_i else 0
     block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
     b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]

@@ -1,4 +1,4 @@
-"""Settings of a simulation: boards, skins, protocols and how they are recorded."""
+"""Settings of a simulation: boards, skins, protocols and the rig that records them."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -16,7 +16,7 @@ from reskin.simulation.defaults import SHARED
 from reskin.simulation.protocols import Drag, Grid, Hand, Protocol
 from reskin.simulation.rig import Rig
 
-MAIN = "grid"  # its captures are named as their skins
+MAIN = "grid"  # the protocol whose captures have the names of their skins
 Count = Annotated[int, Field(ge=1, le=1000)]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 
@@ -37,7 +37,7 @@ class BoardKind(Strict):
 
 
 class SimulationSettings(Strict):
-    """Section `simulate` of a scene, with the sections that all simulations share."""
+    """Section `simulate` of a scene, together with the sections that all simulations share."""
 
     boards: Annotated[dict[str, BoardKind], Field(min_length=1)]
     protocols: Annotated[dict[str, Protocol], Field(min_length=1)]
@@ -52,19 +52,21 @@ class SimulationSettings(Strict):
         used = {term for protocol in self.protocols.values() for term in protocol.terms}
         if used != self.terms.named():
             raise ValueError(
-                f"terms holds exactly what a protocol needs, {sorted(used)}; it holds {sorted(self.terms.named())}"
+                f"terms must be exactly those of the protocols, {sorted(used)}, not {sorted(self.terms.named())}"
             )
         for name, protocol in self.protocols.items():
             if protocol.boards not in self.boards:
-                raise ValueError(f"protocol {name}: boards is one of {sorted(self.boards)}, not {protocol.boards!r}")
+                raise ValueError(
+                    f"protocol {name}: boards must be one of {sorted(self.boards)}, not {protocol.boards!r}"
+                )
             if isinstance(protocol, Hand) and protocol.tilt_sd_deg > 0 and "friction" not in protocol.terms:
-                raise ValueError(f"protocol {name}: a stylus that leans (tilt_sd_deg) needs the term friction")
+                raise ValueError(f"protocol {name}: a tilted stylus (tilt_sd_deg) needs the term friction")
             if isinstance(protocol, Drag) and "friction" not in protocol.terms:
-                raise ValueError(f"protocol {name}: terms of a drag hold friction, without which there is no shear")
+                raise ValueError(f"protocol {name}: a drag needs the term friction, without which there is no shear")
             kind, skins_n = self.boards[protocol.boards], protocol.skins_n
             if skins_n > (have_n := kind.boards_n * kind.skins_per_board_n):
                 raise ValueError(
-                    f"protocol {name}: skins_n {skins_n} is more than {protocol.boards} boards have, {have_n}"
+                    f"protocol {name}: skins_n {skins_n} is more than the {have_n} skins of {protocol.boards} boards"
                 )
         if len({kind.letter for kind in self.boards.values()}) < len(self.boards):
             raise ValueError("kinds of boards need different letters")
@@ -73,12 +75,12 @@ class SimulationSettings(Strict):
     @model_validator(mode="after")
     def _check_main_protocol(self) -> "SimulationSettings":
         if MAIN not in self.protocols or not isinstance(self.protocols[MAIN], Grid):
-            raise ValueError(f"protocols holds a grid named {MAIN}")
+            raise ValueError(f"protocols must include a grid named {MAIN}")
         return self
 
     @property
     def main(self) -> Grid:
-        """The protocol that folds are drawn on."""
+        """The protocol whose captures the folds are drawn from."""
         main = self.protocols[MAIN]
         assert isinstance(main, Grid), "checked above"
         return main
@@ -89,7 +91,7 @@ class SimulationSettings(Strict):
 
 
 def parse_simulation(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> SimulationSettings:
-    """Parse section `simulate` of a scene, with the shared sections skin, rig, chip, spreads, and the terms in use."""
+    """Parse section `simulate` of a scene, with the shared sections skin, rig, chip, spreads and the terms in use."""
     protocols = section.get("protocols")
     named = {
         term

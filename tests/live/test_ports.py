@@ -40,7 +40,7 @@ def test_other_devices_are_no_board():
     script = make_script(pokes_n=0)
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
     assert "another baud rate" in str(find.recognise("port", wrong_baud))
-    assert "no byte came" in str(find.recognise("port", []))
+    assert "no bytes arrived" in str(find.recognise("port", []))
     assert "cannot open the port" in str(find.detect_board("/dev/none"))
 
 

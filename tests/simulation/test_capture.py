@@ -240,13 +240,13 @@ def test_unknown_parameter_is_named(section, name):
 @pytest.mark.parametrize(
     ("protocol", "changes", "message"),
     [
-        (GRID | {"skins_n": 5}, {}, "skins_n 5 is more than rigid boards have, 4"),
-        (GRID | {"boards": "soft"}, {}, "boards is one of .'rigid'., not 'soft'"),
-        (GRID | {"terms": ["ageing"]}, {}, "terms holds exactly what a protocol needs"),
-        (GRID, {"terms": {"ageing": AGEING}}, "terms holds exactly what a protocol needs"),
+        (GRID | {"skins_n": 5}, {}, "skins_n 5 is more than the 4 skins of rigid boards"),
+        (GRID | {"boards": "soft"}, {}, "boards must be one of .'rigid'., not 'soft'"),
+        (GRID | {"terms": ["ageing"]}, {}, "terms must be exactly those of the protocols"),
+        (GRID, {"terms": {"ageing": AGEING}}, "terms must be exactly those of the protocols"),
         (HAND | {"depth_mm": (1.2, 0.4)}, {}, "from the shallower to the deeper"),
-        (HAND | {"tilt_sd_deg": 5.0}, {}, "a stylus that leans .tilt_sd_deg. needs the term friction"),
-        (DRAG | {"terms": []}, {}, "protocol other: terms of a drag hold friction"),
+        (HAND | {"tilt_sd_deg": 5.0}, {}, "a tilted stylus .tilt_sd_deg. needs the term friction"),
+        (DRAG | {"terms": []}, {}, "protocol other: a drag needs the term friction"),
         (LOAD | {"passes_n": 1}, {}, "protocols.other.passes_n must be greater than or equal to 2; got 1"),
     ],
 )

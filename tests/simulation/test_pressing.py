@@ -161,7 +161,7 @@ def test_walk_truth_uses_the_logs_clock():
 def test_force_controlled_presses_refuse_relaxation_and_wear():
     with pytest.raises(ParamsError, match="terms"):
         with_protocol("press", PRESS | {"terms": ["relaxation"]})
-    with pytest.raises(ParamsError, match="duration_s goes from the lower to the higher"):
+    with pytest.raises(ParamsError, match="duration_s must list the smaller value first"):
         with_protocol("press", PRESS | {"duration_s": (1.0, 0.05)})
     with pytest.raises(ParamsError, match="whole number of step_N"):
         with_protocol("glass", GLASS | {"step_N": 0.3})
