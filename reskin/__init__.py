@@ -1,11 +1,11 @@
 """Learning for magnetic tactile skins: boards, recordings, simulation, models and calibration.
 
 =====================================  ==========================================================
-`open`                                 read contacts from a board while they happen
+`open`                                 read contacts from a board as they happen
 `record`, `lifted`, `touch`            record a board while a program moves a robot
 `load_universal`                       the universal model, to be calibrated to any skin
 `load_model`, `Model`                  a trained network
-`load_rows`                            ingested readings, as networks are trained on them
+`load_rows`                            ingested readings, in the form that networks are trained on
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
 =====================================  ==========================================================

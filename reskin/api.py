@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from reskin.universal.model import Universal
 
 AnyModel = Union[Path, str, Sequence[Path | str], "Model", "Universal"]
-Changes = Mapping[str, Any]  # of nominal settings, by name
+Changes = Mapping[str, Any]  # values by name, for the settings that differ from the nominal ones
 NOMINAL_BOARD = "rigid"
 
 
 def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
-    """Load the readings in contact that networks are trained on.
+    """Load the contact readings that networks are trained on.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
     Returns
     -------
     Rows
-        `db_uT` [f ch] is the change of field; `target` [f 3] is x_mm, y_mm and Fz_N; `board` and `skin` [f] are names.
+        `db_uT` [f ch] is the field change; `target` [f 3] is x_mm, y_mm and Fz_N; `board` and `skin` [f] are names.
 
     Raises
     ------
@@ -71,22 +71,22 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
 
 
 def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Board:
-    """Draw a simulated circuit board, with the tolerances of real ones.
+    """Draw a simulated circuit board, with tolerances like those of real boards.
 
     Parameters
     ----------
     name, seed : str, int
         The same name and seed give the same board.
     spreads : mapping, optional
-        Standard deviations between boards that differ from the nominal ones, such as `{"chip_offset_uT": 0.0}`.
+        Standard deviations between boards to use instead of the nominal ones, such as `{"chip_offset_uT": 0.0}`.
     **design
-        Settings that differ from the nominal board's: `chips_xy_mm` [[x, y], ...] from the middle of the skin,
+        Settings to use instead of the nominal board's: `chips_xy_mm` [[x, y], ...] relative to the centre of the skin,
         `chips_turn_deg` [turn, ...], `gap_mm`.
 
     Returns
     -------
     Board
-        `chips_m` [k 3] holds the places of the chips.
+        `chips_m` [k 3] is the position of each chip.
 
     Raises
     ------
@@ -107,21 +107,21 @@ def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = Non
 
 
 def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = None, **design: Any) -> Skin:
-    """Draw a simulated skin, with the tolerances of real ones.
+    """Draw a simulated skin, with tolerances like those of real skins.
 
     Parameters
     ----------
     name, seed : str, int
         The same name and seed give the same skin.
     spreads : mapping, optional
-        Standard deviations between skins that differ from the nominal ones, such as `{"skin_modulus": 0.0}`.
+        Standard deviations between skins to use instead of the nominal ones, such as `{"skin_modulus": 0.0}`.
     **design
-        Settings that differ from the nominal skin's: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
+        Settings to use instead of the nominal skin's: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
 
     Returns
     -------
     Skin
-        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the dipoles that stand for its magnetisation.
+        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the dipoles that represent its magnetisation.
 
     Raises
     ------
@@ -152,8 +152,8 @@ def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = N
 class Pokes(NamedTuple):
     """Simulated indentations, as `simulate_pokes` returns them."""
 
-    noload_uT: np.ndarray  # [n ch] fields before each one
-    b_uT: np.ndarray  # [n ch] fields at each one
+    noload_uT: np.ndarray  # [n ch] field before each indentation
+    b_uT: np.ndarray  # [n ch] field during each indentation
     Fz_N: np.ndarray  # [n] normal forces, positive in compression
 
 
@@ -162,20 +162,20 @@ def simulate_pokes(
 ) -> Pokes:
     """Simulate indentations of a fresh skin: what the chips read, and the normal force.
 
-    Ageing and friction, which only some protocols of the pipeline simulate, are left out.
+    Ageing and friction are not simulated here; some protocols of the pipeline include them.
 
     Parameters
     ----------
     skin : Skin
-        The skin, of `draw_skin`.
+        A skin from `draw_skin`.
     pokes : array [n 3]
-        x_mm, y_mm and depth_mm of each; the middle of the skin is at (8, 8) mm.
+        x_mm, y_mm and depth_mm of each indentation; the centre of the skin is at (8, 8) mm.
     board : Board, optional
-        The board under the skin, of `draw_board`; the nominal one if not given.
+        The board under the skin, from `draw_board`; the nominal board if not given.
     seed : int
-        Seed of the noise, and of the board if none is given.
+        Seed of the noise, and of the board if no board is given.
     chip : mapping, optional
-        Settings that differ from the nominal magnetometer's, such as `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`.
+        Settings to use instead of the nominal magnetometer's, such as `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`.
 
     Returns
     -------
@@ -185,7 +185,7 @@ def simulate_pokes(
     Raises
     ------
     ParamsError
-        If `pokes` has another shape or a setting is invalid.
+        If `pokes` has a different shape or a setting is invalid.
 
     Examples
     --------
@@ -242,7 +242,7 @@ class Model:
         Parameters
         ----------
         b_uT : array [f ch] or [ch]
-            Fields without contact; their mean is subtracted from now on.
+            Fields without contact; `predict` subtracts their mean.
 
         Returns
         -------
@@ -263,7 +263,7 @@ class Model:
         Parameters
         ----------
         b_uT : array [f ch] or [ch]
-            Fields in contact. Without contact the change of field is noise, and the prediction has no meaning.
+            Fields in contact. Without contact the field change is only noise, and the prediction is meaningless.
 
         Returns
         -------
@@ -273,7 +273,7 @@ class Model:
         Raises
         ------
         ParamsError
-            Before `zero` was called.
+            If `zero` has not been called.
         SchemaError
             If the number of channels is not the model's.
         """
@@ -284,7 +284,7 @@ class Model:
         return predicted if np.ndim(b_uT) == 2 else predicted[0]
 
     def export_onnx(self, file: Path | str) -> None:
-        """Write the network as an ONNX file: changes of field in uT in, x_mm, y_mm and F_N out.
+        """Write the network as an ONNX file: its input is field changes in uT, its output x_mm, y_mm and F_N.
 
         Needs the package onnx (`pip install '.[onnx]'`).
         """
@@ -308,7 +308,7 @@ def load_model(file: Path | str) -> Model:
     Parameters
     ----------
     file : path
-        The weights (.safetensors); the JSON card with the same name lies beside them.
+        The weights (.safetensors). The JSON card of the same name must be in the same folder.
 
     Returns
     -------
@@ -331,15 +331,15 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal(calibration: Path | str | None = None) -> Universal:
-    """Load the universal model that comes with the library, for a skin that nobody has recorded.
+    """Load the universal model that comes with the library. It works for a skin without any recording of it.
 
-    Its methods calibrate it to a skin: `zero` to readings without contact, `see` to presses at unknown places, `label`
-    to presses at known ones; `next_place` proposes where to press next, and `save` writes the calibration.
+    Its methods calibrate it to a skin: `zero` uses readings without contact, `see` presses at unknown places, and
+    `label` presses at known places; `next_place` proposes where to press next, and `save` writes the calibration.
 
     Parameters
     ----------
     calibration : path, optional
-        A file that `save` wrote, to go on with that skin.
+        A file that `save` wrote, to continue with that skin.
 
     Returns
     -------
@@ -348,7 +348,7 @@ def load_universal(calibration: Path | str | None = None) -> Universal:
     Raises
     ------
     ReskinError
-        If the file is missing or no calibration.
+        If the file is missing or is not a calibration.
 
     Examples
     --------
@@ -367,7 +367,7 @@ def open(port: str, *, model: AnyModel = (), baud: int = 115200) -> LiveSkin: ..
 @overload
 def open(port: list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkins: ...
 def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkin | LiveSkins:
-    """Open a board's port, to read contacts while they happen.
+    """Open a board's port, to read contacts as they happen.
 
     The `with` statement opens the port, detects wire format and chips, and takes the no-load reading: nothing may touch
     the skin in the first second. A thread reads the port, so that a slow loop loses no bytes.
@@ -392,8 +392,8 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     Raises
     ------
     ReskinError
-        If a model cannot be read or a port is named twice; in the `with` statement, if a port does not open, sends no
-        frames, or has other chips than the model.
+        If a model cannot be read or a port is named twice; in the `with` statement, if a port does not open or sends no
+        frames, or if the board's number of chips is not the model's.
 
     Examples
     --------
@@ -419,21 +419,21 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
 
 
 def lifted() -> Label:
-    """Make the label of a board that nothing touches, for `record`; one has to precede each touch."""
+    """Make the label of an untouched board, for `record`. One such label must come before each touch."""
     from reskin.recordings.labels import Label
 
     return Label(False)
 
 
 def touch(x_mm: float, y_mm: float, **known: Any) -> Label:
-    """Make the label of a touch that holds still, for `record`.
+    """Make the label of a stationary touch, for `record`.
 
     Parameters
     ----------
     x_mm, y_mm : float
-        Its place.
+        The place of the touch.
     **known
-        What else is known: depth_mm, Fx_N, Fy_N and Fz_N (forces on the skin, Fz positive in compression), pass_i.
+        Other known values: depth_mm, Fx_N, Fy_N and Fz_N (forces on the skin, Fz positive in compression), pass_i.
 
     Examples
     --------
@@ -454,7 +454,7 @@ def record(
     dwell_s: float = 0.5,
     **names: str,
 ) -> Path:
-    """Record a board while a program moves a robot and says where it stands.
+    """Record a board while a program moves a robot and reports its position.
 
     Prints to stderr what was recorded, lost and left out.
 
@@ -464,15 +464,15 @@ def record(
         Yields `lifted()` or `touch(...)` once the robot stands still. A callable is called for each label, until it
         returns None.
     port : str, optional
-        The board's port; the only board there is if not given.
+        The board's port; if not given, the only board that is connected.
     out : path, optional
         The capture's folder, which must be new; `captures/DATE-TIME` if not given.
     seconds : float
-        Longest duration.
+        Maximum duration.
     dwell_s : float
-        How long each label holds; the next one is asked for afterwards.
+        How long each label is valid; the next label is requested after this time.
     **names
-        Names for the header: `board`, `skin`, and `scan`, the order of places.
+        Names for the header: `board`, `skin`, and `scan` (the order of places).
 
     Returns
     -------
@@ -484,7 +484,7 @@ def record(
     ReskinError
         If no board is found, or it sends no frames.
     Exception
-        Whatever the program raised; what was recorded until then is kept.
+        Any exception that the program raises; what was recorded until then is kept.
 
     Examples
     --------

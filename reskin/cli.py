@@ -19,7 +19,7 @@ from typer import Argument, Option
 
 from reskin.errors import ParamsError, ReskinError, explaining
 
-CHECKOUT_COMMANDS = (  # of `pipeline.cli`, so that help and errors elsewhere can name them
+CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`, listed here for help and errors outside a checkout
     "add", "check-cache", "compare", "fetch", "merge", "publish", "readme", "remove", "scenes", "verify-reports",
 )  # fmt: skip
 
@@ -35,15 +35,15 @@ Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
 SOURCE = "A capture's folder, nominal (a simulated skin), or the YAML file of a simulated scene."
 ON_FAULT = "NAME=drop|flag|refuse: what to do with readings that have a fault, such as stuck=flag. May be repeated."
-LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM prompts for places to press; or a CSV that a robot's program appends to."
+LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM, to be prompted for places; or a CSV that a robot's program appends to."
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
-FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. An unknown name lists all."
-MODEL = "A trained model (.safetensors, its card beside it) or a saved calibration. Default: the universal model."
+FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. An unknown name lists all names."
+MODEL = "A trained model (.safetensors with its JSON card) or a saved calibration. Default: the universal model."
 LOG = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, or a file of `decode`."
 
 
 def main() -> None:
-    """Run the command; print what a user did wrong without a traceback."""
+    """Run the command; print a user's error without a traceback."""
     try:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `finally` and `with` clean up
         with explaining("reskin"):
@@ -68,7 +68,7 @@ def add_checkout_commands() -> None:
     elif sys.argv[1:2] and sys.argv[1] in CHECKOUT_COMMANDS:
         raise ParamsError(
             f"reskin {sys.argv[1]} works in a checkout of the project, a folder with dvc.yaml and pipeline/; {here} is "
-            "none. Change to the checkout first."
+            "not one. Change to the checkout first."
         )
 
 
@@ -84,12 +84,12 @@ def common_options(
         bool, Option("--version", help="Show the version.", callback=_show_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Declare the options that stand before a command."""
+    """Declare the options that come before a command."""
 
 
 @app.command("ports")
 def find_ports(
-    names: Annotated[list[str] | None, Argument(help="Ports to listen to. Default: all of this machine.")] = None,
+    names: Annotated[list[str] | None, Argument(help="Ports to listen to. Default: all ports of this machine.")] = None,
     hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in.")] = False,
 ) -> None:
     """Find boards: their port, wire format, number of chips, rate and scale."""
@@ -117,10 +117,10 @@ def template(
 @app.command()
 def record(
     port: Annotated[
-        str | None, Option(help="/dev/ttyACM0, COM3 or socket://host:port. Default: the only board there is.")
+        str | None, Option(help="/dev/ttyACM0, COM3 or socket://host:port. Default: the only connected board.")
     ] = None,
-    board: Annotated[str | None, Option(help="Name of the circuit board; `reskin add` can give it too.")] = None,
-    skin: Annotated[str | None, Option(help="Name of the skin, likewise.")] = None,
+    board: Annotated[str | None, Option(help="Name of the circuit board; can be given later, to `reskin add`.")] = None,
+    skin: Annotated[str | None, Option(help="Name of the skin; can be given later, to `reskin add`.")] = None,
     out: Annotated[Path | None, Option(help="New folder for the capture. Default: captures/DATE-TIME.")] = None,
     wire: Annotated[Wire | None, Option(help="Wire format of --port. Default: binary.")] = None,
     chips_n: Annotated[int | None, Option("--chips", help="Chips of --port. Default: 5.", min=1, max=64)] = None,
@@ -129,9 +129,9 @@ def record(
     scan: Annotated[str | None, Option(help="Order of the places: random, snake, or a description.")] = None,
     labels: Annotated[str | None, Option(help=LABELS)] = None,
     gauge: Annotated[str | None, Option(help=GAUGE)] = None,
-    dwell_s: Annotated[float, Option("--dwell", help="Seconds for which the label of a prompt holds.", min=0.1)] = 1.0,
+    dwell_s: Annotated[float, Option("--dwell", help="Seconds for which a prompted label is valid.", min=0.1)] = 1.0,
 ) -> None:
-    """Record what a board sends, with labels if asked; a robot's log can give labels later, in `reskin add`."""
+    """Record what a board sends, with labels if requested; `reskin add` can add labels from a robot's log later."""
     from reskin.board.find import DetectedBoard, find_board
     from reskin.live.record import label_source, record_board
 
@@ -153,11 +153,11 @@ def record(
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
     port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
-    speed: Annotated[float, Option(help="Multiple of its own rate; inf: as fast as it is read.", min=0.01)] = 1.0,
+    speed: Annotated[float, Option(help="Multiple of the source's rate; inf: as fast as it is read.", min=0.01)] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
 ) -> None:
-    """Emulate a board: send a capture or a simulation through a port, with faults if asked."""
+    """Emulate a board: send a capture or a simulation through a port, with faults if requested."""
     from reskin.live.emulator import inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
@@ -179,10 +179,10 @@ def emulate(
 @app.command()
 def live(
     port: Annotated[list[str] | None, Option(help="Port of a board; may be repeated. Default: all boards.")] = None,
-    model: Annotated[list[Path] | None, Option(help=f"{MODEL} Several models: their mean.")] = None,
+    model: Annotated[list[Path] | None, Option(help=f"{MODEL} Several models are averaged.")] = None,
     replay: Annotated[str | None, Option(help="Instead of a board: the folder of a capture.")] = None,
     emulate: Annotated[str | None, Option(help="Instead of a board: nominal, or a simulated scene's YAML.")] = None,
-    host: Annotated[str, Option(help="Address to listen on; other than this machine's needs a token.")] = "127.0.0.1",
+    host: Annotated[str, Option(help="Address to listen on; other machines need a token to connect.")] = "127.0.0.1",
     http_port: Annotated[int, Option(help="Port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
 ) -> None:
@@ -213,12 +213,12 @@ def live(
 
 @app.command()
 def decode(
-    stream: Annotated[Path, Argument(help="A file of bytes as they came from a port.")],
+    stream: Annotated[Path, Argument(help="A file with the bytes that a port sent.")],
     out: Annotated[Path, Option(help="The Parquet file to write.")],
     wire: Annotated[Wire, Option(help="Wire format.")] = "binary",
     chips_n: Chips = 5,
 ) -> None:
-    """Decode a dump of a port to a table of frames, and count lost bytes."""
+    """Decode a serial dump to a table of frames, and count lost bytes."""
     from reskin import io
     from reskin.recordings.decode import decode_dump
 
@@ -232,7 +232,7 @@ def predict(
     log: Annotated[Path, Argument(help=LOG)],
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
     model: Annotated[Path | None, Option(help=MODEL)] = None,
-    rate_hz: Annotated[float, Option("--rate-hz", help="Frames a second of a decoded file without a clock.")] = 400.0,
+    rate_hz: Annotated[float, Option("--rate-hz", help="Frame rate of a decoded file without a clock.")] = 400.0,
 ) -> None:
     """Turn a log into contacts, places and forces. The log must begin with a second without contact."""
     from reskin.predicting import predict as write

@@ -36,12 +36,12 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
-    """Validate plain values by a model; raise `ParamsError` that names the wrong key and what is allowed."""
+    """Validate plain values against a model; raise a `ParamsError` that names the wrong key and what is allowed."""
     try:
         # Through JSON, so that a YAML list may fill a tuple while "3" still does not become 3.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
-        # A misspelt key is also a missing one: report the unknown key first.
+        # A misspelt key makes another key missing: report the unknown key first.
         faults = error.errors(include_url=False)
         first = min(faults, key=lambda found: found["type"] != "extra_forbidden")
         beside = [found for found in faults if found["type"] == "missing" and found["loc"][:-1] == first["loc"][:-1]]

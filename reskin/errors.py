@@ -1,4 +1,4 @@
-"""The errors that a user can cause or mend, and explanations of what the machine and missing packages refuse."""
+"""Errors that a user can cause or fix, and explanations of errors from the machine and of missing packages."""
 
 import errno
 from collections.abc import Iterator
@@ -13,8 +13,8 @@ class ReskinError(ValueError):
     Parameters
     ----------
     where : object
-        The whole message, if it is the only argument: what is wrong, where, and what to try. Else the place: a file
-        with its line or byte, an option, a setting.
+        The whole message, if it is the only argument: what is wrong, where, and what to try. Otherwise the place: a
+        file with its line or byte, an option, a setting.
     what, rule, got, remedy
         The parts of a message: what is wrong, what it must be, what it is, and what to try.
 
@@ -45,19 +45,19 @@ class ParamsError(ReskinError):
 
 
 class TrainingError(ReskinError):
-    """A training cannot go on: it has no rows, or its loss is no longer finite."""
+    """Training cannot continue: there are no rows, or the loss is no longer finite."""
 
 
 class LeakError(ReskinError):
-    """Rows that a result is tested on were used to train."""
+    """Test rows of a result were also used for training."""
 
 
 class MachineError(ReskinError):
-    """The machine could not go on: no disk space, no memory, no rights, a dead worker. Finished work is kept."""
+    """The machine failed: no disk space, no memory, no permission, or a dead worker process. Finished work is kept."""
 
 
 EXTRAS = {"torch": "train", "onnx": "onnx", "onnxruntime": "onnx"}  # by package; all others come with `pipeline`
-DISK_REMEDIES = {  # by number of the system's error
+DISK_REMEDIES = {  # by errno
     getattr(errno, name): remedy
     for names, remedy in (
         ("ENOSPC EDQUOT EFBIG", "Free some disk space."),
@@ -107,6 +107,6 @@ def require(package: str, where: object) -> None:
 
 
 def missing_package(package: str, where: object) -> ParamsError:
-    """Make the error that names the extra which installs a package."""
+    """Make the error for a missing package; it names the extra that installs the package."""
     extra = EXTRAS.get(package, "pipeline")
     return ParamsError(f"{where}: package {package} is not installed. In the checkout: pip install '.[{extra}]'")

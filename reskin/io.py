@@ -1,4 +1,4 @@
-"""Read and write files: Parquet, safetensors, JSON and text, each written whole or not at all; a cache of arrays."""
+"""Read and write Parquet, safetensors, JSON and text files, each written whole or not at all; and a cache of arrays."""
 
 import errno
 import hashlib
@@ -61,8 +61,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def _is_written(error: OSError, temporary: Path) -> bool:
-    """Return whether an error concerns the file that is written, and not one that is read for it."""
-    if error.filename is None:  # from an open stream; EIO may be of reading or of writing
+    """Return whether an error concerns the file being written, and not a file that is read at the same time."""
+    if error.filename is None:  # from an open stream; EIO may come from reading or from writing
         return error.errno != errno.EIO
     names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)  # copyfile gives both
     return any(str(temporary) in str(name) for name in names)
@@ -96,7 +96,7 @@ def sha256(path: Path) -> str:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a whole file; raise `SchemaError` if it is not one."""
+    """Read a whole file; raise `SchemaError` if it cannot be read."""
     _check_is_file(path)
     try:
         return path.read_bytes()
@@ -110,7 +110,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write a folder of texts by file name; what it held before is deleted."""
+    """Write texts into a folder, by file name; the folder's earlier content is deleted."""
     with replacing(folder) as temporary:
         temporary.mkdir()
         for name, text in texts.items():
@@ -118,7 +118,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def append(file: FileIO, data: bytes) -> None:
-    """Append all bytes to an unbuffered file, or none if the disk is full."""
+    """Append all bytes to an unbuffered file, or no bytes if the disk is full."""
     start = file.tell()
     try:
         while data:
@@ -134,7 +134,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read JSON; raise `SchemaError` with the place of the first fault."""
+    """Read JSON; raise `SchemaError` with the place of the first syntax error."""
     _check_is_file(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -157,7 +157,8 @@ def read_tensors(
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Read arrays and metadata that `write_tensors` wrote; no pickle is ever opened.
 
-    A whole file is compared with its digest, which files of older code need not have; single arrays are not.
+    A file that is read whole is compared with its digest (files from older code may lack one, unless `digest_needed`);
+    single arrays are not checked.
     """
     _check_is_file(path)
     try:
@@ -200,7 +201,7 @@ def read_table(path: Path) -> pa.Table:
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block; `counts` may still fill while blocks arrive."""
+    """Write the readings of one capture block by block; `counts` may change until the last block has arrived."""
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:
@@ -209,7 +210,7 @@ def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, 
                 writer = pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True)
             writer.write_table(to_table(block))
         if writer is None:
-            raise SchemaError(f"{path}: the capture has no reading left. See what was dropped, and why.")
+            raise SchemaError(f"{path}: the capture has no readings left. See what was dropped, and why.")
         writer.add_key_value_metadata({COUNTS_KEY.decode(): json.dumps(dict(counts), sort_keys=True)})
         writer.close()
 
@@ -223,7 +224,7 @@ def read_ingest_counts(path: Path) -> dict[str, int]:
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
     if COUNTS_KEY not in metadata:
-        raise SchemaError(f"{path}: the file's metadata has no counts of losses. Ingest it again.")
+        raise SchemaError(f"{path}: the file's metadata lacks the counts of losses. Ingest it again.")
     counts: dict[str, int] = json.loads(metadata[COUNTS_KEY])
     return counts
 
@@ -256,7 +257,7 @@ LIBRARIES = ("numpy", "scipy", "numba")
 
 
 def load_cached_array(package: Path, name: str) -> np.ndarray | None:
-    """Read a cached array; None if there is none, or if it was computed by other code or other libraries."""
+    """Read a cached array; None if it is not cached, or was computed by other code or with other library versions."""
     try:
         return np.load(_cache_file(package, name), allow_pickle=False)
     except (OSError, ValueError, EOFError):
@@ -264,7 +265,7 @@ def load_cached_array(package: Path, name: str) -> np.ndarray | None:
 
 
 def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
-    """Cache an array, and delete those that other code computed."""
+    """Cache an array, and delete cached arrays that other code computed."""
     file = _cache_file(package, name)
     try:
         with replacing(file) as temporary, temporary.open("wb") as stream:

@@ -13,19 +13,20 @@ from jaxtyping import Bool, Float, Float32, Float64
 from reskin.errors import CaptureError
 from reskin.metrics import score
 
-WINDOW_S = 0.1  # assumed: windows whose means are compared with the start's
+WINDOW_S = 0.1  # assumed: length of the windows whose means are compared with the start
 QUIET_MIN_S = 0.5  # assumed: a shorter start gives no reliable no-load reading
-WANDER_SDS = 4.0  # of a window's mean, in any channel: by chance in 1 of 1,000 windows of 15 channels
-START_WINDOWS_N = 2  # the first windows, which give the noise
-CONTACT_SDS = 6.0  # standard deviations of one channel's noise above the median |dB| of the quiet start: a contact
-POINTS_MAX_N = 1500  # of a series in a figure
+WANDER_SDS = 4.0  # standard errors of a window's mean; in some of 15 channels, 1 in 1,000 windows is beyond by chance
+START_WINDOWS_N = 2  # number of windows at the start that the noise is estimated from
+# A contact: |dB| is this many standard deviations of one channel's noise above its median in the quiet start.
+CONTACT_SDS = 6.0
+POINTS_MAX_N = 1500  # points of a series in a figure
 
 Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 
 
 @dataclass(frozen=True)
 class LogEstimates:
-    """Estimates for each reading of a log; places and forces have a meaning in contact only."""
+    """Estimates for each reading of a log; places and forces are meaningful only in contact."""
 
     t_s: Float64[np.ndarray, " f"]
     targets: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm, F_N by each of m models
@@ -69,7 +70,7 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if windows_n > START_WINDOWS_N:
         first_uT = b_uT[:start_n].astype(np.float64)
         means_uT = b_uT[: windows_n * window_n].reshape(windows_n, window_n, -1).mean(axis=1, dtype=np.float64)
-        # From differences of neighbours: a contact that begins at once does not count as noise.
+        # From differences of consecutive readings, so that a contact at the very start does not count as noise.
         sd_uT = np.diff(first_uT, axis=0).std(axis=0) / np.sqrt(2)
         error_uT = sd_uT * np.sqrt(1 / window_n + 1 / start_n)
         wandered = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
@@ -90,7 +91,7 @@ def step_s(t_s: Float64[np.ndarray, " f"]) -> float:
 
 
 def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
-    """Count runs of readings in contact. A single reading in contact is noise; a single gap does not end a run."""
+    """Count runs of readings in contact. A single reading in contact is noise; a gap of one reading ends no run."""
     padded = np.concatenate([[False], contact, [False]])
     closed = padded | (np.roll(padded, 1) & np.roll(padded, -1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(int)))
@@ -113,7 +114,7 @@ def describe(of: LogEstimates) -> dict[str, Any]:
 def score_contacts(of: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
     """Score estimates against the truth, which is NaN without contact; count missed and false readings.
 
-    Each model is scored by itself: scores are the mean over models, and `spread` holds their standard deviation.
+    Each model is scored separately: the scores are means over the models, and `spread` holds standard deviations.
     """
     touched = np.isfinite(true[:, 2])
     both = of.contact & touched
@@ -143,16 +144,16 @@ def truth_at(
     end_s: Float64[np.ndarray, " d"],
     true: Float[np.ndarray, "d 3"],
 ) -> Float64[np.ndarray, "f 3"]:
-    """Return the truth of the dwell that each reading lies in; NaN between dwells."""
+    """Return for each reading the true values of the dwell that contains it; NaN between dwells."""
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])
     return np.where(inside[:, None], true[dwell_i].astype(np.float64), np.nan)
 
 
 def thin(of: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Return at most 1,500 evenly spaced readings for figures; None without contact.
+    """Return at most 1,500 evenly spaced readings for figures; estimates without contact are None.
 
-    `estimated` is that of the first model; with several models, `low` and `high` are their range.
+    `estimated` is the estimate of the first model; with several models, `low` and `high` are their range.
     """
     kept = np.unique(np.linspace(0, len(of.t_s) - 1, POINTS_MAX_N).astype(int))
     targets = np.where(of.contact[:, None], of.targets, np.nan)[:, kept]

@@ -1,4 +1,4 @@
-"""Metrics of predictions: the paper's three, and R^2 of the force. A true value of NaN is unknown and not counted."""
+"""Metrics of predictions: the paper's three, and R^2 of the force. True forces that are NaN (unknown) are left out."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
     """Score predictions of (x_mm, y_mm, F_N).
 
     MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages). R^2 of the force is
-    1 - MSE_F over the variance of the true forces; predicting their mean has 0. Force has no score where none is known,
-    and no R^2 where it does not vary.
+    1 - MSE_F / (variance of the true forces); a constant prediction of their mean scores 0. The force has no scores if
+    no true force is known, and no R^2 if the true force does not vary.
     """
     error = predicted.astype(float) - true
     known = ~np.isnan(error[:, 2])
@@ -28,7 +28,7 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
         numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
         force_N = true[known, 2].astype(float)
         numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
-        # By rounding, the variance of equal forces may not be zero, and that of nearly equal ones may.
+        # Rounding can make the variance of equal forces nonzero, and that of nearly equal forces zero.
         if np.ptp(force_N) > 0 and numbers["force_var_N2"] > 0:
             numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
     return numbers
@@ -37,8 +37,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Shift predicted places by one constant offset, so that their mean error is zero.
 
-    Each rig's origin was set by hand; this shows which part of the error is registration. It uses the true places, so
-    it is a diagnosis and not a result.
+    Each rig's origin was set by hand; this shows how much of the error is due to registration. It uses the true
+    places, so it is a diagnosis and not a result.
     """
     shifted = predicted.astype(float)
     shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)
@@ -48,7 +48,7 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
 def score_groups(
     true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"], board: np.ndarray, skin: np.ndarray
 ) -> dict[str, Any]:
-    """Score all test rows, each test skin, and all rows after one offset a test board (a diagnosis)."""
+    """Score all test rows, each test skin, and (as a diagnosis) all rows after removing one offset per test board."""
     registered = predicted.copy()
     for name in np.unique(board):
         registered[board == name] = register(true[board == name], predicted[board == name])

@@ -1,8 +1,8 @@
-"""Select the same arithmetic on every x86-64 processor with AVX2, through variables that libraries read when they load.
+"""Select the same arithmetic on every x86-64 processor with AVX2, by environment variables that libraries read on load.
 
 PyTorch, NumPy, OpenBLAS and Numba choose their code by the instructions that a processor offers, and OpenBLAS splits
-products among threads; each choice adds in another order, and training amplifies the rounding. With the values below,
-and `reskin.models.reproducible` in place of MKL, results are the same bits on every such processor
+products among threads. Each choice changes the order of summation, and training amplifies the rounding errors. With the
+values below, and `reskin.models.reproducible` in place of MKL, results are bit-identical on every such processor
 (tests/test_numerics.py). `pin` must run before NumPy is imported, so this module imports nothing that needs NumPy.
 """
 
@@ -21,8 +21,8 @@ PINNED = {
     "OPENBLAS_NUM_THREADS": "1",
     "NUMBA_CPU_NAME": "haswell",
 }
-# Features that NumPy must not use, and the CPU flag of the newest instructions of each. NumPy warns of a feature that
-# the processor lacks, so only those are disabled that it has.
+# Features that NumPy must not use, and the CPU flag of the newest instructions of each. NumPy warns about disabled
+# features that the processor lacks, so only features that it has are disabled.
 BEYOND_AVX2 = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_vbmi2", "AVX512_SPR": "avx512_fp16"}
 VARIABLES = (*PINNED, "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_FEATURES")
 TOO_LATE = "NumPy was imported before pipeline"
@@ -31,7 +31,7 @@ _loaded_before: list[str] = []
 
 
 def pin() -> None:
-    """Set the variables that are not set yet, for this process and those that it starts.
+    """Set the variables that are not set yet, for this process and its child processes.
 
     On processors without AVX2 nothing is set, and a variable that the user has set is left alone.
     """
@@ -54,18 +54,18 @@ def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, s
     chosen = dict(PINNED)
     if beyond := [name for name, flag in BEYOND_AVX2.items() if flag in flags]:
         chosen["NPY_DISABLE_CPU_FEATURES"] = " ".join(beyond)
-    empty = {name for name in PINNED if not environment.get(name)}  # libraries take an empty variable for none
+    empty = {name for name in PINNED if not environment.get(name)}  # libraries treat an empty variable as unset
     return {name: value for name, value in chosen.items() if name not in environment or name in empty}
 
 
 def departures(environment: Mapping[str, str]) -> list[str]:
-    """List the settings that differ from those of `pin`, with which results may differ in the last bits.
+    """List the settings that differ from those of `pin`; they may change the last bits of results.
 
     >>> departures({"ATEN_CPU_CAPABILITY": "default", "NUMBA_CPU_NAME": "haswell"})
     ['ATEN_CPU_CAPABILITY=default']
     """
     pinned_to = {name: {value} for name, value in PINNED.items()}
-    features = " ".join(BEYOND_AVX2)  # a processor that has some of them only: a part
+    features = " ".join(BEYOND_AVX2)  # a processor that has only the first of them gets the first part
     pinned_to["NPY_DISABLE_CPU_FEATURES"] = {features[:end].rstrip() for end in range(len(features) + 1)}
     values = {name: environment.get(name, "") for name in VARIABLES}
     changed = [f"{name}={value}" for name, value in values.items() if value and value not in pinned_to.get(name, set())]
@@ -73,12 +73,12 @@ def departures(environment: Mapping[str, str]) -> list[str]:
 
 
 def signature() -> tuple[str, ...]:
-    """Return what may change the last bits of a training on this machine; a part of the keys of cached results."""
+    """Return what may change the last bits of a training run on this machine; part of the keys of cached results."""
     return ("pinned" if "avx2" in cpu_flags() else "not pinned", *departures(os.environ))
 
 
 def cpu_flags(cpuinfo: Path = CPUINFO) -> frozenset[str]:
-    """Read the instruction sets of this processor; empty where the system does not list them, or it is no x86."""
+    """Read the instruction sets of this processor; empty if the system does not list them, or on other than x86-64."""
     if platform.machine().lower() not in ("x86_64", "amd64") or not cpuinfo.is_file():
         return frozenset()
     lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -90,7 +90,7 @@ DEVICES = ("cpu", "cuda")
 
 
 def device() -> str:
-    """Where networks are trained: RESKIN_DEVICE, `cpu` if it is not set; one code path for all."""
+    """Return the device that networks are trained on: RESKIN_DEVICE, or `cpu` if it is not set."""
     name = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
     if name not in DEVICES:
         raise ParamsError(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(name), "Unset it for cpu.")

@@ -1,6 +1,6 @@
-"""Estimate contacts, places and forces in a log with a trained model, as a CSV.
+"""Estimate contacts, places and forces in a log with a trained model, and write them as CSV.
 
-The user has to know whether the model was trained on the log's own board.
+Whether the model was trained on the board of the log is not checked: the user has to know.
 """
 
 from collections.abc import Sequence
@@ -27,18 +27,18 @@ PARQUET_MAGIC = b"PAR1"
 
 
 def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0) -> dict[str, Any]:
-    """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every frame without a fault of a log.
+    """Write a CSV with t_s, x_mm, y_mm, F_N and contact for every fault-free frame of a log.
 
     Parameters
     ----------
     log : a capture's folder, a table that `reskin decode` wrote, or the log of an SD card
     model : a network or a calibration of the universal model; None for the uncalibrated universal model
     out : the CSV file; places and forces are empty without contact
-    rate_hz : frames a second, for a table without a clock
+    rate_hz : frames per second, for a table without a clock
 
     Returns
     -------
-    Counts of frames and contacts, and of what was dropped
+    Counts of frames, contacts and dropped frames
     """
     models = read_models([] if model is None else [model])
     inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
@@ -48,7 +48,7 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     channels_n = CHANNELS_N if isinstance(models, Universal) else models[0].card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         raise SchemaError(
-            f"{log}: the log has {b_uT.shape[1]} channels, but the model {channels_n}. Give a model of such boards."
+            f"{log}: the log has {b_uT.shape[1]} channels, but the model {channels_n}. Give a model for such boards."
         )
     estimators: Sequence[Estimator]
     if isinstance(models, Universal):
@@ -81,7 +81,8 @@ def _read_capture(folder: Path) -> sd_card.Log:
         return sd_card.read_log(folder / LOG_FILE)
     if header.wire is None:
         raise CaptureError(
-            f"{folder}: layout {header.layout} cannot be predicted. Give a capture of `reskin record` or an SD card."
+            f"{folder}: layout {header.layout} cannot be predicted from. Give a capture of `reskin record` or the log of "
+            "an SD card."
         )
     stream = folder / STREAM_FILE
     frames, account = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
@@ -93,7 +94,7 @@ def _read_capture(folder: Path) -> sd_card.Log:
 
 
 def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
-    """Read trained networks, or one calibration of the universal model; of no file, the uncalibrated one."""
+    """Read trained networks, or one calibration of the universal model; without files, the uncalibrated model."""
     calibrations = [file for file in files if file.is_file() and is_calibration(file)]
     if not calibrations:
         return [read_network(file) for file in files] or load_universal()
@@ -103,7 +104,7 @@ def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
 
 
 def render(found: LogEstimates) -> str:
-    """Return the estimates of one model as CSV: mm and N to three decimals, empty without contact."""
+    """Return the estimates of one model as CSV: mm and N to three decimals, empty fields without contact."""
     (target,) = found.targets
     target = np.where(found.contact[:, None], np.round(target, 3), np.nan)
     fields = dict(zip(("x_mm", "y_mm", "F_N"), target.T, strict=True))

@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64, Int32
 
 from reskin.errors import SchemaError
 
-SCHEMA_VERSION = "2"  # 1: Fx_N and Fy_N of layout lab were those of the gauge
+SCHEMA_VERSION = "2"  # in version 1, Fx_N and Fy_N of layout lab were forces on the gauge
 FORCE_SIGNS = (
     "Force on the skin, in newtons: Fx_N and Fy_N positive along the axes of the labels x_mm and y_mm, "
     "Fz_N positive in compression."
@@ -23,9 +23,9 @@ AXES_PER_CHIP_N = 3
 
 @dataclass(frozen=True)
 class Readings:
-    """The readings of one capture, one row each; NaN where a recording does not know a value.
+    """The readings of one capture, one row each; NaN where a recording lacks a value.
 
-    Forces have the signs of `FORCE_SIGNS`, recorded and simulated. `b_uT` is the field as read, `noload_uT` the mean
+    Recorded and simulated forces have the signs of `FORCE_SIGNS`. `b_uT` is the field as read, `noload_uT` the mean
     field of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without contact.
     `n_contacts` counts the skin's contacts before this one.
     """
@@ -85,7 +85,7 @@ def _arrow_type(name: str, chips_n: int) -> pa.DataType:
 
 
 def to_table(readings: Readings) -> pa.Table:
-    """Turn readings into an Arrow table with units."""
+    """Convert readings to an Arrow table with units."""
     schema = arrow_schema(readings.chips_n)
     columns = []
     for field in schema:
@@ -100,15 +100,13 @@ def to_table(readings: Readings) -> pa.Table:
 
 
 def from_table(table: pa.Table, where: str) -> Readings:
-    """Read a table of one capture back; raise `SchemaError` if it is not of this schema."""
+    """Convert a table of one capture to readings; raise `SchemaError` if it does not have this schema."""
     chips_n = check_schema(table.schema, where)
     values: dict[str, object] = {}
     for name in LABELS:
         distinct = table.column(name).unique().to_pylist()
         if len(distinct) != 1:
-            raise SchemaError(
-                f"{where}: column {name} has several values, {distinct[:3]}. Write one capture to a file."
-            )
+            raise SchemaError(f"{where}: column {name} has several values, {distinct[:3]}. Write one capture per file.")
         values[name] = distinct[0]
     for name in UNITS:
         column = table.column(name).combine_chunks()
@@ -123,10 +121,10 @@ def check_schema(schema: pa.Schema, where: str) -> int:
     """Check names, types and units against `arrow_schema`; return the number of chips."""
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
-        raise SchemaError(f"{where}: no column {', '.join(missing)}. Ingest it again.")
+        raise SchemaError(f"{where}: column {', '.join(missing)} is missing. Ingest it again.")
     b_type = schema.field("b_uT").type
     if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
-        raise SchemaError(where, "b_uT", "a fixed list of 3 values a chip", b_type, "Ingest it again.")
+        raise SchemaError(where, "b_uT", "a fixed list of 3 values per chip", b_type, "Ingest it again.")
     chips_n = b_type.list_size // AXES_PER_CHIP_N
     for want in arrow_schema(chips_n):
         have = schema.field(want.name)

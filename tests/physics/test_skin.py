@@ -204,7 +204,7 @@ def test_pokes_are_accepted_up_to_the_edges():
     large = draw_skin(design(), EXACT, seed=0, name="s0", rule=SPARSE, sides_m=(50.8e-3, 101.6e-3))
     assert np.isfinite(change((25.3e-3, -50.7e-3, DEPTH_M), large)).all()
     for place_m in ((25.5e-3, 0.0), (0.0, -50.9e-3)):
-        with pytest.raises(ParamsError, match="within 25.4 and 50.8 mm of its middle"):
+        with pytest.raises(ParamsError, match="within 25.4 and 50.8 mm of its centre"):
             change((*place_m, DEPTH_M), large)
 
 
@@ -285,7 +285,7 @@ def test_force_of_the_specification():
 
 @pytest.mark.parametrize("place_m", [(10.1e-3, 0.0), (0.0, -12e-3), (np.nan, 0.0)])
 def test_poke_beside_the_skin_is_refused(place_m):
-    with pytest.raises(ParamsError, match="skin s0: poke must be on the skin, within 10 and 10 mm of its middle"):
+    with pytest.raises(ParamsError, match="skin s0: poke must be on the skin, within 10 and 10 mm of its centre"):
         change((*place_m, DEPTH_M))
 
 

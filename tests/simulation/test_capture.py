@@ -244,7 +244,7 @@ def test_unknown_parameter_is_named(section, name):
         (GRID | {"boards": "soft"}, {}, "boards must be one of .'rigid'., not 'soft'"),
         (GRID | {"terms": ["ageing"]}, {}, "terms must be exactly those of the protocols"),
         (GRID, {"terms": {"ageing": AGEING}}, "terms must be exactly those of the protocols"),
-        (HAND | {"depth_mm": (1.2, 0.4)}, {}, "from the shallower to the deeper"),
+        (HAND | {"depth_mm": (1.2, 0.4)}, {}, "must list the smaller depth first"),
         (HAND | {"tilt_sd_deg": 5.0}, {}, "a tilted stylus .tilt_sd_deg. needs the term friction"),
         (DRAG | {"terms": []}, {}, "protocol other: a drag needs the term friction"),
         (LOAD | {"passes_n": 1}, {}, "protocols.other.passes_n must be greater than or equal to 2; got 1"),

@@ -57,7 +57,7 @@ def test_more_weight_sinks_deeper():
 
 
 def test_too_heavy_weight_is_refused():
-    with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, which the skin bears"):
+    with pytest.raises(ParamsError, match=r"skin b0_s0: weight must be at most .* N, the force at the greatest depth"):
         depths_under_load(SKIN, np.array([[1e4]]))
 
 

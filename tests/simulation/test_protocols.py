@@ -120,5 +120,5 @@ def test_too_large_margin_is_refused():
 
 
 def test_decreasing_depths_are_refused():
-    with pytest.raises(ParamsError, match="from the shallower to the deeper"):
+    with pytest.raises(ParamsError, match="must list the smaller depth first"):
         scattered(depth_mm=[1.2, 0.4])
