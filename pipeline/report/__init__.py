@@ -1,1 +1,1 @@
-"""From scores to tables, figures and pages. Sees tables, never models."""
+"""Tables, figures and pages, made from the scores and numbers of a scene; nothing here uses models."""

@@ -34,7 +34,7 @@ PLATEAU_POINTS = 1.0  # assumed: "seems to plateau"
 NONE = "–"
 NOT_RUN = "not run in this scene"
 NOT_REACHED = "not reached in this scene"
-SHORT_OF = "not reached: "  # begins the note where ours did not go as far as the paper
+SHORT_OF = "not reached: "  # prefix of the note if ours did not go as far as the paper
 ONE_SKIN = "ours has one training skin: not comparable"
 SETTING = "a setting of this scene, not a result"
 TARGET = "a calibration target of the simulated spreads: agreement is no evidence"
@@ -67,12 +67,13 @@ class Reach(Strict):
 
 
 class Row(Strict):
-    """One result: where it stands in the paper, what the paper gives, and the path of ours in numbers.json.
+    """One result: where it is in the paper, what the paper gives, and the path of our result in numbers.json.
 
-    Rules: `near`, close to the paper's number; `at_most`, `at_least`, `positive`, limits; `gain`, a paired difference
-    is an improvement; `sizeable`, by half of the paper's at least; `each`, all differences of a list are improvements;
-    `slight`, `plateau`, it is small; `finding`, judged by its experiment; `view`, a figure to look at; `input`, a
-    setting of simulated scenes; `setting`, of all scenes; `target`, in simulated scenes a calibration target.
+    Rules: `near`, our number is close to the paper's; `at_most`, `at_least`, `positive`, limits; `gain`, a paired
+    difference is an improvement; `sizeable`, it is an improvement of at least half of the paper's; `each`, all
+    differences of a list are improvements; `slight`, `plateau`, the difference is small; `finding`, the experiment
+    judges it; `view`, a figure to look at; `input`, a setting of simulated scenes; `setting`, a setting of all scenes;
+    `target`, in simulated scenes a calibration target.
     """
 
     id: str
@@ -81,7 +82,7 @@ class Row(Strict):
     paper: str | None = None  # a constant of `pipeline.report.paper`, its parts separated by dots
     says: str | None = None  # the paper's words, where it gives no number
     ours: str | None = None
-    experiment: str | None = None  # the experiment that ours follows from, where a small scene may not have ours
+    experiment: str | None = None  # the experiment behind `ours`, if it may lack this number in a small scene
     rule: Literal[
         "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
         "setting", "target", "view",
@@ -180,10 +181,10 @@ def family_p(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float
 
 
 def p_of(row: Row, printed: Any, ours: Any) -> float | None:
-    """Compute the p-value of a claim about differences over boards; None where too few boards were compared.
+    """Compute the p-value of a claim about differences over boards; None if too few boards were compared.
 
-    A claim about every number of training skins holds only if it does for all: the largest p-value. One number that
-    contradicts it is enough to deny it: then the smallest, by Bonferroni's correction for their number.
+    A claim about every number of training skins holds only if it holds for each, so its p-value is the largest one. If
+    some number significantly contradicts it, the p-value is the smallest of those, with Bonferroni's correction.
     """
     if isinstance(ours, Sequence):
         points = [one["accuracy_pct"] for one in ours]
@@ -209,7 +210,7 @@ def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
 
 
 def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Judgement:
-    """Judge ours by the rule of the row; claims about means over boards get a verdict by their interval.
+    """Judge our result by the rule of the row; claims about means over boards get a verdict from their interval.
 
     `pooled`: some network was trained on several skins. `simulated`: the scene's readings were simulated.
     """
@@ -268,7 +269,7 @@ def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
 
 
 def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
-    """Judge a claim that is to hold at every number of training skins, by accuracy."""
+    """Judge by accuracy a claim that must hold for every number of training skins."""
     verdicts = {row["skins_n"]: statistics.verdict(row["accuracy_pct"]) for row in contrasts}
     return Judgement(
         statistics.combine_verdicts(list(verdicts.values())),
@@ -279,7 +280,7 @@ def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
 
 
 def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
-    """Tell whether our mean is near the paper's: within its sd, or within 10 % where it gives none."""
+    """Judge whether our mean is near the paper's: within its sd, or within 10 % if the paper gives no sd."""
     value, mean = mean_of(ours), mean_of(printed)
     if value is None or mean is None:
         return Judgement()
@@ -300,7 +301,7 @@ def _yes(holds: bool) -> str:
 
 
 def _both(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
-    """Find the paper's number and ours."""
+    """Return the paper's number and ours."""
     printed = look_up(numbers, row.paper) if row.paper else None
     return printed, resolve(numbers, row.ours) if row.ours else None
 
@@ -338,7 +339,7 @@ def mean_of(value: Any) -> float | None:
 
 
 def _paper_in_interval(printed: Any, ours: Any) -> str:
-    """Tell whether our interval over boards includes the paper's number, where there are both."""
+    """Write whether our interval over boards includes the paper's number, if both exist."""
     mean = mean_of(printed)
     if mean is None or not isinstance(ours, Mapping) or "ci95" not in ours:
         return NONE
@@ -372,7 +373,7 @@ def _show_ours(row: Row, ours: Any) -> str:
 
 
 def _show(row: Row, value: Any) -> str:
-    """Write a number with the unit of the last name with one in the path of ours; differences with their sign."""
+    """Write a number with its unit, from the last part of the path `ours` that has one; differences with their sign."""
     ends = [part.rsplit("_", 1)[-1] for part in reversed((row.ours or "").split("."))]
     unit = next((UNITS[end] for end in ends if end in UNITS), "")
     if row.rule in DIFFERENCES:

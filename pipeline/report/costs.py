@@ -23,16 +23,16 @@ COMPUTED = (
     "were finished before."
 )
 MARGIN = 1.6  # factor beyond the outermost points on a logarithmic axis
-LOWEST = 1e-16  # rounding: no error is drawn below it, because the axis is logarithmic
+LOWEST = 1e-16  # size of rounding errors; smaller errors are drawn here, because the axis is logarithmic
 COLUMNS_N = 3
-CAPTION_LETTERS = 38  # in the width of a panel, and in that of the legend
+CAPTION_LETTERS = 38  # letters that fit in the width of a panel or of the legend
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
 
 
 def cost_pages(runtime: Row, source: str) -> dict[str, str]:
-    """Draw and tabulate errors against costs: text by file name; no figure where nothing was timed here."""
+    """Draw and tabulate errors against costs: text by file name; there is no figure of what was not timed here."""
     texts = {f"{name}.md": to_markdown(table) for name, table in cost_tables(runtime, source).items()}
     for name, (key, cost) in TRADE_OFFS.items():
         if any(key in row for row in runtime.get("learning", [])):
@@ -48,7 +48,7 @@ def cost_pages(runtime: Row, source: str) -> dict[str, str]:
 
 
 def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate costs by name: of stages, and beside errors those of methods, of adaptation and of timed studies."""
+    """Tabulate, by name, the costs of stages, and the errors and costs of methods, adaptation and timed studies."""
     methods = [
         {"method": row["method"], "inputs": row["inputs"], "training, s": _time(row, "train_s")}
         | {"one reading, µs": _time(row, "inference_us"), "source": source}
@@ -123,7 +123,7 @@ class Point:
 
 
 def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
-    """Draw errors of methods against the cost `key`, log-log; a step joins the Pareto front, its members numbered."""
+    """Draw errors of methods against the cost `key`, log-log; a step line joins the numbered Pareto front."""
     points = trade_off_points(rows, key)
     members = [point for point in points if point.label]
     with drawing(7.6, 4.2) as figure:
@@ -131,7 +131,7 @@ def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
         for point in points:
             mark = axes.plot(*point.place, **point.look, linestyle="none")[0]
             mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
-            _label(axes, point, (-5, -5))  # no point lies to the lower left of a member of the front
+            _label(axes, point, (-5, -5))  # no point is to the lower left of one on the front
         steps = zip(*(point.place for point in members), strict=True)
         axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbers)")
         figure.legend(loc="outside right upper", frameon=False, fontsize=8)
@@ -139,7 +139,7 @@ def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
 
 
 def trade_off_points(rows: Rows, key: str) -> list[Point]:
-    """List the timed methods, those of the Pareto front first, by cost, and numbered; a look for each method."""
+    """List the timed methods by cost, those of the Pareto front first and numbered; each method has its own look."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     inputs = list(dict.fromkeys(row["inputs"] for row in rows))
     timed = sorted((row for row in rows if key in row), key=lambda row: (row[key], row["mse_xy_mm2"]["mean"]))
@@ -156,7 +156,7 @@ def trade_off_points(rows: Rows, key: str) -> list[Point]:
 
 
 def adaptation(rows: Rows, source: str) -> str:
-    """Draw the error after adaptation against its seconds, every point with its number of pokes."""
+    """Draw the error after adaptation against its duration; every point is labelled with its number of pokes."""
     timed = sorted((row for row in rows if "seconds" in row), key=lambda row: row["pokes_n"])
     points = [Point("", str(row["pokes_n"]), (row["seconds"], row["mse_xy_mm2"]["mean"]), look_of(1)) for row in timed]
     with drawing(7.6, 4.2) as figure:
@@ -234,10 +234,10 @@ def draw_study(
     limit: float | None = None,
     rings: Mapping[str, tuple[str, str, str]] | None = None,
 ) -> str:
-    """Draw error against median time, log-log: a panel a study, a colour and a marker a method, failures below.
+    """Draw error against median time, log-log: one panel per study, one colour and marker per method, failures below.
 
-    Lines join the Pareto front of each method. `limit` is drawn as a line, and a ring around each point of `rings`,
-    which maps a label to study, method and setting. What was not timed is left out.
+    Lines join the Pareto front of each method. `limit` is drawn as a line. Each point of `rings`, which maps a label to
+    study, method and setting, is circled. Rows that were not timed are left out.
     """
     studies = list(dict.fromkeys(row["study"] for row in rows))
     methods = [name for name in dict.fromkeys(row["method"] for row in rows) if name != REFERENCE]
@@ -288,7 +288,7 @@ def draw_study(
 
 
 def failures(rows: Rows) -> list[str]:
-    """List what failed: a line for each method and kind of failure, with the studies and settings where it did."""
+    """List failures: one line for each method and kind of failure, with the studies and settings concerned."""
     found: dict[tuple[str, str], dict[str, list[str]]] = {}
     for row in rows:
         if row["failure"] is not None:

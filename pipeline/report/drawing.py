@@ -1,6 +1,6 @@
-"""SVG figures in one style, whose marks show their values on hover.
+"""SVG figures in a common style, whose marks show their values on hover.
 
-Matplotlib is imported in the functions that draw, so that modules which also compute do not load it.
+Matplotlib is imported in the functions that draw, so that modules that mainly compute do not load it.
 """
 
 import io
@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-MARKS_MAX_N = 150  # in one artist: with more, titles would make the file too large
-USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")  # few marks are written as single paths
+MARKS_MAX_N = 150  # marks of one artist; with more, titles would make the file too large
+USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")  # a few marks are written as separate paths
 GROUP = re.compile(r"<g[ >]|</g>")
 Titles = Mapping[str, list[str]]  # by id of a group: a title for each mark, in order; one for a line without marks
 Format = Callable[[float], str]
-FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana is as wide, where the first is not installed
+FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana, used if the first is not installed, has the same width
 # Not written: indentation, metadata, comments, and coordinates finer than a hundredth of a point.
 REMOVED = re.compile(r"(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n", re.DOTALL)
 COORDINATES = re.compile(r' (d|x|y|transform)="[^"]*"')
@@ -31,13 +31,13 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
-# Okabe & Ito 2008, told apart by colour-blind readers; their yellow is left out, which is pale on white.
+# Okabe & Ito 2008, distinguishable by colour-blind readers; their yellow is left out, as it is pale on white.
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def name_marks(figure: Any) -> Titles:
-    """Give an id to each line and scatter of a figure, and list the titles of its marks."""
+    """Set an id for each line and scatter of a figure; return the titles of their marks by id."""
     titles = {}
     for i, axes in enumerate(figure.axes):
         for j, (artist, texts) in enumerate(_titled_artists(axes)):
@@ -47,7 +47,7 @@ def name_marks(figure: Any) -> Titles:
 
 
 def put_titles(svg: str, titles: Titles) -> str:
-    """Write the titles into the groups of their ids; none where another number of marks was drawn."""
+    """Write the titles into the groups with their ids, except where the number of drawn marks differs."""
     for name, texts in titles.items():
         before, head, after = svg.partition(f'<g id="{name}">')
         if head:  # else nothing was drawn
@@ -65,7 +65,7 @@ def _with_titles(group: str, texts: list[str]) -> str:
 
 
 def _group_end(text: str) -> int:
-    """Find the end of the group that a text begins in."""
+    """Return where the group that contains the start of the text ends."""
     depth = 1
     for tag in GROUP.finditer(text):
         depth += -1 if tag[0] == "</g>" else 1
@@ -116,7 +116,7 @@ def _title(name: str, *values: str) -> str:
 
 
 def _value_format(axes: Any, which: str) -> Format:
-    """Return a function that writes a value of an axis with its label, or the nearest tick where ticks have names."""
+    """Return a function that writes a value with its axis's label, or the nearest tick's name if ticks have names."""
     axis, siblings = getattr(axes, f"{which}axis"), getattr(axes, f"get_shared_{which}_axes")().get_siblings(axes)
     labels = [one.get_label_text() for one in (axis, *(getattr(other, f"{which}axis") for other in siblings))]
     name = " ".join(next((label for label in labels if label), which).split())
@@ -135,7 +135,7 @@ def _number(value: float) -> str:
 
 @contextmanager
 def drawing(width_in: float, height_in: float) -> Iterator[Any]:
-    """Give an empty figure to draw on, in the style of all figures."""
+    """Yield an empty figure to draw on, in the style of all figures."""
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
@@ -146,21 +146,21 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 def svg(figure: Any) -> str:
     """Write a figure as SVG text whose marks show their values on hover.
 
-    There is no date and version in it: the same data give the same bytes.
+    It contains no date and no version, so the same data give the same bytes.
     """
     buffer, titles = io.StringIO(), name_marks(figure)
     _lay_out(figure)
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = COORDINATES.sub(lambda found: DIGITS_BEYOND_2.sub("", found[0]), REMOVED.sub("", buffer.getvalue()))
-    # Formulas name one font family only; where it is not installed, serifs would be used.
+    # Formulas name only one font family; without it, browsers would use a serif font.
     return put_titles(text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\""), titles)
 
 
 def _lay_out(figure: Any) -> None:
-    """Lay out the axes once, in place of saving, which would draw the figure a second time for it."""
+    """Lay out the axes once and turn the layout engine off, so that saving does not draw the figure a second time."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    FigureCanvasSVG(figure)  # texts are measured as they are written
+    FigureCanvasSVG(figure)  # so that texts are measured as they will be written
     figure.dpi = SVG_DPI
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine(None)

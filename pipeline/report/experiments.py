@@ -13,7 +13,7 @@ from pipeline.stages import module_name
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Make the tables of every experiment that the numbers hold, by name of the table."""
+    """Make the tables of every experiment in the numbers, by the table's name."""
     tables: dict[str, pd.DataFrame] = {}
     for key, module in _modules(numbers).items():
         tables |= module.tables(numbers[key], source)
@@ -21,9 +21,9 @@ def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.D
 
 
 def experiment_figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the figures of every experiment that the numbers hold, if it has any: SVG text by file name.
+    """Draw the figures of every experiment in the numbers: SVG text by file name.
 
-    `drawn` holds, by key in numbers.json, the data that only its figures show.
+    drawn: by the experiment's key in numbers.json, the data that only its figures show.
     """
     figures: dict[str, str] = {}
     for key, module in _modules(numbers).items():
@@ -39,7 +39,7 @@ def _modules(numbers: Mapping[str, Any]) -> dict[str, ModuleType]:
 
 
 def add_sections(order: Iterable[Any]) -> list[dict[str, Any]]:
-    """Replace the names of experiments in `order` by their sections of the page; sections not named come last."""
+    """Replace names of experiments in `order` by their sections of the page; experiments not named come last."""
     files = experiment_files().items()
     return _replace({name: {"key": name} | file.section for name, file in files if file.section is not None}, order)
 

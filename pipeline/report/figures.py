@@ -1,4 +1,4 @@
-"""Figures of a scene: scores on boards never seen, maps of place errors, sweeps. SVG text by file name."""
+"""Figures of a scene as SVG text by file name: scores on boards never seen, maps of place errors, sweeps."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from pipeline.report.formatting import COLUMNS, SHORT, n_of, table_2_rows, unive
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2
 
 HEADLINE = "headline.svg"
-OFFSET = 0.17  # of a row: ours is drawn above, the paper's below
-WORST_MM = 2.0  # end of the colour scale of all error maps: twice the distance that counts as right
+OFFSET = 0.17  # of a row's height: our score is drawn this far above the middle of the row, the paper's below it
+WORST_MM = 2.0  # end of the colour scale of all error maps: twice the error that counts as correct
 GRID_MM = 16.0  # the paper's grid of places, from 0 to here
-TICK_MM = 4.0  # every other place of it
+TICK_MM = 4.0  # every other place of the grid
 MARK_PT = 18.0  # side of a mark that nearly fills such a place
 SKIN_MM = (-2.0, 18.0)  # the skin around it: "20mm x 20mm" (paper section 2)
 # The five chips under it, in the frame of the labels (paper section 2), and their package of 3 mm.
 CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
 CHIP_MM = 3.0
-DRAWN = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # what is drawn, and what is possible
-LINEAR_BELOW_N = 65  # pokes: a logarithmic axis has no place for none
+DRAWN = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # the metrics that are drawn, and their range
+LINEAR_BELOW_N = 65  # pokes; the axis is linear below, because a logarithmic axis cannot show 0
 BARS = (
     "Bars: 95 % interval over boards; of two or three boards from least to largest;\n"
     "of one board the sd over seeds; of the paper its sd. Clipped to possible values."
@@ -36,14 +36,14 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def headline_figures(numbers: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the scores on boards held out, where there are any: by number of labels, else the rows of table 2."""
+    """Draw the scores on held-out boards, if there are any: by number of labels, or else the rows of table 2."""
     if "labels" in numbers:
         return {HEADLINE: labels_figure(numbers, source)}
     return {HEADLINE: table2_figure(numbers, source)} if numbers.get("table2") else {}
 
 
 def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
-    """Draw accuracy and MSE of each row of table 2 on boards held out, ours beside the paper's."""
+    """Draw accuracy and MSE of each row of table 2 on held-out boards, ours beside the paper's."""
     of_table = [row for name, row in table_2_rows(numbers).items() if name in numbers["table2"]]
     rows = universal_rows(numbers) + of_table
     y = np.arange(len(rows))[::-1].astype(float)
@@ -59,7 +59,7 @@ def table2_figure(numbers: Mapping[str, Any], source: str) -> str:
                 _draw_scores(axes, metric, np.array([at for at, _ in printed]), paper, **look)
             axes.set(xlabel=COLUMNS[metric].replace(", ", " / "), xlim=(0, 1.18 * axes.dataLim.x1))
             axes.grid(axis="x", alpha=0.25)
-        # A space that does not break holds a count together.
+        # Non-breaking spaces keep "n = 6" on one line.
         names = [fill(f"{model.title} (n\xa0=\xa0{n_of(row)})", 34) for model, row in rows]
         panels[0].set_yticks(y, names, fontsize=9)
         panels[0].set_ylim(-0.6, len(rows) - 0.4)
@@ -80,7 +80,7 @@ def _draw_scores(
 
 
 def labels_figure(numbers: Mapping[str, Any], source: str) -> str:
-    """Draw accuracy and MSE of each method on boards held out, a point for each number of labels of the new board."""
+    """Draw accuracy and MSE of each method on held-out boards, with a point for each number of labels of the board."""
     rows = numbers["labels"]
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     counts = sorted({row["labels_n"] for row in rows})
@@ -123,7 +123,7 @@ def error_grids(predictions: Iterable[pa.Table], recipe: str, scene: str) -> Ite
 def error_grid(true_mm: Float[np.ndarray, "f 2"], predicted_mm: Float[np.ndarray, "f 2"], *, title: str) -> str:
     """Draw the places of the indentations, coloured by the mean distance between true and predicted place.
 
-    All maps have one colour scale. Where places lie on the paper's grid, they are drawn on a skin over its chips.
+    All maps have the same colour scale. If the places are on the paper's grid, the skin and its chips are drawn too.
     """
     places, which = np.unique(np.round(true_mm, 2), axis=0, return_inverse=True)
     distance_mm = np.linalg.norm(predicted_mm - true_mm, axis=1)
@@ -155,7 +155,7 @@ def _draw_skin(axes: Any) -> None:
     look: dict[str, Any] = {"facecolor": "0.92", "edgecolor": "0.5", "linewidth": 1.2, "zorder": 0}
     shape = "round,pad=0,rounding_size=1"
     axes.add_patch(FancyBboxPatch((start_mm, start_mm), side_mm, side_mm, shape, **look, label="skin"))
-    around = [withStroke(linewidth=3.2, foreground="white")]  # so that chips stand out from any colour
+    around = [withStroke(linewidth=3.2, foreground="white")]  # makes chips visible on any colour
     for i, (x_mm, y_mm) in enumerate(CHIPS_MM):
         corner_mm = (x_mm - CHIP_MM / 2, y_mm - CHIP_MM / 2)
         chip = Rectangle(corner_mm, CHIP_MM, CHIP_MM, fill=False, edgecolor="black", linewidth=1.4, zorder=2)
@@ -178,7 +178,7 @@ class Line:
     counts: Sequence[int]
     scores: Rows
     look: Mapping[str, Any]
-    shift_pt: float = 0.0  # to the right, so that bars at one count stand beside each other
+    shift_pt: float = 0.0  # shift to the right, so that bars at the same count do not overlap
 
 
 def learning_figures(numbers: Mapping[str, Any], source: str) -> Iterator[tuple[str, str]]:
@@ -189,7 +189,7 @@ def learning_figures(numbers: Mapping[str, Any], source: str) -> Iterator[tuple[
 
 
 def sweep_pokes(rows: Rows, source: str) -> str:
-    """Draw scores against the number of unlabelled pokes (figure 6a), beside the two that the paper prints."""
+    """Draw scores against the number of unlabelled pokes (figure 6a), with the two scores that the paper prints."""
     ordered = sorted(rows, key=lambda row: row["pokes_n"])
     paper = [{m: {"mean": mean, "sd": sd} for m, (mean, sd) in TABLE_2[row].items()} for row in ("triplet", "adapted")]
     hollow = {"color": COLOURS[2], "marker": MARKERS[1], "markerfacecolor": "white", "linestyle": "none"}
@@ -201,7 +201,7 @@ def sweep_pokes(rows: Rows, source: str) -> str:
 
 
 def sweep_sensors(rows: Rows, source: str) -> str:
-    """Draw scores against the number of training skins (figure 6b), a line for each method."""
+    """Draw scores against the number of training skins (figure 6b), with a line for each method."""
     lines = []
     for i, method in enumerate(SENSOR_METHODS):
         swept = sorted((row for row in rows if row["method"] == method), key=lambda row: row["skins_n"])
@@ -215,11 +215,11 @@ def sweep_sensors(rows: Rows, source: str) -> str:
 def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     """Compute means and the lengths of their bars (down, up): the interval over boards, clipped to possible values.
 
-    Of a few boards bars reach from the least to the largest value; without boards (the paper) they are one sd.
+    For a few boards, bars reach from the smallest to the largest value; without boards (the paper), they are one sd.
     """
     means = np.array([row[metric]["mean"] for row in scores])
     ends = np.array([_ends(row[metric]) for row in scores]).clip(*DRAWN[metric])
-    return means, np.stack([means - ends[:, 0], ends[:, 1] - means]).clip(min=0)  # rounded numbers
+    return means, np.stack([means - ends[:, 0], ends[:, 1] - means]).clip(min=0)  # rounding could make it negative
 
 
 def _ends(stat: Mapping[str, Any]) -> tuple[float, float]:
@@ -260,6 +260,6 @@ def _draw_lines(axes: Any, lines: Sequence[Line], metric: str) -> None:
         look = {"linewidth": 1, "markersize": 5, "capsize": 2, "elinewidth": 0.8, **line.look}
         axes.errorbar(line.counts, means, lengths, transform=axes.transData + shift, label=line.name, **look)
         ends += [*(means - lengths[0]), *(means + lengths[1])]
-    # Shifted data do not set the limits by themselves.
+    # Matplotlib does not set the limits from shifted data.
     margin = 0.05 * (max(ends) - min(ends)) or 1.0
     axes.set_ylim(min(ends) - margin, max(ends) + margin)

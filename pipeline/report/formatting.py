@@ -10,7 +10,7 @@ import pandas as pd
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
 from pipeline.statistics import negate
 
-Stat = Mapping[str, Any]  # mean, n, and where known sd and ci95: [low, high], or values: each of a few boards
+Stat = Mapping[str, Any]  # mean, n, and if known sd and ci95: [low, high], or the values of a few boards
 Results = Mapping[str, Any]  # numbers.json of one scene
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
 OF_FORCE = ("mse_f_N2", "r2_f")  # an offset of places changes neither
@@ -35,7 +35,7 @@ UNIVERSAL = ("universal", 0)  # rows of experiment population: the whole univers
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean with three significant digits, its interval over boards (else its sd), and its sd over seeds."""
+    """Write a mean with three significant digits, its interval over boards (or else its sd), and its sd over seeds."""
     if value is None:
         return "–"
     if "ci95" in value or "values" in value:
@@ -44,13 +44,13 @@ def show(value: Stat | None) -> str:
 
 
 def show_deviation(value: Stat) -> str:
-    """Write a mean, its standard deviation over n, and that over network seeds where it is known."""
+    """Write a mean, its standard deviation over n, and its standard deviation over seeds if known."""
     over_n = f" ± {value['sd']:.2g}" if "sd" in value else ""
     return f"{_three_digits(value['mean'])}{over_n}{_show_seeds(value)}"
 
 
 def show_interval(value: Stat) -> str:
-    """Write the 95 % interval over boards alone, or the values of a few boards."""
+    """Write only the 95 % interval over boards, or the values of a few boards."""
     if "values" in value:
         return f"({'; '.join(map(_three_digits, value['values']))})"
     low, high = value["ci95"]
@@ -58,7 +58,7 @@ def show_interval(value: Stat) -> str:
 
 
 def show_digits(value: Stat, digits: int) -> str:
-    """Write a mean with so many decimals, and its interval over boards and deviation over seeds if it has them."""
+    """Write a mean with `digits` decimals, and its interval over boards and deviation over seeds if it has them."""
     mean, *ends = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", value.get("values", ())))]
     if not ends:
         return f"{mean}{_show_seeds(value)}"
@@ -67,7 +67,7 @@ def show_digits(value: Stat, digits: int) -> str:
 
 
 def show_both(value: Stat | None) -> str:
-    """Write a mean, its standard deviation as the paper does, and its interval over boards."""
+    """Write a mean with its standard deviation, as the paper does, and its interval over boards."""
     if value is None or not {"ci95", "values"} & set(value):
         return show(value)
     return f"{show_deviation(value)} {show_interval(value)}"
@@ -79,7 +79,7 @@ def show_difference(value: Stat | None) -> str:
 
 
 def gain(difference: Stat, metric: str) -> Stat:
-    """Change the sign of the difference of an error, so that more is better."""
+    """Return the difference such that positive is better: the sign of differences of errors is changed."""
     return negate(difference) if metric.startswith("mse_") else difference
 
 
@@ -113,19 +113,19 @@ def beside(
 
 
 def n_of(row: Mapping[str, Any]) -> str:
-    """Write over how many boards, pairs or repeats the scores of a row are."""
+    """Write the number of boards, pairs or repeats that the scores of a row are averaged over."""
     return str(row.get("accuracy_pct", row.get("mse_f_N2"))["n"])
 
 
 def tabulate(lines: Sequence[Mapping[str, str]], **notes: str) -> pd.DataFrame:
-    """Make a table with notes to be shown below it: its `meaning`, and its `spread` (what ± and brackets are)."""
+    """Make a table with notes to show below it: its `meaning`, and its `spread` (what ± and brackets mean)."""
     table = pd.DataFrame(lines)
     table.attrs.update(notes)
     return table
 
 
 def notes(table: pd.DataFrame) -> list[str]:
-    """List the notes to be shown below a table."""
+    """List the notes to show below a table."""
     meanings = [table.attrs["meaning"]] if "meaning" in table.attrs else []
     if any("accuracy" in str(column) for column in table.columns):
         meanings.append(f"{MEANING} {table.attrs.get('spread', SPREAD)}")
@@ -151,7 +151,7 @@ def rounded(value: Any, digits: int = 6) -> Any:
 
 @dataclass(frozen=True)
 class Model:
-    """A row of table 2: its title, also a short one, and the paper's scores of the same (empty: none)."""
+    """A row of table 2: its title, a short title, and the paper's scores for it (empty if it has none)."""
 
     title: str
     short: str
@@ -159,7 +159,7 @@ class Model:
 
 
 def models(numbers: Results) -> dict[str, Model]:
-    """Name the rows of table 2 in the paper's order; the names tell whether there was one training skin only."""
+    """Return the rows of table 2 in the paper's order; their titles say if there was only one training skin."""
     titles = TABLE_2_ROWS | {"control": CONTROL}
     if "adapt" in numbers and numbers["adapt"]["pokes_n"] != ADAPTED_POKES_N:
         pokes = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"
@@ -182,7 +182,7 @@ def table_2_rows(numbers: Results) -> dict[str, tuple[Model, Mapping[str, Any]]]
 
 
 def universal_rows(numbers: Results) -> list[tuple[Model, Mapping[str, Any]]]:
-    """Return the universal model's row of experiment population: without labels, with most unlabelled pokes."""
+    """Return the universal model's row of experiment population without labels and with the most unlabelled pokes."""
     rows = [row for row in numbers.get("population", {}).get("told", ()) if (row["way"], row["labels_n"]) == UNIVERSAL]
     if not rows:
         return []
@@ -192,11 +192,11 @@ def universal_rows(numbers: Results) -> list[tuple[Model, Mapping[str, Any]]]:
 
 
 def control_of(numbers: Results) -> dict[str, Any]:
-    """Return the control's row by its name, where there is one."""
+    """Return the control's row by its name, if there is one."""
     return {name: row for name, row in numbers.get("adapt", {}).items() if name == "control"}
 
 
 def is_pooled(numbers: Results) -> bool:
-    """Whether some leave-one-board-out model was trained on several skins."""
+    """Return whether any leave-one-board-out model was trained on several skins."""
     boards = numbers["lobo"]["by_board"].values() if "lobo" in numbers else ()
     return not boards or max(board["trained_on_skins_n"] for board in boards) > 1

@@ -1,4 +1,4 @@
-"""`numbers.json`: every number that any text shows, nested by experiment."""
+"""Compute the content of `numbers.json`: every number that reports show, nested by experiment."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -36,19 +36,19 @@ from reskin.metrics import METRICS
 
 Row = Mapping[str, Any]
 Points = Mapping[str, Sequence[dict[str, Any]]]
-Seconds = Sequence[Row]  # of trainings: name, train_s, one_reading_s
+Seconds = Sequence[Row]  # of training runs: name, train_s, one_reading_s
 
-CONTROL = "control"  # the recipe of adaptation that fine-tunes as long, without the new skin's pokes
+CONTROL = "control"  # the recipe of adaptation that fine-tunes as long but without the new skin's pokes
 PAIRS = (
     ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
     ("adapted", "multi"),
 )  # fmt: skip
 PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these is compared with the paper's numbers
-STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # the same skin, more of it held out
+STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # hold out whole indentations or passes
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # by method
-OWN_POKES = "its own"  # of experiment reference_methods: the unlabelled pokes that a method is given
+OWN_POKES = "its own"  # in experiment reference_methods: a method receives the unlabelled pokes of the tested skin
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 SINGLE = {
     "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
@@ -56,17 +56,17 @@ SINGLE = {
 }  # fmt: skip
 POLICIES = ("initial", "regular", "each")
 HOVER = ("hover", "hover_network")  # predictors of the place of a tip that does not touch
-SEEN_PCT = 25.0  # assumed: chips sense the tip itself if it is placed so often without touching
+SEEN_PCT = 25.0  # assumed: chips sense the tip itself if this many of its places are right without contact
 OF_DRIFT = ("accuracy_pct", "mse_f_N2")
 OF_TOUCHES = ("single_touches_pct", "mean_left_over_pct")
-SETTINGS = ("scene", "source", "seed")  # of the provenance: equal between equal runs
+SETTINGS = ("scene", "source", "seed")  # keys of the provenance that are equal between equal runs
 TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # of a row below `runtime`
 ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # name a row below `runtime`
 OF_SHEAR = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
 
 def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
-    """Compute the numbers of all trainings from the table of scores.
+    """Compute the numbers of all training runs from the table of scores.
 
     `headline` is the recipe that is compared with the paper's numbers.
     """
@@ -98,7 +98,7 @@ def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
 
 
 def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, float]]]]:
-    """Return the points of sweeps as curves, by experiment: the method, the step on its axis, the mean scores."""
+    """Return the points of sweeps as curves, by experiment: (method, step on the axis, mean scores)."""
     numbers = _sweeps(tidy([], points))
     curves: dict[str, list[tuple[str, int, dict[str, float]]]] = {}
     for experiment, (key, axis) in AXES.items():
@@ -110,7 +110,7 @@ def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, flo
 
 
 def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join errors of methods with the times of trainings on this machine, by stage; untimed methods have no time."""
+    """Join errors of methods with their training times on this machine, by stage; untimed methods have no time."""
     joined: dict[str, Any] = {}
     if "baselines" in numbers:
         joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
@@ -131,7 +131,7 @@ def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, An
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
-    """Summarise networks of the leave-one-board-out experiment, registered and board by board."""
+    """Summarise networks of the leave-one-board-out experiment: with registered places, and board by board."""
     by_board = {
         str(board): {
             "trained_on_skins_n": int(group["trained_on_skins_n"].iloc[0]),
@@ -146,7 +146,7 @@ def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
-    """Summarise one skin by how it was split; `single_sensor` is compared with the paper's numbers."""
+    """Summarise networks of one skin for each way of splitting it; `single_sensor` is compared with the paper."""
     experiments = (*PAPERS_SPLITS, *STRICTER.values())
     numbers = {
         experiment: over_folds(select(table, question=experiment, recipe=headline)) for experiment in experiments
@@ -162,7 +162,7 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise every recipe of every experiment with models; repeats on one skin are no boards."""
+    """Summarise every recipe of every experiment with models; repeats on one skin are not summarised as boards."""
     numbers: dict[str, dict[str, Any]] = {}
     models = table[table["question"].isin([one.name for one in EXPERIMENTS.values() if one.kind == "models"])]
     for (experiment, recipe), group in _groups(models, ["question", "recipe"], sort=False):
@@ -200,9 +200,10 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
 
 
 def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
-    """Compare none with the fewest pokes, with those where the paper sees its plateau, and these with the most.
+    """Compute the paper's statements on its figure 6a as paired differences over boards.
 
-    These are the paper's statements on its figure 6a, as paired differences over boards.
+    Compared are: no pokes with the fewest, no pokes with the number where the paper's plateau begins, and that number
+    with the most.
     """
     at = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
     if 0 not in at or len(at) < 2:
@@ -218,9 +219,10 @@ def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
-    """Compare most with fewest training skins, adapted networks with others, and their gain with few and many skins.
+    """Compute the paper's statements on its figure 6b as paired differences over boards.
 
-    These are the paper's statements on its figure 6b, as paired differences over boards.
+    Compared are: the most training skins with the fewest, adapted networks with others, and the gain by adaptation with
+    the fewest skins with that with the most.
     """
     at = {(method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])}
     counts = sorted({skins_n for _, skins_n in at})
@@ -256,7 +258,7 @@ def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
 
 
 def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
-    """Score the mean of the tested forces as a constant prediction: its MSE is their variance, MSE_F / (1 - R^2)."""
+    """Score the mean tested force as a constant prediction; its MSE is the variance of forces, MSE_F / (1 - R^2)."""
     tested = whole(rows).dropna(subset=["r2_f"])
     tested = tested[tested["r2_f"] < 1]
     variance_N2 = (tested["mse_f_N2"] / (1 - tested["r2_f"])).groupby(tested["board"]).mean()
@@ -270,7 +272,7 @@ def _groups(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> It
 
 
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
-    """Return the median seconds of a method's trainings; those of an adapted network include the one before."""
+    """Return the median seconds of a method's training runs; those of adapted networks include pretraining."""
     experiment = NETWORKS.get(row["method"])
     if experiment is None:
         return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
@@ -301,9 +303,9 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
-    """Summarise predictions of places from readings before the touch, over folds: by experiment and predictor.
+    """Summarise predictions of places from readings before the contact, over folds: by experiment and predictor.
 
-    Hover rows, of a tip that does not touch, are kept by fold (skin), with whether the tip itself is sensed.
+    Scores of a hovering tip are listed by fold (skin), with whether the chips sense the tip itself.
     """
     before: dict[str, dict[str, Any]] = {}
     hover: dict[str, dict[str, Any]] = {}
@@ -324,7 +326,7 @@ def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
 def count_trainings(
     cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
-    """Count trainings by experiment: all, those that collapsed, and those of them that had to be kept."""
+    """Count training runs by experiment: all, those that collapsed, and collapsed ones that had to be kept."""
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)
@@ -335,7 +337,7 @@ def count_trainings(
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
-    """Add the counts of each further protocol's captures, and of rows that its experiments left out."""
+    """Add up the counts of the captures of each further protocol, and of the rows that its experiments left out."""
     found: dict[str, dict[str, Any]] = {}
     for experiment, lost in losses.items():
         protocol = EXPERIMENTS[experiment].protocol
@@ -349,7 +351,7 @@ def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
 def runtime_numbers(
     trainings_n: int, costs: Mapping[str, Row], study: Row | None, seconds: Sequence[Row]
 ) -> dict[str, Any]:
-    """Give what each stage cost, and the results of experiment runtime (`study`) with times of this machine."""
+    """Return what each stage cost, and the results of experiment runtime (`study`) with the times on this machine."""
     numbers: dict[str, Any] = {
         "stages": {stage: _stage_cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n,
     }  # fmt: skip
@@ -364,7 +366,7 @@ def runtime_numbers(
 
 
 def _stage_cost(cost: Row) -> dict[str, float]:
-    """Return what a stage cost when it was computed, its trainings added up, and what its last run took."""
+    """Return what a stage cost when it was computed, with its training runs added up, and what its last run took."""
     trainings_s = cost["trainings_s"].values()
     return {
         "computed_s": cost["other_s"] + sum(trainings_s),
@@ -374,7 +376,7 @@ def _stage_cost(cost: Row) -> dict[str, float]:
 
 
 def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split the numbers of a run into numbers.json, equal in equal runs, and provenance.json, of this run alone."""
+    """Split the numbers of a run into numbers.json, which is equal in equal runs, and provenance.json, which is not."""
     own = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
     costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
     studies: dict[str, Any] = {}
@@ -402,7 +404,7 @@ def join(numbers: Row, provenance: Row) -> dict[str, Any]:
 def headline_scores(numbers: Row) -> dict[str, Any]:
     """Select a scene's headline scores, nested by experiment: means with units in their names.
 
-    Nothing that differs between identical runs: no seconds, no commit, no machine.
+    They contain nothing that differs between equal runs, such as seconds, commit or machine.
     """
     recorded = {
         name for name in ("lobo", "labels") if name in numbers and numbers["provenance"]["source"] == "recorded"
@@ -415,7 +417,7 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         "single_sensor": {
             name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
         },
-        "drift_end": {  # the last window of each policy, a mean over networks already
+        "drift_end": {  # the last window of each policy, already a mean over networks
             policy: {name: drift[policy][-1][name] for name in OF_DRIFT if name in drift[policy][-1]}
             for policy in POLICIES
             if policy in drift
@@ -431,7 +433,7 @@ def _means(row: Row, names: Sequence[str] = METRICS) -> dict[str, float]:
 
 
 def _best_of_labels(rows: Sequence[Row]) -> dict[str, Any]:
-    """Select the most accurate method without labels of the new board, and with the most labels."""
+    """Select the most accurate method with the fewest labels of the new board, and with the most."""
     found = {}
     counts = [row["labels_n"] for row in rows]
     for labels_n in sorted({min(counts), max(counts)}):

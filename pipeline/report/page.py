@@ -26,15 +26,15 @@ Captions = dict[str, str]  # by name of a table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
 NO_NUMBER = ("–", "see file", "")  # cells of the checklist without a number
 FURTHER = "further"  # the section for tables and figures that no other section names
-OPEN = {"table2", "labels", "claims"}  # tables that are shown at once; all others open on demand
-BESIDE_N = 4  # results of the paper that a section lists; the checklist has all
+OPEN = {"table2", "labels", "claims"}  # tables that are open when the page loads; others open on demand
+BESIDE_N = 4  # most results of the paper that a section lists; the checklist has all
 SUMMARY = "Scores on boards never seen"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-# Where no line breaks: within a number and its deviation, and within an interval and its unit.
+# No line may break within a number and its deviation, or within an interval and its unit.
 UNBROKEN = re.compile(r"(?<=\d) ± (?=\d)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
@@ -42,8 +42,8 @@ LONG = 40  # letters of a cell that needs a wide column
 SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
 LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # in a file measured in points
 PX_PER_PT = 4 / 3
-WIDE_PT = 500.0  # a wider figure has a row of its own
-LEGIBLE_PX = 8.0  # letters are not shown smaller: a figure that needs more width than there is scrolls
+WIDE_PT = 500.0  # a wider figure gets a row of its own
+LEGIBLE_PX = 8.0  # smallest size of letters; a figure that would need smaller ones to fit scrolls
 NARROW_PX = 340.0  # width of a telephone
 
 
@@ -65,7 +65,7 @@ class Section(Strict):
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure as the page shows it: its file, its size, and the width below which its smallest letters get lost."""
+    """A figure as the page shows it: its file, its size, and the width below which small letters are illegible."""
 
     file: str
     width_px: int
@@ -75,7 +75,7 @@ class Drawing:
 
     @property
     def scrolls(self) -> bool:
-        """Whether it is wider than a telephone."""
+        """Whether it is wider than the screen of a telephone."""
         return self.least_px > NARROW_PX
 
 
@@ -124,7 +124,7 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     """Render the page of one run, which the page of the scene embeds: its commit, machine, versions and times.
 
-    `numbers` are joined with their provenance; `costs` are the texts of the folder that the page is written to.
+    numbers: joined with their provenance. costs: the other files of the page's folder, text by name.
     """
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)
@@ -150,7 +150,7 @@ def index(results: Sequence[Mapping[str, Any]], drawn: Mapping[str, str]) -> str
     for source, title in KINDS.items():
         entries = [_entry(numbers, drawn) for numbers in results if numbers["provenance"]["source"] == source]
         if entries:
-            entries.sort(key=lambda entry: (entry.summary is None, entry.scene))  # scenes with an answer first
+            entries.sort(key=lambda entry: (entry.summary is None, entry.scene))  # scenes with a summary first
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
     return template("page.index.html").render(kinds=kinds)
 
@@ -182,7 +182,7 @@ def read_sections() -> list[Section]:
 
 
 def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:
-    """List the sections that have something to show; section `further` takes what no other section names."""
+    """List the sections that have something to show; section `further` shows what no other section names."""
     sections, names = read_sections(), {"tables": dict.fromkeys(tables), "figures": dict.fromkeys(figures)}
     named = {name for section in sections for name in section.captions}
     further = {kind: {name: _title(name) for name in of_kind if name not in named} for kind, of_kind in names.items()}
@@ -196,7 +196,7 @@ def _title(name: str) -> str:
 
 
 def about(numbers: Mapping[str, Any]) -> str:
-    """Say where the readings of a scene come from, and how many there are."""
+    """Write where the readings of a scene come from, and how many there are."""
     return f"{SOURCES[numbers['provenance']['source']]} {counts_of(numbers)}"
 
 
@@ -208,7 +208,7 @@ def counts_of(numbers: Mapping[str, Any]) -> str:
 
 
 def beside_paper(section: Section, checklist: pd.DataFrame) -> Table | None:
-    """Select the checklist's rows about a section that have a number of ours; rows with verdicts first."""
+    """Select the checklist's rows for a section that have a number of ours; rows with verdicts come first."""
     rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NO_NUMBER and row["note"] != ONE_SKIN]
     if not rows:
         return None
@@ -218,7 +218,7 @@ def beside_paper(section: Section, checklist: pd.DataFrame) -> Table | None:
 
 
 def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
-    """Name the stages behind a section, and the files of their code."""
+    """List the stages whose results a section shows, and the files of their code."""
     stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist))
     return [(stage, str(file_of(module_name(stage)).relative_to(ROOT))) for stage in stages if is_stage(stage)]
 
@@ -235,9 +235,7 @@ def measure(file: str, svg: str) -> Drawing:
     """Measure a figure from its text: its size in CSS pixels, and how far it may shrink."""
     size = SVG_SIZE_PT.search(svg)
     if size is None:
-        raise SchemaError(
-            f"{file}: no size in points at the head of the file: {svg[:80]}. Was it written by drawing.svg?"
-        )
+        raise SchemaError(f"{file}: the SVG has no size in points: {svg[:80]}. Was it written by drawing.svg?")
     width_pt, height_pt = map(float, size.groups())
     smallest_pt = min(map(float, LETTERS_PT.findall(svg)), default=np.inf)
     least_px = min(LEGIBLE_PX / smallest_pt, PX_PER_PT) * width_pt

@@ -26,7 +26,7 @@ ADAPTED_POKES_N = 390  # table 2
 
 
 def _less(of: Mapping[str, float], over: Mapping[str, float]) -> dict[str, float]:
-    """Give the differences of printed means, with no more digits than they have."""
+    """Return the differences of printed means, rounded to the digits of the means."""
     return {name: round(of[name] - over[name], 3) for name in of}
 
 
@@ -59,7 +59,7 @@ MANUAL: dict[str, dict[str, float]] = {
     "after": {"accuracy_pct": 84.84, "mse_xy_mm2": 0.489, "mse_f_N2": 0.192},
 }
 _means = {row: {name: mean for name, (mean, _) in scores.items()} for row, scores in TABLE_2.items()}
-# The numbers behind its claims of gains: differences of printed means, for which it gives no spread.
+# The gains that the paper claims: differences of its printed means, for which it gives no spread.
 GAINS: dict[str, dict[str, float]] = {
     "multi_over_single": _less(_means["multi"], _means["single"]),  # "significantly better"
     # "slightly affects"
@@ -68,7 +68,7 @@ GAINS: dict[str, dict[str, float]] = {
     "adapted_over_multi": _less(_means["adapted"], _means["multi"]),
     "by_hand": _less(MANUAL["after"], MANUAL["before"]),  # "clearly demonstrating the effectiveness"
 }
-FLEXIBLE: dict[str, float] = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # section 5: about, adapted
+FLEXIBLE: dict[str, float] = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # section 5: adapted; "about"
 FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: distance between skin and circuit board
 SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2N) of water"
 SENSITIVITY_ML = 20.0

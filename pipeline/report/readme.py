@@ -32,7 +32,7 @@ Numbers = Mapping[str, Any]  # of one scene
 
 
 def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
-    """Fill in all pages, and write them if `write`; return the pages that change, and the scenes that they show.
+    """Fill in all pages, and write them if `write`; return the pages that changed, and the scenes that they show.
 
     The pages show the simulated scenes `paper` and `quick`, and every recorded scene with results in `reports/`.
     """
@@ -43,7 +43,7 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
     for name in (FULL_SIZE, HEADLINE):
         if name not in numbers:
             raise ParamsError(
-                f"reports/{name}/numbers.json is missing, and README.md and docs show its results. "
+                f"reports/{name}/numbers.json is missing, but README.md and docs show its results. "
                 f"Restore it: git restore reports/{name}"
             )
     recorded = [result for result in numbers.values() if result["provenance"]["source"] == "recorded"]
@@ -111,7 +111,7 @@ def _summary(numbers: Numbers) -> str:
 def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     """Write the named tables of a scene, below a heading with its provenance."""
     provenance = numbers["provenance"]
-    # Results that were committed before the code of other experiments changed can still be shown.
+    # Only the experiments shown: committed results of others may not fit their current code.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
     heading = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
@@ -121,7 +121,7 @@ def _tables(numbers: Numbers, names: Sequence[str]) -> str:
 
 
 def _time(times: Numbers) -> str:
-    """Write how long fresh clones took, the median of their runs."""
+    """Write how long fresh clones took: medians over their runs."""
     runs = times["runs"]
     environment_min, stages_min = (
         median(run[part]["wall_s"] for run in runs) / 60 for part in ("environment", "stages")
@@ -136,7 +136,7 @@ def _time(times: Numbers) -> str:
 
 
 def costs_table(scenes: Sequence[Numbers]) -> pd.DataFrame:
-    """Tabulate what each scene costs when all of it is computed, and its trainings."""
+    """Tabulate what each scene costs when all of it is computed, and the number of its training runs."""
     lines = [
         {
             "scene": f"`{numbers['provenance']['scene']}`",
@@ -151,7 +151,7 @@ def costs_table(scenes: Sequence[Numbers]) -> pd.DataFrame:
 
 
 def _stages(stages: Mapping[str, Any]) -> str:
-    """Tabulate the stages of dvc.yaml with their code and outputs; unpadded, so that one stage changes one line."""
+    """Tabulate the stages of dvc.yaml with code and outputs; without padding, an edited stage changes one line only."""
     lines = ["| stage | code | writes |", "|---|---|---|"]
     for name, stage in stages.items():
         outs = [

@@ -1,4 +1,4 @@
-"""Tables of a scene: numbers.json -> rows, as Markdown for people and CSV for programs."""
+"""Tables of a scene, made from numbers.json and written as Markdown for people and as CSV for programs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -127,7 +127,7 @@ SKINS_MEANING = (
     "the median over readings within 20 % of the force. – : too few readings."
 )
 SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
-UNIVERSAL = "universal, "  # begins the name of a method that is calibrated to the skin
+UNIVERSAL = "universal, "  # prefix of the names of methods that are calibrated to the skin
 CHECKS = {
     "subject": "what", "law": "law", "against": "against", "error": "error", "tolerance": "allowed",
     "reason": "why so much",
@@ -136,13 +136,13 @@ CASES = {
     "area": "area", "case": "case", "should": "should", "happened": "happened", "error": "error", "limit": "allowed",
 }  # fmt: skip
 TABLE_1 = Path(__file__).with_suffix(".yaml")  # the table of the paper
-LOCALISATION = "Localisation (within 1 mm, new skin)"  # our row: the paper's table has none
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # a row of ours, which the paper's table lacks
 OURS = "ours, measured"
 NOT_GIVEN = "–"
 
 
 def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
-    """Make every table that the numbers can fill, by name."""
+    """Make every table for which there are numbers, by name."""
     source = numbers["provenance"]["source"]
     tables = {}
     if "table2" in numbers:
@@ -180,7 +180,7 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
 
 
 def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:
-    """Write every table twice, by file name: as Markdown for people and as CSV for programs."""
+    """Write every table as Markdown for people and as CSV for programs: text by file name."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     return texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
 
@@ -216,7 +216,7 @@ def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd.DataFrame:
-    """List scores by the number of labelled indentations of the new skin; last a constant force, where given."""
+    """List scores by the number of labelled indentations of the new skin; a constant force, if given, comes last."""
     places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in OF_FORCE}
     uncertainty = UNCERTAINTY if any(metric in row["as_labelled"] for row in rows for metric in UNCERTAINTY) else {}
     lines = [
@@ -256,7 +256,7 @@ def audit_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List the candidate settings of each stage and which was chosen, by leave-one-board-out on boards of their own."""
+    """List the candidate settings of each stage and which was chosen, by leave-one-board-out on separate boards."""
     lines = [
         {
             "arm": stage,
@@ -273,7 +273,7 @@ def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate table 2 beside the paper's, in its order; the control and the constant force are ours."""
+    """Tabulate our table 2 beside the paper's, in its order; the control and the constant force are ours alone."""
     rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     constant = numbers.get("constant_force", {}).get("table2")
     if constant:
@@ -289,7 +289,7 @@ def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
 
 
 def _single(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate each split of one skin beside the paper, and predictions of its places without any change of field."""
+    """Tabulate each split of one skin beside the paper's, and predictions of places without any change of field."""
     rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
     seen = [skin for skin, own in numbers.get("hover", {}).items() if own["seen"]]
     for name, split in SPLITS.items():
@@ -357,7 +357,7 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
-    """List how many networks were trained, how many of those collapsed, and how many of them had to be kept."""
+    """List how many networks were trained, how many collapsed, and how many collapsed ones had to be kept."""
     columns = {
         "trainings": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
     }  # fmt: skip
@@ -378,7 +378,7 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List what was read and lost, of the main captures and of each further protocol's; of these, no 0."""
+    """List what was read and lost in the main captures and in further protocols; 0 only for main."""
     further = numbers.get("capture_by_protocol", {})
     lines = [
         {"protocol": protocol, "what": what, "count": str(count), "source": source}
@@ -396,7 +396,7 @@ def _counts(account: Mapping[str, Any]) -> dict[str, int]:
 
 
 def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Compare descriptions of skins by title; where there are simulated and recorded ones, by the nearest ratio."""
+    """Compare descriptions of skins, by title; add the nearest ratio if some are simulated and some recorded."""
     both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
     lines = []
     for name, title in QUANTITIES.items():
@@ -417,7 +417,7 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def table_2_summary(numbers: Numbers) -> pd.DataFrame:
-    """Tabulate scores on boards never seen, for a first look; the paper's means in brackets."""
+    """Tabulate the main scores on boards never seen, with the paper's means in brackets."""
     lines = []
     for model, row in [*universal_rows(numbers), *table_2_rows(numbers).values()]:
         line = {
@@ -431,7 +431,7 @@ def table_2_summary(numbers: Numbers) -> pd.DataFrame:
 
 
 def labels_summary(rows: Rows) -> pd.DataFrame:
-    """Tabulate scores on boards never seen, without a label and with most: calibrated methods, and the first one."""
+    """Tabulate scores on boards never seen, with the fewest and the most labels, of calibrated methods and the first."""
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
     counts = {row["labels_n"] for row in rows}
@@ -448,7 +448,7 @@ def labels_summary(rows: Rows) -> pd.DataFrame:
 
 
 def summary_table(numbers: Numbers) -> pd.DataFrame | None:
-    """Tabulate the scores on boards never seen that a scene is about; None where no board was held out."""
+    """Tabulate a scene's main scores on boards never seen; None if no board was held out."""
     if numbers.get("labels"):
         return labels_summary(numbers["labels"])
     return table_2_summary(numbers) if numbers.get("table2") else None
@@ -506,7 +506,7 @@ def _checks(rows: Rows, titles: Mapping[str, str], source: str) -> pd.DataFrame:
 
 
 class Table1(Strict):
-    """Table 1 as printed: by column the source that the paper cites, by row a cell for each column."""
+    """Table 1 as printed: for each column the source that the paper cites, for each row a cell per column."""
 
     columns: dict[str, str]
     rows: dict[str, tuple[str, ...]]
@@ -525,7 +525,7 @@ def read_table1(path: Path = TABLE_1) -> Table1:
 
 
 def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
-    """Add our column (cells by row) to the paper's table 1, whose cells stay as printed."""
+    """Add our column (cells by row) to the paper's table 1, whose cells remain as printed."""
     rows = data.rows | {LOCALISATION: (NOT_GIVEN,) * len(data.columns)}
     if unknown := sorted(measured.keys() - rows.keys()):
         raise ParamsError("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Use the names of the table.")
@@ -539,7 +539,7 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
 
 
 def measured(numbers: Numbers) -> dict[str, str]:
-    """Write our cells of table 1, by row: what the scene measured or was set to."""
+    """Write our cells of table 1, by row: what the scene measured, or its settings."""
     source = numbers["provenance"]["source"]
     simulated = source == "simulated"
     described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})

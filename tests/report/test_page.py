@@ -137,7 +137,7 @@ def test_smallest_width_of_a_figure_is_legible():
 
 
 def test_figure_without_size_is_an_error():
-    with pytest.raises(SchemaError, match=r"figures/a\.svg: no size"):
+    with pytest.raises(SchemaError, match=r"figures/a\.svg: the SVG has no size"):
         measure("figures/a.svg", '<svg viewBox="0 0 1 1"/>')
 
 
