@@ -1,18 +1,18 @@
 # make repro   everything from nothing: environment, then `dvc repro` on the scenes of pipeline/plan.yaml
 # make test    lint, types, layers, tests
-# make test-processors   trainings on emulated processors of Intel and AMD: the same bits (needs qemu-user)
+# make test-processors   checks that training gives the same bits on emulated Intel and AMD processors (needs qemu-user)
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks at full size (the tests run each at a tiny size)
-# make faults   injects every fault for real (Linux, root for mounts) -> docs/faults.md
-# make time-repro   `make repro` in a fresh clone, its stages three times: seconds, CPU seconds, disk -> reports/time.json
-# make constraints   the newest versions that fit together -> constraints.txt; then make test, then commit
-# make licences   the licences of all that is installed; fails on one that is not compatible
-# make audit   known faults of the versions in constraints.txt; asks pypi.org
-# make time-install   the wheel in an empty environment: seconds, MB, and a page of `reskin live`
+# make faults   injects every fault for real (Linux; mounts need root) -> docs/faults.md
+# make time-repro   times `make repro` in a fresh clone (three runs of its stages) -> reports/time.json
+# make constraints   the newest versions that fit together -> constraints.txt; then run make test, and commit
+# make licences   lists the licences of all installed packages; fails if one is not compatible
+# make audit   known vulnerabilities of the versions in constraints.txt, from pypi.org
+# make time-install   installs the wheel in an empty environment: seconds, MB, and a page of `reskin live`
 # make team-server FOLDER=... [HOST=0.0.0.0] [PORT=5000]   MLflow on PostgreSQL, until Ctrl-C
-# make teams      what a team does, on servers of its own, which it ends -> docs/measured/teams.md
-# make cluster-test   a sweep on a cluster in network namespaces, as root -> docs/measured/cluster.md, scaling.md
-# make clean   removes what the targets above made, but no data and no results
+# make teams      tests what a team does, on servers that it starts and stops -> docs/measured/teams.md
+# make cluster-test   runs a sweep on a cluster in network namespaces, as root -> docs/measured/cluster.md, scaling.md
+# make clean   removes what the targets above made, except data and results
 
 PYTHON ?= python3
 VENV := .venv
@@ -22,11 +22,12 @@ STAMP := $(VENV)/.installed
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 export DVC_NO_ANALYTICS = 1
-# One thread a process: steadier on few cores, and the same sums in the same order everywhere.
+# One thread per process: run times vary less on few cores, and sums have the same order everywhere.
 export OMP_NUM_THREADS = 1
-# Where an environment forbids it, every stage and every worker of the tests would compile all its modules again.
+# Empty, so that bytecode is written even if the user's environment forbids it. Without bytecode, every stage and every
+# test worker compiles all its modules again.
 export PYTHONDONTWRITEBYTECODE =
-# Stages run `python`: the one of this environment.
+# Stages run `python`, which must be the one of this environment.
 export PATH := $(CURDIR)/$(BIN):$(PATH)
 
 .PHONY: repro test test-processors lint ui bench faults time-repro time-install readme constraints licences audit clean
@@ -43,12 +44,12 @@ repro: $(STAMP)
 	$(BIN)/reskin scenes check
 	$(BIN)/dvc repro
 	@[ -e mlflow.db ] || $(BIN)/reskin publish # DVC skips stage publish if all results equal those in dvc.lock
-	@$(BIN)/reskin compare || true # compares with the committed reports; a scene of your own has none
+	@$(BIN)/reskin compare || true # compares with the committed reports, which your own scenes do not have
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
-# Tiny trainings on processors that QEMU emulates: their weights must be those of this processor. Needs package qemu-user.
+# Trains tiny networks on processors that QEMU emulates: weights must equal those from this processor. Needs qemu-user.
 test-processors: $(STAMP)
 	$(BIN)/python -m tests.arithmetic Haswell-v2 Skylake-Client-v1 EPYC-v1
 
@@ -65,15 +66,15 @@ ui: $(STAMP)
 bench: $(STAMP)
 	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks -s -q -p no:xdist
 
-# Kills, full disks, cut files, dead servers: each hits a copy of a small checkout that has finished.
+# Kills, full disks, cut files, dead servers: each fault is injected into a copy of a small finished checkout.
 faults: $(STAMP)
 	$(BIN)/python -m tests.faults
 
-# How long a newcomer waits, and what it takes on disk: a fresh clone, its stages three times from nothing.
+# Time and disk space that a newcomer needs: a fresh clone, its stages run three times without any cache.
 time-repro:
 	$(PYTHON) tests/benchmarks/time_repro.py --times 3
 
-# What somebody with a board and nothing but Python waits for, and what it takes on disk.
+# Time and disk space that somebody with a board and only Python needs.
 time-install:
 	$(PYTHON) tests/benchmarks/time_install.py --constraint constraints.txt
 
@@ -83,13 +84,13 @@ constraints: $(STAMP)
 licences: $(STAMP)
 	$(BIN)/python -m release.licences
 
-# In an environment of its own: what audits is no package of the project.
+# In a separate environment, because the auditing tool is not a dependency of the project.
 audit:
 	$(PYTHON) -m venv .audit
 	.audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit
-	.audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip # strict: what cannot be asked about fails
+	.audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip # strict: fails if a package cannot be audited
 
-# Both extras, and for the tests a server that speaks S3.
+# Extras dask and team, and for the tests an S3-compatible server.
 $(VENV)/.team: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dask,team]' 'moto[server]'
 	@touch $@
@@ -97,7 +98,7 @@ $(VENV)/.team: $(STAMP)
 HOST ?= 127.0.0.1
 PORT ?= 5000
 team-server: $(VENV)/.team
-	$(BIN)/python -m deploy.team_server $(or $(FOLDER),$(error FOLDER=... is where the database and the artifacts lie)) --host $(HOST) --port $(PORT)
+	$(BIN)/python -m deploy.team_server $(or $(FOLDER),$(error FOLDER=... is missing: the folder for the database and the artifacts)) --host $(HOST) --port $(PORT)
 
 teams: $(VENV)/.team
 	$(BIN)/python -m tests.benchmarks.teams

@@ -1,1 +1,1 @@
-"""What a team or a cluster starts: servers, workers, scripts for SLURM and Kubernetes. No part of the package."""
+"""Programs for a team or a cluster: servers, workers, scripts for SLURM and Kubernetes. Not part of the package."""

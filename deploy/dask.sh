@@ -1,9 +1,9 @@
 #!/bin/sh
-# Work past one machine, in three words. Every machine sees this checkout, its .venv included, under the same path.
-#   sh deploy/dask.sh scheduler [PORT]        until it is ended; prints its address
-#   sh deploy/dask.sh worker ADDRESS [N]      N workers of one thread (1); end with the scheduler, wait 5 minutes for it
-#   sh deploy/dask.sh run ADDRESS COMMAND...  the command, its trainings and simulations on those workers
-# There is no password: let nobody else reach the port.
+# Run work on several machines. Every machine must see this checkout, with its .venv, under the same path.
+#   sh deploy/dask.sh scheduler [PORT]        start a scheduler and print its address; runs until it is ended
+#   sh deploy/dask.sh worker ADDRESS [N]      start N workers (default 1); they end after 5 minutes without a scheduler
+#   sh deploy/dask.sh run ADDRESS COMMAND...  run a command, its training and simulations on those workers
+# There is no password: make sure that nobody else can reach the port.
 set -eu
 cd "$(dirname "$0")/.."
 export OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE="" PATH="$PWD/.venv/bin:$PATH"
@@ -13,7 +13,7 @@ case $word in
 scheduler)
     exec python -m distributed.cli.dask_scheduler --port "${1:-8786}" --no-dashboard --no-jupyter
     ;;
-worker) # through the package, which sets what libraries read when they load
+worker) # imports the package first: it sets variables that libraries read when they load
     exec python -c "import pipeline.cluster; from distributed.cli.dask_worker import main; main()" \
         "$1" --nworkers "${2:-1}" --nthreads 1 --no-dashboard --death-timeout 300
     ;;

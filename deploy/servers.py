@@ -1,6 +1,6 @@
 """Servers of a team as context managers: PostgreSQL, MLflow on it, and for tests an S3-compatible store.
 
-The servers are children of this process and end with it.
+The servers are child processes of this process and end with it.
 """
 
 import ctypes
@@ -26,11 +26,11 @@ LOOPBACK = "127.0.0.1"
 DATABASE, OWNER = "mlflow", "mlflow"
 DEBIAN = Path("/usr/lib/postgresql")  # Debian and Ubuntu install the server's programs by version, outside the PATH
 PR_SET_PDEATHSIG = 1
-UNPRIVILEGED = "postgres"  # PostgreSQL refuses to run as root; its package makes this user
+UNPRIVILEGED = "postgres"  # PostgreSQL refuses to run as root; its package creates this user
 
 
 class ServerError(RuntimeError):
-    """A server that cannot be started; the message says why."""
+    """A server cannot be started or has stopped; the message says why."""
 
 
 def free_port() -> int:
@@ -79,7 +79,7 @@ def mlflow(folder: Path, database: str, port: int, *, host: str = LOOPBACK) -> I
     words = ["-m", "mlflow", "server", "--artifacts-destination", folder / "artifacts", "--host", host, "--port", port]
     names = [name for name in {host, socket.gethostname(), "localhost", LOOPBACK} if name != "0.0.0.0"]
     allowed = ",".join(part for name in sorted(names) for part in (name, f"{name}:*"))  # MLflow refuses other names
-    # As a variable: every user can read a password on the command line.
+    # The database's URI is a variable, because every user could read its password on the command line.
     variables = {"MLFLOW_BACKEND_STORE_URI": database, "MLFLOW_DISABLE_TELEMETRY": "true"}
     variables |= {"MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"}  # eight processes of 240 MB that nobody uses
     command = [sys.executable, *map(str, words), "--workers", "1", "--allowed-hosts", allowed]
@@ -101,7 +101,7 @@ def s3(folder: Path, port: int) -> Iterator[str]:
 
 
 def responds(url: str) -> bool:
-    """Tell whether an HTTP server answers with success."""
+    """Return whether an HTTP server responds with success."""
     try:
         with urlopen(url, timeout=2.0):
             return True
@@ -110,7 +110,7 @@ def responds(url: str) -> bool:
 
 
 def listens(address: str) -> bool:
-    """Tell whether anything accepts connections at an address."""
+    """Return whether a server accepts connections at an address."""
     at = urlsplit(address)
     try:
         socket.create_connection((at.hostname or "", at.port or 0), timeout=1.0).close()
@@ -149,7 +149,7 @@ def running(
 
 
 def _end_with_parent(stop: signal.Signals) -> None:
-    """Make a server end with its parent process, even if that is killed (Linux)."""
+    """Make a server end with its parent process, even if the parent is killed (Linux)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(stop))
 

@@ -1,7 +1,7 @@
-"""A team's MLflow server on PostgreSQL: python -m deploy.team_server FOLDER. Runs until Ctrl-C.
+"""Run a team's MLflow server on PostgreSQL until Ctrl-C: python -m deploy.team_server FOLDER.
 
-FOLDER holds the database and the artifacts, also for the next start. PostgreSQL listens on loopback only, with a
-password of its own; MLflow has no password: put its port behind a firewall or a proxy.
+FOLDER keeps the database and the artifacts for the next start. PostgreSQL listens only on loopback and has a generated
+password. MLflow has no password: put its port behind a firewall or a proxy.
 """
 
 import argparse
@@ -16,10 +16,10 @@ LOOK_EVERY_s = 2.0
 
 
 def main() -> None:
-    """Start both servers, say how to use them, and wait."""
+    """Start both servers, print how to use them, and wait."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--host", default=LOOPBACK, help="the address to listen on; 0.0.0.0: every one of this machine")
+    parser.add_argument("--host", default=LOOPBACK, help="address to listen on; 0.0.0.0: all addresses")
     parser.add_argument("--port", type=int, default=5000)
     arguments = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -35,7 +35,7 @@ def main() -> None:
             )
             while listens(address):
                 time.sleep(LOOK_EVERY_s)
-            raise ServerError(f"MLflow does not answer at {address} any more. See {folder}/mlflow.log.")
+            raise ServerError(f"MLflow no longer responds at {address}. See {folder}/mlflow.log.")
     except ServerError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

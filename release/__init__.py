@@ -1,1 +1,1 @@
-"""Tools of a release: versions and licences. Not part of the wheel."""
+"""Tools for releases: versions and licences. Not part of the wheel."""

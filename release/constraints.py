@@ -1,8 +1,7 @@
 """Update constraints.txt to the newest versions that fit together: python -m release.constraints [FILE].
 
-pip resolves all extras but `fuzz`, whose package few processors have, and
-installs nothing. Run it with the oldest supported Python, so that the versions exist for it; run `make test` before you
-commit the result.
+pip resolves all extras except `fuzz`, whose package exists for few processors, and installs nothing. Run it with the
+oldest supported Python, so that all versions exist for that Python; run `make test` before you commit the result.
 """
 
 import json
@@ -15,7 +14,7 @@ from reskin import io
 
 HEAD = "# Exact versions with all extras but fuzz; made with `make constraints`. torch is {torch} and nothing else.\n"
 EXCLUDED = "fuzz"
-OF_CUDA = ("nvidia-", "cuda-", "triton")  # torch for other graphics cards brings none of them
+OF_CUDA = ("nvidia-", "cuda-", "triton")  # left out, because torch without CUDA does not need them
 RESOLVE = ("-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--report", "-")
 
 
@@ -27,7 +26,7 @@ def resolve(python: str, wanted: str) -> dict[str, str]:
 
 
 def render(versions: dict[str, str]) -> str:
-    """Write versions as pip reads them, sorted as `pip freeze` sorts, without this project.
+    """Write versions in pip's format, in the order of `pip freeze`, without this project.
 
     >>> print(render({"torch": "2.0", "Attrs": "1.0", "nvidia-nccl": "3", "reskin": "0.1"}).splitlines()[1:])
     ['Attrs==1.0', 'torch==2.0']
@@ -38,7 +37,7 @@ def render(versions: dict[str, str]) -> str:
 
 
 def wanted(project: str) -> str:
-    """Return the project with its extras, as pip takes it.
+    """Return the requirement for pip: the project with its extras.
 
     >>> wanted('[project.optional-dependencies]\\ndev = ["pytest"]\\ndask = ["dask"]\\nfuzz = ["atheris"]')
     '.[dask,dev]'

@@ -1,7 +1,7 @@
 """Check the licences of all installed packages: python -m release.licences.
 
 Prints them, and fails if one is not compatible with MIT. A package states its licence by an SPDX expression, a
-classifier or free text; an unknown statement is refused. No legal advice.
+classifier or free text; an unknown statement counts as incompatible. This is not legal advice.
 """
 
 import re
@@ -15,20 +15,20 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-# Licences that a program under MIT may import: they require notices, and MPL the changes of its own files.
+# Licences that a program under MIT may import. They require notices; MPL also requires changes of its files.
 COMPATIBLE = re.compile(
     r"\b(MIT|BSD|0BSD|Apache|PSF|Python Software Foundation|ISC|MPL|Mozilla Public|Zlib|CC0|BSL-1\.0|ZPL|Zope|HPND)",
     re.I,
 )
 WITHHELD = re.compile(r"\b(A?GPL|LGPL|GNU|EPL|SSPL|BUSL|Commercial|Proprietary)", re.I)
 GROUP = re.compile(r"(?:^|(?<=AND )|(?<=OR )|(?<=\())\(([^()]*)\)")  # other brackets belong to a name: BSD (3-clause)
-# Of extra `pipeline`, never of the core: DVC imports them, we start DVC; none of them is part of our wheel.
+# Packages of extra `pipeline`, never of the core. DVC imports them, and we only run DVC; none of them is in our wheel.
 TOLERATED = {
     "asyncssh": "EPL-2.0 or GPL-2.0+: remotes of DVC over SSH",
     "grandalf": "GPL-2.0 or EPL-1.0: `dvc dag` draws with it",
-    "pygit2": "GPL-2.0 with an exception for what links it: DVC reads git",
+    "pygit2": "GPL-2.0 with an exception for programs that link it: DVC reads git",
 }
-SILENT = {"huey": "MIT", "skops": "MIT"}  # stated in licence files, not in the metadata
+SILENT = {"huey": "MIT", "skops": "MIT"}  # packages that state it in licence files only, not in the metadata
 
 
 def wanted(extra: str | None = None) -> list[str]:
@@ -60,7 +60,7 @@ def closure(requirements: Iterable[str]) -> dict[str, Distribution]:
 
 
 def licence_of(package: Distribution) -> str:
-    """Return the licence that a package states: the expression, else classifiers, else the first line of its text."""
+    """Return the licence that a package states: its expression, else classifiers, else the first line of its text."""
     metadata, name = package.metadata, canonicalize_name(package.metadata["Name"])
     kinds = [line.split(" :: ")[-1] for line in metadata.get_all("Classifier") or () if line.startswith("License ::")]
     stated = [kind for kind in kinds if kind not in ("OSI Approved", "DFSG approved")]
@@ -69,7 +69,7 @@ def licence_of(package: Distribution) -> str:
 
 
 def is_compatible(licence: str) -> bool:
-    """Tell whether every part of an expression, or of one of its alternatives, is a known licence that MIT may import.
+    """Return whether every part of an expression, or of one of its alternatives, is a licence compatible with MIT.
 
     >>> is_compatible("Apache-2.0 OR GPL-2.0-or-later"), is_compatible("MIT AND unheard-of"), is_compatible("")
     (True, False, False)
@@ -82,7 +82,7 @@ def is_compatible(licence: str) -> bool:
 
 
 def incompatible(packages: dict[str, Distribution]) -> dict[str, str]:
-    """Return the packages with an unknown or incompatible licence, and that licence."""
+    """Return the packages with an unknown or incompatible licence, with that licence."""
     licences = {name: licence_of(package) for name, package in packages.items()}
     return {name: licence or "nothing" for name, licence in licences.items() if not is_compatible(licence)}
 
@@ -99,7 +99,7 @@ def main() -> None:
         sys.exit(
             f"licences not compatible with MIT: {refused}. Drop the package, or state in TOLERATED why it may stay."
         )
-    print(f"{len(core)} packages of the core, {len(full)} with all extras of development: compatible with MIT")
+    print(f"{len(core)} packages of the core, {len(full)} with all development extras: compatible with MIT")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, register it, plan its scene.
 
-The recording is read through and checked first. An add that fails or is stopped leaves nothing behind.
+The whole recording is read and checked first. If adding fails or is stopped, nothing is left behind.
 """
 
 import hashlib
@@ -25,11 +25,11 @@ from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
-COMPARED_N = 3  # captures of the scene, the last ones, with which the places of a new one are compared
+COMPARED_N = 3  # the places of a new capture are compared with those of so many last captures of the scene
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
-    """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; all, or nothing."""
+    """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; undo all on failure."""
     require_idle(root)
     header, files = prepared
     settings = read_scene(root, plan.scene_file(root, scene).stem)
@@ -68,15 +68,15 @@ def remove(root: Path, scene: str, capture: str) -> None:
 
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
-        remedy = "Is it the same recording? It is in already. Otherwise choose another --name."
+        remedy = "If it is the same recording, nothing is to be done. Otherwise choose another --name."
         raise CaptureError(f"the name {target.name} is taken in this scene. {remedy}")
     if target.exists():
-        remedy = "It is in no scene: an add was killed there. Delete the folder, or choose another --name."
+        remedy = "It is in no scene: `reskin add` was killed there. Delete the folder, or choose another --name."
         raise CaptureError(f"{target}: the folder exists already. {remedy}")
 
 
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
-    """Read a capture as ingestion will; return hashes that a copy of it shares, whatever its names and layout."""
+    """Read a capture as ingestion will; return hashes that a copy shares, whatever its names and layout are."""
     _, blocks, account = open_capture(folder, policy)
     rows_n, readings = 0, hashlib.sha256()
     for block in blocks:
@@ -92,7 +92,7 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
 
 
 def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
-    """Warn if chips, labels or skin of a capture seem to lie otherwise than its scene's section `compare` says."""
+    """Warn if chips, labels or skin of a capture seem oriented otherwise than its scene's section `compare` says."""
     from pipeline.experiments.compare import (
         Compare,
         find_departure,  # late: the physics takes seconds
@@ -104,13 +104,13 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
     try:
         sentence = find_departure(list(blocks), section, config.parse(SkinDesign, skin, "nominal.yaml: skin"))
     except ReskinError as error:
-        sentence = f"Whether labels, chips and skin lie as the scene says was not checked: {error}"
+        sentence = f"The orientation of labels, chips and skin was not compared with the scene's: {error}"
     if sentence:
-        say(f"warning: capture {folder.name}: {sentence} It was added all the same.")
+        say(f"warning: capture {folder.name}: {sentence} It was added anyway.")
 
 
 def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:
-    """Warn if places seem turned, mirrored or exchanged, compared with the scene's other captures."""
+    """Warn if places seem rotated, mirrored or with x and y exchanged, compared with the scene's other captures."""
     found = []
     own = presses_of(open_capture(folder, policy)[1])
     for other in others[-COMPARED_N:]:
@@ -120,13 +120,13 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
     if usual is not None:
         say(
             f"warning: capture {folder.name}: its places agree with those of the scene's other captures only {usual}. "
-            "Are columns exchanged, or was the board turned? It was added all the same."
+            "Are columns exchanged, or was the board turned? It was added anyway."
         )
 
 
 @contextmanager
 def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
-    """Name the user's own files in errors instead of their copies, which are removed."""
+    """In errors, name the user's own files instead of their copies, which are removed."""
     try:
         yield
     except ReskinError as error:
@@ -142,7 +142,7 @@ def _removing_on_failure(target: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        _remove_files(target)  # after Ctrl-C too
+        _remove_files(target)
         raise
 
 
@@ -159,8 +159,8 @@ def _remove_files(target: Path) -> None:
 
 
 def _track(folder: Path, root: Path) -> None:
-    """Track a folder with DVC, as `dvc add` does; within this process, as starting another takes seconds."""
-    from dvc.exceptions import DvcException  # late: DVC takes a second
+    """Track a folder with DVC, as `dvc add` does, but in this process, because starting another takes seconds."""
+    from dvc.exceptions import DvcException  # imported late: it takes a second
     from dvc.repo import Repo
 
     try:

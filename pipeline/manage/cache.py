@@ -1,7 +1,7 @@
 """Check DVC's cache for damaged objects, and set them aside.
 
-DVC names an object by the MD5 of its content, and restores outputs from a read-only object without reading it again, so
-that an object damaged by a failing disk would come back as a result.
+DVC names an object by the MD5 of its content, and restores outputs from a read-only object without checking it again.
+An object that a failing disk has damaged would therefore be restored as a result.
 """
 
 import hashlib
@@ -20,19 +20,19 @@ from reskin.errors import SchemaError
 
 DAMAGED = ".reskin/damaged"  # the folder of objects that were set aside
 FOLDER = ".dir"  # suffix of an object that lists the files of a folder
-OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other files are the partial writes of a killed DVC
+OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other files were being written when DVC was killed
 READ_ONLY = 0o444  # as DVC keeps objects
 
 
 class Use(NamedTuple):
-    """An output that holds an object, and the command that restores it."""
+    """An output that contains an object, and the command that restores it."""
 
     command: str
     path: Path
 
 
 def check(root: Path, echo: Callable[[str], None]) -> int:
-    """Compare every object with its name; set aside damaged ones and their copies; return 1 if any is, else 0."""
+    """Compare every object with its name; set damaged ones and their copies aside; return 1 if there is any, else 0."""
     require_idle(root)
     cache = _cache_of(root)
     files = (file for file in sorted(cache.glob("[0-9a-f][0-9a-f]/*")) if OBJECT.fullmatch(file.name))
@@ -51,7 +51,7 @@ def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
     changed, aside = _md5(file), root / DAMAGED / name
     outputs = [(use.path, _md5(use.path)) for use in uses if use.path.is_file()]
     aside.parent.mkdir(parents=True, exist_ok=True)
-    shutil.move(file, aside)  # kept: of a recording there may be no other copy
+    shutil.move(file, aside)  # not deleted: there may be no other copy of a recording
     for path, digest in outputs:
         if digest == name:
             with io.replacing(file) as temporary:
@@ -68,14 +68,14 @@ def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
 
 
 def _uses(root: Path, objects: Mapping[str, Path]) -> dict[str, list[Use]]:
-    """List the outputs that hold each object, by the object's name; files of a folder too."""
+    """List the outputs that contain each object, by the object's name, including files of folders."""
     found: dict[str, list[Use]] = defaultdict(list)
     for command, path, name in _outputs(root):
         found[name].append(Use(command, path))
         if name.endswith(FOLDER) and name in objects:
             try:
                 listed: list[dict[str, Any]] = io.read_json(objects[name])
-            except SchemaError:  # damaged itself, and reported as such
+            except SchemaError:  # the list is damaged too, and reported as such
                 continue
             for entry in listed:
                 found[entry["md5"]].append(Use(command, path / entry["relpath"]))
@@ -99,7 +99,7 @@ def _md5(file: Path) -> str:
 
 
 def _cache_of(root: Path) -> Path:
-    from dvc.repo import Repo  # late: DVC takes a second
+    from dvc.repo import Repo  # imported late: it takes a second
 
     with Repo(str(root)) as repo:
         return Path(repo.cache.local.path)

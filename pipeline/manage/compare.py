@@ -18,13 +18,13 @@ import pandas as pd
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
-LABEL_N = 3  # leading texts and counts of a row that may name it
+LABEL_N = 3  # a row is named by at most so many of its leading texts and counts
 LISTED_N = 10  # largest differences that are listed
-# Verdicts that cells begin with; the first three are of results before 2026-11.
+# Verdicts that cells begin with; the first three are from results before 2026-11.
 VERDICT = re.compile(
     r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|not judged \([^)]*\))(?![\w ])"
 )
-MACHINE = ("device", "versions", "trained", "git")  # of the provenance: possible causes of a difference
+MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance: possible causes of a difference
 EXPECTED = (
     "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
     "processor with AVX2; a GPU or other versions may differ. If none of these explains it, please report it."
@@ -45,7 +45,7 @@ class Difference:
 
     @property
     def relative(self) -> float | None:
-        """The difference relative to the larger of two numbers (0 to 2); None if one is no number."""
+        """The difference relative to the larger of two numbers (0 to 2); None if one is not a number."""
         old, new = self.committed, self.fresh
         if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in (old, new)):
             return None
@@ -79,7 +79,7 @@ class Comparison:
 
 
 def compare(committed: Mapping[str, Any], fresh: Mapping[str, Any]) -> Comparison:
-    """Compare nested numbers, truths and texts of a fresh run with committed ones."""
+    """Compare the nested numbers, booleans and texts of a fresh run with the committed ones."""
     done = Comparison(Counter(), [], [], [])
     for name, old, new in _pairs(committed, fresh, ""):
         if new is MISSING:
@@ -108,12 +108,12 @@ def section_of(name: str) -> str:
 
 
 def leaves(value: Any) -> Iterator[tuple[str, Leaf]]:
-    """Name every number, truth and text of a nested value."""
+    """Yield every number, boolean and text of a nested value, with its name."""
     yield from ((name, leaf) for name, leaf, _ in _pairs(value, MISSING, ""))
 
 
 def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the name of every value of either side, with the values of both sides."""
+    """Yield the name of every value that one of the sides has, and its values on both sides."""
     present = [value for value in (old, new) if value is not MISSING]
     if all(isinstance(value, Mapping) for value in present):
         before, after = ({} if value is MISSING else value for value in (old, new))
@@ -133,7 +133,7 @@ def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
 def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Label the rows of two lists by their leading values, so that an additional row shifts no other.
 
-    Where the labels differ and the lists are equally long, rows are paired by position.
+    If the labels differ and the lists are equally long, rows are paired by position.
     """
     before, after = _labels(old), _labels(new)
     if set(before) != set(after) and len(before) == len(after):
@@ -167,7 +167,7 @@ def _labels(rows: Sequence[Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class Report:
-    """What is compared of a report: numbers.json and the cells of tables; also its place and its provenance."""
+    """The compared parts of a report, numbers.json and the cells of tables, and its location and provenance."""
 
     where: str
     numbers: dict[str, Any]
@@ -178,7 +178,7 @@ class Report:
 def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
     """Compare `reports/<scene>` with those of a revision or a folder; return the exit status.
 
-    A scene that cannot be compared is an error in one sentence; other scenes are compared all the same.
+    If a scene cannot be compared, this prints an error and returns its status, so that other scenes are still compared.
     """
     try:
         folder = root / "reports" / scene
@@ -272,7 +272,7 @@ def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -
             numbers = {title: str(by_section[section]) for title, by_section in found.items()}
             counts.append({"part": name, "section": section, "equal": str(part.equal[section])} | numbers)
     differing = [one for part in parts.values() for one in part.differing]
-    # Tables repeat the numbers of numbers.json: theirs are listed only if no number there differs.
+    # Tables repeat the numbers of numbers.json, so theirs are listed only if none of numbers.json differs.
     numeric = next(filter(None, ([one for one in part.differing if one.relative] for part in parts.values())), [])
     largest = [
         {

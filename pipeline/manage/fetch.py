@@ -1,6 +1,6 @@
 """Fetch public recordings (`pipeline/fetch.yaml`) from a git repository or a folder, check them, and add them.
 
-Of a git repository only the commit and the files that are needed are transferred, where its server can do that.
+From a git repository, only the needed commit and files are transferred, if its server supports that.
 """
 
 import os
@@ -46,7 +46,7 @@ Below = Annotated[str, AfterValidator(_below)]
 
 
 class File(Strict):
-    """One file: its path in the repository (`at`) and here (`path`), and the size and hash of its content here."""
+    """One file: its path in the repository (`at`) and on disk (`path`), and the size and hash of the latter."""
 
     path: Below
     at: str
@@ -55,7 +55,7 @@ class File(Strict):
 
 
 class Recording(Strict):
-    """How fetched files are added: the options of `reskin add`."""
+    """A recording in the fetched files, with the options of `reskin add` for it."""
 
     path: Below
     layout: ReaderLayout
@@ -65,7 +65,7 @@ class Recording(Strict):
 
 
 class Source(Strict):
-    """One public set of recordings; without a scene it is fetched and not added, and the note says why."""
+    """One public set of recordings; without a scene, it is fetched but not added, and the note says why."""
 
     home: str
     commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
@@ -130,7 +130,7 @@ def _is_unchanged(path: Path, file: File) -> bool:
 
 
 def download(source: Source, where: str, folder: Path) -> None:
-    """Read the files of a source, check each, and replace a folder by them; all, or nothing."""
+    """Read the files of a source, check each, and replace a folder by them; on failure, leave the folder as it was."""
     try:
         with io.replacing(folder) as temporary:
             needed, free = COPIES_N * sum(file.bytes_n for file in source.files), shutil.disk_usage(folder.parent).free
@@ -154,7 +154,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     """Read a file, as CSV if it is an archive of pickled samples, and check its hash."""
     found = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
     if found is None:
-        remedy = f"Is it the right place? {USE_FROM}"
+        remedy = f"Is this the right source? {USE_FROM}"
         raise CaptureError(f"{origin.name}: no file {file.at} or {file.path}. {remedy}")
     content, name = origin.read(found), f"{origin.name} {found}"
     if found.endswith(".npz"):
@@ -162,13 +162,13 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     digest = sha256(content).hexdigest()
     if digest != file.sha256:
         rule, got = f"{file.sha256} ({file.bytes_n} bytes)", f"{digest} ({len(content)} bytes)"
-        remedy = f"It was changed or cut, or is another of that name; nothing was kept. Run it again; {USE_FROM}"
+        remedy = f"It is changed, cut or another file of that name; nothing was kept. Run the command again; {USE_FROM}"
         raise CaptureError(name, "sha256", rule, got, remedy)
     return content
 
 
 def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> None:
-    """Add each recording that its scene does not hold; what was added stays, should a later one fail."""
+    """Add each recording that its scene does not have yet; recordings stay added if a later one fails."""
     done_n = 0
     try:
         for recording in source.recordings:
@@ -187,7 +187,7 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
 
 
 def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
-    """Find the capture of a scene that holds the same files, or has the same name while its files are away."""
+    """Find the capture of a scene that has the same files, or the same name if its files are not on disk."""
     header, files = prepared
     hashes = {
         name: sha256(io.read_bytes(file) if isinstance(file, Path) else file).hexdigest()
@@ -222,7 +222,7 @@ class Origin:
     read: Callable[[str], bytes]
 
     def find(self, wanted: str) -> str | None:
-        """Return the path with the most last parts in common with the one wanted; None if no file name is equal."""
+        """Return the path that shares most of its last parts with the wanted one; None if no file name is equal."""
 
         def common_n(path: str) -> int:
             parts = zip(reversed(PurePosixPath(path).parts), reversed(PurePosixPath(wanted).parts), strict=False)
@@ -234,9 +234,9 @@ class Origin:
 
 
 def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
-    """Open a folder, or a git repository at a commit (None: its newest); `scratch` is an empty folder for git."""
+    """Open a folder, or a git repository at a commit (None: the newest); `scratch` is an empty folder for git."""
     folder = Path(where)
-    if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # neither a path nor URL nor host:path
+    if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # not a path, a URL or host:path
         raise CaptureError(f"{where}: no such mirror or folder. Check the path; {USE_FROM}")
     is_bare = (folder / "HEAD").is_file() and (folder / "objects").is_dir()
     if folder.is_dir() and not is_bare and not (folder / ".git").exists():
@@ -246,7 +246,7 @@ def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
 
 
 def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
-    """Fetch the commit alone, and its files as they are read; or all commits, from a server that cannot do that."""
+    """Fetch only the commit, and its files when they are read; if the server cannot do that, fetch all commits."""
     repository, whole = scratch / "partial", scratch / "whole"
     try:
         _git("init", "--quiet", "--bare", str(repository))
@@ -259,7 +259,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
     try:
         _git("fetch", "--quiet", "--filter=blob:none", "--depth=1", "origin", commit, repository=repository)
     except subprocess.CalledProcessError:
-        try:  # with all files: a partial clone would look for a missing commit without end
+        try:  # with all files, because a partial clone would search for a missing commit endlessly
             repository = whole
             _git("clone", "--quiet", "--mirror", url, str(whole))
             _git("cat-file", "-e", f"{commit}^{{commit}}", repository=whole)
@@ -272,7 +272,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
         try:
             return _git("cat-file", "blob", f"{commit}:{path}", repository=repository)
         except subprocess.CalledProcessError as error:
-            remedy = f"Run it again; {USE_FROM}"
+            remedy = f"Run the command again; {USE_FROM}"
             raise CaptureError(f"{url} {path}: cannot read the file: {_reason(error)}. {remedy}") from None
 
     listed = _git("ls-tree", "-r", "-z", "--name-only", commit, repository=repository).decode(errors="replace")
@@ -280,7 +280,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
 
 
 def _git(*arguments: str, repository: Path | None = None) -> bytes:
-    """Run git; it gives up on a dead line and never asks for a password."""
+    """Run git such that it gives up on a dead connection and never asks for a password."""
     command = ["git", "-c", "http.lowSpeedLimit=1000", "-c", "http.lowSpeedTime=60"]
     command += [] if repository is None else ["--git-dir", str(repository)]
     silent = {"GIT_TERMINAL_PROMPT": "0", "GIT_ASKPASS": "true", "GIT_SSH_COMMAND": "ssh -oBatchMode=yes"}
@@ -290,7 +290,7 @@ def _git(*arguments: str, repository: Path | None = None) -> bytes:
             env={**os.environ, **silent},
         ).stdout  # fmt: skip
     except FileNotFoundError:
-        raise CaptureError("git is not installed. Install it, or give a folder of the files with --from.") from None
+        raise CaptureError("git is not installed. Install it, or name a folder of the files with --from.") from None
 
 
 def _reason(error: subprocess.CalledProcessError) -> str:

@@ -1,6 +1,6 @@
 """Resolve the conflicts of a `git merge` of two people's recordings: in the registry, the plan, dvc.lock and reports.
 
-Files that people write (params.yaml, scenes, code) are theirs to merge first.
+Conflicts in files that people write (params.yaml, scenes, code) must be resolved by hand first.
 """
 
 import subprocess
@@ -26,13 +26,13 @@ from reskin.errors import ParamsError
 
 LOCK = "dvc.lock"
 RESOLVED = (REGISTRY, PLAN, LOCK)
-REPORTS = "reports/"  # written by stages: ours are kept until the next `dvc repro`
+REPORTS = "reports/"  # written by stages; our version is kept until the next `dvc repro`
 SIDES = ("1", "2", "3")  # git's numbers of base, ours and theirs
 Versions = tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
 
 
 def merge(root: Path) -> str:
-    """Resolve the conflicts of a merge; return a sentence on what was done and what is left to do."""
+    """Resolve the conflicts of a merge; return a sentence about what was done and what remains to do."""
     unmerged = _unmerged(root)
     if by_hand := [name for name in unmerged if name not in RESOLVED and not name.startswith(REPORTS)]:
         raise ParamsError(f"Resolve {', '.join(by_hand)} by hand, `git add` them, and run `reskin merge` again.")
@@ -42,7 +42,7 @@ def merge(root: Path) -> str:
     with io.restoring(*files):
         if REGISTRY in unmerged:
             write_registry(root, merge_registries(*_registries(root, unmerged[REGISTRY])))
-        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # also where only captures changed
+        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # also if only captures changed
         both = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
     gone = {name for name in unmerged if name.startswith(REPORTS) and "2" not in unmerged[name]}
     for name in unmerged:
@@ -56,7 +56,7 @@ def merge(root: Path) -> str:
 
 
 def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Registry:
-    """Apply their changes since the base to our registry; raise if one of their captures contradicts ours."""
+    """Apply their changes since the base to our registry; raise if one of their captures conflicts with ours."""
     merged, before, after = ours, _entries(base), _entries(theirs)
     for (scene, name), entry in before.items():
         if after.get((scene, name)) != entry == _entries(ours).get((scene, name)):
@@ -70,9 +70,9 @@ def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Regist
 def merge_stages(
     base: Mapping[str, Any], ours: Mapping[str, Any], theirs: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Merge the stages of dvc.lock, each entry from the side that changed it; also name those that both changed.
+    """Merge the stages of dvc.lock, each entry from the side that changed it.
 
-    Of those, ours is kept.
+    Of an entry that both sides changed, ours is kept. Returns the merged stages and the names of those entries.
 
     >>> merge_stages({"a": 1, "b": 1}, {"a": 2, "b": 1}, {"a": 3, "b": 3, "c": 3})
     ({'a': 2, 'b': 3, 'c': 3}, ['a'])
@@ -111,7 +111,7 @@ def _scenes(root: Path, blobs: Mapping[str, str] | None) -> list[str]:
 
 
 def _merge_lock(root: Path, blobs: Mapping[str, str]) -> list[str]:
-    from dvc.utils.serialize import dumps_yaml  # as DVC writes it; late: DVC takes a second
+    from dvc.utils.serialize import dumps_yaml  # DVC's own format; imported late: it takes a second
 
     base, ours, theirs = _versions(root, blobs)
     stages, both = merge_stages(*(content.get("stages", {}) for content in (base, ours, theirs)))

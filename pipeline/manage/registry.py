@@ -20,7 +20,7 @@ class Entry(Strict):
     skin: str
     layout: str
     chips_n: int
-    fingerprints: tuple[str, ...]  # SHA-256 of the readings and of the stream; a copy has one in common
+    fingerprints: tuple[str, ...]  # SHA-256 of the readings and of the stream; copies have at least one in common
     copy_of: str | None
 
 
@@ -47,7 +47,7 @@ def with_capture(
 
 
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
-    """Add an entry by the rules of `with_capture`; also one that another clone has made."""
+    """Add an entry, possibly one made in another clone, by the rules of `with_capture`."""
     captures, where = registry.captures.get(scene, {}), f"capture {capture}"
     original = next(
         (name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None
@@ -59,7 +59,7 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
     for name, other in captures.items():
         if other.skin == entry.skin and other.board != entry.board:
             what, rule = f"the board of skin {entry.skin}", f"{other.board}, as in {name}"
-            remedy = "A skin that moves to another board gets a new name, or it would stand on both sides of a fold."
+            remedy = "Give a skin that moves to another board a new name, or folds would train and test on one skin."
             raise CaptureError(where, what, rule, entry.board, remedy)
         if other.chips_n != entry.chips_n:
             what = f"{entry.chips_n} chips, but {name} in the same scene has {other.chips_n}"
@@ -69,7 +69,7 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
 
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
-    """Return the registry without a capture; a scene without captures goes too."""
+    """Return the registry without a capture, and without its scene if no capture of it is left."""
     captures = registry.captures.get(scene, {})
     if capture not in captures:
         known = ", ".join(sorted(captures)) or "none"
@@ -93,5 +93,5 @@ def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_c
         return
     remedy = "It is in the scene already."
     if relabelled:
-        remedy = "Under two labels it would stand on both sides of a fold; to try that knowingly, add --allow-copy."
+        remedy = "Under two labels, folds would train and test on the same readings; to allow that, use --allow-copy."
     raise CaptureError(f"{where}: it has the same readings as {original}. {remedy}")

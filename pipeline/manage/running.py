@@ -1,4 +1,4 @@
-"""Refuse to change a checkout while DVC runs in it: its stages read the plan, the captures and dvc.lock."""
+"""Refuse to change a checkout while DVC runs in it, because its stages read the plan, the captures and dvc.lock."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,7 @@ from reskin import io
 from reskin.errors import ParamsError, SchemaError
 
 DVC_FILES = Path(".dvc/tmp")
-LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages; during one it notes in the second who uses what
+LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages; the second lists users of files during a stage
 
 
 def require_idle(root: Path) -> None:
@@ -24,10 +24,10 @@ def require_idle(root: Path) -> None:
 
 
 def _users(rwlock: Path) -> set[int]:
-    """List the processes noted there that are alive; DVC leaves notes of a process that was killed."""
+    """List the processes in the file that are alive; a killed process leaves its entries there."""
     try:
         noted = io.read_json(rwlock)
-    except SchemaError:  # none yet, or broken: DVC refuses it itself
+    except SchemaError:  # no such file yet, or a broken one, which DVC itself refuses
         return set()
     entries = [*noted.get("write", {}).values(), *(one for users in noted.get("read", {}).values() for one in users)]
     return {entry["pid"] for entry in entries if _is_alive(entry["pid"])}
@@ -39,14 +39,14 @@ def _is_alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True  # another user's
+        return True  # a process of another user
     return True
 
 
 def _is_locked(file: Path) -> bool:
     if not file.exists():
         return False
-    from zc.lockfile import LockError, LockFile  # late: a part of DVC
+    from zc.lockfile import LockError, LockFile  # imported late: a dependency of DVC
 
     try:
         LockFile(str(file)).close()

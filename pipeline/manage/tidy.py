@@ -1,6 +1,6 @@
 """Find and remove the outputs of experiments that a scene no longer runs.
 
-Only of scenes in the plan: the outputs of another scene may have taken hours, and it may run again.
+Only scenes in the plan are considered: the outputs of another scene may have taken hours, and it may run again.
 """
 
 from collections.abc import Iterable, Mapping
@@ -60,7 +60,7 @@ def _outs(stage: Mapping[str, Any]) -> list[Path]:
 
 
 def _overlaps(path: Path, others: Iterable[Path]) -> bool:
-    """Tell whether a path equals one of the others, lies in one or contains one."""
+    """Return whether a path equals, contains or is inside one of the others."""
     return any(path.is_relative_to(other) or other.is_relative_to(path) for other in others)
 
 

@@ -16,7 +16,7 @@ from pipeline.stage import say
 from reskin import io
 from reskin.errors import SchemaError
 
-VERIFIED = ".reskin/verified"  # reports of the last reruns, to look at and for `--against` elsewhere
+VERIFIED = ".reskin/verified"  # reports of the last reruns, to look at, and for `--against` on another machine
 QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as the Makefile does
 
 
@@ -32,7 +32,7 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
 def rerun(root: Path, names: Sequence[str]) -> None:
     """Run scenes in a clone of the last commit, and keep their reports."""
     if changed := _git(root, "status", "--porcelain", "--untracked-files=no"):
-        say(f"warning: {len(changed.splitlines())} files differ from the last commit, which is what runs")
+        say(f"warning: {len(changed.splitlines())} files differ from the last commit; the last commit runs")
     with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
@@ -41,8 +41,8 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
-            _clear(clone / "reports" / name)  # so that a scene that does not run cannot pass
-        # Forced: no cache of this machine replaces a stage. Stage publish does not run.
+            _clear(clone / "reports" / name)  # a scene that does not run must not pass
+        # Forced, so that no cache of this machine replaces a stage. Stage publish does not run.
         _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
         for name in names:
             with io.replacing(root / VERIFIED / name) as folder:
@@ -59,7 +59,7 @@ def _clear(reports: Path) -> None:
 
 
 def _bring_recordings(root: Path, clone: Path, names: Sequence[str]) -> None:
-    """Copy the recordings of these scenes, which git does not hold."""
+    """Copy the recordings of these scenes, which are not in git."""
     shutil.copy(root / REGISTRY, clone / REGISTRY)
     for name in names:
         if (root / RAW / name).is_dir() and any((root / RAW / name).glob("*.dvc")):
@@ -73,7 +73,7 @@ def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool =
         try:
             running.wait()
         except BaseException:
-            os.killpg(running.pid, signal.SIGTERM)  # DVC's stages too: they would go on in a folder that is no more
+            os.killpg(running.pid, signal.SIGTERM)  # with DVC's stages, which would go on in a deleted folder
             raise
     if running.returncode:
         raise SchemaError(

@@ -431,7 +431,7 @@ def table_2_summary(numbers: Numbers) -> pd.DataFrame:
 
 
 def labels_summary(rows: Rows) -> pd.DataFrame:
-    """Tabulate scores on boards never seen, with the fewest and the most labels, of calibrated methods and the first."""
+    """Tabulate scores on boards never seen, with fewest and most labels, of calibrated methods and the first."""
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
     counts = {row["labels_n"] for row in rows}
