@@ -123,7 +123,7 @@ def record(
     skin: Annotated[str | None, Option(help="Name of the skin; can be given later, to `reskin add`.")] = None,
     out: Annotated[Path | None, Option(help="New folder for the capture. Default: captures/DATE-TIME.")] = None,
     wire: Annotated[Wire | None, Option(help="Wire format of --port. Default: binary.")] = None,
-    chips_n: Annotated[int | None, Option("--chips", help="Chips of --port. Default: 5.", min=1, max=64)] = None,
+    chips_n: Annotated[int | None, Option("--chips", help="Number of chips. Default: 5.", min=1, max=64)] = None,
     baud: Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)] = 115200,
     seconds: Annotated[float, Option(help="Duration. Default: until Ctrl-C.", min=0.0)] = math.inf,
     scan: Annotated[str | None, Option(help="Order of the places: random, snake, or a description.")] = None,
