@@ -307,7 +307,7 @@ def _both(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
 
 
 def resolve(numbers: Any, path: str) -> Any:
-    """Follow a dotted path; `name=3,other=x` selects that row of a list. None where the scene has no such number."""
+    """Follow a dotted path; `name=3,other=x` selects that row of a list. None if the scene has no such number."""
     here = numbers
     for part in path.split("."):
         if isinstance(here, list) and "=" in part:
@@ -330,7 +330,7 @@ def look_up(numbers: Mapping[str, Any], name: str) -> Any:
 
 
 def mean_of(value: Any) -> float | None:
-    """Return the mean of a summary or of the paper's pair, or a plain number; None where there is none."""
+    """Return the mean of a summary or of the paper's pair, or a plain number; None if there is none."""
     if isinstance(value, Mapping):
         return value.get("mean")
     if isinstance(value, tuple):

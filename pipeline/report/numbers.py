@@ -333,7 +333,7 @@ def count_trainings(
     for experiment, swept in points.items():
         trainings[experiment] = [point for point in swept if "collapsed" in point]
     counted = {experiment: tally(trained) for experiment, trained in trainings.items() if trained}
-    return counted | {name: dict(answer["trainings"]) for name, answer in experiments.items() if "trainings" in answer}
+    return counted | {name: dict(result["trainings"]) for name, result in experiments.items() if "trainings" in result}
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:

@@ -78,7 +78,7 @@ def to_record(
 
 
 def settings_of(card: Card) -> dict[str, Any]:
-    """Return the settings of a training: its recipe, or those of its adaptation."""
+    """Return the settings of a training run: its recipe, or those of its adaptation."""
     settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
     return settings
 
