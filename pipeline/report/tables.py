@@ -130,7 +130,7 @@ SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
 UNIVERSAL = "universal, "  # prefix of the names of methods that are calibrated to the skin
 CHECKS = {
     "subject": "what", "law": "law", "against": "against", "error": "error", "tolerance": "allowed",
-    "reason": "why so much",
+    "reason": "reason for the tolerance",
 }  # fmt: skip
 CASES = {
     "area": "area", "case": "case", "should": "should", "happened": "happened", "error": "error", "limit": "allowed",
@@ -259,7 +259,7 @@ def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
     """List the candidate settings of each stage and which was chosen, by leave-one-board-out on separate boards."""
     lines = [
         {
-            "arm": stage,
+            "stage": stage,
             "candidate": row["recipe_name"],
             "settings": row["settings"],
             "chosen": f"yes, by {choice['by']}" if row["recipe_name"] == choice["recipe_name"] else "",
@@ -283,7 +283,7 @@ def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
     kept_n = sum(trainings[name]["kept_collapsed_n"] for name in scenes.TABLE_2.values() if name in trainings)
     meaning = [TARGET] * (source == "simulated")
     if kept_n:
-        meaning.append(f"{kept_n} networks collapsed every time that they were trained, and are in these means.")
+        meaning.append(f"{kept_n} networks collapsed in every training run and are included in these means.")
     table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(meaning)} if meaning else {})
     return table
 
@@ -359,10 +359,10 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
 def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
     """List how many networks were trained, how many collapsed, and how many collapsed ones had to be kept."""
     columns = {
-        "trainings": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
+        "training runs": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
     }  # fmt: skip
     lines = [
-        {"question": experiment, "source": source} | {title: str(counted[name]) for title, name in columns.items()}
+        {"experiment": experiment, "source": source} | {title: str(counted[name]) for title, name in columns.items()}
         for experiment, counted in counts.items()
     ]
     return tabulate(lines, meaning=COLLAPSED_MEANING)

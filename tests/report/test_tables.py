@@ -349,7 +349,7 @@ def test_verification_table_has_error_and_tolerance():
     table = verification_table([CHECK, CHECK | {"unit": "1", "error": 1.5e-15}], "simulated")
     assert table["error"].tolist() == ["3.3e-05 uT", "1.5e-15"]
     assert table["allowed"].tolist() == ["5e-05 uT", "5e-05"]
-    assert table["why so much"].tolist() == ["four decimals"] * 2
+    assert table["reason for the tolerance"].tolist() == ["four decimals"] * 2
 
 
 def test_stability_table_has_dashes_without_numbers():
