@@ -81,8 +81,8 @@ def _read_capture(folder: Path) -> sd_card.Log:
         return sd_card.read_log(folder / LOG_FILE)
     if header.wire is None:
         raise CaptureError(
-            f"{folder}: layout {header.layout} cannot be predicted from. Give a capture of `reskin record` or the log "
-            "of an SD card."
+            f"{folder}: a capture of layout {header.layout} cannot be predicted from. Give a capture of `reskin "
+            "record` or the log of an SD card."
         )
     stream = folder / STREAM_FILE
     frames, account = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))

@@ -38,7 +38,7 @@ from pipeline.training.variants import (  # fmt: skip
     predict_before,
     summarise_variants,
 )
-from reskin.data.lines import Lines, hand_rows, shifted
+from reskin.data.lines import Lines, hand_rows, shift_rows
 from reskin.data.rows import stack
 from reskin.data.splits import Fold
 from reskin.errors import SchemaError
@@ -55,7 +55,7 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pret
     starts = read_pretrained(pretrained)
     adapting = data.settings.section(Adaptations, "adapt")
     poked, found = hand_rows(read_captures(indentations))
-    lines = {skin: shifted(own, len(data.rows)) for skin, own in found.items()}
+    lines = {skin: shift_rows(own, len(data.rows)) for skin, own in found.items()}
     data = replace(data, rows=stack(data.rows, poked))
     jobs: list[tuple[str, TrainingJob]] = []
     predictions: list[VariantPrediction] = []

@@ -78,7 +78,7 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
         if readings.skin in lines:
             what = f"skin {readings.skin} is poked by hand in another capture too"
             raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two.")
-        lines[readings.skin] = shifted(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
+        lines[readings.skin] = shift_rows(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
         f = len(readings)
         parts.append(
             Rows(
@@ -95,7 +95,7 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
     return reduce(stack, parts), lines
 
 
-def shifted(lines: Lines, rows_n: int) -> Lines:
+def shift_rows(lines: Lines, rows_n: int) -> Lines:
     """Return the lines after their rows were stacked below `rows_n` others."""
     return replace(lines, row=lines.row + rows_n)
 

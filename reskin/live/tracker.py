@@ -427,7 +427,7 @@ class LiveSkin:
         self.account += new
         lost_n = sum(count for name, count in new.items() if name.startswith("skipped_"))
         frame_n = new["frame_bytes_n"] / new["frames_n"] if new["frames_n"] else frame_min_n
-        # The port was opened within a frame. One byte more may be lost: a frame's last byte cannot be told apart alone.
+        # The port was opened within a frame. One byte more may be lost: a last byte alone does not show the next frame.
         if at_start and self._first_bytes_n + lost_n <= frame_n + 1:
             self._first_bytes_n += lost_n
             self._partial_first_bytes_n += lost_n

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reskin.data.grid import SKIN_MM, points_mm, protocol
-from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, shifted, take_pokes
+from reskin.data.lines import Lines, grid_lines, hand_lines, hand_rows, shift_rows, take_pokes
 from reskin.data.rows import Rows, Selection, gather, stack
 from reskin.errors import ParamsError
 from reskin.seeds import rng_for
@@ -274,7 +274,7 @@ def test_lines_of_each_skin_name_its_own_rows():
         assert lines[one.skin].order_i.tolist() == alone.order_i.tolist() == [0, 0, 1, 1, 2, 2]
         assert set(rows.skin[lines[one.skin].row]) == {one.skin}
     above = gather([readings("c0", f=4)], EVERY)
-    below = shifted(lines["s1"], len(above))
+    below = shift_rows(lines["s1"], len(above))
     assert set(stack(above, rows).skin[below.row]) == {"s1"}
 
 
