@@ -1,13 +1,14 @@
-"""Print digests of the weights of three tiny trainings, here or on emulated processors.
+"""Print digests of the weights of three tiny training runs, on this processor or on emulated ones.
 
-The trainings: the paper's networks side by side with all terms of the loss, the adversarial network, the universal
-model's. `python -m tests.arithmetic` prints their digests; test_numerics.py runs it under several settings.
-`python -m tests.arithmetic Haswell-v2 EPYC-v1` also runs it on processors that QEMU emulates (package qemu-user; some
-two minutes each; all names: `qemu-x86_64 -cpu help`) and fails if one has other digests. MKL and PyTorch choose their
-code by maker and features of the processor that is emulated, so this finds what variables cannot show.
+The runs train the paper's networks as one batch with all terms of the loss, the adversarial network, and the network
+of the universal model. `python -m tests.arithmetic` prints their digests; test_numerics.py runs it with several
+settings. `python -m tests.arithmetic Haswell-v2 EPYC-v1` also runs on processors that QEMU emulates (package qemu-user;
+about two minutes per processor; `qemu-x86_64 -cpu help` lists their names) and fails if the digests differ. MKL and
+PyTorch choose their code by the maker and the features of the emulated processor, so this finds differences that
+environment variables alone cannot cause.
 """
 
-import pipeline  # isort: skip  # noqa: F401  (first: it selects the arithmetic that NumPy loads with)
+import pipeline  # isort: skip  # noqa: F401  (must be first: sets variables that NumPy reads when imported)
 
 import hashlib
 import os
@@ -65,10 +66,10 @@ def universal_network() -> str:
     return digest(weights[name] for name in sorted(weights))
 
 
-def on_processor(name: str) -> str:
-    """Return the digests as an emulated processor computes them."""
+def digests_on(name: str) -> str:
+    """Return the digests that an emulated processor computes."""
     command = ["qemu-x86_64", "-cpu", name, sys.executable, "-m", "tests.arithmetic"]
-    # It reads this machine's features from /proc/cpuinfo, and NumPy warns of those that the emulated one lacks.
+    # NumPy reads this machine's /proc/cpuinfo and warns of features that the emulated processor lacks.
     environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": ""}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)
     return done.stdout.decode().strip()
@@ -79,11 +80,11 @@ def main(processors: Sequence[str]) -> None:
     print(here, flush=True)
     different = []
     for name in processors:
-        there = on_processor(name)
+        there = digests_on(name)
         print(f"{there}  {name}", flush=True)
         different += [name] * (there != here)
     if different:
-        sys.exit(f"other weights than on this processor: {', '.join(different)}")
+        sys.exit(f"the weights differ from those of this processor on: {', '.join(different)}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Shared fixtures and settings of the tests; array annotations are checked at run time."""
 
-import pipeline  # isort: skip  # noqa: F401  (first: it selects the arithmetic that NumPy loads with)
+import pipeline  # isort: skip  # noqa: F401  (must be first: sets variables that NumPy reads when imported)
 
 import gc
 import inspect
@@ -26,7 +26,7 @@ SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
 LONG = (  # files that run stages and commands
     "stages/test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
 )  # fmt: skip
-CHECKED_N = 50  # calls of a function, in each test
+CHECKED_N = 50  # calls checked per function and test
 calls_n: Counter[Any] = Counter()
 
 
@@ -51,7 +51,7 @@ def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
         calls_n[of] += 1
         if calls_n[of] > CHECKED_N:
             return of(*args, **kwargs)
-        checked = checked or jaxtyped(of, typechecker=typechecker)  # late: it takes longer than to import the function
+        checked = checked or jaxtyped(of, typechecker=typechecker)  # late, because it is slower than the import
         return checked(*args, **kwargs)
 
     return checked_at_first
@@ -59,7 +59,7 @@ def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
 
 def _names_an_array(hint: Any) -> bool:
     if isinstance(hint, str):
-        return "[" in hint  # a name alone is a class, whose own annotations are executed
+        return "[" in hint  # a plain name is a class, not an array annotation
     return (inspect.isclass(hint) and issubclass(hint, AbstractArray)) or any(map(_names_an_array, get_args(hint)))
 
 
@@ -68,9 +68,9 @@ def pytest_runtest_setup() -> None:
 
 
 gc.disable()  # while everything is imported
-jaxtyping.jaxtyped = check_arrays  # by this name the import hook decorates every function of the project
+jaxtyping.jaxtyped = check_arrays  # the import hook decorates all functions of the project with it
 if not FULL:  # benchmarks at full size run the code as it is
-    # not by its pytest plugin, which would import NumPy too early
+    # jaxtyping's pytest plugin would import NumPy too early
     jaxtyping.install_import_hook(["pipeline", "reskin"], "beartype.beartype")
 
 

@@ -1,7 +1,7 @@
-"""A layer and a plate by finite elements (scikit-fem): references for the layer, its shear and rigid sliding.
+"""Finite elements (scikit-fem) of a layer and of a plate: references for the layer, its shear and rigid sliding.
 
-Taylor & Hood's elements: displacement of order 2, pressure of order 1. Axisymmetric loads and loads along x need only
-the (r, z) plane. The shear modulus is 1.
+The elements are Taylor-Hood: displacement of order 2, pressure of order 1. Axisymmetric loads and loads along x need
+only the (r, z) plane. The shear modulus is 1.
 """
 
 from collections.abc import Callable
@@ -14,12 +14,12 @@ from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementQuad2, ElementVector, LinearForm, MeshQuad, asm
 from skfem.helpers import ddot, dot, sym_grad, trace
 
-SLIP_SHARE = 1e-3  # Coulomb's law is smooth below this part of the largest slip
+SLIP_SHARE = 1e-3  # Coulomb's law is smoothed below this fraction of the largest slip
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Displacement [part, element, point] and gradient [part, by r or z, element, point] at points of integration."""
+    """Displacement [component, element, point] and gradient [component, axis, element, point] at integration points."""
 
     r_m: np.ndarray
     z_m: np.ndarray
@@ -29,8 +29,8 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Solved:
-    """The layer, its base, its top, and the mean displacement of the loaded part, weighted with the load."""
+class Solution:
+    """The motion in the layer, at its base and top, and the load-weighted mean displacement of the loaded component."""
 
     inside: Motion
     base: Motion
@@ -39,13 +39,13 @@ class Solved:
 
 
 def axisymmetric_strains(u, r):
-    """Return the strains of u_r, u_z: normal strains, then shear strains."""
+    """Return the normal strains and the shear strains of the displacements u_r, u_z."""
     (r_r, r_z), (z_r, z_z) = u.grad
     return (r_r, u[0] / r, z_z), (r_z + z_r,)
 
 
 def along_x_strains(u, r):
-    """Return those of A, B, C of `ShearMap`: u_r = (A + B) cos f, u_f = (B - A) sin f, u_z = C cos f."""
+    """Return the strains of A, B, C of `ShearMap`: u_r = (A + B) cos f, u_f = (B - A) sin f, u_z = C cos f."""
     (a_r, a_z), (b_r, b_z), (c_r, c_z) = u.grad
     return (a_r + b_r, 2 * u[1] / r, c_z), (b_r - a_r - 2 * u[1] / r, a_z + b_z + c_r, b_z - a_z - u[2] / r)
 
@@ -75,35 +75,36 @@ class Layer:
     @cached_property
     def matrices(self) -> tuple[sp.csr_matrix, sp.csr_matrix]:
         def work(u, v, w):
-            (long, angle), (long_v, angle_v) = self.strains(u, w.x[0]), self.strains(v, w.x[0])
-            return (2 * sum(map(np.multiply, long, long_v)) + sum(map(np.multiply, angle, angle_v))) * w.x[0]
+            (normal, shear), (normal_v, shear_v) = self.strains(u, w.x[0]), self.strains(v, w.x[0])
+            return (2 * sum(map(np.multiply, normal, normal_v)) + sum(map(np.multiply, shear, shear_v))) * w.x[0]
 
-        def swelling(u, q, w):
+        def dilation(u, q, w):
             return -sum(self.strains(u, w.x[0])[0]) * q * w.x[0]
 
-        squeezed = asm(BilinearForm(swelling), self.basis, self.basis.with_element(ElementQuad1()))
-        return asm(BilinearForm(work), self.basis), squeezed
+        coupling = asm(BilinearForm(dilation), self.basis, self.basis.with_element(ElementQuad1()))
+        return asm(BilinearForm(work), self.basis), coupling
 
-    def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solved:
-        """Solve for a load(r) on one component at the top, components held at edges, and springs(r) on u_r there."""
-        (work, swelling), at = self.matrices, self.basis
-        push = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), at.boundary("top"))
+    def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solution:
+        """Solve for a load(r) on one component at the top, with fixed components and springs(r) on u_r at edges."""
+        (work, dilation), at = self.matrices, self.basis
+        load_vector = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), at.boundary("top"))
         for edge, of in drag.items():
             work = work + asm(BilinearForm(lambda u, v, w, of=of: of(w.x[0]) * u[0] * v[0] * w.x[0]), at.boundary(edge))
-        still = np.concatenate([at.get_dofs(edge).all([f"u^{i + 1}"]) for edge, parts in held.items() for i in parts])
-        whole = sp.bmat([[work, swelling.T], [swelling, None]], format="csc")
-        sides = np.append(push, np.zeros(swelling.shape[0]))
-        free, found = np.setdiff1d(np.arange(len(sides)), still), np.zeros(len(sides))
-        found[free] = splu(whole[free][:, free], permc_spec="MMD_ATA").solve(sides[free])
+        fixed = np.concatenate([at.get_dofs(edge).all([f"u^{i + 1}"]) for edge, parts in held.items() for i in parts])
+        matrix = sp.bmat([[work, dilation.T], [dilation, None]], format="csc")
+        right_side = np.append(load_vector, np.zeros(dilation.shape[0]))
+        free, solution = np.setdiff1d(np.arange(len(right_side)), fixed), np.zeros(len(right_side))
+        solution[free] = splu(matrix[free][:, free], permc_spec="MMD_ATA").solve(right_side[free])
         total = asm(LinearForm(lambda v, w: load(w.x[0]) * v * w.x[0]), at.boundary("top").with_element(ElementQuad1()))
-        parts = found[: at.N], found[at.N :]
+        parts = solution[: at.N], solution[at.N :]
         motions = (_motion(where, *parts) for where in (at, at.boundary("base"), at.boundary("top")))
-        return Solved(*motions, push @ parts[0] / total.sum())
+        return Solution(*motions, load_vector @ parts[0] / total.sum())
 
-    def with_friction(self, load: Callable, friction: float, *, steps_n: int = 4, **edges) -> Solved:
+    def with_friction(self, load: Callable, friction: float, *, steps_n: int = 4, **edges) -> Solution:
         """Solve for a pressure on top with Coulomb friction at the base, by fixed-point iteration.
 
-        t = -friction p u / (|u| + u0), p and u of the solution before: sticks where p is large, slides elsewhere.
+        The traction is t = -friction p u / (|u| + u0), with p and u of the previous iteration: the layer sticks where p
+        is large and slides elsewhere.
         """
         at = self.solve(1, load, edges["held"], edges["drag"])
         small_m = SLIP_SHARE * np.abs(at.base.parts_m[0]).max()
@@ -119,10 +120,11 @@ def _motion(at: Basis, displacement: np.ndarray, pressure: np.ndarray) -> Motion
     return Motion(*at.global_coordinates(), np.asarray(u), u.grad, np.asarray(p))
 
 
-def plate(sides_m, place_m, taken_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
-    """Displace a patch of a plate in plane stress that is held by even springs.
+def plate(sides_m, place_m, patch_motion_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
+    """Displace a patch of a plate in plane stress on a uniform bed of springs.
 
-    `stiffness` is E t over the drag per area, in areas of the plate. Returns the patch's middle, the mean motion, spin.
+    `stiffness` is E t over the drag per area, in units of the plate's area. Return the centre of the patch, the mean
+    motion and the mean rotation.
     """
     area_m2, (nu, young) = np.prod(sides_m), (0.5, stiffness * np.prod(sides_m))
     mesh = MeshQuad.init_tensor(*(np.linspace(-side_m / 2, side_m / 2, cells_n + 1) for side_m in sides_m))
@@ -143,8 +145,8 @@ def plate(sides_m, place_m, taken_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
     patch /= patch[0] @ ones
     middle_m = np.array([mean(lambda v, x, i=i: x[i] * v[0], bump) @ ones for i in (0, 1)])
     middle_m /= mean(lambda v, _x: v[0], bump) @ ones
-    whole = sp.bmat([[asm(BilinearForm(work), at), patch.T], [patch, None]], format="csc")
-    found = splu(whole).solve(np.append(np.zeros(at.N), taken_m))[: at.N]
-    move_m = np.array([mean(lambda v, _x, i=i: v[i]) @ found for i in (0, 1)]) / area_m2
-    spin = mean(lambda v, x: x[0] * v[1] - x[1] * v[0]) @ found
+    matrix = sp.bmat([[asm(BilinearForm(work), at), patch.T], [patch, None]], format="csc")
+    solution = splu(matrix).solve(np.append(np.zeros(at.N), patch_motion_m))[: at.N]
+    move_m = np.array([mean(lambda v, _x, i=i: v[i]) @ solution for i in (0, 1)]) / area_m2
+    spin = mean(lambda v, x: x[0] * v[1] - x[1] * v[0]) @ solution
     return middle_m, move_m, spin / (area_m2 * (sides_m[0] ** 2 + sides_m[1] ** 2) / 12)

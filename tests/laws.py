@@ -1,6 +1,6 @@
-"""Helper for tests of the checks and cases that experiments tabulate."""
+"""Helper for tests of the checks that experiments tabulate."""
 
 
 def broken(rows):
-    """Return the rows that do not hold; pytest shows their error, tolerance and reason."""
+    """Return the failed checks; pytest shows their error, tolerance and reason."""
     return [row for row in rows if not row.holds]

@@ -1,4 +1,4 @@
-"""Git repositories for tests, as the homes of public recordings."""
+"""Git repositories for tests; they stand in for public repositories of recordings."""
 
 import subprocess
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ def commit(folder: Path, files: Mapping[str, bytes]) -> str:
 
 
 def bare(folder: Path, mirror: Path, *, filters: bool) -> str:
-    """Clone a bare repository, which may serve commits without files (`filters`); return its URL."""
+    """Make a bare clone, which may serve commits without their files (`filters`); return its URL."""
     subprocess.run(["git", "clone", "--quiet", "--bare", str(folder), str(mirror)], check=True)
     git(mirror, "config", "uploadpack.allowFilter", str(filters).lower())
     return mirror.as_uri()

@@ -1,4 +1,4 @@
-"""Scenes for tests, as plain dictionaries, and the settings that a stage reads of them."""
+"""Scenes for tests, as plain dictionaries, and the settings that a stage reads from them."""
 
 from pipeline.scenes import EXPERIMENTS, Scene, check_scene, stages
 from pipeline.settings import Settings
@@ -14,7 +14,7 @@ SHARED_RECIPE = {name: value for name, value in RECIPE.items() if name != "steps
 TRAINING = {"recipe": "paper", "steps_n": 1, "seeds_n": 1, "variants": {}}
 
 
-def recorded(**changes: object) -> dict[str, object]:
+def recorded_scene(**changes: object) -> dict[str, object]:
     scene: dict[str, object] = {
         "source": "recorded", "seed": 1, "experiments": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
         "train_multi": TRAINING,
@@ -24,7 +24,7 @@ def recorded(**changes: object) -> dict[str, object]:
 
 SCHEDULE = {"batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 8, "variants": {}}
-# params.yaml of tests
+# replaces params.yaml in tests
 SHARED: dict[str, object] = {
     "lost_fraction_max": 0.05,
     "faults": AS_USUAL.model_dump(),
@@ -35,7 +35,7 @@ SHARED: dict[str, object] = {
     "skin": {}, "rig": {}, "chip": {}, "spreads": {}, "terms": {},
 }  # fmt: skip
 
-# the sections of a scene that an experiment needs
+# The sections of a scene that each experiment needs.
 SECTIONS: dict[str, dict[str, object]] = {
     "lobo": {"train_multi": TRAINING},
     "transfer": {"train_single": TRAINING},
@@ -67,7 +67,8 @@ SECTIONS |= {
     },
     "contacts": {"contacts": {"pairs_n": 10, "separations_mm": [8.0], "false_alarm_fraction": 0.05}},
 }  # fmt: skip
-DRAWN_WITH: dict[str, dict[str, object]] = {
+# The settings of section split that each experiment needs.
+SPLIT_SETTINGS: dict[str, dict[str, object]] = {
     "transfer": {"transfer_skins_n": 1},
     "single_random": {"random_test_fraction": 0.1, "random_repeats_n": 1},
     "single_temporal": {"temporal_test_fraction": 0.1},
@@ -81,11 +82,11 @@ DRAWN_WITH: dict[str, dict[str, object]] = {
 
 def scene_with(*experiments: str, **changes: object) -> dict[str, object]:
     """Return a recorded scene with exactly the settings that these experiments need."""
-    scene = {name: value for name, value in recorded().items() if name != "train_multi"}
+    scene = {name: value for name, value in recorded_scene().items() if name != "train_multi"}
     split: dict[str, object] = {}
     for experiment in experiments:
         scene |= SECTIONS[experiment]
-        split |= DRAWN_WITH.get(experiment, {})
+        split |= SPLIT_SETTINGS.get(experiment, {})
     return scene | {"experiments": list(experiments), "split": split} | changes
 
 

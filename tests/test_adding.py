@@ -26,18 +26,18 @@ from reskin.seeds import rng_for
 from tests.board.signals import make_frames
 from tests.recordings.headers import AS_USUAL, make_header
 from tests.recordings.readers.test_lab import PRESSES, write
-from tests.scenes import recorded
+from tests.scenes import recorded_scene
 from tests.stages.checkout import copy_checkout, run
 from tests.universal.skins import fields_uT
 
 
 @pytest.fixture(scope="module")
 def empty(tmp_path_factory) -> Path:
-    """Return a checkout without running scenes."""
+    """Return a checkout whose plan has no scenes."""
     root = copy_checkout(tmp_path_factory.mktemp("checkout"))
     plan.use(root, [])
     with (root / SCENES / "small.yaml").open("w") as stream:
-        YAML().dump(recorded(), stream)
+        YAML().dump(recorded_scene(), stream)
     return root
 
 
@@ -89,23 +89,23 @@ def test_added_recording_is_tracked_registered_and_planned(root, lab_file):
 
 
 @pytest.mark.parametrize("found", ["Against the scene, chips 1 and 2 are exchanged.", None, CaptureError("no places")])
-def test_departure_from_section_compare_is_a_warning(root, lab_file, monkeypatch, capsys, found):
-    def departure(*_: object) -> str | None:
+def test_difference_from_section_compare_is_a_warning(root, lab_file, monkeypatch, capsys, found):
+    def find_departure(*_: object) -> str | None:
         if isinstance(found, CaptureError):
             raise found
         return found
 
-    monkeypatch.setattr("pipeline.experiments.compare.find_departure", departure)
-    arguments = recorded()
+    monkeypatch.setattr("pipeline.experiments.compare.find_departure", find_departure)
+    arguments = recorded_scene()
     arguments["experiments"] = [*arguments["experiments"], "compare"]
     arguments["compare"] = config.read_yaml(root / SCENES / "lab.yaml")["compare"]
     with (root / SCENES / "small.yaml").open("w") as stream:
         YAML().dump(arguments, stream)
     add_lab(root, lab_file)
     assert "board1_skin1_readings" in read_registry(root).captures["small"]
-    output_of = capsys.readouterr().err
-    assert ("warning: capture board1_skin1_readings: " in output_of) == (found is not None)
-    assert str(found or "") in output_of
+    stderr = capsys.readouterr().err
+    assert ("warning: capture board1_skin1_readings: " in stderr) == (found is not None)
+    assert str(found or "") in stderr
 
 
 def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypatch, capsys):
@@ -204,12 +204,12 @@ def test_wrong_layout_suggests_the_right_one(lab_file, tmp_path):
         native_folder(tmp_path / "run1"): ("eflesh", "capture"),
         tmp_path / "dump.bin": ("lab", "serial-binary"),
     }
-    for recording, (output_of, right) in cases.items():
+    for recording, (wrong, right) in cases.items():
         with (
             pytest.raises(ReskinError, match=f"It can be read with --layout {right}."),
-            preparing.suggesting_layout(recording, output_of),
+            preparing.suggesting_layout(recording, wrong),
         ):
-            preparing.foreign(recording, output_of, labels(), {})
+            preparing.foreign(recording, wrong, labels(), {})
     with (
         pytest.raises(ReskinError, match=r"one that is taken\. Choose another\.$"),
         preparing.suggesting_layout(lab_file, "lab"),
@@ -349,7 +349,7 @@ def output_of(arguments: list[str]) -> str:
     return str(done.exception) if isinstance(done.exception, ReskinError) else done.stdout
 
 
-def test_command_line_reports_a_switched_on_scene(root, lab_file, monkeypatch):
+def test_command_line_reports_a_scene_added_to_the_plan(root, lab_file, monkeypatch):
     monkeypatch.chdir(root)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     assert "added scene small to pipeline/plan.yaml" in run(root, "reskin", *arguments).stdout
@@ -360,16 +360,16 @@ def test_command_line_reports_a_switched_on_scene(root, lab_file, monkeypatch):
 
 def test_new_scene_is_a_copy_and_is_removed_after_a_failed_add(root, lab_file, monkeypatch):
     monkeypatch.chdir(root)
-    known = contents(root)
+    before = contents(root)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "mine", "--like"]
     assert "no scene nowhere. The scenes are:" in output_of([*arguments, "nowhere"])
-    up = output_of([*arguments[:-2], "../up", "--like", "small"])
-    assert "--scene: a name must be 1 to 64 of" in up
+    invalid = output_of([*arguments[:-2], "../up", "--like", "small"])
+    assert "--scene: a name must be 1 to 64 of" in invalid
     assert "no truths_" in output_of([*arguments[:3], "ini", *arguments[4:], "ini"])
-    assert contents(root) == known
+    assert contents(root) == before
     run(root, "reskin", *arguments, "small")
     text = (root / SCENES / "mine.yaml").read_text()
-    assert YAML(typ="safe").load(text) == recorded()
+    assert YAML(typ="safe").load(text) == recorded_scene()
     assert read_registry(root).captures.keys() == {"mine"}
     again = output_of([*arguments, "small", "--name", "again"])
     assert "scene mine exists already" in again

@@ -1,4 +1,4 @@
-"""An edit reruns only the stages that depend on it, by DVC's index and hashes; no stage runs here."""
+"""Tests of which stages an edit reruns, from DVC's index and hashes; only stage `code` runs here."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -65,10 +65,7 @@ def before(root) -> dict[str, tuple[Any, ...]]:
 
 
 def state(root: Path) -> dict[str, tuple[Any, ...]]:
-    """Return the command, the hashes of dependencies and parameters, and the outputs of each stage.
-
-    Stage `code`, which runs after every edit, has run.
-    """
+    """Run stage `code`; return the command, the hashes of dependencies and the outputs of each other stage."""
     from dvc.dependency.param import read_param_file
     from dvc.repo import Repo
 
@@ -95,8 +92,8 @@ def state(root: Path) -> dict[str, tuple[Any, ...]]:
         }
 
 
-def run_again(before: dict[str, tuple[Any, ...]], after: dict[str, tuple[Any, ...]]) -> set[str]:
-    """Return the changed stages and those that depend on their outputs."""
+def stale_stages(before: dict[str, tuple[Any, ...]], after: dict[str, tuple[Any, ...]]) -> set[str]:
+    """Return the changed stages and the stages that depend on their outputs."""
     stale: set[str] = set()
     more = {name for name in after if after[name] != before.get(name)}
     while more - stale:
@@ -141,26 +138,26 @@ def test_new_experiment_runs_its_stage_and_the_report(root, before):
     with edited_files(root, files):
         run(root, "reskin", "scenes", "use", "ci")
         after = state(root)
-    assert run_again(before, after) == {
+    assert stale_stages(before, after) == {
         "repeat@ci", "table2@ci", "report@ci", "publish@ci",  # stages that show numbers
         "contacts@ci",  # depends on the whole scene file
     }  # fmt: skip
 
 
-def test_new_caption_runs_the_report_and_new_code_the_experiment(root, before):
+def test_caption_reruns_the_report_and_code_reruns_the_experiment(root, before):
     captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
     with edited_files(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
         after = state(root)
-    assert run_again(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # one module makes all tables
+    assert stale_stages(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # one module makes all tables
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
-    assert run_again(before, after) == {"shear@ci", "table2@ci", "report@ci", "publish@ci"}
+    assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci", "publish@ci"}
 
 
-def test_comments_run_nothing(root, before):
+def test_comments_rerun_no_stage(root, before):
     io = "reskin/io.py"
     with edited_files(root, {io: "# More.\n" + (root / io).read_text().replace('"""', '"""More. ', 1)}):
-        assert run_again(before, state(root)) == set()
+        assert stale_stages(before, state(root)) == set()
 
 
 def test_comments_in_training_code_keep_cache_keys(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ from reskin.physics.deformation import rotation_angle
 from tests.conftest import CHECKED_N
 
 
-@pytest.mark.parametrize("wrong", [np.zeros((4, 2, 3)), np.zeros((4, 2, 2), int)], ids=["shape", "kind"])
+@pytest.mark.parametrize("wrong", [np.zeros((4, 2, 3)), np.zeros((4, 2, 2), int)], ids=["shape", "dtype"])
 def test_wrong_array_is_an_error(wrong):
     with pytest.raises(TypeCheckError, match="rotation_angle"):
         rotation_angle(wrong)

@@ -63,7 +63,7 @@ def test_simulate_pokes_equals_a_simulated_capture_without_noise():
     noload_uT, b_uT, Fz_N = reskin.simulate_pokes(skin, places.tolist(), board=board, chip=QUIET_CHIP)
 
     per_poke = capture.b_uT.reshape(len(places), -1, 15)
-    step_uT = 0.5  # the largest step of the chip; rounding of float32 places is smaller
+    step_uT = 0.5  # the chip's largest quantisation step; the rounding of places to float32 changes less
     assert np.abs(per_poke[:, 1] - noload_uT).max() <= step_uT
     last_contact_i = per_poke.shape[1] - 1 - shared["rig"]["moving_frames_n"]
     assert np.abs(per_poke[:, last_contact_i] - b_uT).max() <= step_uT
@@ -82,15 +82,15 @@ def test_designs_take_plain_values_and_wrong_ones_raise():
         reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
 
 
-def test_model_predicts_as_the_network(model):  # noqa: F811
+def test_loaded_model_predicts_as_its_network(model):  # noqa: F811
     b_uT = rng_for(0, "api").normal(500, 100, (4, 15)).astype(np.float32)
 
     loaded = reskin.load_model(str(model)).zero(b_uT[:2].tolist())
-    answer = loaded.predict(b_uT[2:].tolist())
+    predicted = loaded.predict(b_uT[2:].tolist())
 
     noload_uT = b_uT[:2].mean(axis=0, dtype=np.float64)
-    np.testing.assert_array_equal(answer, read_network(model)((b_uT[2:] - noload_uT).astype(np.float32)))
-    np.testing.assert_array_equal(loaded.predict(b_uT[2].tolist()), answer[0])
+    np.testing.assert_array_equal(predicted, read_network(model)((b_uT[2:] - noload_uT).astype(np.float32)))
+    np.testing.assert_array_equal(loaded.predict(b_uT[2].tolist()), predicted[0])
     with pytest.raises(ReskinError, match="the model has no no-load reading"):
         reskin.load_model(model).predict(b_uT)
     with pytest.raises(ReskinError, match=r"fields of shape \(2,\) do not fit the 15 channels"):

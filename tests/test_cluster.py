@@ -1,4 +1,4 @@
-"""Tests of trainings on a Dask cluster: two workers of a scheduler on this machine."""
+"""Tests of training on a Dask cluster: a scheduler with two workers on this machine."""
 
 import importlib.util
 import json
@@ -66,7 +66,7 @@ def address(tmp_path_factory) -> Iterator[str]:
         yield scheduler_address
 
 
-def where(i: int) -> tuple[int, str, int]:
+def describe_call(i: int) -> tuple[int, str, int]:
     time.sleep(0.1)
     return os.getpid(), os.getcwd(), i
 
@@ -81,7 +81,7 @@ def test_sweep_on_two_workers_equals_a_local_one(address, tmp_path, monkeypatch)
         with make_executor(imports="reskin.models.train") as executor:
             cache = tmp_path / name
             results.append(run_jobs(small_jobs, example_data(), executor=executor, cache=cache, log=lambda _: None))
-            ran = [future.result() for future in [executor.submit(where, i) for i in range(6)]]
+            ran = [future.result() for future in [executor.submit(describe_call, i) for i in range(6)]]
     for a, b in zip(*results, strict=True):
         assert (a.key, a.predicted.tobytes()) == (b.key, b.predicted.tobytes())
         assert alike(a, b)
@@ -130,8 +130,8 @@ def test_lost_scheduler_is_an_error():
         future.result(0)
 
 
-def imported_from(file: Path) -> ModuleType:
-    """Return the module as a newly started process imports it."""
+def import_fresh(file: Path) -> ModuleType:
+    """Import a module afresh, as a newly started process would."""
     spec = importlib.util.spec_from_file_location("cluster_of_a_copy", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -144,11 +144,11 @@ def test_worker_older_than_an_edit_is_an_error(tmp_path, monkeypatch):
         shutil.copy(ROOT / package / "__init__.py", tmp_path / package)
         monkeypatch.setattr(sys.modules[package], "__file__", str(tmp_path / package / "__init__.py"))
     source = ROOT / "pipeline/cluster.py"
-    before = imported_from(source)
+    before = import_fresh(source)
     with (tmp_path / "reskin/seeds.py").open("w") as module:
         module.write("# edited\n")
-    now = imported_from(source)
-    cluster._compare(now.describe_process(), imported_from(source).describe_process(), "w")
+    now = import_fresh(source)
+    cluster._compare(now.describe_process(), import_fresh(source).describe_process(), "w")
     with pytest.raises(ParamsError, match="sources as imported of worker w must be .* Restart it"):
         cluster._compare(now.describe_process(), before.describe_process(), "w")
     with pytest.raises(ParamsError, match="sources as imported of worker process"):

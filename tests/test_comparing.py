@@ -46,7 +46,7 @@ def rows(output: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("against", [[], ["--against", "first"]])
-def test_equal_values_are_one_line(checkout, against):
+def test_equal_values_print_one_line(checkout, against):
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
     provenance = io.read_json(checkout / "reports/quick/provenance.json")
     io.write_json(checkout / "reports/quick/provenance.json", provenance | {"device": EPYC, "seconds": 9.0})
@@ -118,7 +118,7 @@ def test_missing_reports_are_an_error(checkout, arguments, message):
     assert message is None or f"error: {message}" in output
 
 
-def test_outside_git_there_is_no_commit(tmp_path, monkeypatch):
+def test_checkout_outside_git_is_an_error(tmp_path, monkeypatch):
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     monkeypatch.chdir(tmp_path)

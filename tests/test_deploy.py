@@ -47,7 +47,7 @@ def test_program_and_children_end_with_the_block(tmp_path):
         raise ZeroDivisionError
     group = int((tmp_path / "group").read_text())
     with pytest.raises(ProcessLookupError):
-        for _ in range(100):  # until init has reaped them
+        for _ in range(100):  # until init has reaped the processes
             os.killpg(group, 0)
             time.sleep(0.05)
 

@@ -1,4 +1,4 @@
-"""Tests of the description of captures, against the values that synthetic readings are made of."""
+"""Tests of the description of captures, with synthetic readings whose noise, steps and forces are known."""
 
 from dataclasses import replace
 
@@ -17,18 +17,19 @@ REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
 
 def example_readings(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known_force=True):
     """Return readings of two chips, the second a quarter as sensitive as the first."""
-    rng, f = rng_for(0, "made"), INDENTATIONS_N * READINGS_N
+    rng, readings_n = rng_for(0, "made"), INDENTATIONS_N * READINGS_N
     forces_N = force_N * np.repeat(rng.uniform(0.9, 1.1, INDENTATIONS_N), READINGS_N)
     shape = np.array([0, 0, 4.0, 0, 0, 1.0]) / np.sqrt(17)
     sd_uT = np.tile([noise_uT[0], noise_uT[0], noise_uT[1]], 2)
-    b_uT = REST_uT + uT_per_N * forces_N[:, None] * shape + sd_uT * rng.standard_normal((f, 6))
+    b_uT = REST_uT + uT_per_N * forces_N[:, None] * shape + sd_uT * rng.standard_normal((readings_n, 6))
     steps_uT = np.tile([0.2, 0.2, 0.3227], 2)
-    ones, index = np.ones(f, np.float32), np.arange(f, dtype=np.int32)
+    ones, index = np.ones(readings_n, np.float32), np.arange(readings_n, dtype=np.int32)
     return Readings(
         "c", "b", "s", "simulated", index // READINGS_N, 0 * index, index % READINGS_N,
         ones if places else np.nan * ones, ones if places else np.nan * ones, ones, 0 * ones, 0 * ones,
         (forces_N if known_force else np.nan * ones).astype(np.float32),
-        (np.rint(b_uT / steps_uT) * steps_uT).astype(np.float32), np.tile(REST_uT, (f, 1)), np.ones((f, 2), np.float32),
+        (np.rint(b_uT / steps_uT) * steps_uT).astype(np.float32), np.tile(REST_uT, (readings_n, 1)),
+        np.ones((readings_n, 2), np.float32),
         index / 400.0, index // READINGS_N,
     )  # fmt: skip
 
@@ -47,16 +48,16 @@ def test_fields_noise_steps_and_forces_are_recovered():
     assert found["rate_hz"] == pytest.approx(400.0)
 
 
-def test_random_walk_at_rest_grows_with_the_root_of_contacts():
+def test_random_walk_at_rest_grows_with_the_root_of_the_contact_count():
     still = example_readings()
     steps_uT = 0.5 * rng_for(0, "walk").standard_normal((INDENTATIONS_N, 6))
-    walked = replace(
+    drifting = replace(
         still, noload_uT=REST_uT + np.repeat(np.cumsum(steps_uT, axis=0), READINGS_N, axis=0).astype(np.float32)
     )
-    found = describe(walked)
+    found = describe(drifting)
     assert found["rest_changes_in_1_uT"] == pytest.approx(0.5, rel=0.05)
     assert found["rest_changes_in_10_uT"] == pytest.approx(0.5 * np.sqrt(10), rel=0.1)
-    assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)  # four stretches of six channels
+    assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)  # 4 x 6 changes only
     assert "rest_changes_in_1000_uT" not in found
     assert describe(still)["rest_changes_in_100_uT"] == 0
 

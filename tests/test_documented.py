@@ -21,15 +21,8 @@ from reskin.simulation.defaults import NOMINAL
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = [ROOT / "params.yaml", NOMINAL, *sorted((ROOT / "pipeline/scenes").glob("*.yaml"))]
-NAMED = {
-    "recipes",
-    "adaptations",
-    "labellings",
-    "boards",
-    "protocols",
-    "variants",
-    "rules",
-}  # keys of these are names
+# Sections whose keys are names of rows.
+NAMED = {"recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}
 
 # Names of rows, boards, captures and stages, which need no documentation.
 NAME = re.compile(r".* .*|[0-9]+|[bf][0-9](_s[0-9].*)?|board[0-9].*|(ingest|simulate).*|knn-.*|shape|released")
@@ -40,13 +33,13 @@ def code_words(page: str) -> set[str]:
     return set(re.findall(r"`([^`]+)`", text))
 
 
-def keys(settings: Any, depth: int = 0) -> Iterator[str]:
-    """Yield the keys of nested settings, except for names of rows."""
+def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
+    """Yield the keys of nested settings, except for names of rows, which the next `names_depth` levels have."""
     for key, value in settings.items() if isinstance(settings, dict) else ():
-        if not depth:
+        if not names_depth:
             yield key
-        sets = 2 if key == "methods" else 1 if key in NAMED else 0
-        yield from keys(value, max(sets, depth - 1))
+        levels_n = 2 if key == "methods" else 1 if key in NAMED else 0
+        yield from keys(value, max(levels_n, names_depth - 1))
 
 
 @pytest.mark.parametrize("file", SETTINGS, ids=lambda file: file.stem)
@@ -67,9 +60,9 @@ def test_columns_of_predictions_and_scores_are_documented():
     assert sorted(columns.union(KEYS, METRICS, UNCERTAINTY) - code_words("data/README.md")) == []
 
 
-def numbers(settings: Any) -> Iterator[str]:
+def number_names(settings: Any) -> Iterator[str]:
     for value in settings.values() if isinstance(settings, dict) else settings if isinstance(settings, list) else ():
-        yield from numbers(value)
+        yield from number_names(value)
     yield from settings if isinstance(settings, dict) else ()
 
 
@@ -83,7 +76,7 @@ def test_numbers_are_documented():
         *read_yaml(ROOT / "params.yaml")["recipes"],
     }
     chosen |= {name for file in SETTINGS[1:] for name in read_yaml(file).get("simulate", {}).get("protocols", ())}
-    found = {key for file in (ROOT / "reports").glob("*/numbers.json") for key in numbers(io.read_json(file))}
+    found = {key for file in (ROOT / "reports").glob("*/numbers.json") for key in number_names(io.read_json(file))}
     unknown = {key for key in found - known - chosen if not NAME.fullmatch(key)}
     assert sorted(key for key in unknown if not any(fnmatch(key, pattern) for pattern in patterns)) == []
 

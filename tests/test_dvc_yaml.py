@@ -1,4 +1,4 @@
-"""Tests of dvc.yaml: dependencies on code, and declared paths of commands."""
+"""Tests of dvc.yaml: stages depend on their code and declare the paths in their commands."""
 
 import shutil
 import subprocess
@@ -30,8 +30,8 @@ def test_every_stage_depends_on_its_code_digests():
 def test_stage_code_depends_on_exactly_the_imported_modules():
     named = {ROOT / path for path in STAGES["code"]["deps"]}
     needed = {file_of(name) for stage in all_stages() for name in digests_of(stage)}
-    homes = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}
-    assert homes == named
+    deps = {next((path for path in (file, *file.parents) if path in named), file) for file in needed}
+    assert deps == named
 
 
 def test_digests_contain_the_modules_of_a_stage():
@@ -84,6 +84,6 @@ def test_ignored_recordings_are_tracked_by_dvc(tmp_path):
     (capture / "readings.csv").write_text("x\n")
     (tmp_path / "data/raw/lab/one.dvc").write_text("outs:\n- path: one\n  md5: d41d8cd98f00b204e9800998ecf8427e.dir\n")
     with Repo(str(tmp_path)) as repo:
-        assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]  # they are pushed
+        assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]  # pushed by DVC
     status = subprocess.check_output(["git", "status", "--porcelain", "-uall", "data"], cwd=tmp_path, text=True)
     assert status == "?? data/raw/lab/one.dvc\n"

@@ -11,7 +11,7 @@ from reskin.models import job
 from reskin.numerics import device
 
 
-def test_trainings_run_in_separate_processes(monkeypatch):
+def test_calls_run_in_separate_processes(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
@@ -24,7 +24,7 @@ def test_cpu_time_of_ended_workers_is_counted(monkeypatch):
     before_s = children_s()
     end_workers()
     assert children_s() - before_s >= 0.3
-    end_workers()  # without workers
+    end_workers()  # has no effect without workers
 
 
 def children_s() -> float:
@@ -56,7 +56,7 @@ def test_unknown_executor_is_an_error(monkeypatch, value):
         make_executor(imports="json")
 
 
-def test_trainings_can_run_in_this_process(monkeypatch):
+def test_calls_can_run_in_this_process(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     with make_executor(imports="json") as executor:
         assert executor.submit(os.getpid).result() == os.getpid()
@@ -95,7 +95,7 @@ def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
     assert median_s == (2 + job.REPEATS_N + 1) / 2  # the median of 2 .. 26 s
 
 
-def test_single_slow_call_changes_little(monkeypatch):
+def test_single_slow_call_does_not_change_the_median(monkeypatch):
     now_s, durations_s = [0.0], iter([1.0] * 10 + [500.0] + [1.0] * job.REPEATS_N)
 
     def call() -> None:

@@ -25,7 +25,7 @@ from reskin.recordings.readers import eflash7, eflesh, ini, lab
 from tests import repositories
 from tests.recordings.headers import AS_USUAL
 from tests.recordings.readers.test_lab import PRESSES, write
-from tests.scenes import recorded
+from tests.scenes import recorded_scene
 from tests.stages.checkout import copy_checkout
 from tests.test_adding import contents
 from tests.test_pickled import archive_of_csv
@@ -35,7 +35,7 @@ SOURCES = fetching.read_sources(ROOT)
 
 
 def boards(folder: Path) -> dict[str, bytes]:
-    """Return two recordings, of one board each, with line ends that git would change."""
+    """Return two recordings, one per board, with line ends that git would change."""
     folder.mkdir()
     text = (write(folder, *PRESSES) / lab.READINGS).read_text().replace("\n", "\r\n")
     return {"board1.csv": text.encode(), "board2.csv": text.replace("160.0000", "160.4000").encode()}
@@ -55,25 +55,25 @@ def source_of(files: dict[str, bytes], home: str, commit: str | None, **changes:
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory) -> SimpleNamespace:
-    """Return a checkout without running scenes, and a repository of two recordings, one changed by a later commit."""
+def example(tmp_path_factory) -> SimpleNamespace:
+    """Return a checkout whose plan has no scenes, and a repository of two recordings, one changed by a later commit."""
     root, away = copy_checkout(tmp_path_factory.mktemp("checkout")), tmp_path_factory.mktemp("away")
     plan.use(root, [])
     with (root / SCENES / "small.yaml").open("w") as stream:
-        YAML().dump(recorded(), stream)
+        YAML().dump(recorded_scene(), stream)
     files = boards(away / "rig")
     home = {f"data/{name}": content for name, content in files.items()}
     commit = repositories.commit(away / "home", {**home, "README.md": b"A rig.\n"})
-    repositories.commit(away / "home", {"data/board1.csv": b"mended\n"})
+    repositories.commit(away / "home", {"data/board1.csv": b"edited\n"})
     url = repositories.bare(away / "home", away / "mirror.git", filters=True)
     return SimpleNamespace(root=root, away=away, files=files, commit=commit, url=url)
 
 
 @pytest.fixture
-def root(world, tmp_path) -> Path:
+def root(example, tmp_path) -> Path:
     """Return a checkout whose only source is that repository."""
-    root = shutil.copytree(world.root, tmp_path / "checkout", symlinks=True)
-    write_source(root, source_of(world.files, world.url, world.commit))
+    root = shutil.copytree(example.root, tmp_path / "checkout", symlinks=True)
+    write_source(root, source_of(example.files, example.url, example.commit))
     return root
 
 
@@ -96,25 +96,25 @@ def assert_refused(root: Path, message: str, origin: str | Path | None = None) -
     assert contents(root) == before
 
 
-def fetched(root: Path) -> dict[str, bytes]:
+def fetched_files(root: Path) -> dict[str, bytes]:
     folder = root / fetching.FETCHED / "rig"
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
-def only_fetched(monkeypatch) -> None:
-    """Fetch without adding, which takes seconds."""
+def without_adding(monkeypatch) -> None:
+    """Fetch without adding the recordings, which takes seconds."""
     monkeypatch.setattr(fetching, "_add_all", lambda *_: None)
     monkeypatch.setattr(fetching, "_say_what_runs", lambda *_: None)
 
 
-def test_recordings_are_fetched_and_added_once(root, world):
+def test_recordings_are_fetched_and_added_once(root, example):
     output = fetch(root)
-    assert fetched(root) == world.files
+    assert fetched_files(root) == example.files
     assert sorted(read_registry(root).captures["small"]) == ["board1_skin-board1_board1", "board2_skin-board2_board2"]
     for board in ("board1", "board2"):
         raw = root / adding.RAW / "small" / f"{board}_skin-{board}_{board}"
-        assert (raw / lab.READINGS).read_bytes() == world.files[f"{board}.csv"]
+        assert (raw / lab.READINGS).read_bytes() == example.files[f"{board}.csv"]
     assert list(plan.check(root).scenes) == ["small"]
     assert "added scene small to pipeline/plan.yaml (already there: none)" in output
     assert "next: dvc repro" in output
@@ -130,13 +130,13 @@ def test_recordings_are_fetched_and_added_once(root, world):
 def test_interrupted_add_continues(root, monkeypatch):
     add, calls = adding.add, []
 
-    def interrupted(*fields, **options):
+    def interrupt_second_add(*fields, **options):
         calls.append(fields)
         if len(calls) == 2:
             raise KeyboardInterrupt
         return add(*fields, **options)
 
-    monkeypatch.setattr(adding, "add", interrupted)
+    monkeypatch.setattr(adding, "add", interrupt_second_add)
     with pytest.raises(KeyboardInterrupt):
         fetch(root)
     assert list(read_registry(root).captures["small"]) == ["board1_skin-board1_board1"]
@@ -145,66 +145,67 @@ def test_interrupted_add_continues(root, monkeypatch):
     assert len(calls) == 3
 
 
-def test_recording_added_by_hand_is_not_added_again(root, world, tmp_path):
-    (tmp_path / "mine.csv").write_bytes(world.files["board1.csv"])
+def test_recording_added_earlier_is_not_added_again(root, example, tmp_path):
+    (tmp_path / "mine.csv").write_bytes(example.files["board1.csv"])
     prepared = preparing.foreign(tmp_path / "mine.csv", "lab", CaptureNames("b", "s", "mine"), {})
     adding.add(root, "small", prepared, allow_copy=False)
     assert "small/mine: added already" in fetch(root)
     assert sorted(read_registry(root).captures["small"]) == ["board2_skin-board2_board2", "mine"]
 
 
-@pytest.mark.usefixtures("only_fetched")
-def test_mirror_or_folder_replaces_the_home(root, world, tmp_path):
-    write_source(root, source_of(world.files, (tmp_path / "away").as_uri(), world.commit))
+@pytest.mark.usefixtures("without_adding")
+def test_mirror_or_folder_replaces_the_home(root, example, tmp_path):
+    write_source(root, source_of(example.files, (tmp_path / "away").as_uri(), example.commit))
     assert_refused(root, "cannot read the repository")
     (tmp_path / "files/deep").mkdir(parents=True)
-    for name, content in world.files.items():
+    for name, content in example.files.items():
         (tmp_path / "files/deep" / name).write_bytes(content)
-    for origin in (world.url, world.away / "mirror.git", world.away / "home", tmp_path / "files"):
+    for origin in (example.url, example.away / "mirror.git", example.away / "home", tmp_path / "files"):
         assert f"taken from: {origin}" in fetch(root, origin)
-        assert fetched(root) == world.files
+        assert fetched_files(root) == example.files
         shutil.rmtree(root / fetching.FETCHED)
 
 
-def test_missing_commit_is_an_error(root, world):
-    write_source(root, source_of(world.files, world.url, "1" * 40))
+def test_missing_commit_is_an_error(root, example):
+    write_source(root, source_of(example.files, example.url, "1" * 40))
     assert_refused(root, f"the repository does not have commit {'1' * 40}, at which")
 
 
-def test_wrong_checksum_is_an_error(root, world):
-    write_source(root, source_of(world.files, world.url, None))  # the newest commit, with one other file
-    other, right = sha256(b"mended\n").hexdigest(), sha256(world.files["board1.csv"]).hexdigest()
+def test_wrong_checksum_is_an_error(root, example):
+    write_source(root, source_of(example.files, example.url, None))  # the newest commit, in which one file differs
+    other, right = sha256(b"edited\n").hexdigest(), sha256(example.files["board1.csv"]).hexdigest()
     assert_refused(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")
 
 
-def test_truncated_or_missing_file_is_an_error(root, world, tmp_path):
-    (tmp_path / "board1.csv").write_bytes(world.files["board1.csv"])
-    (tmp_path / "board2.csv").write_bytes(world.files["board2.csv"][:-1])
+def test_truncated_or_missing_file_is_an_error(root, example, tmp_path):
+    (tmp_path / "board1.csv").write_bytes(example.files["board1.csv"])
+    (tmp_path / "board2.csv").write_bytes(example.files["board2.csv"][:-1])
     assert_refused(root, "board2.csv: sha256 must be", tmp_path)
     (tmp_path / "board2.csv").unlink()
     assert_refused(root, "no file data/board2.csv or board2.csv", tmp_path)
 
 
-@pytest.mark.usefixtures("only_fetched")
-def test_changed_file_is_fetched_again(root, world):
+@pytest.mark.usefixtures("without_adding")
+def test_changed_file_is_fetched_again(root, example):
     fetch(root)
     (root / fetching.FETCHED / "rig/board2.csv").write_bytes(b"changed")
     assert "all checksums match" in fetch(root)
-    assert fetched(root) == world.files
+    assert fetched_files(root) == example.files
 
 
-@pytest.mark.usefixtures("only_fetched")
-def test_unlicensed_data_need_consent(root, world):
-    write_source(root, source_of(world.files, world.url, world.commit, licence=None))
+@pytest.mark.usefixtures("without_adding")
+def test_unlicensed_data_need_consent(root, example):
+    write_source(root, source_of(example.files, example.url, example.commit, licence=None))
     assert_refused(root, "use without a licence was not agreed to. Nothing was fetched.*--yes")
     output = fetch(root, consent=True)
     assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in output
-    assert f"home: {world.url}, commit {world.commit}" in output
-    assert fetched(root) == world.files
+    assert f"home: {example.url}, commit {example.commit}" in output
+    assert fetched_files(root) == example.files
 
 
-def test_consent_can_be_given_on_the_command_line(root, world, monkeypatch):
-    write_source(root, source_of(world.files, world.url, world.commit, licence=None, scene=None, note="Not added."))
+def test_consent_can_be_given_on_the_command_line(root, example, monkeypatch):
+    changes = {"licence": None, "scene": None, "note": "Not added."}
+    write_source(root, source_of(example.files, example.url, example.commit, **changes))
     monkeypatch.chdir(root)
     done = CliRunner().invoke(app, ["fetch", "rig"])
     assert "add --yes" in str(done.exception)
@@ -228,16 +229,16 @@ def test_archives_are_checked_as_converted_tables(root, tmp_path):
     source["files"][0]["at"] = "raw/port_1.npz"
     write_source(root, source)
     fetch(root)
-    assert fetched(root) == {"board1.csv": table}
+    assert fetched_files(root) == {"board1.csv": table}
     assert list(read_registry(root).captures["small"]) == ["board1_skin-board1_board1"]
 
 
-@pytest.mark.usefixtures("only_fetched")
-def test_interrupted_fetch_leaves_no_files(root, world, monkeypatch):
-    opened, reads = fetching.open_origin, []
+@pytest.mark.usefixtures("without_adding")
+def test_interrupted_fetch_leaves_no_files(root, example, monkeypatch):
+    open_origin, reads = fetching.open_origin, []
 
-    def interrupted(*fields) -> Origin:
-        origin = opened(*fields)
+    def interrupt_second_read(*fields) -> Origin:
+        origin = open_origin(*fields)
 
         def read(path: str) -> bytes:
             reads.append(path)
@@ -247,14 +248,14 @@ def test_interrupted_fetch_leaves_no_files(root, world, monkeypatch):
 
         return Origin(origin.name, origin.paths, read)
 
-    monkeypatch.setattr(fetching, "open_origin", interrupted)
+    monkeypatch.setattr(fetching, "open_origin", interrupt_second_read)
     before = contents(root)
     with pytest.raises(KeyboardInterrupt):
         fetch(root)
     assert contents(root) == before
     assert list((root / fetching.FETCHED).iterdir()) == []
     fetch(root)
-    assert fetched(root) == world.files
+    assert fetched_files(root) == example.files
 
 
 def test_full_disk_is_an_error(root, monkeypatch):
@@ -281,7 +282,7 @@ def test_sources_are_listed_without_a_name(monkeypatch):
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_recordings_of_sources_are_fetched_into_known_scenes(name):
+def test_sources_have_recordings_and_a_known_scene_or_a_note(name):
     source, paths = SOURCES[name], {Path(file.path) for file in SOURCES[name].files}
     assert len(paths) == len(source.files)
     for recording in source.recordings:
@@ -295,7 +296,7 @@ def test_recordings_of_sources_are_fetched_into_known_scenes(name):
 
 
 @pytest.mark.parametrize("name", SOURCES)
-def test_real_recordings_have_their_checksums_and_are_read(name, shared_data, tmp_path):
+def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, tmp_path):
     fetching.download(SOURCES[name], str(shared_data / name), tmp_path / name)
     counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # rows, as in data/README.md
     readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7}

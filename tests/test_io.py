@@ -35,7 +35,7 @@ def test_columns_have_units_and_the_file_a_schema_version(tmp_path):
     assert pq.ParquetFile(tmp_path / "c0.parquet").metadata.row_group(0).column(5).compression == "ZSTD"
 
 
-def test_blocks_equal_one_piece(tmp_path):
+def test_blocks_are_concatenated(tmp_path):
     io.write_readings(tmp_path / "whole.parquet", [readings()], {})
     io.write_readings(tmp_path / "blocks.parquet", [readings(), readings()], {})
     assert len(io.read_readings(tmp_path / "blocks.parquet")) == 2 * len(io.read_readings(tmp_path / "whole.parquet"))
@@ -63,7 +63,7 @@ def test_failed_write_keeps_the_old_file(tmp_path):
 
 def test_os_errors_name_the_right_file(tmp_path):
     def names_in_errors(*names: Path) -> tuple[str, ...]:
-        """Return the file that the error names, if the disk reports these names while a.txt is written."""
+        """Return the file named for EACCES, ENOSPC and EIO when writing a.txt fails with `names` in the error."""
         found = []
         for number in (errno.EACCES, errno.ENOSPC, errno.EIO):
             metadata = (names[0], None, names[1]) if len(names) == 2 else names
@@ -75,11 +75,7 @@ def test_os_errors_name_the_right_file(tmp_path):
     source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
     assert names_in_errors(source) == ("source", "source", "source")
     assert names_in_errors(temporary) == ("a.txt", "a.txt", "a.txt")
-    assert names_in_errors(source, temporary) == (
-        "a.txt",
-        "a.txt",
-        "source",
-    )  # of a copy; EIO may be of either
+    assert names_in_errors(source, temporary) == ("a.txt", "a.txt", "source")  # EIO may concern either file of a copy
     assert names_in_errors() == ("a.txt", "a.txt", "")
 
 
@@ -184,23 +180,20 @@ def test_flipped_bits_of_tensors_are_detected(tmp_path):
             continue
         assert all(np.array_equal(found[name], tensors[name]) for name in tensors)
         assert {name: metadata[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
-    assert detected_n > file.stat().st_size - 8  # except for bits of the name of the digest
+    assert detected_n > file.stat().st_size - 8  # a flip in the key of the digest goes undetected
 
 
 def test_flipped_bits_of_tables_are_detected(tmp_path):
     file = tmp_path / "c0.parquet"
     io.write_readings(file, [readings()], {"rows_n": 6})
     before, chunks = repr(io.read_table(file).to_pydict()), pq.read_metadata(file).row_group(0)
-    end, detected_n = (
-        chunks.column(chunks.num_columns - 1).data_page_offset,
-        0,
-    )  # followed by metadata
+    end, detected_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0  # metadata follow after this byte
     for i in flip_bits(file):
         try:
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
             detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert detected_n > end // 2  # the other bits are of the pages' headers, which say nothing of what is read
+    assert detected_n > end // 2  # the other bits are in page headers and do not affect the values
 
 
 def test_tensors_without_digest_are_read(tmp_path):

@@ -13,7 +13,7 @@ def package(tmp_path):
     return tmp_path
 
 
-def files(package):
+def cached_files(package):
     return sorted((package / "__pycache__").glob("*"))
 
 
@@ -35,17 +35,17 @@ def test_changed_source_or_setting_invalidates_the_array(package, monkeypatch, w
     io._cache_state.cache_clear()
     assert io.load_cached_array(package, "flow") is None
     io.save_cached_array(package, "flow", np.zeros(3))
-    assert len(files(package)) == 1
+    assert len(cached_files(package)) == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY", b"no array"])
 def test_damaged_array_is_not_loaded(package, content):
     io.save_cached_array(package, "flow", np.ones(3))
-    files(package)[0].write_bytes(content)
+    cached_files(package)[0].write_bytes(content)
     assert io.load_cached_array(package, "flow") is None
 
 
-def test_unwritable_folder_is_no_error(package):
+def test_unwritable_folder_is_ignored(package):
     (package / "__pycache__").write_text("a file in the way")
     io.save_cached_array(package, "flow", np.ones(3))
     assert io.load_cached_array(package, "flow") is None

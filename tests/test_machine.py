@@ -1,4 +1,4 @@
-"""Tests of errors of the machine, which become one line; programming errors pass unchanged."""
+"""Tests of operating-system errors, which become one line; programming errors pass unchanged."""
 
 import errno
 import os
@@ -39,7 +39,7 @@ def test_other_errors_pass_unchanged(error):
         raise error
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk without room, on Linux only")
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full, which only Linux has")
 @pytest.mark.parametrize("write", [io.write_json, io.write_table, io.write_tensors])
 def test_full_disk_error_names_the_target(tmp_path, write):
     target, (temporary,) = tmp_path / "out", [tmp_path / f".out.{os.getpid()}.tmp"]

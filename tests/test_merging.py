@@ -12,7 +12,7 @@ from pipeline.manage import merge
 from pipeline.manage.registry import Entry, Registry, read_registry, with_entry, write_registry
 from reskin import io
 from reskin.errors import ReskinError
-from tests.scenes import recorded
+from tests.scenes import recorded_scene
 from tests.stages.checkout import ROOT
 
 NOTHING = Registry(captures={})
@@ -30,7 +30,7 @@ def entry(skin: str, board: str, *fingerprints: str) -> Entry:
 
 
 def add_and_commit(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
-    """Commit the changes that `reskin add` and `dvc repro` make to files in git."""
+    """Make and commit the changes that `reskin add` and `dvc repro` make to files in git."""
     write_registry(root, with_entry(read_registry(root), scene, name, entry(skin, board), allow_copy=False))
     plan.use(root, sorted({*plan.read_plan(root / PLAN).scenes, scene}))
     lock = YAML(typ="safe").load((root / "dvc.lock").read_text())
@@ -49,7 +49,7 @@ def initial_checkout(tmp_path_factory) -> Path:
         shutil.copy(ROOT / name, root)
     (root / SCENES).mkdir(parents=True)
     with (root / SCENES / "shared.yaml").open("w") as stream:
-        YAML().dump(recorded(), stream)
+        YAML().dump(recorded_scene(), stream)
     write_registry(root, NOTHING)
     plan.use(root, [])
     (root / "dvc.lock").write_text("schema: '2.0'\nstages:\n  report@quick:\n    cmd: as it was\n")
@@ -79,7 +79,7 @@ def test_registry_plan_and_lock_have_both_recordings(root):
     assert list(plan.check(root).stages["ingest"]) == ["shared-mine", "shared-yours"]
     stages = YAML(typ="safe").load((root / "dvc.lock").read_text())["stages"]
     assert {"report@quick", "ingest@shared-mine", "ingest@shared-yours"} <= stages.keys()
-    assert stages["report@shared"] == {"cmd": "with mine"}  # taken whole; DVC runs it again
+    assert stages["report@shared"] == {"cmd": "with mine"}  # our entry, unmerged; DVC runs it again
     assert (root / "reports/shared/tables/lobo.md").read_text() == "with mine\n"
     assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
     git(root, "commit", "-qm", "Merge")
@@ -99,7 +99,7 @@ def test_deleted_report_stays_deleted(root):
     assert not (root / "reports/shared/tables/lobo.md").exists()
 
 
-def test_contradicting_recordings_change_nothing(root):
+def test_contradictory_recordings_change_nothing(root):
     merge_two(root, ("mine", "s1", "b1"), ("yours", "s1", "b2"))
     before = {name: (root / name).read_bytes() for name in merge.RESOLVED}
     with pytest.raises(ReskinError, match="the board of skin s1 must be b1, as in mine; got b2"):
@@ -122,7 +122,7 @@ def test_merged_registry_is_validated(theirs, message):
         merge.merge_registries(NOTHING, ours, Registry(captures={"shared": theirs}))
 
 
-def test_added_scenes_run_and_removed_ones_do_not():
+def test_added_scenes_are_planned_and_removed_ones_are_not():
     assert merge.merge_scenes(["a", "b"], ["a", "b", "mine"], ["yours", "b"]) == ["b", "mine", "yours"]
     assert merge.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
 
@@ -144,7 +144,7 @@ def test_merge_without_conflict_is_an_error(root):
         merge.merge(root)
 
 
-def test_removed_and_replaced_captures_stay_so():
+def test_removed_and_replaced_captures_are_not_restored():
     kept, gone, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
     base = Registry(captures={"scene": {"kept": kept, "gone": gone, "replaced": old}})
     theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})
@@ -153,7 +153,7 @@ def test_removed_and_replaced_captures_stay_so():
     assert merge.merge_registries(base, theirs, theirs) == theirs
 
 
-def test_lock_entries_are_taken_whole():
+def test_lock_entries_come_from_one_side():
     base, changed = {"a": {"in": 1, "out": 1}, "b": 1}, {"a": {"in": 2, "out": 2}}
     assert merge.merge_stages(base, base, changed) == (changed, [])
     assert merge.merge_stages(base, changed, base) == (changed, [])

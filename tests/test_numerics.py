@@ -1,4 +1,4 @@
-"""Trainings are equal to the last bit on all processors with AVX2; settings of the user are kept."""
+"""Tests that training is equal to the last bit on all processors with AVX2, and that the user's settings are kept."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ needs_avx2 = pytest.mark.skipif("avx2" not in cpu_flags(), reason="nothing is se
 
 @cache
 def digests_under(*settings: str) -> str:
-    """Return digests of tiny trainings in a new process with these environment variables."""
+    """Return digests of tiny training runs in a new process with these environment variables."""
     inherited = {
         name: value for name, value in os.environ.items() if name not in VARIABLES and not name.startswith("MKL")
     }
@@ -42,13 +42,13 @@ def digests_under(*settings: str) -> str:
     ],
     ids=" ".join,
 )
-def test_trainings_do_not_depend_on_mkl_or_threads(settings):
+def test_training_does_not_depend_on_mkl_or_threads(settings):
     assert digests_under(*settings) == digests_under()
 
 
 @needs_avx2
 @pytest.mark.parametrize("setting", ["ATEN_CPU_CAPABILITY=default", "OPENBLAS_CORETYPE=Prescott"])
-def test_trainings_depend_on_the_selected_instructions(setting):
+def test_training_depends_on_the_selected_instructions(setting):
     pairs = zip(digests_under(setting).split(), digests_under().split(), strict=True)
     assert all(one != other for one, other in pairs)
 

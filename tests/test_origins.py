@@ -62,23 +62,23 @@ def test_folder_has_its_files(home, scratch):
     }
 
 
-def test_older_commit_is_read_as_it_was(tmp_path, home, scratch):
+def test_older_commit_has_its_own_bytes(tmp_path, home, scratch):
     first = repositories.commit(home, FILES)
-    repositories.commit(home, {"data/lf.csv": b"mended\n"})
+    repositories.commit(home, {"data/lf.csv": b"edited\n"})
     url = repositories.bare(home, tmp_path / "mirror.git", filters=True)
     assert open_origin(url, first, scratch).read("data/lf.csv") == FILES["data/lf.csv"]
 
 
 def test_newest_commit_is_the_default(tmp_path, home, scratch):
     repositories.commit(home, FILES)
-    repositories.commit(home, {"data/lf.csv": b"mended\n"})
+    repositories.commit(home, {"data/lf.csv": b"edited\n"})
     url = repositories.bare(home, tmp_path / "mirror.git", filters=True)
-    assert open_origin(url, None, scratch).read("data/lf.csv") == b"mended\n"
+    assert open_origin(url, None, scratch).read("data/lf.csv") == b"edited\n"
 
 
 def test_old_server_is_read_by_branches(tmp_path, home, scratch, monkeypatch):
     first = repositories.commit(home, FILES)
-    repositories.commit(home, {"data/lf.csv": b"mended\n"})
+    repositories.commit(home, {"data/lf.csv": b"edited\n"})
     url = repositories.bare(home, tmp_path / "mirror.git", filters=False)
     for name, value in {"COUNT": "1", "KEY_0": "protocol.version", "VALUE_0": "0"}.items():
         monkeypatch.setenv(f"GIT_CONFIG_{name}", value)  # the old protocol offers branches and tags only
@@ -106,7 +106,7 @@ def test_missing_commit_is_an_error(tmp_path, home, scratch):
 
 def test_shallow_clone_without_the_commit_is_an_error(tmp_path, home, scratch):
     first = repositories.commit(home, FILES)
-    repositories.commit(home, {"data/lf.csv": b"mended\n"})
+    repositories.commit(home, {"data/lf.csv": b"edited\n"})
     repositories.git(tmp_path, "clone", "--quiet", "--depth=1", home.as_uri(), "shallow")
     assert_error("a clone made with --depth", str(tmp_path / "shallow"), first, scratch)
 
@@ -141,7 +141,7 @@ def test_folder_is_read_without_git(tmp_path, home, scratch, monkeypatch):
         ("data/raw/a.csv", "data/raw/a.csv"),
         ("raw/a.csv", "data/raw/a.csv"),
         ("home/data/old/a.csv", "data/old/a.csv"),
-        ("elsewhere/a.csv", "data/old/a.csv"),  # the first of the shortest
+        ("elsewhere/a.csv", "data/old/a.csv"),  # the first of two paths of equal length
         ("raw/ba.csv", None),
         ("raw", None),
     ],

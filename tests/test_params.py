@@ -6,10 +6,10 @@ import pytest
 from pipeline.scenes import Scene, parse_scene, read_plan, read_scene, read_shared, stages
 from reskin.config import read_yaml
 from reskin.errors import ParamsError
-from tests.scenes import ADAPTATIONS, DRAWN_WITH, SECTIONS, TRAINING, check, recorded, scene_with
+from tests.scenes import ADAPTATIONS, SECTIONS, SPLIT_SETTINGS, TRAINING, check, recorded_scene, scene_with
 
 ROOT = Path(__file__).resolve().parents[1]
-ADAPTED = ("lobo", "triplet", "adapt")  # the experiments that those of adaptation need
+ADAPTED = ("lobo", "triplet", "adapt")  # experiments that the adaptation experiments need
 LEARNING = ("models", "curve", "study")
 
 
@@ -56,7 +56,7 @@ def test_params_and_plan_are_valid():
 )
 def test_invalid_scene_names_the_parameter(changes, message):
     with pytest.raises(ParamsError, match=message):
-        check(recorded(**changes))
+        check(recorded_scene(**changes))
 
 
 def scene(*experiments: str, **changes: object) -> Scene:
@@ -102,7 +102,7 @@ def test_contradictory_drift_windows_are_an_error(changes, message):
 
 def test_simulated_experiment_needs_a_simulated_scene():
     with pytest.raises(ParamsError, match="only a simulated scene can run experiments sensitivity"):
-        parse_scene(recorded(experiments=["lobo", "sensitivity"]), "scene.yaml")
+        parse_scene(recorded_scene(experiments=["lobo", "sensitivity"]), "scene.yaml")
 
 
 @pytest.mark.parametrize("dropped", ["drift", "shear"])
@@ -126,14 +126,14 @@ def test_removed_experiment_removes_section_and_protocol(dropped):
 def test_stages_follow_experiments_and_protocols(unit):
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     assert parse_scene(settings, "ci.yaml").runs(unit)
-    gone = ("drift", "variation")
+    removed = ("drift", "variation")
     settings["experiments"] = [
-        experiment for experiment in settings["experiments"] if experiment not in (*gone, "neglected_effects")
+        experiment for experiment in settings["experiments"] if experiment not in (*removed, "neglected_effects")
     ]
-    settings = {name: section for name, section in settings.items() if name not in gone}
+    settings = {name: section for name, section in settings.items() if name not in removed}
     settings["simulate"]["protocols"].pop("wear")
-    left = parse_scene(settings, "ci.yaml")
-    assert left.runs(unit) == (unit in ("train_multi", "simulate", "report"))
+    remaining = parse_scene(settings, "ci.yaml")
+    assert remaining.runs(unit) == (unit in ("train_multi", "simulate", "report"))
 
 
 def test_all_missing_experiments_are_listed():
@@ -176,10 +176,10 @@ def test_scene_sections_match_experiments(experiment):
         scene("single_temporal" if experiment == "lobo" else "lobo", **{section: settings})
 
 
-@pytest.mark.parametrize("experiment", DRAWN_WITH)
+@pytest.mark.parametrize("experiment", SPLIT_SETTINGS)
 def test_split_settings_match_experiments(experiment):
     keys, others = (
-        DRAWN_WITH[experiment],
+        SPLIT_SETTINGS[experiment],
         ("lobo", "triplet", *(["adapt"] if experiment == "sensors" else [])),
     )
     with_experiment = scene_with(*others, experiment)
@@ -219,18 +219,18 @@ def test_all_missing_and_unused_settings_are_listed():
 
 
 def test_settings_have_no_defaults():
-    words = recorded()
-    del words["seed"]
+    settings = recorded_scene()
+    del settings["seed"]
     with pytest.raises(ParamsError, match="scene.yaml: seed is missing"):
-        parse_scene(words, "scene.yaml")
+        parse_scene(settings, "scene.yaml")
 
 
 def test_misspelt_parameter_is_named():
     with pytest.raises(ParamsError, match=r"recipes.fast.rat_max is not a known parameter .its value: 4"):
-        check(recorded(train_multi=TRAINING | {"variants": {"fast": {"rat_max": 4}}}))
-    words = {name: value for name, value in TRAINING.items() if name != "steps_n"} | {"step_n": 4}
+        check(recorded_scene(train_multi=TRAINING | {"variants": {"fast": {"rat_max": 4}}}))
+    settings = {name: value for name, value in TRAINING.items() if name != "steps_n"} | {"step_n": 4}
     with pytest.raises(ParamsError, match=r"train_multi: steps_n is missing .given: .*step_n"):
-        check(recorded(train_multi=words))
+        check(recorded_scene(train_multi=settings))
 
 
 def test_yaml_exponents_are_numbers(tmp_path):

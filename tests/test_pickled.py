@@ -32,7 +32,7 @@ def test_plain_values_round_trip(value, protocol):
     assert decode(pickle.dumps(value, protocol), "a") == value
 
 
-def test_repeated_value_is_repeated():
+def test_repeated_value_is_decoded_each_time():
     row = [1.5, 2.5]
     assert decode(pickle.dumps({"a": row, "b": [row, row]}, 3), "a") == {"a": row, "b": [row, row]}
 
@@ -77,7 +77,7 @@ def sample(indent: int, place, fields, forces) -> dict:
 
 def archive_of(**samples) -> bytes:
     stream = BytesIO()
-    np.savez(stream, **samples)  # a list of dicts: an array of objects, which NumPy pickles
+    np.savez(stream, **samples)  # a list of dicts becomes an array of objects, which NumPy pickles
     return stream.getvalue()
 
 

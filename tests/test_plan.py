@@ -12,7 +12,7 @@ from pipeline.stages.report import planned_scene
 from reskin.config import parse
 from reskin.errors import ParamsError
 from reskin.simulation.defaults import SHARED as SIMULATED
-from tests.scenes import SHARED, recorded, scene_with, settings
+from tests.scenes import SHARED, recorded_scene, scene_with, settings
 from tests.stages.checkout import copy_checkout, run
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -20,7 +20,7 @@ ENTRY = Entry(board="b", skin="s", layout="lab", chips_n=5, fingerprints=("0",),
 
 
 def scene(**changes: object) -> Scene:
-    return parse_scene(recorded(**changes), "scene.yaml")
+    return parse_scene(recorded_scene(**changes), "scene.yaml")
 
 
 def test_plan_of_the_checkout_is_up_to_date():
@@ -69,7 +69,7 @@ def test_recorded_experiment_reads_its_captures():
     assert not any(generated["stages"][experiment] for experiment in ANALYSES if experiment != "drift")
 
 
-def test_choice_needs_no_stage():
+def test_experiment_choice_adds_no_stage():
     chosen, plain = (parse_scene(scene_with(*names), "scene.yaml") for names in ((*ADAPTED, "choice"), ADAPTED))
     captures = Registry(captures={"lab": {"c0": ENTRY}})
     with_choice, without = (make_plan({"lab": one}, captures)["stages"] for one in (chosen, plain))
@@ -112,18 +112,18 @@ def test_recorded_scene_without_captures_is_an_error():
         make_plan({"lab": scene()}, Registry(captures={}))
 
 
-def checkout(folder: Path, running: str = "{}") -> Path:
+def checkout(folder: Path, planned: str = "{}") -> Path:
     (folder / SCENES).mkdir(parents=True)
     (folder / "data").mkdir()
     for name, experiments in (("one", ["lobo"]), ("two", ["lobo"])):
         with (folder / SCENES / f"{name}.yaml").open("w") as stream:
-            YAML().dump(recorded(experiments=experiments), stream)
+            YAML().dump(recorded_scene(experiments=experiments), stream)
     with (folder / "data/captures.yaml").open("w") as stream:
         YAML().dump({"captures": {"one": {"c0": ENTRY.model_dump()}, "two": {"c0": ENTRY.model_dump()}}}, stream)
     with (folder / PARAMS).open("w") as stream:
         YAML().dump({name: rows for name, rows in SHARED.items() if name not in SIMULATED}, stream)
     shutil.copy(ROOT / FLOW, folder)
-    (folder / PLAN).write_text(f"scenes: {running}\ncaptures: {{}}\nheld_out: {{}}\nmodels: {{}}\nstages: {{}}\n")
+    (folder / PLAN).write_text(f"scenes: {planned}\ncaptures: {{}}\nheld_out: {{}}\nmodels: {{}}\nstages: {{}}\n")
     return folder
 
 
@@ -150,26 +150,26 @@ def test_unknown_scene_is_an_error(tmp_path):
         plan.use(checkout(tmp_path), ["three"])
 
 
-def simulated(tmp_path, **changes):
-    """Return a checkout whose scene `one` is ci with changes of its section simulate."""
+def simulated_checkout(tmp_path, **changes):
+    """Return a checkout whose scene `one` is a copy of ci with changes in section simulate."""
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     shutil.copy(ROOT / SCENES / "ci.yaml", root / SCENES / "one.yaml")
     for path, value in changes.items():
         *sections, name = path.split("__")
         changed = root / SCENES / "one.yaml"
-        words = YAML(typ="safe").load(changed.read_text())
-        section = words["simulate"]
+        scene_settings = YAML(typ="safe").load(changed.read_text())
+        section = scene_settings["simulate"]
         for part in sections:
             section = section[part]
         section[name] = value
         with changed.open("w") as stream:
-            YAML().dump(words, stream)
+            YAML().dump(scene_settings, stream)
     return root
 
 
 def test_each_protocol_has_a_folder_and_stages(tmp_path):
-    root = simulated(tmp_path)
+    root = simulated_checkout(tmp_path)
     plan.use(root, ["one"])
     stages = plan.check(root).stages
     protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
@@ -189,7 +189,7 @@ def test_each_protocol_has_a_folder_and_stages(tmp_path):
     ],
 )
 def test_invalid_simulation_is_an_error_before_any_stage(tmp_path, changes, message):
-    root = simulated(tmp_path, **changes)
+    root = simulated_checkout(tmp_path, **changes)
     before = (root / PLAN).read_text()
     with pytest.raises(ParamsError, match=message):
         plan.use(root, ["one"])

@@ -1,4 +1,4 @@
-"""Tests of `reskin predict` with a network of constant output, and its errors."""
+"""Tests of `reskin predict` and its errors, with a network of constant output."""
 
 import json
 
@@ -84,7 +84,7 @@ def test_fields_in_mT_are_refused(tmp_path, model):
         predict(write_log(tmp_path, scale=1e-3), model, tmp_path / "out.csv")
 
 
-def test_other_tables_and_labelled_recordings_raise(tmp_path, model):
+def test_unsuitable_tables_and_labelled_recordings_raise(tmp_path, model):
     io.write_table(tmp_path / "x.parquet", pa.table({"x": [1.0]}))
     with pytest.raises(CaptureError, match="not the columns of reskin decode: x"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
@@ -171,7 +171,7 @@ def test_an_incomplete_card_raises(tmp_path, model, lacking):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
-def test_a_card_that_is_no_mapping_raises(tmp_path, model):
+def test_a_card_that_is_not_a_mapping_raises(tmp_path, model):
     model.with_suffix(".json").write_text("[1]")
     with pytest.raises(ReskinError, match="format None is not supported"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")

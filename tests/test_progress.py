@@ -13,7 +13,7 @@ ORDER = ["code", "split@tiny", "ingest@tiny-tiny_1", "report@tiny"]
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch) -> Path:
-    """Return a checkout with dvc.yaml and a plan, the working directory."""
+    """Change to a checkout with dvc.yaml and a plan, and return it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pipeline").mkdir()
     (tmp_path / "pipeline/plan.yaml").write_text("scenes: {tiny: [lobo]}\n")
@@ -39,7 +39,7 @@ def test_order_is_read_again_when_the_plan_changes(checkout, monkeypatch):
             plan.write("stages: {}\n")
 
 
-def test_unknown_position_is_no_error(tmp_path, monkeypatch):
+def test_unknown_position_is_printed_as_unknown(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(progress.VARIABLE, "split@tiny")
     assert "unknown (FileNotFoundError" in progress.announce()

@@ -115,18 +115,18 @@ def test_costs_are_in_seconds_and_megabytes(tmp_path):
     costs = read_costs(tmp_path)
     assert list(costs) == ["split"]
     assert costs["split"]["seconds"] == 2.35 or costs["split"]["seconds"] == 2.34  # half to even
-    assert 0.1 < costs["split"]["cpu_s"] < 100_000  # of this process, with imports
+    assert 0.1 < costs["split"]["cpu_s"] < 100_000  # the whole process, including imports
     assert 10 < costs["split"]["peak_process_memory_MB"] < 100_000  # a Python process, in MB
 
 
-def test_stage_cost_includes_reused_trainings(tmp_path):
+def test_stage_cost_includes_reused_training(tmp_path):
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, False), "b": (9.0, False)}, waited_s=10.0)
     record_cost(tmp_path, "train", 12.0)
     first = read_costs(tmp_path)["train"]
     assert first["seconds"] == 12.0
     assert first["reused_n"] == 0
-    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # and the rest of the stage
+    assert total_cost_s([first]) == 8.0 + 9.0 + 2.0  # 2 s for the rest of the stage
 
     clear_cost(tmp_path, "train")
     record_trainings(tmp_path, "train", {"a": (8.0, True), "b": (9.0, True)}, waited_s=0.5)
@@ -161,7 +161,7 @@ def test_shared_training_costs_once(tmp_path):
         clear_cost(tmp_path, stage)
         record_trainings(tmp_path, stage, {"a": (8.0, stage == "other")}, waited_s=1.0)
         record_cost(tmp_path, stage, 3.0)
-    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # the stage that reused it waited too
+    assert total_cost_s(read_costs(tmp_path).values()) == 8.0 + 2.0 + 3.0  # the second stage took 3 s
 
 
 def test_costs_of_a_killed_run_are_dropped(tmp_path):

@@ -19,7 +19,7 @@ def test_readme_shows_the_committed_results():
         ["git", "status", "--porcelain", "--", *INPUTS], cwd=ROOT, capture_output=True, text=True, check=False
     )
     if status.returncode or status.stdout:
-        pytest.skip("this checkout has results or scenes of its own; `reskin readme` would show those")
+        pytest.skip("the results or scenes of this checkout are not committed; `reskin readme` would show them")
     done = run(ROOT, "reskin", "readme", "--check", check=False)
     assert done.returncode == 0, done.stderr
 
@@ -31,7 +31,7 @@ def copy_results(root, scenes):
             shutil.copy(ROOT / "reports" / name / file, root / "reports" / name)
 
 
-def test_pages_do_not_depend_on_the_running_scene(tmp_path):
+def test_pages_do_not_depend_on_the_planned_scene(tmp_path):
     root = copy_checkout(tmp_path)
     copy_results(root, [file.parent.name for file in (ROOT / "reports").glob("*/numbers.json")])
     run(root, "reskin", "readme")
@@ -40,9 +40,9 @@ def test_pages_do_not_depend_on_the_running_scene(tmp_path):
 
     run(root, "reskin", "scenes", "use", "ci")
     numbers = all_experiments()
-    shared, of_this_run = split(numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
+    shared, run_provenance = split(numbers | {"provenance": numbers["provenance"] | {"scene": "ci"}})
     io.write_json(root / "reports/ci/numbers.json", shared)
-    io.write_json(root / "reports/ci/provenance.json", of_this_run)
+    io.write_json(root / "reports/ci/provenance.json", run_provenance)
     output = run(root, "reskin", "readme").stdout
     assert [page.read_bytes() for page in pages] == before
     assert output.startswith("rewritten: nothing; results shown: scenes paper, quick, ")
@@ -64,8 +64,8 @@ def test_rewritten_pages_and_scenes_are_printed(tmp_path):
 
 def test_readme_links_the_code_of_every_stage():
     stages = read_yaml(ROOT / "dvc.yaml")["stages"]
-    numbers, of_run = (io.read_json(ROOT / f"reports/quick/{name}.json") for name in ("numbers", "provenance"))
-    links = re.findall(r"\]\((\S+)\)", blocks_of([join(numbers, of_run)], [], stages, None)["stages"])
+    numbers, provenance = (io.read_json(ROOT / f"reports/quick/{name}.json") for name in ("numbers", "provenance"))
+    links = re.findall(r"\]\((\S+)\)", blocks_of([join(numbers, provenance)], [], stages, None)["stages"])
     assert len(links) == len(stages)
     assert [link for link in links if not (ROOT / "docs" / link).is_file()] == []
 

@@ -1,4 +1,4 @@
-"""Tests of `reskin record` over a pseudo-terminal, however the recording ends."""
+"""Tests of `reskin record` with a pseudo-terminal as the serial port, for each way in which a recording can end."""
 
 import os
 import signal
@@ -30,16 +30,16 @@ from tests.board.signals import make_frames
 from tests.stages.checkout import ROOT
 
 FRAMES = make_frames(200, 5, seed=0)
-LONG_S = 120.0  # for a process on a busy machine
+LONG_S = 120.0  # time-out, long enough on a busy machine
 
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, str]]:
-    far, near = os.openpty()
-    tty.setraw(near)
-    yield far, os.ttyname(near)
-    os.close(far)
-    os.close(near)
+    board_fd, port_fd = os.openpty()
+    tty.setraw(port_fd)
+    yield board_fd, os.ttyname(port_fd)
+    os.close(board_fd)
+    os.close(port_fd)
 
 
 def start(name: str, out: Path, *options: str) -> subprocess.Popen:
@@ -48,12 +48,12 @@ def start(name: str, out: Path, *options: str) -> subprocess.Popen:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def send_until_recorded(far: int, part: Path) -> None:
+def send_until_recorded(board_fd: int, part: Path) -> None:
     stream = part / "stream.bin"
     end_s = time.monotonic() + LONG_S
     while time.monotonic() < end_s:
         if stream.exists():
-            os.write(far, encode(FRAMES, "binary")[:1640])
+            os.write(board_fd, encode(FRAMES, "binary")[:1640])
             if stream.stat().st_size:
                 return
         time.sleep(0.05)
@@ -61,9 +61,9 @@ def send_until_recorded(far: int, part: Path) -> None:
 
 
 def test_ctrl_c_ends_a_recording_that_can_be_added(terminal, tmp_path):
-    far, name = terminal
+    board_fd, name = terminal
     recorder = start(name, tmp_path / "run1", "--scan", "random")
-    send_until_recorded(far, tmp_path / "run1.part")
+    send_until_recorded(board_fd, tmp_path / "run1.part")
     recorder.send_signal(signal.SIGINT)
     stdout, stderr = recorder.communicate(timeout=LONG_S)
     assert recorder.returncode == 0, stderr
@@ -92,9 +92,9 @@ def test_progress_on_a_terminal(monkeypatch, capsys):
 
 
 def test_killed_recording_can_be_added(terminal, tmp_path):
-    far, name = terminal
+    board_fd, name = terminal
     recorder = start(name, tmp_path / "run1")
-    send_until_recorded(far, tmp_path / "run1.part")
+    send_until_recorded(board_fd, tmp_path / "run1.part")
     recorder.kill()
     recorder.communicate()
     probe = tmp_path / "probe.csv"
@@ -114,10 +114,10 @@ def test_missing_port_leaves_no_files(tmp_path):
 
 
 def test_failing_label_source_is_reported(terminal, tmp_path):
-    def no_gauge(_):
+    def fail_to_open(_):
         raise CaptureError("the gauge: cannot open the port. Plug it in.")
 
-    info = CaptureInfo("b0", "s0", "random", LabelSource("gauge", None, no_gauge))
+    info = CaptureInfo("b0", "s0", "random", LabelSource("gauge", None, fail_to_open))
     settings = PortSettings(115200, "binary", 5, LONG_S, None, silence_s=LONG_S, no_frame_s=LONG_S)
     with pytest.raises(CaptureError, match="the gauge: cannot open the port") as raised:
         record_capture(terminal[1], tmp_path / "run1", info=info, settings=settings, report=len, watch=len)

@@ -12,27 +12,27 @@ def header(capture: str = "c0", board: str = "b0", skin: str = "s0", chips_n: in
     return make_header(capture=capture, board=board, skin=skin, chips_n=chips_n)
 
 
-def added(registry: Registry, entry_header: Header, fingerprint: str, *, allow_copy: bool = False) -> Registry:
+def register(registry: Registry, entry_header: Header, fingerprint: str, *, allow_copy: bool = False) -> Registry:
     return with_capture(registry, "lab", entry_header, (fingerprint, f"stream of {fingerprint}"), allow_copy=allow_copy)
 
 
-ONE = added(EMPTY, header(), "aa")
+ONE = register(EMPTY, header(), "aa")
 
 
 def test_board_and_skin_can_have_several_captures():
-    assert sorted(added(ONE, header("c1"), "bb").captures["lab"]) == ["c0", "c1"]
+    assert sorted(register(ONE, header("c1"), "bb").captures["lab"]) == ["c0", "c1"]
 
 
 def test_same_recording_twice_is_an_error():
     with pytest.raises(CaptureError, match="it has the same readings as c0. It is in the scene already"):
-        added(ONE, header("c1"), "aa", allow_copy=True)
+        register(ONE, header("c1"), "aa", allow_copy=True)
 
 
 def test_relabelled_copy_is_an_error_unless_allowed():
     copy = header("c1", board="b1", skin="s1")
     with pytest.raises(CaptureError, match="--allow-copy"):
-        added(ONE, copy, "aa")
-    assert added(ONE, copy, "aa", allow_copy=True).captures["lab"]["c1"].copy_of == "c0"
+        register(ONE, copy, "aa")
+    assert register(ONE, copy, "aa", allow_copy=True).captures["lab"]["c1"].copy_of == "c0"
 
 
 @pytest.mark.parametrize(
@@ -43,13 +43,13 @@ def test_relabelled_copy_is_an_error_unless_allowed():
         (header("c1", skin="s1", chips_n=10), "10 chips, but c0 in the same scene has 5"),
     ],
 )
-def test_contradicting_capture_is_an_error(second, message):
+def test_contradictory_capture_is_an_error(second, message):
     with pytest.raises(CaptureError, match=message):
-        added(ONE, second, "bb")
+        register(ONE, second, "bb")
 
 
 def test_removing_a_capture_restores_the_registry():
-    assert without_capture(added(ONE, header("c1"), "bb"), "lab", "c1") == ONE
+    assert without_capture(register(ONE, header("c1"), "bb"), "lab", "c1") == ONE
     assert without_capture(ONE, "lab", "c0") == EMPTY
 
 

@@ -1,4 +1,4 @@
-"""Tests of the release: files of the wheel, version, licences, required packages."""
+"""Tests of the release: the files of the wheel, the version, licences and required packages."""
 
 import re
 import subprocess
@@ -122,7 +122,7 @@ def test_version_is_the_same_everywhere():
 
 
 def test_licences_are_compatible():
-    assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # no needless exception
+    assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # an unneeded exception fails too
     assert closure(wanted()).keys() & TOLERATED.keys() == set()
 
 

@@ -65,7 +65,7 @@ def test_nan_equals_nan():
     assert compare({"a": float("nan")}, {"a": float("nan")}).reproduced
 
 
-def test_additional_row_shifts_no_other():
+def test_additional_row_does_not_shift_other_rows():
     rows = [{"method": "ridge", "labels_n": n, "accuracy_pct": float(n)} for n in (0, 10)]
     done = compare({"labels": rows}, {"labels": [{"method": "ridge", "labels_n": 5, "accuracy_pct": 50.0}, *rows]})
     assert done.differing == []
@@ -95,7 +95,7 @@ def test_changed_labels_are_paired_by_position():
         (True, False, None), (1.0, 2.0, None),
     ],
 )  # fmt: skip
-def test_verdict_changes_with_the_leading_word(old, new, verdicts):
+def test_verdict_is_the_leading_word(old, new, verdicts):
     (difference,) = compare({"cell": old}, {"cell": new}).differing
     assert difference.verdicts == verdicts
 

@@ -12,7 +12,7 @@ def test_generator_depends_on_seed_and_names(seed, path):
 
 
 @given(st.integers(0, 2**40), names, names)
-def test_other_names_or_seeds_give_other_streams(seed, one, other):
+def test_different_names_or_seeds_have_different_streams(seed, one, other):
     if one != other:
         assert seed_for(seed, *one) != seed_for(seed, *other)
     assert seed_for(seed, *one) != seed_for(seed + 1, *one)

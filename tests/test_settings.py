@@ -1,4 +1,4 @@
-"""The params of a stage cover the settings that it reads; an override reruns the stages that read it."""
+"""Tests that the params of a stage cover the settings that it reads, and that an override reruns its readers."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -45,7 +45,7 @@ class RecordingMapping(Mapping[str, Any]):
         return key in self.values_by_key
 
 
-def declared(stage: str) -> tuple[set[str], set[str]]:
+def declared_sections(stage: str) -> tuple[set[str], set[str]]:
     """Return the sections of a scene and the shared sections that dvc.yaml lists for a stage."""
     scene_sections: set[str] = set()
     shared: set[str] = set()
@@ -68,12 +68,12 @@ def test_stages_with_a_section_are_those_with_scene_settings():
 @pytest.mark.parametrize("stage", [stage for stage, model in MODELS.items() if model])
 def test_params_cover_the_settings_a_stage_reads(stage):
     scene = next(one for one in ("ci", "lab", "eflash7", "decide", "universal") if scene_runs(one, stage))
-    given = read_settings(scene, ROOT)
-    of_scene, of_all = RecordingMapping(given.of_scene), RecordingMapping(given.shared)
-    Settings(scene, given.where, of_scene, of_all, given.captures).section(MODELS[stage], stage)
-    scene_sections, shared = declared(stage)
-    assert of_scene.read - scene_sections == set() or "*" in scene_sections
-    assert of_all.read - shared == set()
+    settings = read_settings(scene, ROOT)
+    scene_mapping, shared_mapping = RecordingMapping(settings.of_scene), RecordingMapping(settings.shared)
+    Settings(scene, settings.where, scene_mapping, shared_mapping, settings.captures).section(MODELS[stage], stage)
+    scene_sections, shared = declared_sections(stage)
+    assert scene_mapping.read - scene_sections == set() or "*" in scene_sections
+    assert shared_mapping.read - shared == set()
 
 
 def scene_runs(scene: str, stage: str) -> bool:
@@ -97,7 +97,7 @@ def stages(root) -> list[Any]:
         return list(repo.index.stages)
 
 
-def tracked(root: Path, stages: list[Any]) -> dict[str, str]:
+def parameter_values(root: Path, stages: list[Any]) -> dict[str, str]:
     """Return the parameter values that DVC compares, by stage."""
     from dvc.dependency.param import read_param_file
 
@@ -112,7 +112,7 @@ def tracked(root: Path, stages: list[Any]) -> dict[str, str]:
 
 
 @contextmanager
-def overridden(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
+def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
     """Change files as `dvc exp run -S file:key=value` does; restore them at the end."""
     from dvc.utils.hydra import apply_overrides
 
@@ -128,23 +128,26 @@ def overridden(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
 
 FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
 SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
-BASED = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
-RECIPES = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient", *BASED}
-PHYSICS = {"audit", "report"}  # compare its fingerprint with that of scene tuning
-DRAWN = {"flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects"}
-# The stages that DVC reruns. Sections of params.yaml are dependencies as a whole; trainings are cached.
+# Stages that read adaptations, recipes, or the skin's physics; `SIMULATING` draws skins itself.
+ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
+TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
+FINGERPRINTED = {"audit", "report"}  # compare the physics' fingerprint with that of scene tuning
+SIMULATING = {
+    "flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects",
+}  # fmt: skip
+# File, override, the stages that DVC reruns. Each section of params.yaml is one dependency of a stage.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
-    (PARAMS, "recipes.slow.rate_max=0.001", RECIPES),
-    (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *BASED}),
+    (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
+    (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
     (PARAMS, "labellings.few.own_weight=2.0", {"few_labels"}),
     (PARAMS, "methods.tiny.ridge.alpha=2.0", {"train_classical", "few_labels"}),
-    (SKIN, "skin.modulus_kPa=300.0", SIMULATE | PHYSICS | DRAWN),
-    (SKIN, "terms.ageing.settling=0.2", SIMULATE | DRAWN),
+    (SKIN, "skin.modulus_kPa=300.0", SIMULATE | FINGERPRINTED | SIMULATING),
+    (SKIN, "terms.ageing.settling=0.2", SIMULATE | SIMULATING),
     (SCENE, "split.pool_passes_n=2", {"split", "flexible", "contacts"}),
-    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *DRAWN}),
+    (SCENE, "simulate.protocols.drag.step_mm=1.0", {"simulate@ci-drag", *SIMULATING}),
     (SCENE, "train_single.steps_n=10", {"train_single", "contacts"}),
     (SCENE, "train_multi.steps_n=10", {"train_multi", "sweep_sensors", "ambient", "contacts"}),
-    (SCENE, "adapt.steps_n=4", {*BASED, "contacts"}),
+    (SCENE, "adapt.steps_n=4", {*ADAPTING, "contacts"}),
     (SCENE, "sweep_pokes.pokes_n=[0,10]", {"sweep_pokes", "contacts"}),
     (SCENE, "shear.repeats_n=1", {"shear", "contacts"}),
     (SCENE, "runtime.repeats_n=2", {"runtime", "contacts"}),
@@ -153,24 +156,24 @@ OVERRIDES: list[tuple[str, str, set[str]]] = [
 
 @pytest.mark.parametrize(("file", "override", "readers"), OVERRIDES, ids=[override for _, override, _ in OVERRIDES])
 def test_override_reruns_the_stages_that_read_it(root, stages, file, override, readers):
-    before = tracked(root, stages)
-    with overridden(root, (file, override)):
-        after = tracked(root, stages)
+    before = parameter_values(root, stages)
+    with override_files(root, (file, override)):
+        after = parameter_values(root, stages)
     known = {name if "@" in name else f"{name}@ci" for name in set().union(*(named for _, _, named in OVERRIDES))}
     changed = {name for name in before if before[name] != after[name]}
     assert changed & known == {name if "@" in name else f"{name}@ci" for name in readers}
 
 
 def test_protocol_edit_simulates_only_that_protocol(root, stages):
-    before = tracked(root, stages)
+    before = parameter_values(root, stages)
     for protocol in FURTHER_PROTOCOLS:
-        with overridden(root, (SCENE, f"+simulate.protocols.{protocol}.note=1")):
-            after = tracked(root, stages)
+        with override_files(root, (SCENE, f"+simulate.protocols.{protocol}.note=1")):
+            after = parameter_values(root, stages)
         assert {name for name in SIMULATE if before[name] != after[name]} == {f"simulate@ci-{protocol}"}
 
 
 def test_override_changes_the_settings(root):
-    with overridden(root, (SCENE, "train_multi.recipe=slow")):
+    with override_files(root, (SCENE, "train_multi.recipe=slow")):
         assert read_settings("ci", root).section(Training, "train_multi").recipes["paper"].rate_max == 0.003
 
 
@@ -186,7 +189,7 @@ def test_dvc_files_have_no_anchors_or_merge_keys(file):
 
 
 def test_stage_fails_only_on_its_own_sections(root):
-    with overridden(root, (SCENE, "shear.repeats_n=0")):
+    with override_files(root, (SCENE, "shear.repeats_n=0")):
         read_settings("ci", root).section(Training, "train_multi")
         with pytest.raises(ParamsError, match="shear: repeats_n must be greater than or equal to 1; got 0"):
             read_settings("ci", root).section(Shear, "shear")
@@ -195,7 +198,7 @@ def test_stage_fails_only_on_its_own_sections(root):
 
 
 def test_control_follows_its_adaptation(root):
-    with overridden(root, (PARAMS, "adaptations.paper.rate_max=0.5")):
+    with override_files(root, (PARAMS, "adaptations.paper.rate_max=0.5")):
         adapt = read_settings("ci", root).section(Adaptations, "adapt")
     assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}
     assert adapt.recipes["control"].unlabelled_weight == 0

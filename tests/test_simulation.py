@@ -1,4 +1,4 @@
-"""Protocols of a scene, checked against what its experiments read."""
+"""Tests of the check that the protocols of a scene fit the experiments that read them."""
 
 import pytest
 
@@ -17,16 +17,16 @@ FRICTION = {"boards": FLEXIBLE, "terms": {"friction": {"coefficient": 0.8}}}
         ("glass", "load"), ("grip", "load"), ("press", "press"), ("log", "walk"),
     ],
 )  # fmt: skip
-def test_wrong_kind_of_protocol(name, kind):
+def test_wrong_kind_of_protocol_is_an_error(name, kind):
     other = HAND if kind == "grid" else GRID | {"skins_n": 1}
-    sentence = f"test: protocol {name}: kind must be {kind}, which its experiment reads, not {other['kind']}. "
-    with pytest.raises(ParamsError, match=sentence) as refused:
+    message = f"test: protocol {name}: kind must be {kind}, which its experiment reads, not {other['kind']}. "
+    with pytest.raises(ParamsError, match=message) as refused:
         check_protocols(with_protocol(name, other), "test")
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    ("name", "protocol", "changes", "sentence"),
+    ("name", "protocol", "changes", "message"),
     [
         ("wear", GRID | {"skins_n": 2}, {}, "protocol wear: skins_n must be 1, .*, not 2"),
         ("glass", LOAD | {"skins_n": 2}, {}, "protocol glass: skins_n must be 1, .*, not 2"),
@@ -52,8 +52,8 @@ def test_wrong_kind_of_protocol(name, kind):
         ("flexible", GRID, {"boards": FLEXIBLE}, "protocol flexible: boards must differ from rigid"),
     ],
 )
-def test_wrong_boards_or_skins(name, protocol, changes, sentence):
-    with pytest.raises(ParamsError, match=sentence):
+def test_wrong_boards_or_skins_are_an_error(name, protocol, changes, message):
+    with pytest.raises(ParamsError, match=message):
         check_protocols(with_protocol(name, protocol, **changes), "test")
 
 
@@ -64,7 +64,7 @@ def test_wrong_boards_or_skins(name, protocol, changes, sentence):
         ("flexible", GRID | {"boards": "flexible"}, {"boards": FLEXIBLE}),
     ],
 )  # fmt: skip
-def test_suitable_protocols(name, protocol, changes):
+def test_suitable_protocols_are_accepted(name, protocol, changes):
     check_protocols(with_protocol(name, protocol, **changes), "test")
 
 

@@ -19,7 +19,7 @@ from reskin import io
 
 @pytest.fixture(scope="module")
 def empty_store(tmp_path_factory) -> Path:
-    """Return a store without runs, which is copied as creating it takes seconds."""
+    """Return a store without runs; tests copy it, because creating one takes seconds."""
     store = tmp_path_factory.mktemp("store") / "mlflow.db"
     mlflow.MlflowClient(f"sqlite:///{store}").search_experiments()
     return store
@@ -33,7 +33,7 @@ def _embedded(monkeypatch, tmp_path, empty_store):
 
 @pytest.fixture
 def silent_server() -> Iterator[str]:
-    """Yield the address of a server that accepts and never responds."""
+    """Yield the address of a server that accepts connections and never responds."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         accepted: list[socket.socket] = []
         threading.Thread(target=lambda: accepted.append(server.accept()[0]), daemon=True).start()
@@ -45,7 +45,7 @@ def silent_server() -> Iterator[str]:
 @pytest.fixture
 def dead_address() -> str:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"http://127.0.0.1:{server.getsockname()[1]}"  # closed on return
+        return f"http://127.0.0.1:{server.getsockname()[1]}"  # the socket closes on return
 
 
 def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -> None:
@@ -150,7 +150,7 @@ def test_report_run_has_figures_page_and_numbers(tmp_path):
     curve = client.get_metric_history(run.info.run_id, "drift.each.accuracy_pct")
     assert [(point.step, point.value) for point in curve] == [(5, 90.0), (10, 80.0)]
 
-    # Other costs update the files of the report; another number makes a new report.
+    # Changed costs update the files of the report; a changed number creates a new report.
     write_report(tmp_path / "reports", seconds=2.0)
     publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     (same,) = runs(tmp_path, "tags.stage = 'report'")
@@ -177,7 +177,7 @@ CURVES = {old: {"sweep_pokes": [("adapted", 0, {"accuracy_pct": pct})]} for old,
 
 
 def publish_state(root: Path, old: bool, reported: bool = True) -> dict:
-    """Write and publish the state of a workspace, as after `git checkout` and `dvc checkout`, or the latter alone."""
+    """Write and publish the old or the new state of a workspace; unless `reported`, leave the reports as they are."""
     io.remove(root / "models")
     write_model(root / "models", "b0", "k0" if old else "k9", accuracy_pct=50.0 if old else 51.0)
     if reported:
@@ -196,13 +196,13 @@ def test_restored_state_becomes_current_without_new_runs(tmp_path):
     assert len(first) == 4  # a training, its stage, a sweep, the report
     assert current(tmp_path) & first == set()
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
-    counted = {run.info.run_id: history_n(client, run) for run in runs(tmp_path, "")}
+    before = {run.info.run_id: history_points_n(client, run) for run in runs(tmp_path, "")}
     assert publish_state(tmp_path, old=True) == {"new_n": 0, "kept_n": 1, "superseded_n": 4}
     assert current(tmp_path) == first
-    assert {run.info.run_id: history_n(client, run) for run in runs(tmp_path, "")} == counted
+    assert {run.info.run_id: history_points_n(client, run) for run in runs(tmp_path, "")} == before
 
 
-def history_n(client: mlflow.MlflowClient, run) -> int:
+def history_points_n(client: mlflow.MlflowClient, run) -> int:
     return sum(len(client.get_metric_history(run.info.run_id, name)) for name in run.data.metrics)
 
 
@@ -254,7 +254,7 @@ def test_unreachable_server_is_reported_within_seconds(kind, request, tmp_path, 
     start_s = time.monotonic()
     with pytest.raises(TrackingUnavailable, match="`reskin publish` sends them when it is back"):
         write(tmp_path, b0="k0")
-    assert time.monotonic() - start_s < 15  # two of these the time-out; MLflow's retries take 20
+    assert time.monotonic() - start_s < 15  # the time-out is 2 s; MLflow's own retries take 20 s
 
 
 def test_probe_creates_no_store(tmp_path):
@@ -276,12 +276,12 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
     write(tmp_path, b0="k0")
     find, messages = tracking.Publisher.find, []
 
-    def fails(self, *arguments, **tags):
+    def fail_to_find(self, *arguments, **tags):
         with closing(sqlite3.connect(tmp_path / "mlflow.db")) as other:
             other.execute("DROP TABLE IF EXISTS tags")
         return find(self, *arguments, **tags)
 
-    monkeypatch.setattr(tracking.Publisher, "find", fails)
+    monkeypatch.setattr(tracking.Publisher, "find", fail_to_find)
     handler = logging.Handler()
     handler.emit = messages.append
     logging.getLogger("mlflow.store.db.utils").addHandler(handler)
@@ -292,7 +292,7 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
 
 
 def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # no time for two trainings
+    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # with 2 s per run: a limit of 0 s for two runs
     with pytest.raises(TrackingUnavailable, match="took longer than 0 s"):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()

@@ -1,4 +1,4 @@
-"""Tests of `reskin verify-reports`: reports of a rerun or finished reports against the commit."""
+"""Tests of `reskin verify-reports`, which compares reports of a rerun, or finished reports, with the last commit."""
 
 import json
 import subprocess

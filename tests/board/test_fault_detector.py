@@ -1,4 +1,4 @@
-"""Fault detection on a stream that arrives in chunks."""
+"""Tests of fault detection on a stream that arrives in chunks."""
 
 import dataclasses
 from itertools import pairwise
@@ -22,7 +22,7 @@ RESET_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_u
 
 
 def board(frames_n: int, *, steps_uT: tuple[float, float, float] = (0.15, 0.15, 0.242), seed: int = 0) -> Frames:
-    """Chips with 5 uT of noise about a constant field, on the grid of their LSB."""
+    """Return readings of chips with 5 uT of noise about a constant field, rounded to their LSB."""
     rng = seeds.rng_for(seed, "watch")
     rest_uT = seeds.rng_for(0, "rest").uniform(-1500, 1500, 3 * CHIPS_N)
     b_uT = rest_uT + 5 * rng.standard_normal((frames_n, 3 * CHIPS_N))
@@ -47,7 +47,7 @@ def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | No
     return np.concatenate(masks)
 
 
-def test_sound_board_has_no_fault() -> None:
+def test_working_board_has_no_fault() -> None:
     assert not detect(board(2000)).any()
     assert not detect(board(2000), expected_lsb_uT=(0.15, 0.242)).any()
 

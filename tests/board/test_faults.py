@@ -1,4 +1,4 @@
-"""Chip faults in synthetic and in real recordings."""
+"""Tests of chip faults in synthetic and in real recordings."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def load_ini(shared_data, name: str, rows: slice = slice(None)) -> tuple[np.ndar
 
 
 class TestFailedReads:
-    def test_all_four_values_must_be_those_of_a_failure(self):
+    def test_all_four_values_must_match_a_failure(self):
         b_uT = np.tile([8028.16, 5194.00, 12943.36], 3)[None]
         temperature_degC = np.array([[-880.49, -880.49, 25.0]])
         b_uT[0, 4] = 5194.2

@@ -1,4 +1,4 @@
-"""Decoding does not depend on how a stream is split into chunks, and every byte is accounted for."""
+"""Tests that decoding does not depend on how a stream is split into chunks, and accounts for every byte."""
 
 import struct
 from itertools import pairwise
@@ -88,7 +88,7 @@ def test_frame_is_emitted_with_its_last_byte(wire):
 
 
 @given(st.binary(max_size=600), EVERY_WIRE, st.integers(1, 3), st.lists(st.integers(0, 50), max_size=8))
-def test_random_bytes_decode_alike_in_any_chunks(data, wire, chips_n, sizes):
+def test_random_bytes_decode_equally_in_any_chunks(data, wire, chips_n, sizes):
     whole, account = decode_portions([data], wire, chips_n)
     chunks, chunks_account = decode_portions(split_bytes(data, sizes), wire, chips_n)
     check_equal(whole, chunks)
@@ -101,7 +101,7 @@ FRAGMENTS = (b"\r\n", b"\r", b"\n", b"\r\n" * 9, b"\0" * 16, b"\0" * 7, b"B", b"
 
 @settings(max_examples=150)
 @given(st.lists(st.sampled_from(FRAGMENTS)).map(b"".join), st.integers(1, 2), st.lists(st.integers(1, 30), max_size=8))
-def test_terminators_decode_alike_in_any_chunks(data, chips_n, sizes):
+def test_terminators_decode_equally_in_any_chunks(data, chips_n, sizes):
     whole, account = decode_portions([data], "binary", chips_n)
     chunks, chunks_account = decode_portions(split_bytes(data, sizes), "binary", chips_n)
     check_equal(whole, chunks)
@@ -114,11 +114,11 @@ def test_terminators_decode_alike_in_any_chunks(data, chips_n, sizes):
 
 @settings(max_examples=150)
 @given(frames_strategy(min_frames_n=6), st.sampled_from(BINARY_WIRES), st.floats(0, 1), st.floats(0, 1))
-def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, how_many):
+def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, missing_share):
     data = encode(frames, wire)
-    missing_n = 1 + int(how_many * (record_type(wire, chips_of(frames)).itemsize - 2))
+    missing_n = 1 + int(missing_share * (record_type(wire, chips_of(frames)).itemsize - 2))
     first = int(where * (len(data) - missing_n))
-    # The remains of two frames can pass for one frame only if a payload contains CR LF at one frame's distance.
+    # The remains of two frames look like one frame only if a payload contains CR LF at the distance of one frame.
     false_n = int(data.count(b"\r\n") > len(frames))
     check_damage(frames, wire, [data[:first], data[first + missing_n :]], lost_n=2, false_n=false_n)
 
@@ -155,11 +155,11 @@ def test_terminator_in_steady_temperature():
     )
 
 
-def test_remains_of_two_frames_are_no_frame():
+def test_remains_of_two_frames_are_not_a_frame():
     frames = make_frames(6, 1, 3)
     frames.temperature_degC[2], frames.b_uT[2, 0] = CRLF_TEMPERATURE_degC, 100.0
     data = encode(frames, "binary")
-    # 8 bytes of frame 2 and 13 of frame 3 remain: after the CR LF in the temperature, exactly one frame's length.
+    # 8 bytes of frame 2 and 13 of frame 3 remain. After the CR LF in the temperature, they are as long as one frame.
     kept, _ = decode_portions([data[: 2 * 18 + 8] + data[3 * 18 + 5 :]], "binary", 1)
     assert records(kept) == [record for i, record in enumerate(records(frames)) if i not in (2, 3)]
 
@@ -195,11 +195,11 @@ def test_infinite_clock_is_not_finite():
 @pytest.mark.parametrize("wire", TEXT_WIRES)
 def test_text_nan_and_inf_are_not_finite(wire, word):
     line = encode(make_frames(1, 2, 7), wire)
-    broken = word.encode() + line[line.index(b"\t") :]
-    _, account = decode_portions([line + broken + line], wire, 2)
+    damaged = word.encode() + line[line.index(b"\t") :]
+    _, account = decode_portions([line + damaged + line], wire, 2)
     assert account["frames_n"] == 2
     assert account["not_finite_frames_n"] == 1
-    assert account["skipped_not_finite_bytes_n"] == len(broken)
+    assert account["skipped_not_finite_bytes_n"] == len(damaged)
 
 
 @pytest.mark.parametrize("chunk_n", [1, 7, 10**6])
@@ -211,7 +211,7 @@ def test_endless_line_is_skipped(chunk_n):
     check_account(account, data)
 
 
-def test_rest_of_endless_line_is_no_frame():
+def test_rest_of_endless_line_is_not_a_frame():
     line = encode(make_frames(1, 1, 8), "text-xyzt")
     kept, account = decode_portions([line + b"9" * 2 * line_bytes_max_n(1), line, line], "text-xyzt", 1)
     assert kept.end_byte.tolist() == [len(line), account["bytes_n"]]
@@ -236,7 +236,7 @@ def test_long_stream_with_many_breaks():
 # Errors ---------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)  # each error tries what would fit instead
+@settings(max_examples=25, deadline=None)  # each error searches for a wire format that fits
 @given(st.binary(max_size=2000), EVERY_WIRE, st.integers(1, 6))
 def test_random_bytes_decode_or_raise_capture_error(data, wire, chips_n):
     try:

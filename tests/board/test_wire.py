@@ -1,4 +1,4 @@
-"""Frames have the byte layout of the firmware and survive a round trip."""
+"""Tests that frames have the byte layout of the firmware and survive a round trip."""
 
 import re
 import struct
@@ -20,7 +20,7 @@ def lines_of(text: bytes, wire: str, chips_n: int):
 
 
 def one_frame(chips_n: int):
-    """Chip 0 reads X 1.25, Y -2.5, Z 56.78, T 25; chip 1 reads 3 more of each."""
+    """Return a frame: chip 0 reads X 1.25, Y -2.5, Z 56.78, T 25; each further chip reads 3 more in every value."""
     b_uT = np.array([[1.25, -2.5, 56.78]]) + 3 * np.arange(chips_n)[:, None]
     return frames_of(b_uT.reshape(1, -1), 25.0 + 3 * np.arange(chips_n)[None])
 

@@ -9,14 +9,14 @@ from reskin.seeds import rng_for
 B_uT, NOLOAD_uT = (rng_for(0, name).normal(0, 500, (5, 15)).astype(np.float32) for name in ("b", "noload"))
 
 
-def test_change_equals_two_loops():
+def test_change_equals_nested_loops():
     expected = [[float(B_uT[f, ch] - NOLOAD_uT[f, ch]) for ch in range(15)] for f in range(5)]
     assert subtract(B_uT, NOLOAD_uT).tolist() == expected
 
 
 @given(st.floats(-3000, 3000, width=32))
 def test_constant_field_cancels(ambient_uT):
-    # float32 rounding of numbers in the thousands: about 1e-4 each
+    # each number is in the thousands, where float32 rounds to about 1e-4
     shifted = subtract(B_uT + np.float32(ambient_uT), NOLOAD_uT + np.float32(ambient_uT))
     np.testing.assert_allclose(shifted, subtract(B_uT, NOLOAD_uT), atol=2e-3)
 
@@ -25,7 +25,7 @@ runs_n = st.lists(st.integers(1, 4), min_size=1, max_size=12)  # readings per in
 
 
 def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Indentation numbers, with gaps, and no-load fields that equal the number of their indentation."""
+    """Return no-load fields that equal the number of their indentation, and these numbers, which have gaps."""
     indentation = np.repeat(7 + 3 * np.arange(len(runs_n), dtype=np.int32), runs_n)
     return np.repeat(indentation[:, None], 3, axis=1).astype(np.float32), indentation
 
@@ -60,8 +60,8 @@ def test_ranks_follow_time():
     assert rank(np.zeros(0, np.int32)).tolist() == []
 
 
-def touched(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A skin with a random walk at rest, touched at random places for `rows_n` rows each: b, no-load, indentation."""
+def make_touches(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return b, no-load and indentation of touches of `rows_n` rows, on a skin whose field at rest drifts randomly."""
     rng = rng_for(0, "touched")
     rest_uT = np.cumsum(walk_uT * rng.standard_normal((touches_n, 15)), axis=0)
     touch_uT = 60 * rng.standard_normal((touches_n, 15))
@@ -72,16 +72,16 @@ def touched(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tuple[np
 
 @pytest.mark.parametrize("rows_n", [1, 4, 50])
 def test_contact_free_policy_follows_drift(rows_n):
-    b_uT, noload_uT, indentation = touched(rows_n)
+    b_uT, noload_uT, indentation = make_touches(rows_n)
     within_uT = alike_within_uT(noload_uT[: 20 * rows_n], indentation[: 20 * rows_n])
     assert within_uT == pytest.approx(2.0, rel=0.2)
     off_uT = free(b_uT, noload_uT, indentation, within_uT=within_uT) - noload_uT
-    assert np.sqrt((off_uT**2).mean()) < 0.7  # the drift during part of a touch, occasionally of one or two
+    assert np.sqrt((off_uT**2).mean()) < 0.7  # the policy lags by part of a touch, occasionally by one or two touches
     assert np.sqrt(((initial(noload_uT, indentation) - noload_uT) ** 2).mean()) > 5
 
 
 def test_long_slide_keeps_the_old_no_load_reading():
-    b_uT, noload_uT, _ = touched(1, walk_uT=0.1)
+    b_uT, noload_uT, _ = make_touches(1, walk_uT=0.1)
     sent = [field for pair in zip(noload_uT, b_uT, strict=True) for field in pair]
     slid = [*sent[:100], *(sent[101] + 20 * i for i in range(60)), *sent[100:]]
     zeros = list(follow_free(slid, within_uT=0.5))
@@ -90,6 +90,6 @@ def test_long_slide_keeps_the_old_no_load_reading():
 
 
 def test_contact_free_policy_is_causal():
-    b_uT, noload_uT, indentation = touched(2)
+    b_uT, noload_uT, indentation = make_touches(2)
     whole, part = (free(b_uT[:n], noload_uT[:n], indentation[:n], within_uT=2.0) for n in (400, 123))
     np.testing.assert_array_equal(whole[:123], part)

@@ -1,4 +1,4 @@
-"""The grid protocol, compared with the paper's counts and the order of real recordings."""
+"""Tests of the grid protocol against the paper's counts and the order of real recordings."""
 
 import csv
 

@@ -13,16 +13,16 @@ from reskin.errors import ParamsError
 from reskin.seeds import rng_for
 from reskin.simulation.protocols import Hand
 from tests.data.tables import readings
-from tests.data.tables import rows as labelled
+from tests.data.tables import rows as make_rows
 
 READINGS_N = 2  # per indentation
 
 
-def at(place_mm, skins=None, indentation=None) -> Rows:
-    """Rows at places (x, y), by default one indentation each."""
+def rows_at(place_mm, skins=None, indentation=None) -> Rows:
+    """Return rows at places (x, y); by default, each row is one indentation."""
     f = len(place_mm)
     skins = ["s0"] * f if skins is None else skins
-    table = labelled([f"b_{skin}" for skin in skins], skins)
+    table = make_rows([f"b_{skin}" for skin in skins], skins)
     target = np.column_stack([place_mm, np.arange(f)]).astype(np.float32)
     numbers = np.arange(f) if indentation is None else np.asarray(indentation, np.int64)
     return replace(table, target=target, indentation=numbers)
@@ -31,20 +31,20 @@ def at(place_mm, skins=None, indentation=None) -> Rows:
 def grid(depths_n: int = 1, passes_n: int = 1, skin: str = "s0") -> Rows:
     pokes = protocol([0.5 + 0.1 * i for i in range(depths_n)], passes_n)
     place_mm = np.repeat(np.column_stack([pokes.x_mm, pokes.y_mm]), READINGS_N, axis=0)
-    return at(place_mm, [skin] * len(place_mm), np.repeat(pokes.indentation, READINGS_N))
+    return rows_at(place_mm, [skin] * len(place_mm), np.repeat(pokes.indentation, READINGS_N))
 
 
-def every(table: Rows) -> np.ndarray:
+def all_rows(table: Rows) -> np.ndarray:
     return np.arange(len(table))
 
 
 def as_set(lines: Lines, names=None) -> set:
-    """The lines without their numbers: each a set of (row, index)."""
+    """Return each line as a set of (row, index), regardless of the numbers of the lines."""
     names = np.arange(lines.row.max() + 1) if names is None else np.asarray(names)
-    one = {line: [] for line in lines.line_i.tolist()}
+    pairs_of = {line: [] for line in lines.line_i.tolist()}
     for row, line, order in zip(lines.row, lines.line_i, lines.order_i, strict=True):
-        one[int(line)].append((int(names[row]), int(order)))
-    return {frozenset(pairs) for pairs in one.values()}
+        pairs_of[int(line)].append((int(names[row]), int(order)))
+    return {frozenset(pairs) for pairs in pairs_of.values()}
 
 
 def grid_lines_naively(table: Rows, chosen) -> set:
@@ -69,25 +69,26 @@ places = st.lists(
 
 @given(places, st.data())
 def test_grid_lines_equal_nested_loops(labels, data):
-    table = at([(1.3 * x, 0.7 * y) for _, x, y in labels], [skin for skin, _, _ in labels])
+    table = rows_at([(1.3 * x, 0.7 * y) for _, x, y in labels], [skin for skin, _, _ in labels])
     chosen = np.array(sorted(data.draw(st.sets(st.integers(0, len(labels) - 1), min_size=1))))
     lines, naive = grid_lines(table, chosen), grid_lines_naively(table, chosen)
-    assert as_set(lines, every(table)) == {line for _, line in naive}
+    assert as_set(lines, all_rows(table)) == {line for _, line in naive}
     assert len(set(lines.line_i.tolist())) == len(naive)
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
 def test_65_points_are_9_rows_and_9_columns():
-    lines = grid_lines(grid(depths_n=2), every(grid(depths_n=2)))
+    lines = grid_lines(grid(depths_n=2), all_rows(grid(depths_n=2)))
     lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
     assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # rows of the grid, then columns
     assert lines.line_i.max() == 17
-    assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)  # each in its row and column
+    # Each table row is once in a row and once in a column of the grid.
+    assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)
 
 
 def test_repeated_visits_share_line_and_index():
     table = grid(depths_n=2, passes_n=3)
-    lines = grid_lines(table, every(table))
+    lines = grid_lines(table, all_rows(table))
     of_row = {row: set() for row in range(len(table))}
     for row, line, order in zip(lines.row.tolist(), lines.line_i.tolist(), lines.order_i.tolist(), strict=True):
         of_row[row].add((line, order))
@@ -96,19 +97,19 @@ def test_repeated_visits_share_line_and_index():
         by_place.setdefault((x_mm, y_mm), set()).add(frozenset(of_row[row]))
     assert len(by_place) == 65
     assert all(len(seen) == 1 for seen in by_place.values())
-    assert len(set.union(*by_place.values())) == 65  # no two places share both
+    assert len(set.union(*by_place.values())) == 65  # no two places share both lines
 
 
 @given(places, st.data())
 def test_row_order_does_not_matter(labels, data):
     order = data.draw(st.permutations(range(len(labels))))
-    straight = at([(x, y) for _, x, y in labels], [skin for skin, _, _ in labels])
-    turned = [labels[i] for i in order]
-    shuffled = at([(x, y) for _, x, y in turned], [skin for skin, _, _ in turned])
-    ahead, behind = grid_lines(straight, every(straight)), grid_lines(shuffled, every(shuffled))
-    back = [np.array(order)[behind.row], behind.line_i, behind.order_i]
-    assert sorted(zip(*map(np.ndarray.tolist, back), strict=True)) == sorted(
-        zip(ahead.row.tolist(), ahead.line_i.tolist(), ahead.order_i.tolist(), strict=True)
+    original = rows_at([(x, y) for _, x, y in labels], [skin for skin, _, _ in labels])
+    reordered = [labels[i] for i in order]
+    shuffled = rows_at([(x, y) for _, x, y in reordered], [skin for skin, _, _ in reordered])
+    expected, found = grid_lines(original, all_rows(original)), grid_lines(shuffled, all_rows(shuffled))
+    restored = [np.array(order)[found.row], found.line_i, found.order_i]
+    assert sorted(zip(*map(np.ndarray.tolist, restored), strict=True)) == sorted(
+        zip(expected.row.tolist(), expected.line_i.tolist(), expected.order_i.tolist(), strict=True)
     )
 
 
@@ -116,30 +117,30 @@ def test_row_order_does_not_matter(labels, data):
 def test_only_the_order_of_places_matters(labels, gaps_mm, origin_mm):
     skins = [skin for skin, _, _ in labels]
     along_mm = origin_mm + np.cumsum(gaps_mm)
-    plain = at([(x, y) for _, x, y in labels], skins)
-    warped = at([(along_mm[x], along_mm[5 + y]) for _, x, y in labels], skins)
+    plain = rows_at([(x, y) for _, x, y in labels], skins)
+    warped = rows_at([(along_mm[x], along_mm[5 + y]) for _, x, y in labels], skins)
     rng = rng_for(0, "other recording")
     warped.target[:, 2] = rng.normal(size=len(labels))
     warped = replace(warped, db_uT=rng.normal(size=plain.db_uT.shape).astype(np.float32))
-    one, other = grid_lines(plain, every(plain)), grid_lines(warped, every(warped))
+    one, other = grid_lines(plain, all_rows(plain)), grid_lines(warped, all_rows(warped))
     for field in fields(Lines):
         assert (getattr(one, field.name) == getattr(other, field.name)).all()
 
 
 def test_rounding_differences_are_one_place():
-    lines = grid_lines(at([(0, 0), (2.00001, 0), (1.99999, 0.02), (4, 0)]), np.arange(4))
+    lines = grid_lines(rows_at([(0, 0), (2.00001, 0), (1.99999, 0.02), (4, 0)]), np.arange(4))
     assert as_set(lines) == {frozenset({(0, 0), (1, 1), (2, 1), (3, 2)})}
 
 
 def test_missing_place_leaves_a_gap():
-    lines = grid_lines(at([(0, 0), (4, 0), (0, 2), (2, 2)]), np.arange(4))
+    lines = grid_lines(rows_at([(0, 0), (4, 0), (0, 2), (2, 2)]), np.arange(4))
     assert frozenset({(0, 0), (1, 2)}) in as_set(lines)
     assert frozenset({(2, 0), (3, 1)}) in as_set(lines)
 
 
 def test_empty_pool_and_single_place_have_no_lines():
-    assert len(grid_lines(at([(1, 1)] * 3), np.arange(3))) == 0
-    assert len(grid_lines(at([(1, 1)]), np.zeros(0, np.int64))) == 0
+    assert len(grid_lines(rows_at([(1, 1)] * 3), np.arange(3))) == 0
+    assert len(grid_lines(rows_at([(1, 1)]), np.zeros(0, np.int64))) == 0
 
 
 @pytest.mark.parametrize("lines", [grid_lines(grid(), np.arange(130)), hand_lines(*np.zeros((2, 4), np.int32))])
@@ -153,8 +154,8 @@ def test_lines_expose_no_place_force_or_field(lines):
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), min_size=1, max_size=30))
 def test_hand_lines_equal_nested_loops(pokes):
-    pass_i, along = (np.array(column, np.int32) for column in zip(*pokes, strict=True))
-    indentation = (10 * pass_i + along).astype(np.int32)  # continues across passes
+    pass_i, poke_i = (np.array(column, np.int32) for column in zip(*pokes, strict=True))
+    indentation = (10 * pass_i + poke_i).astype(np.int32)  # numbers go on from pass to pass
     naive = set()
     for one in set(pass_i.tolist()):
         own = [i for i in range(len(pokes)) if pass_i[i] == one]
@@ -182,7 +183,7 @@ def test_simulated_hand_pokes_are_indexed_from_0():
 @given(st.integers(0, 6 * 65), st.integers(0, 2**32))
 def test_places_are_poked_equally_often(indentations_n, seed):
     table = grid(depths_n=3, passes_n=2)
-    chosen = take_pokes(table, every(table), indentations_n, rng_for(seed, "pokes"))
+    chosen = take_pokes(table, all_rows(table), indentations_n, rng_for(seed, "pokes"))
     taken = set(table.indentation[chosen].tolist())
     assert len(taken) == indentations_n
     assert chosen.tolist() == [row for row in range(len(table)) if table.indentation[row] in taken]
@@ -192,24 +193,24 @@ def test_places_are_poked_equally_often(indentations_n, seed):
 
 
 @given(st.integers(0, 390), st.integers(0, 390), st.integers(0, 2**32))
-def test_smaller_choice_is_part_of_larger_one(one_n, other_n, seed):
+def test_smaller_choice_is_a_subset_of_a_larger_one(one_n, other_n, seed):
     table = grid(depths_n=3, passes_n=2)
     few, many = (
-        set(take_pokes(table, every(table), n, rng_for(seed, "pokes")).tolist()) for n in sorted((one_n, other_n))
+        set(take_pokes(table, all_rows(table), n, rng_for(seed, "pokes")).tolist()) for n in sorted((one_n, other_n))
     )
     assert few <= many
 
 
 @given(st.integers(0, 2**32))
-def test_row_order_does_not_decide_the_choice(seed):
+def test_choice_does_not_depend_on_row_order(seed):
     table = grid(depths_n=2)
     order = rng_for(seed, "order").permutation(len(table))
     shuffled = replace(table, target=table.target[order], indentation=table.indentation[order])
-    one, other = (take_pokes(each, every(each), 80, rng_for(seed, "pokes")) for each in (table, shuffled))
+    one, other = (take_pokes(each, all_rows(each), 80, rng_for(seed, "pokes")) for each in (table, shuffled))
     assert set(table.indentation[one].tolist()) == set(shuffled.indentation[other].tolist())
 
 
-def test_only_the_pool_is_poked():
+def test_only_rows_of_the_pool_are_taken():
     table = grid(depths_n=2, passes_n=2)
     pool = np.flatnonzero(table.indentation >= 130)  # the second pass
     assert take_pokes(table, pool, 130, rng_for(0, "pokes")).tolist() == pool.tolist()
@@ -217,9 +218,9 @@ def test_only_the_pool_is_poked():
 
 
 def test_remainder_and_depths_are_drawn_fairly():
-    # Place 0 has 8 visits, place 1 has one: the poke falls on each place equally often, and on each of the 8 visits.
-    table = at([(0, 0)] * 8 + [(2, 0)])
-    taken = Counter(int(take_pokes(table, every(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
+    # Place 0 has 8 visits, place 1 has one. The poke is equally likely at both places, and at each of the 8 visits.
+    table = rows_at([(0, 0)] * 8 + [(2, 0)])
+    taken = Counter(int(take_pokes(table, all_rows(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
     assert abs(taken[8] - 800) < 4 * np.sqrt(1600 / 4)  # four standard deviations of a fair coin
     assert all(abs(taken[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
 
@@ -227,26 +228,26 @@ def test_remainder_and_depths_are_drawn_fairly():
 def test_too_many_pokes_are_refused():
     table = grid()
     with pytest.raises(ParamsError, match="skin s0: pokes to choose must be at most the 65 indentations.*; got 66"):
-        take_pokes(table, every(table), 66, rng_for(0, "pokes"))
+        take_pokes(table, all_rows(table), 66, rng_for(0, "pokes"))
 
 
 def test_pokes_are_chosen_on_one_skin():
     with pytest.raises(ParamsError, match="of several skins: s0, s1"):
-        take_pokes(at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
+        take_pokes(rows_at([(0, 0), (2, 0)], ["s0", "s1"]), np.arange(2), 1, rng_for(0, "pokes"))
 
 
 EVERY = Selection(force_min_N=0.0)
 UNKNOWN = np.full(6, np.nan, np.float32)
 
 
-def by_hand(skin: str = "s0", **changes: object):
+def hand_readings(skin: str = "s0", **changes: object):
     pressed = {"indentation": np.repeat(np.arange(3, dtype=np.int32), 2), "pass_i": np.zeros(6, np.int32)}
     unknown = {"x_mm": UNKNOWN, "y_mm": UNKNOWN, "depth_mm": UNKNOWN, "Fz_N": UNKNOWN}
     return readings(f"{skin}-hand", "b0", skin, **(pressed | unknown | changes))
 
 
 @given(st.integers(2, 12), st.integers(2, 12))
-def test_rows_above_stay_and_indentations_are_distinct(above_n, below_n):
+def test_stacked_rows_are_kept_and_indentations_are_distinct(above_n, below_n):
     above, below = gather([readings("c0", f=above_n)], EVERY), gather([readings("c1", skin="s1", f=below_n)], EVERY)
     both = stack(above, below)
     assert len(both) == above_n + below_n
@@ -259,15 +260,15 @@ def test_rows_above_stay_and_indentations_are_distinct(above_n, below_n):
 
 
 def test_hand_pokes_have_fields_but_no_labels():
-    rows, _ = hand_rows([by_hand("s0"), by_hand("s1")])
+    rows, _ = hand_rows([hand_readings("s0"), hand_readings("s1")])
     assert len(rows) == 12
     assert np.isnan(rows.target).all()
     assert rows.db_uT[:, 0].tolist() == [0, 1, 2, 3, 4, 5] * 2
     assert len({*rows.indentation}) == 6
 
 
-def test_lines_of_each_skin_name_its_own_rows():
-    captures = [by_hand("s0"), by_hand("s1")]
+def test_lines_of_each_skin_refer_to_its_own_rows():
+    captures = [hand_readings("s0"), hand_readings("s1")]
     rows, lines = hand_rows(captures)
     for one in captures:
         alone = hand_lines(one.pass_i, one.indentation)
@@ -284,4 +285,4 @@ def test_other_channels_and_repeated_skin_are_refused():
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):
         stack(gather([readings("c0")], EVERY), other)
     with pytest.raises(ParamsError, match="skin s0 is poked by hand in another capture too"):
-        hand_rows([by_hand("s0"), by_hand("s0")])
+        hand_rows([hand_readings("s0"), hand_readings("s0")])

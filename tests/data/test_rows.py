@@ -1,4 +1,4 @@
-"""Rows of captures that models see: change of field, passes, indentation numbers, scan order."""
+"""Tests of the rows that models receive: field change, passes, indentation numbers and order of captures."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_passes_continue_across_captures_of_a_skin():
 
 
 def test_indentation_numbers_are_unique_in_the_scene():
-    press = np.array([7, 7, 2, 2, 9, 9], np.int32)  # all captures use the same numbers, not from 0
+    press = np.array([7, 7, 2, 2, 9, 9], np.int32)  # both captures use the same numbers, which do not start at 0
     lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
     rows = gather([readings("c1", indentation=press, x_mm=lost), readings("c0", indentation=press)], ALL)
     naive, seen = [], []
@@ -46,9 +46,9 @@ def test_indentation_numbers_are_unique_in_the_scene():
 
 def test_capture_order_does_not_matter():
     one, other = readings("c0"), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, 2, np.float32))
-    ahead, behind = gather([one, other], ALL), gather([other, one], ALL)
-    assert (ahead.board == behind.board).all()
-    assert (ahead.target == behind.target).all()
+    expected, actual = gather([one, other], ALL), gather([other, one], ALL)
+    assert (expected.board == actual.board).all()
+    assert (expected.target == actual.target).all()
 
 
 @pytest.mark.parametrize(

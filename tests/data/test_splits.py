@@ -1,4 +1,4 @@
-"""Splits into training, test and pool rows, and their JSON form."""
+"""Tests of splits into training, test and pool rows, and of their JSON form."""
 
 import doctest
 import json
@@ -23,17 +23,17 @@ TEMPORAL = Split(temporal_test_fraction=0.2)
 labels = st.lists(st.tuples(st.sampled_from("abcd"), st.integers(0, 2)), min_size=4, max_size=40)
 
 
-def of_pairs(pairs):
+def rows_of_pairs(pairs):
     return rows([f"b{board}" for board, _ in pairs], [f"b{board}_s{skin}" for board, skin in pairs])
 
 
 def six_by_three(readings_n: int = 4):
-    return of_pairs([(board, skin) for board in range(6) for skin in range(3) for _ in range(readings_n)])
+    return rows_of_pairs([(board, skin) for board in range(6) for skin in range(3) for _ in range(readings_n)])
 
 
 @given(labels.filter(lambda pairs: len({board for board, _ in pairs}) > 1))
 def test_every_row_is_held_out_once(pairs):
-    table = of_pairs(pairs)
+    table = rows_of_pairs(pairs)
     folds = draw_folds(table, ["lobo"], Split(), 0)
     assert sorted(np.concatenate([fold.test for fold in folds]).tolist()) == list(range(len(table)))
     for fold in folds:
@@ -52,15 +52,15 @@ def test_six_boards_give_six_folds():
 @given(st.permutations(range(18)))
 def test_row_order_does_not_matter(order):
     pairs = [(board, skin) for board in range(6) for skin in range(3)]
-    straight, shuffled = of_pairs(pairs), of_pairs([pairs[i] for i in order])
+    original, shuffled = rows_of_pairs(pairs), rows_of_pairs([pairs[i] for i in order])
     for experiment, split in (("lobo", Split()), ("transfer", TRANSFER)):
-        ahead, behind = (draw_folds(table, [experiment], split, 0) for table in (straight, shuffled))
-        for one, other in zip(ahead, behind, strict=True):
+        expected, actual = (draw_folds(table, [experiment], split, 0) for table in (original, shuffled))
+        for one, other in zip(expected, actual, strict=True):
             assert one.name == other.name
-            assert set(straight.skin[one.test]) == set(shuffled.skin[other.test])
+            assert set(original.skin[one.test]) == set(shuffled.skin[other.test])
 
 
-def test_transfer_is_three_skins_on_nine_others():
+def test_transfer_trains_on_three_skins_and_tests_on_nine():
     table = six_by_three()
     folds = draw_folds(table, ["transfer"], TRANSFER, 0)
     assert [set(table.skin[fold.train]) for fold in folds] == [{"b0_s0"}, {"b1_s0"}, {"b2_s0"}]
@@ -121,15 +121,15 @@ def test_pool_is_the_first_passes_of_held_out_skins(experiment, split):
 
 @pytest.mark.parametrize("experiment", ["lobo", "sensors"])
 @given(order=st.permutations(range(12)))
-def test_row_order_decides_neither_pool_nor_skins(experiment, order):
+def test_pool_and_skins_do_not_depend_on_row_order(experiment, order):
     labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
     split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no rows
-    straight, shuffled = (
+    original, shuffled = (
         rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
         for numbers in (range(12), order)
     )
-    ahead, behind = (draw_folds(table, [experiment], split, 7) for table in (straight, shuffled))
-    for one, other in zip(ahead, behind, strict=True):
+    expected, actual = (draw_folds(table, [experiment], split, 7) for table in (original, shuffled))
+    for one, other in zip(expected, actual, strict=True):
         assert one.name == other.name
         for side in ("train", "test", "pool"):
             assert {*getattr(one, side).tolist()} == {order[i] for i in getattr(other, side).tolist()}
@@ -199,7 +199,7 @@ def test_boards_draw_their_skins_independently():
         tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
         for fold in folds
     }
-    assert len(ranks) > 1  # boards do not all draw the same three
+    assert len(ranks) > 1  # not all boards draw the same three skins
 
 
 def test_repeated_number_of_sensors_is_refused():
@@ -209,11 +209,12 @@ def test_repeated_number_of_sensors_is_refused():
 
 LABELS = Split(labels_pool_n=5, labels_draws_n=3)
 PLACES_N = 4
-PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])  # places of ten indentations, unequally often as in recordings
+# The places of ten indentations. As in recordings, places occur unequally often.
+PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])
 
 
-def poked(boards_n: int = 3, readings_n: int = 2):
-    """Two skins per board, each with ten indentations at four places in two passes."""
+def poked_rows(boards_n: int = 3, readings_n: int = 2):
+    """Return rows of two skins per board; each skin has ten indentations at four places in two passes."""
     labels = [
         (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
         for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)
@@ -226,7 +227,7 @@ def poked(boards_n: int = 3, readings_n: int = 2):
 
 @given(st.integers(0, 2**32), st.integers(1, 9), st.integers(1, 3))
 def test_boards_are_held_out_with_a_pool_of_each_skin(seed, pool_n, draws_n):
-    table = poked()
+    table = poked_rows()
     folds = draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=draws_n), seed)
     assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
     for fold in folds:
@@ -240,7 +241,7 @@ def test_boards_are_held_out_with_a_pool_of_each_skin(seed, pool_n, draws_n):
 
 @given(st.integers(0, 2**32), st.integers(1, 8))
 def test_label_pool_takes_places_equally_often(seed, pool_n):
-    table = poked()
+    table = poked_rows()
     for fold in draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=2), seed):
         for skin in np.unique(table.skin[fold.pool]):
             own = fold.pool[table.skin[fold.pool] == skin]
@@ -249,8 +250,8 @@ def test_label_pool_takes_places_equally_often(seed, pool_n):
             assert visits.max() <= -(-pool_n // PLACES_N)
 
 
-def test_label_pools_follow_from_seed_and_draw():
-    table = poked()
+def test_label_pools_depend_only_on_seed_and_draw():
+    table = poked_rows()
     first, again, other = (draw_folds(table, ["labels"], LABELS, seed) for seed in (1, 1, 2))
     fewer = draw_folds(table, ["labels"], Split(labels_pool_n=5, labels_draws_n=1), 1)
     assert [fold.pool.tolist() for fold in first] == [fold.pool.tolist() for fold in again]
@@ -259,7 +260,7 @@ def test_label_pools_follow_from_seed_and_draw():
 
 
 def test_skins_of_a_board_have_different_label_pools():
-    table = poked(boards_n=2)
+    table = poked_rows(boards_n=2)
     own_n = len(PLACE)
     for fold in draw_folds(table, ["labels"], LABELS, 0):
         one, other = (
@@ -270,7 +271,7 @@ def test_skins_of_a_board_have_different_label_pools():
 
 
 def test_adaptation_pool_does_not_change_label_folds():
-    table = poked()
+    table = poked_rows()
     plain, pooled = (
         draw_folds(table, ["labels"], LABELS.model_copy(update={"pool_passes_n": passes_n}), 0)
         for passes_n in (None, 1)
@@ -300,11 +301,11 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (ONE_BOARD, "sensors", SENSORS, "at most the 0 skins beside held-out board b0; got 15"),
         (ONE_BOARD, "labels", LABELS, "experiment lobo: boards must be two or more; got 1"),
         (
-            poked(), "labels", Split(labels_pool_n=10, labels_draws_n=1),
+            poked_rows(), "labels", Split(labels_pool_n=10, labels_draws_n=1),
             "fold labels/b0: split.labels_pool_n must be less than its indentations; got 10",
         ),
         (
-            poked(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
+            poked_rows(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
             "skin b0_s0: pokes to choose must be at most the 10 indentations of its pool; got 11",
         ),
         (TWO_CAPTURES, "single_temporal", TEMPORAL, "captures of skin s0 is unknown: run10, run2"),

@@ -50,14 +50,14 @@ def test_units_are_tested_once_and_never_trained_on(sizes):
 def test_skins_share_the_shortest_range():
     windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
-    assert windows.left_out_units_n == 24 - 15  # everything from the first window that the shorter one lacks
+    assert windows.left_out_units_n == 24 - 15  # all units from the first window that the shorter capture lacks
 
 
 def test_parts_are_whole_rows():
-    some = take(readings(), np.array([0, 1, 0, 0, 1, 0], bool))
-    assert some.x_mm.tolist() == [1, 4] == some.indentation.tolist()
-    assert some.b_uT[:, 0].tolist() == [101, 104]
-    assert (some.capture, len(some)) == ("c0", 2)
+    taken = take(readings(), np.array([0, 1, 0, 0, 1, 0], bool))
+    assert taken.x_mm.tolist() == [1, 4] == taken.indentation.tolist()
+    assert taken.b_uT[:, 0].tolist() == [101, 104]
+    assert (taken.capture, len(taken)) == ("c0", 2)
 
 
 def test_two_captures_of_one_skin_are_refused():
@@ -78,20 +78,20 @@ POLICIES = {
 
 
 def capture(skin: str, f: int = 24):
-    """One reading per indentation, with its number as no-load field; every fifth is too weak to be selected."""
+    """Return one reading per indentation, whose number is the no-load field; every fifth is too weak to be selected."""
     noload_uT = np.tile(np.arange(f, dtype=np.float32)[:, None], (1, 3))
     weak = np.where(np.arange(f) % 5 == 0, 0.01, 1).astype(np.float32)
     return readings(skin, skin=skin, f=f, noload_uT=noload_uT, b_uT=np.full((f, 3), 100, np.float32), Fz_N=weak)
 
 
-def lay(*skins: str):
+def example_parts(*skins: str):
     captures = [(one, rank(one.indentation)) for one in map(capture, skins)]
     windows = make_windows([24] * len(skins), train_n=6, test_n=4, every_n=8)
     return make_parts(captures, POLICIES, windows=windows, selection=Selection(force_min_N=0.1))
 
 
 def test_every_window_has_the_change_of_each_policy():
-    for part in lay("s0", "s1"):
+    for part in example_parts("s0", "s1"):
         start, end = {TRAIN: (0, 6), 0: (8, 12), 1: (16, 20)}[part.window_i]
         strong = [i for i in range(start, end) if i % 5]
         expected = [100.0 - (i if part.policy == "each" else 0) for i in strong]
@@ -101,12 +101,12 @@ def test_every_window_has_the_change_of_each_policy():
 
 
 def test_first_no_load_reading_may_be_unselected():
-    first = next(part for part in lay("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
+    first = next(part for part in example_parts("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
     assert (first.rows.db_uT == 100).all()  # relative to reading 0, whose contact is too weak
 
 
-def test_parts_know_their_rows():
-    parts = lay("s0", "s1")
+def test_parts_index_their_rows():
+    parts = example_parts("s0", "s1")
     rows = stack(parts)
     assert np.concatenate([part.row_i for part in parts]).tolist() == list(range(len(rows)))
     for part in parts:
@@ -116,11 +116,11 @@ def test_parts_know_their_rows():
 
 def test_unselected_rows_are_counted_once():
     weak_n = sum(i % 5 == 0 for window in ((0, 6), (8, 12), (16, 20)) for i in range(*window))
-    assert stack(lay("s0")).dropped == {"no_contact_rows_n": 0, "low_force_rows_n": weak_n}
+    assert stack(example_parts("s0")).dropped == {"no_contact_rows_n": 0, "low_force_rows_n": weak_n}
 
 
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 3))
-def test_as_read_part_equals_gather(train_n, test_n, more_n):
+def test_parts_with_policy_each_equal_gather(train_n, test_n, more_n):
     every_n = max(train_n, test_n) + more_n
     windows = make_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
     one, everything = capture("s0"), Selection(force_min_N=0.0)

@@ -13,7 +13,7 @@ from tests.faults.harness import Checkout, Result, Row, fault, judge
 from tests.faults.kills import address
 from tests.recordings.readers.test_lab import PRESSES, write
 from tests.repositories import git
-from tests.scenes import recorded
+from tests.scenes import recorded_scene
 
 TRIPLET = address("train_triplet")
 FINISHED = (address("report"), address("publish"))
@@ -57,7 +57,7 @@ def two_stages(at: Checkout) -> Row:
 def _add(at: Checkout) -> list[str]:
     """Write a recorded scene and a recording; return the command that adds it."""
     with (at.folder / "pipeline/scenes/rig.yaml").open("w") as stream:
-        YAML().dump(recorded(), stream)
+        YAML().dump(recorded_scene(), stream)
     recording = at.folder.with_name("recording")
     recording.mkdir(exist_ok=True)
     write(recording, *PRESSES)

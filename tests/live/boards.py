@@ -42,7 +42,7 @@ def make_script(
 
 
 def changes_uT(chips_n: int) -> np.ndarray:
-    """Changes of field of the two pokes [2 ch], unlike those of a distant magnet."""
+    """Field changes of the two pokes [2 ch], unlike those of a distant magnet."""
     return 200.0 * rng_for(1, "pokes").standard_normal((2, 3 * chips_n))
 
 
@@ -58,10 +58,10 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
     scaler |= {"target_shift": np.array([off_mm * 2, 0, 0]), "target_scale": np.ones(3)}
     tensors = weights | {key: value.astype(np.float32) for key, value in scaler.items()}
     io.write_tensors(folder / f"{name}.safetensors", tensors, {})
-    shown = {"quantity": "change of field", "unit": "uT", "channels_n": 3 * chips_n}
+    card_input = {"quantity": "change of field", "unit": "uT", "channels_n": 3 * chips_n}
     card = {
         "format": "reskin-model/3", "scene": "quick", "recipe": {"inputs": "raw", "architecture": "paper"},
-        "input": shown, "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"}, "collapsed": False,
+        "input": card_input, "output": {"x_mm": "mm", "y_mm": "mm", "Fz_N": "N"}, "collapsed": False,
     }  # fmt: skip
     io.write_json(folder / f"{name}.json", card)
     return folder / f"{name}.safetensors"
@@ -81,8 +81,11 @@ def write_script(script: Script, folder: Path) -> Path:
     return folder
 
 
-class PlayedReader:
-    """Return a script's bytes at the script's own times, without port and thread, so that no load disturbs them."""
+class ScriptReader:
+    """A reader that returns a script's bytes at the script's own times, without a port or a thread.
+
+    So results do not depend on the load of the machine.
+    """
 
     plugged_in, was_plugged_in, problem, missed_bytes_n, taken_s = True, True, "", 0, 0.0
 
@@ -108,10 +111,10 @@ class PlayedReader:
         return [(b"".join(pieces), self.unix_s())] if pieces else []
 
 
-def played(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Estimates]]:
+def play_to_skin(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Estimates]]:
     """Play a script to a skin as fast as possible; return the skin and all its estimates."""
     skin, estimates = LiveSkin("played", models), []
-    skin.reader = reader = PlayedReader(script)
+    skin.reader = reader = ScriptReader(script)
     while not reader.at_end:
         if (found := skin.poll(0.0)) is not None:
             estimates.append(found)
@@ -119,7 +122,7 @@ def played(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Estimate
 
 
 def zero_requests(monkeypatch) -> list[LiveSkin]:
-    """Collect the skins on which `zero` is called (on a busy machine, zeroing ends before the page shows it)."""
+    """Collect the skins on which `zero` is called; on a busy machine, zeroing can end before the page shows it."""
     zeroed, zero = [], LiveSkin.zero
     monkeypatch.setattr(LiveSkin, "zero", lambda skin: (zero(skin), zeroed.append(skin)))
     return zeroed

@@ -1,4 +1,4 @@
-"""Longer time limits: they are meant for quiet machines, and tests also run on busy ones."""
+"""Longer time limits, because tests also run on busy machines."""
 
 import pytest
 

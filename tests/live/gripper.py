@@ -26,17 +26,17 @@ DEPTHS_MM = np.linspace(0.02, 1.5, 60)
 
 
 @dataclass(frozen=True)
-class Fitted(Network):
+class FittedNetwork(Network):
     """A network of one skin, fitted to labelled pokes all over it (paper section 5)."""
 
-    fitted: MLPRegressor = field(default_factory=MLPRegressor)
+    regressor: MLPRegressor = field(default_factory=MLPRegressor)
 
     def __call__(self, db_uT: np.ndarray) -> np.ndarray:
         scaler = Scaler.of_arrays(self.tensors)
-        return scaler.decode(self.fitted.predict(scaler.encode(db_uT)).astype(np.float32))
+        return scaler.decode(self.regressor.predict(scaler.encode(db_uT)).astype(np.float32))
 
 
-def fit(seed: int, pokes_n: int = 600) -> Fitted:
+def fit(seed: int, pokes_n: int = 600) -> FittedNetwork:
     """Fit a network to simulated pokes of a skin, each read once."""
     rng = rng_for(seed, "gripper")
     pokes = np.column_stack([rng.uniform(2, 14, (pokes_n, 2)), rng.uniform(DEPTHS_MM[0], DEPTHS_MM[-1], pokes_n)])
@@ -50,11 +50,11 @@ def fit(seed: int, pokes_n: int = 600) -> Fitted:
         warnings.simplefilter("ignore")  # not converged
         net.fit(scaler.encode(db_uT), scaler.encode_target(target))
     card = {"input": {"channels_n": 15}, "recipe": {"inputs": "raw"}}
-    return Fitted(card, scaler.arrays(), net)
+    return FittedNetwork(card, scaler.arrays(), net)
 
 
 class Finger:
-    """Readings of a skin's chips when its middle is pressed with a force: simulated once, then interpolated."""
+    """The readings of a skin's chips when its centre is pressed with a force: simulated once, then interpolated."""
 
     def __init__(self, seed: int, at_mm: tuple[float, float] = (8.0, 8.0)) -> None:
         pokes = np.column_stack([np.tile(at_mm, (len(DEPTHS_MM), 1)), DEPTHS_MM])
@@ -74,7 +74,7 @@ class Finger:
 
 
 class FingerReader:
-    """A reader whose next frame is of the current force."""
+    """A reader whose next frame shows the current force."""
 
     plugged_in, problem, missed_bytes_n = True, "", 0
 
@@ -101,15 +101,15 @@ def grip(
     finger: Finger, models: Models, rng: np.random.Generator, *, aim_N: float = AIM_N, seconds: float = PERIOD_S
 ) -> np.ndarray:
     """Hold an object whose stiffness varies tenfold; return true and estimated force in N of every step [f 2]."""
-    skin, wire, closed_mm, held = LiveSkin("gripper", models), FingerReader(finger, rng), 0.0, []
+    skin, wire, closed_mm, forces_N = LiveSkin("gripper", models), FingerReader(finger, rng), 0.0, []
     skin.reader = wire
-    while len(held) < seconds * RATE_HZ:
+    while len(forces_N) < seconds * RATE_HZ:
         estimates = skin.poll(0.0, latest=True)
         if estimates is None or not skin.zeroed:
             continue
         estimate_N = float(estimates.target[-1, 2])
-        held.append((wire.force_N, estimate_N))
+        forces_N.append((wire.force_N, estimate_N))
         closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # the controller
-        share = (1 - np.cos(2 * np.pi * len(held) / RATE_HZ / PERIOD_S)) / 2
+        share = (1 - np.cos(2 * np.pi * len(forces_N) / RATE_HZ / PERIOD_S)) / 2
         wire.force_N = finger.force_at(closed_mm, SOFT_N_MM * (HARD_N_MM / SOFT_N_MM) ** share)
-    return np.array(held)
+    return np.array(forces_N)

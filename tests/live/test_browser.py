@@ -1,7 +1,8 @@
-"""The page in a real Chromium: contacts are drawn at their place; zero, record and adapt work by button and by key.
+"""Tests of the page in a real Chromium: contacts are drawn in place; buttons and keys zero, record and adapt.
 
-Skipped where there is none: RESKIN_BROWSER names one, else it is looked for on the path. It is driven through its own
-debugging protocol, so that no package is needed. RESKIN_SCREENSHOTS names a folder for what is to be looked at.
+The environment variable RESKIN_BROWSER names the browser; by default, it is searched on the path. Without a browser,
+the tests are skipped. They use the browser's debugging protocol and need no further package. RESKIN_SCREENSHOTS names a
+folder for screenshots.
 """
 
 import asyncio
@@ -24,9 +25,9 @@ from reskin.models.trained import read_network
 from reskin.recordings.header import HEADER_FILE
 from reskin.universal.model import load_universal
 from tests.live.boards import PLACES, make_script, plugged_in, write_model, zero_requests
-from tests.live.test_estimators import poked, pressed, simulated  # noqa: F401 - fixtures
+from tests.live.test_estimators import guided_pokes, make_poke_script, random_pokes  # noqa: F401 - fixtures
 from tests.live.test_server import LONG_S, serve
-from tests.live.test_several import GOES, RATES_HZ, plug_in_all
+from tests.live.test_several import RATES_HZ, UNPLUGGED_I, plug_in_all
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
@@ -38,8 +39,8 @@ DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = d
   scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
   return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
     ratio * (margin + (bottom + high - y) * scale), 1, 1).data].slice(0, 3) : []; })"""
-# Number of pixels of a trace that differ from a trace drawn at once, and number of inked pixels.
-ANEW = """((board, i) => {
+# The number of pixels in which a trace differs from the same trace drawn in one piece, and the number of drawn pixels.
+COMPARE_TRACES = """((board, i) => {
   const count = i ? board.last.chips : 1, shown = board.traces[i];
   const anew = new Trace(shown.canvas, shown.first, shown.least);
   while (shown.draw(board.rows, board.changed, count)) {}
@@ -79,9 +80,9 @@ class Tab:
     async def text(self, name: str) -> str:
         return str(await self.value(f"boards[0].parts.{name}.innerText"))
 
-    async def until(self, expression: str, is_so: Callable[[object], bool] = bool) -> object:
+    async def until(self, expression: str, accept: Callable[[object], bool] = bool) -> object:
         for _ in range(round(LONG_S / 0.02)):
-            if is_so(found := await self.value(expression)):
+            if accept(found := await self.value(expression)):
                 return found
             await asyncio.sleep(0.02)
         raise AssertionError(f"never: {expression}; last {found}")
@@ -107,7 +108,7 @@ class Tab:
 def in_browser(folder: Path, act: Callable) -> Callable:
     """Turn an action on a tab into an action on a server's address."""
 
-    async def shown(address: str, client: aiohttp.ClientSession) -> None:
+    async def act_in_browser(address: str, client: aiohttp.ClientSession) -> None:
         profile = folder / "profile"
         browser = await asyncio.create_subprocess_exec(
             BROWSER, *FLAGS, f"--user-data-dir={profile}", stderr=asyncio.subprocess.DEVNULL
@@ -117,9 +118,9 @@ def in_browser(folder: Path, act: Callable) -> Callable:
             while not (port_file.exists() and "\n" in port_file.read_text()):
                 await asyncio.sleep(0.05)
             debugging = f"http://127.0.0.1:{port_file.read_text().split()[0]}"
-            async with client.put(f"{debugging}/json/new?about:blank") as answer:
-                where = (await answer.json())["webSocketDebuggerUrl"]
-            async with client.ws_connect(where, max_msg_size=0) as socket:
+            async with client.put(f"{debugging}/json/new?about:blank") as response:
+                socket_url = (await response.json())["webSocketDebuggerUrl"]
+            async with client.ws_connect(socket_url, max_msg_size=0) as socket:
                 tab = Tab(socket)
                 await tab.call("Runtime.enable")
                 await tab.call("Page.navigate", url=address)
@@ -130,7 +131,7 @@ def in_browser(folder: Path, act: Callable) -> Callable:
             browser.kill()
             await browser.wait()
 
-    return shown
+    return act_in_browser
 
 
 def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
@@ -151,8 +152,8 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
             "(({rate}) => rate.innerText.endsWith('Hz') && parseFloat(rate.innerText) < 520)(boards[0].parts)"
         )
         await tab.look("network")
-        for trace_i in range(2):  # a scrolled and scaled trace looks like one drawn at once
-            differ_n, inked_n = await tab.value(f"{ANEW}(boards[0], {trace_i})")
+        for trace_i in range(2):  # a scrolled and scaled trace looks like one drawn in one piece
+            differ_n, inked_n = await tab.value(f"{COMPARE_TRACES}(boards[0], {trace_i})")
             assert differ_n < 0.01 * inked_n  # Chromium smooths short and long paths differently
             assert inked_n > 1000
         await tab.value("boards[0].parts.record.click()")
@@ -171,7 +172,7 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
     assert (folder / HEADER_FILE).is_file()
 
 
-def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, simulated):  # noqa: F811
+def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, random_pokes):  # noqa: F811
     async def act(tab: Tab) -> None:
         await tab.until(
             "boards[0].last && boards[0].last.contact && boards[0].last.sdX > .1 && boards[0].last.sdY > .1"
@@ -182,18 +183,20 @@ def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, simulated):  # n
         assert "mm before" in await tab.text("adapting")
         await tab.look("map")
 
-    with plugged_in(poked(simulated), loop=True) as name:
+    with plugged_in(make_poke_script(random_pokes), loop=True) as name:
         serve(name, load_universal(), in_browser(tmp_path, act))
 
 
-def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, pressed):  # noqa: F811
-    quiet = poked(pressed)
+def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):  # noqa: F811
+    quiet = make_poke_script(guided_pokes)
     late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)  # time to press the button before the first place
     script = replace(quiet, t_s=quiet.t_s + late_s)
 
     async def act(tab: Tab) -> None:
-        none = "rows.slice(-30).every(({high}) => high[0] === 0)"  # longer than the pause between two places
-        await tab.until(f"(({{rows}}) => rows.length > 30 && rows.at(-1).n - rows.at(-30).n < 35 && {none})(boards[0])")
+        no_contact = "rows.slice(-30).every(({high}) => high[0] === 0)"  # longer than the pause between two places
+        await tab.until(
+            f"(({{rows}}) => rows.length > 30 && rows.at(-1).n - rows.at(-30).n < 35 && {no_contact})(boards[0])"
+        )
         await tab.press_key("p")
         await tab.until("boards[0].state.next_mm && !boards[0].dirty")
         await tab.look("cross")
@@ -212,16 +215,16 @@ def test_page_draws_several_boards(tmp_path):
         await tab.until("boards.length === 8 && boards.every(({state}) => state.zeroed)")
         for i in range(1, 8):  # the model has five chips; the sleeve is drawn without a dot
             await tab.until(f"(({{last}}) => last && last.contact && !isNaN(last.x))(boards[{i}])")
-        for i, rate_hz in enumerate(RATES_HZ[:GOES]):
+        for i, rate_hz in enumerate(RATES_HZ[:UNPLUGGED_I]):
             await tab.until(f"((hz) => 0 < hz && hz < 1.4 * {rate_hz})(parseFloat(boards[{i}].parts.rate.innerText))")
-        await asyncio.to_thread(goes.close)
+        await asyncio.to_thread(unplugged.close)
         await tab.until("boards[7].state.silent && boards[7].parts.rate.innerText === '–'")
-        lost = ",".join(["0"] * GOES + ["NaN"])  # a silent board shows no rate and no further loss
+        lost = ",".join(["0"] * UNPLUGGED_I + ["NaN"])  # a silent board shows no rate and no further loss
         await tab.until("boards.map(({parts}) => parseFloat(parts.lost.innerText)).join()", lost.__eq__)
         assert "unplugged" in str(await tab.value("boards[7].state.alarms.join()"))
         assert await tab.value("boards.slice(0, 7).every(({state}) => !state.alarms.join().includes('unplugged'))")
         await tab.look("several", "boards[1].last.contact")
 
-    with ExitStack() as stack, ExitStack() as goes:
-        names = plug_in_all(stack, goes, tmp_path, range(8))
+    with ExitStack() as stack, ExitStack() as unplugged:
+        names = plug_in_all(stack, unplugged, tmp_path, range(8))
         serve(names, load_universal(), in_browser(tmp_path, act))

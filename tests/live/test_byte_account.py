@@ -1,4 +1,4 @@
-"""Every byte of a faulty board is in a frame or counted as lost for the right reason, for random faults."""
+"""Tests, with random faults, that every byte of a board is in a frame or counted as lost for the right reason."""
 
 from collections import Counter
 from dataclasses import replace
@@ -19,45 +19,47 @@ REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_fini
 
 
 def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generator]:
-    """Draw a stream with faults in most slots; also its undamaged frames and which of them are finite."""
+    """Draw a stream with faults in most slots; return also its undamaged frames and which of them are finite."""
     rng = rng_for(seed, "byte account")
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
     faults = [str(name) for name in rng.choice([*VALUE_FAULTS, *BYTE_FAULTS, "none"], SLOTS_N - 1)]
-    # After damage, an implausible frame is taken for the rest of one and lost in the resynchronisation.
+    # After damage, the decoder takes an implausible frame for the rest of a damaged one and skips it.
     finite = rng.random(len(frames)) >= NOT_FINITE_SHARE
     finite |= np.repeat([name in BYTE_FAULTS for name in [*faults, "none"]], SLOT_FRAMES_N)
     script = Script("recorded", wire, frames, encode_pieces(frames, wire), np.arange(len(frames)) / RATE_HZ)
     for slot_i, name in enumerate(faults):  # first faults of chips, then faults of the wire
         if name in VALUE_FAULTS and (name != "clock-jump" or wire == "binary-clock"):
-            script = inject(script, in_slot(name, slot_i, rng))
+            script = inject(script, make_fault(name, slot_i, rng))
     pieces = list(script.pieces)
-    finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])  # a terminator in the payload: plausibility decides
+    # Frames with a terminator in the payload are decoded only if their values are plausible.
+    finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])
     for i in np.flatnonzero(~finite):
-        pieces[i] = not_finite(pieces[i], wire)
+        pieces[i] = with_nan(pieces[i], wire)
     script, clean = replace(script, pieces=pieces), pieces
     for slot_i, name in enumerate(faults):
         if name in BYTE_FAULTS:
-            script = inject(script, in_slot(name, slot_i, rng))
+            script = inject(script, make_fault(name, slot_i, rng))
     return script, clean, finite.tolist(), rng
 
 
-def in_slot(name: str, slot_i: int, rng: np.random.Generator) -> Fault:
+def make_fault(name: str, slot_i: int, rng: np.random.Generator) -> Fault:
     first, frames_n = rng.integers(0, SLOT_FRAMES_N // 2), rng.integers(1, SLOT_FRAMES_N // 2)
     return Fault(name, (slot_i * SLOT_FRAMES_N + first) / RATE_HZ, frames_n / RATE_HZ)
 
 
-def not_finite(piece: bytes, wire: str) -> bytes:
+def with_nan(piece: bytes, wire: str) -> bytes:
     """Replace the last number of a frame by NaN."""
     if wire in TEXT_WIRES:
         return piece[: piece.rstrip().rindex(b"\t") + 1] + b"nan\r\n"
     return piece[:-6] + np.float32(np.nan).tobytes() + piece[-2:]
 
 
-def expected(script: Script, clean: list[bytes], finite: list[bool]) -> Counter[str]:
-    """Expected account, from the faults applied to each frame and not from its bytes.
+def expected_account(script: Script, clean: list[bytes], finite: list[bool]) -> Counter[str]:
+    """Return the expected account, from the faults applied to each frame and not from its bytes.
 
-    What is damaged takes the next frame with it, as nothing says where that begins; but for a line feed by chance.
+    After a damaged frame, the next frame is lost too, because the decoder cannot know where it starts. Exception: a
+    damaged text frame that still ends with a line feed.
     """
     count: Counter[str] = Counter()
     in_step = True
@@ -85,7 +87,7 @@ def test_every_byte_is_in_a_frame_or_counted_by_reason():
     total: Counter[str] = Counter()
     for seed in range(SEEDS_N):
         script, clean, finite, rng = draw(seed)
-        count, data = expected(script, clean, finite), b"".join(script.pieces)
+        count, data = expected_account(script, clean, finite), b"".join(script.pieces)
         if seed % 2 and finite[-1]:  # unplugged inside the last frame
             left_n = len(clean[-1]) - int(rng.integers(3, len(clean[-1])))
             data = data[: len(data) - len(clean[-1]) + left_n]

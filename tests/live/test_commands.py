@@ -1,4 +1,4 @@
-"""Commands without options find the boards that are plugged in."""
+"""Tests that commands without options find the boards that are plugged in."""
 
 import time
 from types import SimpleNamespace
@@ -11,13 +11,13 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.recordings.header import HEADER_FILE, STREAM_FILE, parse
 from tests.live.boards import make_script, plugged_in
 
-UNTOLD = {"board": None, "skin": None, "wire": None, "chips_n": None, "baud": 115200, "scan": None}
+NO_OPTIONS = {"board": None, "skin": None, "wire": None, "chips_n": None, "baud": 115200, "scan": None}
 RATE_BYTES_S = 82 * 400
 
 
 @pytest.fixture(autouse=True)
 def clock(tmp_path, monkeypatch):
-    """Advance the recorder's clock as bytes arrive, so that a busy machine records as much."""
+    """Advance the recorder's clock as bytes arrive, so that a busy machine records as much as a quiet one."""
 
     def monotonic() -> float:
         return sum(stream.stat().st_size for stream in tmp_path.rglob(STREAM_FILE)) / RATE_BYTES_S
@@ -29,7 +29,7 @@ def test_record_without_options_finds_the_only_board(tmp_path, monkeypatch, caps
     monkeypatch.chdir(tmp_path)
     with plugged_in(make_script(chips_n=4, wire="text-txyz"), loop=True) as name:
         monkeypatch.setattr(find, "port_names", lambda: [name])
-        commands.record(None, seconds=0.5, out=None, **UNTOLD)
+        commands.record(None, seconds=0.5, out=None, **NO_OPTIONS)
     output = capsys.readouterr().out
     assert f"{name}: text-txyz, 4 chips" in output
     (folder,) = (tmp_path / "captures").iterdir()
@@ -40,7 +40,7 @@ def test_record_without_options_finds_the_only_board(tmp_path, monkeypatch, caps
 def test_record_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with plugged_in(inject(make_script(), parse_fault("failed-read@0+99")), loop=True) as name:
-        commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **UNTOLD)
+        commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **NO_OPTIONS)
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
 
 

@@ -1,4 +1,4 @@
-"""Scripts of the emulator contain the recorded bytes, which all arrive in time; injected faults."""
+"""Tests of emulated boards: their scripts, when bytes arrive, and injected faults."""
 
 import math
 import threading
@@ -40,14 +40,14 @@ class SimulatedClock:
 
 
 class FakeReader:
-    """A reader that notes when each frame arrives and is `late_s` late once, at frame `late_i`."""
+    """A reader that notes the arrival of each frame and is late once, by `late_s` at frame `late_i`."""
 
     def __init__(self, times, late_i=-1, late_s=0.0):
-        self.times, self.late_i, self.late_s, self.came_s = times, late_i, late_s, []
+        self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []
 
     def send(self, data, _stop):
-        self.came_s += [self.times.s] * (len(data) // 82)
-        if self.late_i in range(len(self.came_s)):
+        self.arrival_s += [self.times.s] * (len(data) // 82)
+        if self.late_i in range(len(self.arrival_s)):
             self.times.s, self.late_i = self.times.s + self.late_s, -1
         return len(data)
 
@@ -86,34 +86,34 @@ def test_loop_starts_again_when_the_port_is_opened_again(port):
     end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
     player = threading.Thread(target=play, args=[script, end, stop], kwargs={"loop": True})
     player.start()
-    began = []
+    restarted = []
     for _ in range(2):
         with open_port(end.name, 115200) as device:
             data = b""
             while len(data) < 8 * len(early):  # a stream that is not restarted would differ
                 data += read_waiting(device)
-        began.append(early in data)
+        restarted.append(early in data)
     stop.set()
     player.join()
     end.unplug()
     assert len(script) > 800
-    assert all(began)
+    assert all(restarted)
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0])
 def test_speed_multiplies_the_rate_of_the_script(times, speed):
-    taker = FakeReader(times)
-    assert play(SCRIPT, taker, times, speed=speed) == len(b"".join(SCRIPT.pieces))
-    np.testing.assert_allclose(taker.came_s, SCRIPT.t_s / speed, atol=1e-8)
+    reader = FakeReader(times)
+    assert play(SCRIPT, reader, times, speed=speed) == len(b"".join(SCRIPT.pieces))
+    np.testing.assert_allclose(reader.arrival_s, SCRIPT.t_s / speed, atol=1e-8)
 
 
 def test_a_late_reader_gets_at_most_a_tenth_of_a_second_at_once(times):
-    taker = FakeReader(times, late_i=100, late_s=2.0)
-    play(SCRIPT, taker, times)
-    late_s = np.array(taker.came_s) - SCRIPT.t_s
+    reader = FakeReader(times, late_i=100, late_s=2.0)
+    play(SCRIPT, reader, times)
+    late_s = np.array(reader.arrival_s) - SCRIPT.t_s
     np.testing.assert_allclose(late_s[:101], 0, atol=1e-8)
     np.testing.assert_allclose(late_s[-100:], 2.0 - LATE_MAX_S, atol=1 / RATE_HZ)
-    assert max(Counter(taker.came_s).values()) <= LATE_MAX_S * RATE_HZ + 1
+    assert max(Counter(reader.arrival_s).values()) <= LATE_MAX_S * RATE_HZ + 1
 
 
 def test_link_keeps_its_name_over_unplugging(tmp_path):

@@ -1,4 +1,4 @@
-"""Estimators of a live board, their calibration on the page, and unknown skins."""
+"""Tests of the estimators of a live board, their calibration on the page, and unknown skins."""
 
 import re
 
@@ -13,35 +13,35 @@ from reskin.live.tracker import UNKNOWN_SKIN, Estimates, UniversalEstimator
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
 from reskin.universal.model import load_universal
-from tests.live.boards import make_script, played
+from tests.live.boards import make_script, play_to_skin
 
 QUIET_N, POKED_N = 600, 100
 
 
 @pytest.fixture(scope="module")
-def simulated():
-    """A simulated skin's no-load reading, and pokes all over it: fields, places, forces."""
+def random_pokes():
+    """Return the no-load readings of a simulated skin, and fields, places and forces of pokes all over it."""
     places = np.column_stack([rng_for(0, "places").uniform(3, 13, (PRESSES_N, 2)), np.full(PRESSES_N, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
     return noload_uT, b_uT, places[:, :2], force_N
 
 
-def poked(simulated, chips_on_n: int = 0):
-    """A script with a quiet start and all pokes with pauses; the last chips start `chips_on_n` places later."""
-    noload_uT, b_uT, _, _ = simulated
+def make_poke_script(pokes, rotated_n: int = 0):
+    """Make a script with a quiet start and all pokes with pauses; `rotated_n` rotates the order of the chips."""
+    noload_uT, b_uT, _, _ = pokes
     script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * len(b_uT)) / 400)
     poke_i, since_n = np.divmod(np.arange(len(script)) - QUIET_N, 2 * POKED_N)
     clean_uT = np.where(((poke_i >= 0) & (since_n < POKED_N))[:, None], b_uT[poke_i], noload_uT.mean(axis=0))
     noise_uT = script.frames.b_uT - script.frames.b_uT.mean(axis=0)
-    script.frames.b_uT[:] = np.roll(clean_uT, 3 * chips_on_n, axis=1) + noise_uT
+    script.frames.b_uT[:] = np.roll(clean_uT, 3 * rotated_n, axis=1) + noise_uT
     return Script("simulated", "binary", script.frames, encode_pieces(script.frames, "binary"), script.t_s)
 
 
-def test_universal_model_estimates_places_and_their_standard_deviation(simulated):
-    skin, readings = played(poked(simulated), load_universal())
+def test_universal_model_estimates_places_and_their_standard_deviation(random_pokes):
+    skin, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
     estimates = np.concatenate([each.target[each.contact] for each in readings])
     sd_mm = np.concatenate([each.sd_mm[each.contact] for each in readings])
-    true = np.repeat(simulated[2], POKED_N, axis=0)
+    true = np.repeat(random_pokes[2], POKED_N, axis=0)
     assert len(estimates) == pytest.approx(len(true), abs=20)
     error_mm = np.abs(estimates[: len(true), :2] - true[: len(estimates)])
     assert np.median(error_mm) < 1.0
@@ -49,75 +49,74 @@ def test_universal_model_estimates_places_and_their_standard_deviation(simulated
     assert skin.health.alarms == {}
 
 
-def test_chips_in_another_order_are_an_unknown_skin(simulated):
-    skin, _ = played(poked(simulated, chips_on_n=1), load_universal())
+def test_chips_in_another_order_are_an_unknown_skin(random_pokes):
+    skin, _ = play_to_skin(make_poke_script(random_pokes, rotated_n=1), load_universal())
     assert skin.health.alarms[UNKNOWN_SKIN].count_n > 0.5 * POKED_N * PRESSES_N
 
 
-def test_presses_are_collected_and_adapted_to(simulated):
-    _, readings = played(poked(simulated), load_universal())
+def test_presses_are_collected_and_adapted_to(random_pokes):
+    _, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
     pokes = Presses()
     for each in readings:
         pokes.add(each)
     assert pokes.complete
-    change_uT = simulated[1] - simulated[0].mean(axis=0)
-    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # the strongest of 200 readings with noise of 3 uT
+    change_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
+    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # maximum noise of 200 readings with 3 uT
     estimator = UniversalEstimator(load_universal())
-    estimator.set_noload(simulated[0])
+    estimator.set_noload(random_pokes[0])
     assert "adapted to 12 presses: standard deviation of a place" in estimator.adapt(pokes.db_uT)
     before = estimator(pokes.db_uT.astype(np.float32))
-    estimator.set_noload(simulated[0])  # the adaptation is kept
+    estimator.set_noload(random_pokes[0])  # the adaptation is kept
     np.testing.assert_allclose(estimator(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
 
 
-def test_new_presses_replace_wrong_ones(simulated):
-    db_uT = simulated[1] - simulated[0].mean(axis=0)
-    mended, once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
-    for estimator in (mended, once):
-        estimator.set_noload(simulated[0])
-    mended.adapt(rng_for(0, "a hand").normal(0, 300, db_uT.shape))
-    wrong = mended(db_uT.astype(np.float32)).target
-    for estimator in (mended, once):
+def test_new_presses_replace_wrong_ones(random_pokes):
+    db_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
+    corrected, adapted_once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
+    for estimator in (corrected, adapted_once):
+        estimator.set_noload(random_pokes[0])
+    corrected.adapt(rng_for(0, "a hand").normal(0, 300, db_uT.shape))
+    wrong = corrected(db_uT.astype(np.float32)).target
+    for estimator in (corrected, adapted_once):
         estimator.adapt(db_uT)
-    right = once(db_uT.astype(np.float32)).target
-    np.testing.assert_allclose(mended(db_uT.astype(np.float32)).target, right, rtol=1e-6)
+    right = adapted_once(db_uT.astype(np.float32)).target
+    np.testing.assert_allclose(corrected(db_uT.astype(np.float32)).target, right, rtol=1e-6)
     assert np.abs(wrong - right).max() > 1.0
 
 
 @pytest.fixture(scope="module")
-def pressed():
-    """A simulated skin that is pressed at the places shown by the page, in that order."""
+def guided_pokes():
+    """Return the same for a skin that is pressed at the places that the page shows, in that order."""
     places = np.column_stack([GuidedPresses().place_mm, np.full(GuidedPresses().presses_n, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=5), places, seed=5)
     return noload_uT, b_uT, places[:, :2], force_N
 
 
-def test_guided_presses_calibrate_and_test_the_model(pressed):
-    _, readings = played(poked(pressed), load_universal())
+def test_guided_presses_calibrate_and_test_the_model(guided_pokes):
+    _, readings = play_to_skin(make_poke_script(guided_pokes), load_universal())
     pokes, crosses = GuidedPresses(), []
     for each in readings:
         crosses += [pokes.next_mm] if pokes.next_mm not in [None, *crosses] else []
         pokes.add(each)
-    np.testing.assert_allclose(crosses, pressed[2])
+    np.testing.assert_allclose(crosses, guided_pokes[2])
     assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.held_out.sum()
     assert pokes.next_mm is None
     estimator = UniversalEstimator(load_universal())
-    estimator.set_noload(pressed[0])
+    estimator.set_noload(guided_pokes[0])
     message = estimator.label(pokes.place_mm, pokes.db_uT, pokes.held_out)
     before_mm, after_mm = map(float, re.findall(r"([0-9.]+) mm (?:before|after)", message))
     found = estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2]
-    assert after_mm == pytest.approx(
-        np.median(np.linalg.norm(found - pressed[2][pokes.held_out], axis=1)), abs=0.006
-    )  # held-out presses
+    held_out_mm = np.linalg.norm(found - guided_pokes[2][pokes.held_out], axis=1)
+    assert after_mm == pytest.approx(np.median(held_out_mm), abs=0.006)
     assert after_mm < before_mm
-    estimator.set_noload(pressed[0])  # the calibration is kept
+    estimator.set_noload(guided_pokes[0])  # the calibration is kept
     np.testing.assert_allclose(
         estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6
     )
 
 
-def test_guided_presses_add_to_the_labels_of_a_calibration(pressed):
-    noload_uT, b_uT, place_mm, force_N = pressed
+def test_guided_presses_add_to_the_labels_of_a_calibration(guided_pokes):
+    noload_uT, b_uT, place_mm, force_N = guided_pokes
     kept, rest_uT = GuidedPresses().held_out, noload_uT.mean(axis=0)
     calibrated = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
     # The guided presses have no measured force.
@@ -130,7 +129,7 @@ def test_guided_presses_add_to_the_labels_of_a_calibration(pressed):
     assert calibrated.presses_n == kept.sum()
 
 
-def test_short_contact_is_no_press():
+def test_short_contact_is_not_a_press():
     pokes, db_uT = Presses(), np.full((6, 15), 100.0, np.float32)
     contact = np.array([True, True, False, True, False, False])
     pokes.add(Estimates(np.arange(6.0), db_uT, db_uT, np.zeros((6, 3)), np.zeros((6, 2)), contact))
@@ -138,32 +137,32 @@ def test_short_contact_is_no_press():
 
 
 def test_universal_model_is_refused_for_other_chips():
-    skin, readings = played(make_script(pokes_n=1, chips_n=4), load_universal())
+    skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
     assert "no place or force: the universal model is for five chips. Give a model for this board." in skin.alarms()
     assert all(np.isnan(each.target).all() for each in readings)
 
 
-def test_opening_a_board_keeps_the_calibration(simulated, tmp_path):
-    noload_uT, b_uT, place_mm, force_N = simulated
+def test_opening_a_board_keeps_the_calibration(random_pokes, tmp_path):
+    noload_uT, b_uT, place_mm, force_N = random_pokes
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     calibrated.save(tmp_path / "s3.safetensors")
-    before, number = calibrated.predict(b_uT), calibrated.skin.mean
-    (tmp_path / "s3.json").write_text("{}")  # a user's file of that name is no network card
+    before, mean = calibrated.predict(b_uT), calibrated.skin.mean
+    (tmp_path / "s3.json").write_text("{}")  # a user's file of that name is not taken for a network card
     for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
-        _, readings = played(poked(simulated), models)
+        _, readings = play_to_skin(make_poke_script(random_pokes), models)
         estimates = np.concatenate([each.target[each.contact] for each in readings])
         true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(estimates)]
         uncalibrated = np.concatenate(
-            [each.target[each.contact] for each in played(poked(simulated), load_universal())[1]]
+            [each.target[each.contact] for each in play_to_skin(make_poke_script(random_pokes), load_universal())[1]]
         )
         assert np.abs(estimates[:, :2] - true_mm).mean() < 0.6 * np.abs(uncalibrated[:, :2] - true_mm).mean()
     np.testing.assert_array_equal(calibrated.predict(b_uT), before)  # the user's model is unchanged
-    np.testing.assert_array_equal(calibrated.skin.mean, number)
+    np.testing.assert_array_equal(calibrated.skin.mean, mean)
 
 
-def test_calibration_is_refused_for_several_boards(simulated, tmp_path):
-    noload_uT, b_uT, place_mm, force_N = simulated
+def test_calibration_is_refused_for_several_boards(random_pokes, tmp_path):
+    noload_uT, b_uT, place_mm, force_N = random_pokes
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):
         reskin.open(["/dev/a", "/dev/b"], model=calibrated)

@@ -1,4 +1,4 @@
-"""The examples of docs/live.md and docs/add-a-skin.md run, with fakes for third-party packages."""
+"""Tests that the examples of docs/live.md and docs/add-a-skin.md run, with fakes for third-party packages."""
 
 import re
 import sys
@@ -51,13 +51,8 @@ def test_ros_2_example(run):
     ros = {"init": lambda: None, "create_node": lambda _: node}
     run("ros2", rclpy=ros, skin_msgs={}, skin_msgs__msg={"Contact": message})
     (sent,) = published
-    assert (sent.x_mm, sent.y_mm, sent.force_n, sent.sd_mm, sent.alarms) == (
-        4.0,
-        6.0,
-        0.5,
-        [0.1, 0.2],
-        ["no data"],
-    )
+    assert (sent.x_mm, sent.y_mm, sent.force_n) == (4.0, 6.0, 0.5)
+    assert (sent.sd_mm, sent.alarms) == ([0.1, 0.2], ["no data"])
     assert (sent.header.stamp.sec, sent.header.stamp.nanosec) == (12, 500_000_000)
 
 

@@ -1,4 +1,4 @@
-"""A proportional controller holds half a newton by the estimated force while the object stiffens."""
+"""Test that a proportional controller keeps the estimated force at half a newton while the object stiffens."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ SEEDS = range(3)  # one skin and network each
 def test_controller_holds_half_a_newton():
     """Over 12 seeds (mean and standard deviation), the estimate is held at 0.512 +- 0.002 N.
 
-    The true force is off by 15 +- 9 % of the aim, so the mean of three seeds by 15 +- 5 %, and is 0.7 N at most.
+    The true force differs from the aim by 15 +- 9 %, its mean over three seeds by 15 +- 5 %; its maximum is 0.7 N.
     """
     errors = []
     for seed in SEEDS:

@@ -1,4 +1,4 @@
-"""Every fault raises an alarm with its chip; a healthy board raises none."""
+"""Tests that every fault raises an alarm that names the chip, and that a healthy board raises none."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def feed(script, frames_n=7):
 
 
 def inject_fault(name, wire="binary"):
-    """The frames of a script with a fault, decoded again."""
+    """Return a script with a fault; its frames are decoded from the damaged bytes."""
     from reskin.board.stream import decode_all
     from reskin.live.emulator import Script
 
@@ -64,7 +64,7 @@ def test_fault_is_named_and_counted(name):
 
 
 def fail_reads_of_chip_0(script, every_n):
-    """The script, with a failed read of chip 0 in every `every_n`-th frame."""
+    """Return the script with a failed read of chip 0 in every `every_n`-th frame."""
     b_uT, temperature_degC = script.frames.b_uT.copy(), script.frames.temperature_degC.copy()
     b_uT[every_n - 1 :: every_n, :3], temperature_degC[every_n - 1 :: every_n, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     return replace(script, frames=replace(script.frames, b_uT=b_uT, temperature_degC=temperature_degC))
@@ -72,7 +72,7 @@ def fail_reads_of_chip_0(script, every_n):
 
 @pytest.mark.parametrize("every_n", [30, BATCH_FRAMES_N])
 @pytest.mark.parametrize("name", ["stuck", "chip-reset", "int16-wrap", "repeated"])
-def test_failed_reads_of_another_chip_hide_no_fault(name, every_n):
+def test_failed_reads_of_another_chip_do_not_hide_a_fault(name, every_n):
     alarms = feed(fail_reads_of_chip_0(inject_fault(name), every_n)).alarms
     assert {"chip 0: failed I2C reads", ALARMS.get(name, "frames repeat")} == set(alarms)
 
@@ -83,7 +83,8 @@ def test_stuck_chip_stays_invalid_beside_failed_reads(every_n):
     health, used = Health(5), np.zeros(len(script), bool)
     for i in range(len(script)):
         used[i : i + 1] = health.feed(script.frames.where(np.arange(len(script)) == i), float(script.t_s[i]))
-    found_s = 1.5 + 2 * BATCH_FRAMES_N * 1.5 / 400  # two batches of sound frames, of which up to a third fail
+    # Detection needs two batches of frames without failed reads; up to a third of the frames fail.
+    found_s = 1.5 + 2 * BATCH_FRAMES_N * 1.5 / 400
     assert not used[(script.t_s > found_s) & (script.t_s < 2.95)].any()
     assert used[script.t_s < 1.5].any()
 
@@ -153,20 +154,20 @@ def test_fault_policy_setting():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         frames = changed_frames(script, BATCH_FRAMES_N)
-        for action, believed in (("drop", False), ("flag", True), ("refuse", False)):
+        for action, used in (("drop", False), ("flag", True), ("refuse", False)):
             health = Health(5, override(LIVE_POLICY, [f"{fault}={action}"], "test"))
-            assert health.feed(frames, 1.0)[:20].all() == believed, name
+            assert health.feed(frames, 1.0)[:20].all() == used, name
             (alarm,) = health.alarms.values()
             assert (alarm.action, alarm.count_n) == (action, 20)
 
 
 def test_stuck_chip_is_invalid_unless_flagged():
-    for action, unbelieved_n in (("drop", 500), ("flag", 0)):
+    for action, unused_n in (("drop", 500), ("flag", 0)):
         health, script, lost_n = Health(5, override(LIVE_POLICY, [f"stuck={action}"], "test")), inject_fault("stuck"), 0
         for first in range(0, len(script.frames), 10):
             rows = (np.arange(len(script.frames)) >= first) & (np.arange(len(script.frames)) < first + 10)
             lost_n += int((~health.feed(script.frames.where(rows), float(script.t_s[rows][-1]))).sum())
-        assert lost_n == pytest.approx(unbelieved_n, abs=100)
+        assert lost_n == pytest.approx(unused_n, abs=100)
 
 
 RESET, FAILED = "step differs from the other chips: reset", "failed I2C reads"

@@ -1,4 +1,4 @@
-"""A board is recognised from its bytes; other ports are not."""
+"""Tests that a board is recognised from its bytes, and that other devices are not taken for boards."""
 
 from dataclasses import replace
 
@@ -13,11 +13,11 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
 
-CHUNK_N = 3  # frames per chunk, cut anywhere
+CHUNK_N = 3  # frames per chunk; chunks do not start at frames
 
 
 def chunks_of(script, cut_n=31):
-    """The script's bytes, as read from a port opened in the middle of a frame."""
+    """Return the script's bytes as read from a port that is opened in the middle of a frame."""
     data = b"".join(script.pieces)[cut_n:]
     size = CHUNK_N * len(script.pieces[0])
     every_s = CHUNK_N * script.duration_s / len(script)
@@ -36,7 +36,7 @@ def test_wire_chips_rate_and_lsb_are_detected(wire, chips_n, rate_hz):
     assert f"{chips_n} chips" in str(found)
 
 
-def test_other_devices_are_no_board():
+def test_other_devices_are_not_boards():
     script = make_script(pokes_n=0)
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
     assert "another baud rate" in str(find.recognise("port", wrong_baud))
@@ -45,13 +45,13 @@ def test_other_devices_are_no_board():
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
-def test_any_bytes_are_a_board_or_none(data, size):
+def test_any_bytes_are_described(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
     assert str(find.recognise("port", chunks)).startswith("port: ")
 
 
 @given(st.integers(0, 2**32), st.integers(1, 4))
-def test_random_frames_are_a_board(seed, chips_n):
+def test_frames_of_random_values_are_described(seed, chips_n):
     rng = rng_for(seed, "numbers")
     values = rng.integers(0, 2**32, (40, 4 * chips_n), dtype=np.uint32)
     values[rng.random(values.shape) < 0.5] = np.float32(25).view(np.uint32)

@@ -1,4 +1,4 @@
-"""Commands in real processes, with an emulated board: emulate, ports, record, decode, live."""
+"""Tests of commands in separate processes with an emulated board: emulate, ports, record, decode, live."""
 
 import asyncio
 import os
@@ -26,7 +26,7 @@ from tests.live.boards import PLACES, make_script, write_model, write_script
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT
 
-LONG_S = 120.0  # a process that imports torch on a busy machine
+LONG_S = 120.0  # enough for a process that imports torch on a busy machine
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 
@@ -36,7 +36,7 @@ def restore_ctrl_c() -> None:
 
 
 class Shell:
-    """Run `reskin` in a folder, and stop what is left running."""
+    """Run `reskin` in a folder; `close` stops all processes that are left."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running = folder, []
@@ -69,9 +69,9 @@ def shell(tmp_path) -> Iterator[Shell]:
         yield shell
 
 
-def wait_until(is_so: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     end_s = time.monotonic() + LONG_S
-    while not is_so():
+    while not condition():
         assert time.monotonic() < end_s
         time.sleep(0.05)
 
@@ -99,12 +99,12 @@ def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
     page = shell.start("live", "--port", link, "--model", write_model(tmp_path), "--http-port", http_port)
     assert "open http://localhost" in page.stdout.readline()  # the page waits for the board
     board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "stall@3+2", "--fault", "unplug@6.5+1")
-    asyncio.run(look(f"http://localhost:{http_port}/live"))
+    asyncio.run(watch_page(f"http://localhost:{http_port}/live"))
     page.send_signal(signal.SIGINT)
     assert page.wait(timeout=LONG_S) == 0
 
 
-async def look(address: str) -> None:
+async def watch_page(address: str) -> None:
     """Wait for contacts at their places and for the alarms of the board."""
     async with aiohttp.ClientSession() as client, connect(client, address) as page:
         await until(page, lambda message: message.get("zeroed") is True)

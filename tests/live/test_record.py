@@ -1,4 +1,4 @@
-"""Labelled recordings can be added, however they end."""
+"""Tests that labelled recordings can be added to a scene, in whichever way they end."""
 
 import os
 import signal
@@ -28,20 +28,20 @@ PLACES = [(4.0, 8.0), (12.0, 4.0)]
 FRAME_BYTES_N, DWELL_FRAMES_N, LONG_S = 82, 40, 120.0
 
 
-def read_n(part):
-    """Number of frames that a recorder has written."""
+def frames_written_n(part):
+    """Return the number of frames that a recorder has written."""
     stream = part / STREAM_FILE
     return stream.stat().st_size // FRAME_BYTES_N if stream.exists() else 0
 
 
 @pytest.fixture
-def held(monkeypatch, tmp_path):
-    """Hold each label until some frames have arrived, so that a busy machine changes nothing."""
+def hold_until_frames(monkeypatch, tmp_path):
+    """Hold each label until enough frames have arrived, also on a busy machine."""
 
     def hold(self, label, dwell_s):
-        start_s, before_n = self.unix_s(), read_n(tmp_path / "run1.part")
+        start_s, before_n = self.unix_s(), frames_written_n(tmp_path / "run1.part")
         self.stop.wait(dwell_s)
-        while read_n(tmp_path / "run1.part") < before_n + DWELL_FRAMES_N and not self.stop.wait(0.01):
+        while frames_written_n(tmp_path / "run1.part") < before_n + DWELL_FRAMES_N and not self.stop.wait(0.01):
             pass
         return Dwell(label, start_s, self.unix_s())
 
@@ -68,7 +68,7 @@ def places_of(blocks):
     return {(float(x), float(y)) for block in blocks for x, y in zip(block.x_mm, block.y_mm, strict=True)}
 
 
-def test_program_labels_a_recording(tmp_path, held, capsys):
+def test_program_labels_a_recording(tmp_path, hold_until_frames, capsys):
     with plugged_in(make_script(pokes_n=2), loop=True) as port:
         folder = reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.3, board="b0", scan="random")
     assert "2 touches labelled" in capsys.readouterr().err
@@ -82,9 +82,9 @@ def test_program_labels_a_recording(tmp_path, held, capsys):
     frames, _ = decode_all((folder / STREAM_FILE).read_bytes(), "binary", 5, "stream")
     t_s = clocks.times_of(frames.end_byte, clocks.parse(folder / ARRIVALS_FILE, "arrivals"))
     dwells_s = zip(log.t_start_s[log.contact], log.t_end_s[log.contact], strict=True)
-    came_n = sum(int(((t_s > start_s) & (t_s < end_s)).sum()) for start_s, end_s in dwells_s)
-    assert came_n >= 2 * DWELL_FRAMES_N
-    assert account["frames_contact_n"] == pytest.approx(came_n, abs=2)
+    arrived_n = sum(int(((t_s > start_s) & (t_s < end_s)).sum()) for start_s, end_s in dwells_s)
+    assert arrived_n >= 2 * DWELL_FRAMES_N
+    assert account["frames_contact_n"] == pytest.approx(arrived_n, abs=2)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # Python 3.12 warns because of threads
@@ -97,7 +97,7 @@ def test_killed_recording_keeps_its_labels(tmp_path):
         if child == 0:
             record_board(DetectedBoard(port, None, "binary", 5), source, folder=tmp_path / "run1", seconds=60.0)
             os._exit(0)
-        write_robots_log(robot, tmp_path / "run1.part")
+        write_robot_log(robot, tmp_path / "run1.part")
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
     blocks, account = read(tmp_path / "run1.part")
@@ -105,15 +105,15 @@ def test_killed_recording_keeps_its_labels(tmp_path):
     assert account["dropped_no_frame_indentations_n"] == 0
 
 
-def write_robots_log(robot, part):
+def write_robot_log(robot, part):
     """Touch (4, 8) repeatedly until the recorder has written two touches; hold each until frames have arrived."""
     end_s = time.monotonic() + LONG_S
     with robot.open("w", buffering=1) as stream:
         stream.write("unix_s,phase,x_mm,y_mm,Fz_N\n")
         for phase in cycle(["noload", "contact"]):
-            before_n, holds = read_n(part), True
+            before_n, holds = frames_written_n(part), True
             while holds:  # the last row is written after the frames have arrived
-                holds = read_n(part) < before_n + DWELL_FRAMES_N
+                holds = frames_written_n(part) < before_n + DWELL_FRAMES_N
                 stream.write(f"{time.time():.4f},{phase},4,8,0.5\n")
                 time.sleep(0.02)
                 assert time.monotonic() < end_s, "no labels were written"
@@ -121,7 +121,7 @@ def write_robots_log(robot, part):
                 return
 
 
-def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
+def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until_frames):
     from errno import ENOSPC
 
     from reskin.recordings import labels
@@ -134,7 +134,7 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, held):
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 
-    monkeypatch.setattr(labels, "io", SimpleNamespace(append=append))  # of labels, not of the stream
+    monkeypatch.setattr(labels, "io", SimpleNamespace(append=append))  # for the labels, not for the stream
     with plugged_in(make_script(pokes_n=1), loop=True) as port, pytest.raises(OSError, match="No space left"):
         reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.2)
     assert not (tmp_path / "run1").exists()

@@ -1,4 +1,4 @@
-"""The page and its websocket: estimates and buttons, access, and limits."""
+"""Tests of the page and its websocket: estimates, buttons, access and limits."""
 
 import asyncio
 import json
@@ -60,7 +60,7 @@ def unpack(data: bytes) -> dict:
 
 
 async def until(socket, wanted: Callable[[dict], bool]) -> dict:
-    """Receive messages until one is wanted."""
+    """Receive messages until `wanted` accepts one, and return it."""
     end_s = time.monotonic() + LONG_S
     while time.monotonic() < end_s:
         received = await asyncio.wait_for(socket.receive(), LONG_S)  # aiohttp's timeout restarts with every ping

@@ -1,4 +1,4 @@
-"""Eight boards on eight ports, one of them a sleeve of forty chips; one is unplugged."""
+"""Tests of eight boards on eight ports: one is a sleeve of forty chips, another one is unplugged."""
 
 import asyncio
 import math
@@ -17,25 +17,25 @@ from reskin.live.server import PAGES_MAX_N
 from reskin.live.session import BINS_N, LATENCIES_N, Session, open_sessions
 from reskin.live.tracker import LiveSkin, LiveSkins
 from reskin.universal.model import load_universal
-from tests.live.boards import PLACES, FailingModel, PlayedReader, make_script, plugged_in, write_model
+from tests.live.boards import PLACES, FailingModel, ScriptReader, make_script, plugged_in, write_model
 from tests.live.test_server import serve, until
 
 RATES_HZ = [133.0, 400.0, *(50.0,) * 6]
 CHIPS_N = [40, *(5,) * 7]
-GOES = 7
+UNPLUGGED_I = 7
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
 ]
 
 
-def plug_in_all(stack: ExitStack, goes: ExitStack, folder, boards) -> list[str]:
-    """Play boards beside the test; the last of eight is unplugged when `goes` is closed."""
+def plug_in_all(stack: ExitStack, unplugged: ExitStack, folder, boards) -> list[str]:
+    """Play boards in threads; closing `unplugged` unplugs the last of eight, closing `stack` the others."""
     names = []
     for i in boards:
         script = make_script(pokes_n=3, chips_n=CHIPS_N[i], rate_hz=RATES_HZ[i])
-        with_i = goes if i == GOES else stack
-        names.append(with_i.enter_context(plugged_in(script, str(folder / f"board{i}"), loop=True)))
+        owner = unplugged if i == UNPLUGGED_I else stack
+        names.append(owner.enter_context(plugged_in(script, str(folder / f"board{i}"), loop=True)))
     return names
 
 
@@ -49,9 +49,8 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
             poke = await until(
                 page, lambda message: message.get("contact") == 1 and 0 < message["rate_hz"] < 1.3 * RATES_HZ[i]
             )
-            assert math.isfinite(poke["x_mm"]) == (
-                CHIPS_N[i] == 5
-            )  # the model has five chips; other boards have no estimate
+            # The model has five chips; other boards have no estimate.
+            assert math.isfinite(poke["x_mm"]) == (CHIPS_N[i] == 5)
             assert len(poke["change_uT"]) == 3 * CHIPS_N[i]
             assert np.abs(poke["change_uT"]).max() > 100
 
@@ -60,9 +59,9 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
             assert page.status == 404
         await asyncio.gather(*(look(address, client, i) for i in range(len(CHIPS_N))))
         pages = [await client.ws_connect(f"{address}/live?board={i}") for i in range(len(CHIPS_N))]
-        await asyncio.to_thread(goes.close)
-        await until(pages[GOES], lambda message: "unplugged" in " ".join(message.get("alarms", [])))
-        for page in pages[:GOES]:
+        await asyncio.to_thread(unplugged.close)
+        await until(pages[UNPLUGGED_I], lambda message: "unplugged" in " ".join(message.get("alarms", [])))
+        for page in pages[:UNPLUGGED_I]:
             after = await until(page, lambda message: "lost" in message)
             assert after["lost"] == 0
             assert after["bins_n"] <= BINS_N
@@ -73,21 +72,21 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
 
     assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # maximum number of bins: memory is bounded
     assert LATENCIES_N < 1e4
-    with ExitStack() as stack, ExitStack() as goes:
-        serve(plug_in_all(stack, goes, tmp_path, range(len(CHIPS_N))), load_universal(), act)
+    with ExitStack() as stack, ExitStack() as unplugged:
+        serve(plug_in_all(stack, unplugged, tmp_path, range(len(CHIPS_N))), load_universal(), act)
 
 
 def test_unplugged_board_does_not_delay_the_others(tmp_path):
-    with ExitStack() as stack, ExitStack() as goes:
-        names = plug_in_all(stack, goes, tmp_path, (1, 2, GOES))
+    with ExitStack() as stack, ExitStack() as unplugged:
+        names = plug_in_all(stack, unplugged, tmp_path, (1, 2, UNPLUGGED_I))
         with reskin.open(names, model=write_model(tmp_path)) as skins:
-            updates, found = Counter(), []  # updates of the other boards per update of the last board
-            for *well, last in skins:
-                found += [each[1:4] for each in well if each.F_N > 0]
+            updates, found = Counter(), []  # how often the others were read during each update of the last board
+            for *others, last in skins:
+                found += [each[1:4] for each in others if each.F_N > 0]
                 if len(found) > 20:
-                    goes.close()
+                    unplugged.close()
                 if math.isnan(last.F_N) and any("unplugged" in alarm for alarm in last.alarms):
-                    assert not any("unplugged" in alarm for each in well for alarm in each.alarms)
+                    assert not any("unplugged" in alarm for each in others for alarm in each.alarms)
                     updates[last.t_s] += 1
                 if len(updates) >= 5 and max(updates.values()) >= 5:
                     break
@@ -95,16 +94,16 @@ def test_unplugged_board_does_not_delay_the_others(tmp_path):
         assert np.median(nearest) < 0.5
 
 
-def played_at(port: str) -> LiveSkin:
+def skin_at(port: str) -> LiveSkin:
     skin = LiveSkin(port)
-    skin.reader = PlayedReader(make_script(pokes_n=1))
+    skin.reader = ScriptReader(make_script(pokes_n=1))
     return skin
 
 
 def test_model_error_is_raised_to_the_caller():
-    dying, well = played_at("dying"), played_at("well")
-    dying.estimator = FailingModel()
-    with LiveSkins([dying, well]) as skins:
+    failing, working = skin_at("failing"), skin_at("working")
+    failing.estimator = FailingModel()
+    with LiveSkins([failing, working]) as skins:
         skins._threads[0].join(60.0)
         with pytest.raises(RuntimeError, match="out of memory"):
             next(iter(skins))
@@ -112,7 +111,7 @@ def test_model_error_is_raised_to_the_caller():
 
 def test_model_error_is_an_alarm_on_the_page():
     live = Session("played", [], "a board")
-    live.skin = played_at("played")
+    live.skin = skin_at("played")
     live.skin.estimator = FailingModel()
     live.run()
     assert "estimates ended: RuntimeError('out of memory')" in live.state()["alarms"]

@@ -1,4 +1,4 @@
-"""`LiveSkin`: estimates, no-load reading, alarms, and the account of bytes."""
+"""Tests of `LiveSkin`: estimates, no-load reading, alarms, and the account of bytes."""
 
 import itertools
 import math
@@ -23,9 +23,9 @@ from reskin.seeds import rng_for
 from tests.live.boards import (
     PLACES,
     QUIET_S,
-    PlayedReader,
+    ScriptReader,
     make_script,
-    played,
+    play_to_skin,
     plugged_in,
     write_model,
 )
@@ -36,7 +36,7 @@ LATE = {"no data", "slower than before: frames are missing"}  # possible alarms 
 
 def test_every_reading_has_time_place_and_force(tmp_path):
     script = make_script(pokes_n=3, quiet_s=QUIET_S + 2.5)
-    unread_n = 1000  # upper limit of frames that opening a pseudo-terminal late discards
+    unread_n = 1000  # opening the pseudo-terminal late discards at most so many frames
     with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         wanted_n = len(script) - unread_n
         contacts = list(itertools.takewhile(lambda _: skin.account["frames_n"] < wanted_n, skin.every()))
@@ -70,14 +70,14 @@ def test_slow_caller_gets_the_latest_reading(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        came = (contact for contact in skin if np.isfinite(contact.b_uT).all())  # skips "no data" on a busy machine
-        before, before_n = next(came), skin.account["frames_n"]
+        readings = (contact for contact in skin if np.isfinite(contact.b_uT).all())  # skips "no data" on a busy machine
+        before, before_n = next(readings), skin.account["frames_n"]
         while skin.reader.waiting_bytes_n < 300 * 82:  # a slow controller
             time.sleep(0.01)
-        late = next(came)
+        late = next(readings)
         came_n = skin.account["frames_n"] - before_n
         assert came_n >= 300
-        assert (frame_i(late) - frame_i(before) - came_n) % len(SCRIPT) == 0  # the latest frame, and none is missing
+        assert (frame_i(late) - frame_i(before) - came_n) % len(SCRIPT) == 0  # the latest frame; no frame is missing
         assert skin.reader.missed_bytes_n == skin.lost_bytes_n == 0
 
 
@@ -95,18 +95,21 @@ def test_stalls_and_unplugging_are_alarms_and_it_continues(tmp_path):
 
 
 def test_failed_reads_have_no_estimate(tmp_path):
-    skin, readings = played(inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))])
+    skin, readings = play_to_skin(
+        inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))]
+    )
     failed = [row for each in readings for row in each.target[each.b_uT[:, 3] == np.float32(8028.16)]]
     assert len(failed) == 200
     assert np.isnan(failed).all()
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
 
 
-def test_opening_a_port_mid_frame_is_no_loss():
+def test_opening_a_port_mid_frame_loses_no_frame():
     whole = make_script(pokes_n=0)
-    for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):  # a line feed alone starts no frame
+    # After a lone line feed, the next frame is skipped too.
+    for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):
         pieces = [piece[-left_n:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
-        skin, _ = played(replace(whole, pieces=pieces))
+        skin, _ = play_to_skin(replace(whole, pieces=pieces))
         assert skin.account["skipped_resync_bytes_n"] == skipped_n
         assert skin.lost_bytes_n == (skipped_n if cut_i else 0)
         assert set(skin.health.alarms) == ({"bytes lost between frames"} if cut_i else set())
@@ -114,7 +117,7 @@ def test_opening_a_port_mid_frame_is_no_loss():
 
 @pytest.mark.parametrize("chunk_n", [20, 3280])
 def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
-    skin, _ = played(make_script(pokes_n=0))
+    skin, _ = play_to_skin(make_script(pokes_n=0))
     garbage = np.random.default_rng(0).bytes(40 * 3280)
     skin._start_stream(skin.detected)
     for i in range(0, len(garbage), chunk_n):
@@ -124,27 +127,27 @@ def test_garbage_after_plugging_in_is_counted_as_lost(chunk_n):
 
 
 def test_magnet_raises_only_the_outside_field_alarm(tmp_path):
-    skin, _ = played(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
+    skin, _ = play_to_skin(inject(SCRIPT, parse_fault("magnet@3+1")), [read_network(write_model(tmp_path))])
     assert {word.split(":")[0] for word in skin.health.alarms} == {"external field"}
 
 
 def test_no_load_reading_waits_for_a_still_skin():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
-    skin, _ = played(script)
+    skin, _ = play_to_skin(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
     np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # noise of 3 uT
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
-    assert not played(moving)[0].zeroed
+    assert not play_to_skin(moving)[0].zeroed
 
 
 def test_zero_from_another_thread_restarts_the_no_load_reading():
-    class Pressed(list):
+    class ZeroingList(list):
         def append(self, frames):  # interrupts the polling thread between two statements
             super().append(frames)
             skin.zero()
 
     skin = LiveSkin("played")
-    skin.reader, skin._quiet = PlayedReader(make_script(pokes_n=0, quiet_s=2.0)), Pressed()
+    skin.reader, skin._quiet = ScriptReader(make_script(pokes_n=0, quiet_s=2.0)), ZeroingList()
     while not skin.zeroed:
         assert not skin.reader.at_end
         skin.poll(0.0)
@@ -185,7 +188,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
 
 def test_sleeve_of_forty_chips_has_layout_and_estimates(tmp_path):
     model = read_network(write_model(tmp_path, chips_n=40))
-    skin, readings = played(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
+    skin, readings = play_to_skin(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
     assert skin.layout.known
     assert skin.detected.chips_n == 40
     found = np.concatenate([each.target[each.contact] for each in readings])
@@ -223,7 +226,7 @@ def test_port_held_by_another_program_is_not_open():
         skin = LiveSkin(name)
         skin.reader.start(there=False)
         try:
-            while not skin.reader.problem:  # ended by the suite's time limit
+            while not skin.reader.problem:  # the suite's time limit ends an endless loop
                 time.sleep(0.01)
             assert skin.alarms()[0].startswith(f"not open: {name}: cannot open the port")
         finally:

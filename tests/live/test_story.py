@@ -1,4 +1,4 @@
-"""From an emulated board to a trained model: emulate, record, add, dvc repro, and estimate live."""
+"""Test of the whole path from an emulated board to live estimates: emulate, record, add, dvc repro."""
 
 import json
 import os
@@ -17,7 +17,7 @@ from reskin.recordings import clocks, probe
 from reskin.recordings.header import ARRIVALS_FILE, HEADER_FILE, STREAM_FILE, parse, seal
 from reskin.recordings.probe import ProbeLog
 from reskin.seeds import rng_for
-from tests.live.boards import RATE_HZ, played, write_script
+from tests.live.boards import RATE_HZ, play_to_skin, write_script
 from tests.live.test_processes import Shell, wait_until
 from tests.stages.checkout import copy_checkout, run
 
@@ -32,8 +32,8 @@ SCENE = {
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 
-def make_poked() -> tuple[Script, ProbeLog]:
-    """Poke places of a grid with varying pauses; return the script and the log of a robot 100 s behind."""
+def make_poke_script() -> tuple[Script, ProbeLog]:
+    """Poke places of a grid with varying pauses; return the script and a robot's log, whose clock is 100 s ahead."""
     rng = rng_for(0, "poked")
     starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.1, 0.25, POKES_N))
     place_mm, force_N = 4.0 * rng.integers(1, 4, (POKES_N, 2)), rng.uniform(0.5, 2.0, POKES_N)
@@ -60,8 +60,8 @@ def make_poked() -> tuple[Script, ProbeLog]:
     return Script("recorded", "binary", frames, encode_pieces(frames, "binary"), t_s), log
 
 
-def let_arrive_in_time(folder: Path, sent: Script) -> None:
-    """Write arrival times as on a machine that is never late."""
+def write_punctual_arrivals(folder: Path, sent: Script) -> None:
+    """Replace the arrival times by those of a machine that is never late."""
     data, header = (folder / STREAM_FILE).read_bytes(), parse((folder / HEADER_FILE).read_text(), "header")
     first = b"".join(sent.pieces).find(data)
     assert first >= 0  # the recording is a suffix of the sent bytes
@@ -73,7 +73,7 @@ def let_arrive_in_time(folder: Path, sent: Script) -> None:
 
 
 def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
-    script, log = make_poked()
+    script, log = make_poke_script()
     root, link = copy_checkout(tmp_path / "checkout"), tmp_path / "board"
     (root / "robot.csv").write_text(probe.render(log))
     with (root / "pipeline/scenes/pressed.yaml").open("w") as stream:
@@ -83,7 +83,7 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
         shell.start("emulate", write_script(script, tmp_path / "c0"), "--port", link, "--fault", CRLF)
         wait_until(link.is_symlink)
         assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # at the end of the script
-        let_arrive_in_time(root / "run1", inject(script, parse_fault(CRLF)))
+        write_punctual_arrivals(root / "run1", inject(script, parse_fault(CRLF)))
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
     run(root, "dvc", "repro", "report@pressed")
 
@@ -93,7 +93,7 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     assert numbers["capture"]["frames_n"] * 82 == numbers["capture"]["frame_bytes_n"]
     assert numbers["capture"]["frames_n"] > 0.7 * len(script)  # opening and closing a terminal discard waiting bytes
     model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
-    _, readings = played(script, [read_network(model)])
+    _, readings = play_to_skin(script, [read_network(model)])
     t_s = np.concatenate([each.t_s[each.contact] for each in readings])
     found = np.concatenate([each.target[each.contact] for each in readings])
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ

@@ -1,4 +1,4 @@
-"""Messages to a page have a limited size and keep peaks."""
+"""Tests that messages to a page have a limited size and keep peaks."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ def readings(t_s, force_N):
 
 
 def forces(data):
-    """The bins of a message: start, minimum and maximum of the force."""
+    """Return the bins of a message: their starts, and the minimum and maximum of the force."""
     _, chips_n, bins_n, t_s = HEAD.unpack_from(data)
     rest = np.frombuffer(data, "<f4", offset=HEAD.size)[NUMBERS_N + 3 * chips_n :]
     start_s, traces = t_s + rest[:bins_n].astype(float), rest[bins_n:].reshape(2, bins_n, 1 + chips_n)

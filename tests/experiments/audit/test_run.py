@@ -21,7 +21,7 @@ from reskin.models.job import TrainingData, TrainingJob, TrainingResult
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 from tests.data.tables import readings
-from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded, settings
+from tests.scenes import ADAPTATIONS, RECIPE, SHARED, TRAINING, recorded_scene, settings
 from tests.simulation.scene import SECTIONS
 
 PLACES_N, PASSES_N, READINGS_N, CH_N = 16, 2, 2, 15
@@ -33,7 +33,7 @@ SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
 COPY = "b3_s0"  # a copy of b0_s0 as a skin of another board
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
 ADAPTATION = SHARED["adaptations"]["paper"]
-SCENE = recorded(
+SCENE = recorded_scene(
     source="simulated",
     seed=SEED,
     experiments=["single_random", "lobo", "triplet", "adapt", "audit"],
