@@ -2,7 +2,7 @@
 
 from pipeline.scenes import EXPERIMENTS, Scene, check_scene, stages
 from pipeline.settings import Settings
-from tests.recordings.headers import AS_USUAL
+from tests.recordings.headers import DEFAULT_POLICY
 
 RECIPE = {
     "architecture": "paper", "inputs": "raw", "scaling": "standard", "triplet_weight": 0.0, "steps_n": 1, "batch_n": 64,
@@ -27,7 +27,7 @@ ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 
 # replaces params.yaml in tests
 SHARED: dict[str, object] = {
     "lost_fraction_max": 0.05,
-    "faults": AS_USUAL.model_dump(),
+    "faults": DEFAULT_POLICY.model_dump(),
     "recipes": {"paper": SHARED_RECIPE, "triplet": SHARED_RECIPE | {"triplet_weight": 0.1}},
     "adaptations": {"paper": {"unlabelled_weight": 0.1} | SCHEDULE},
     "labellings": {"few": {"own_weight": 1.0} | SCHEDULE},

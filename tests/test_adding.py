@@ -24,7 +24,7 @@ from reskin.recordings.probe import ProbeLog
 from reskin.recordings.readers import table
 from reskin.seeds import rng_for
 from tests.board.signals import make_frames
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.recordings.readers.test_lab import PRESSES, write
 from tests.scenes import recorded_scene
 from tests.stages.checkout import copy_checkout, run
@@ -274,7 +274,7 @@ def test_native_capture_keeps_its_header(root, tmp_path):
     folder = native_folder(tmp_path / "run1")
     header = add.add(root, "small", preparing.native(folder, labels(), None, ()), allow_copy=False)
     assert header == read_header(root / "data/raw/small/run1")
-    _, blocks, account = open_capture(root / "data/raw/small/run1", AS_USUAL)
+    _, blocks, account = open_capture(root / "data/raw/small/run1", DEFAULT_POLICY)
     assert sum(map(len, blocks)) == account["frames_contact_n"] > 0
 
 

@@ -23,7 +23,7 @@ from reskin.recordings import preparing
 from reskin.recordings.preparing import CaptureNames
 from reskin.recordings.readers import eflash7, eflesh, ini, lab
 from tests import repositories
-from tests.recordings.headers import AS_USUAL
+from tests.recordings.headers import DEFAULT_POLICY
 from tests.recordings.readers.test_lab import PRESSES, write
 from tests.scenes import recorded_scene
 from tests.stages.checkout import copy_checkout
@@ -304,7 +304,7 @@ def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, t
         labels = CaptureNames(recording.board, recording.skin, None)
         prepared = preparing.foreign(tmp_path / name / recording.path, recording.layout, labels, recording.options)
         header = preparing.headers.write_capture(tmp_path / prepared[0].capture, *prepared)
-        _, account = readers[name].read(tmp_path / header.capture, header, AS_USUAL)
+        _, account = readers[name].read(tmp_path / header.capture, header, DEFAULT_POLICY)
         assert account["rows_read_n"] == counts[name]
 
 

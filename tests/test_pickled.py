@@ -16,7 +16,7 @@ from pipeline.manage.fetch import read_sources
 from reskin.errors import CaptureError
 from reskin.recordings.pickled import COLUMNS, decode, to_lab_csv
 from reskin.recordings.readers import lab
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 PROTOCOLS = (3, 4)
 ROOT = Path(__file__).resolve().parents[1]
@@ -118,7 +118,7 @@ def test_archive_becomes_a_lab_recording(tmp_path):
     presses = [sample(i, [4 * i, 2], FIELDS, [0, 0, 0]) for i in range(3)]
     contacts = [sample(i, [4 * i, 2], [2 * value for value in FIELDS], [0, 0, -1 - i]) for i in range(3)]
     (tmp_path / lab.READINGS).write_bytes(to_lab_csv(archive_of(bl_arr=presses, cont_arr=contacts), "a"))
-    readings, account = lab.read(tmp_path, make_header(layout="lab", chips_n=5), AS_USUAL)
+    readings, account = lab.read(tmp_path, make_header(layout="lab", chips_n=5), DEFAULT_POLICY)
     assert (account["rows_n"], account["noload_rows_n"]) == (3, 3)
     assert readings.x_mm.tolist() == [0, 4, 8]
     assert readings.Fz_N.tolist() == [1, 2, 3]

@@ -22,7 +22,7 @@ from reskin.recordings.ingest import read_native
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.seeds import rng_for
 from tests.benchmarks import FULL, size
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 INDENTATIONS_N = size(1_000_000, 800)
 TILE_N = size(4_000, 400)  # indentations whose bytes are written again and again
@@ -90,11 +90,11 @@ def test_a_million_indentations_are_read_in_bounded_memory(
     probe.parse(folder / PROBE_FILE, PROBE_FILE)
     parse_s = time.perf_counter() - begin_s
     begin_s = time.perf_counter()
-    blocks, account = read_native(folder, capture, AS_USUAL)
+    blocks, account = read_native(folder, capture, DEFAULT_POLICY)
     rows_n = sum(len(block) for block in blocks)
     read_s = time.perf_counter() - begin_s
     begin_s = time.perf_counter()
-    io.write_readings(tmp_path / "c.parquet", *read_native(folder, capture, AS_USUAL))
+    io.write_readings(tmp_path / "c.parquet", *read_native(folder, capture, DEFAULT_POLICY))
     write_s = time.perf_counter() - begin_s
     print(
         f"\nprobe log {parse_s:.1f} s; read {account['frames_n'] / read_s:,.0f} frames/s ({read_s:.0f} s), "
@@ -111,10 +111,10 @@ import resource, sys
 from pathlib import Path
 from reskin import io
 from reskin.recordings.ingest import read_native
-from tests.benchmarks.test_ingest_memory import ALLOWED_MB, AS_USUAL, header, peak_mb
+from tests.benchmarks.test_ingest_memory import ALLOWED_MB, DEFAULT_POLICY, header, peak_mb
 resource.setrlimit(resource.RLIMIT_AS, (ALLOWED_MB * 10**6,) * 2)
 folder = Path(sys.argv[1])
-blocks, account = read_native(folder, header(), AS_USUAL)
+blocks, account = read_native(folder, header(), DEFAULT_POLICY)
 io.write_readings(folder / "c.parquet", blocks, account)
 print(account["frames_n"], account["indentations_n"], round(peak_mb()))
 """

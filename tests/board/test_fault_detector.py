@@ -15,7 +15,7 @@ from reskin.board.wire import Frames
 from reskin.errors import CaptureError
 from reskin.recordings.fault_policy import FaultLog
 from tests.board.signals import frames_of
-from tests.recordings.headers import AS_USUAL
+from tests.recordings.headers import DEFAULT_POLICY
 
 CHIPS_N = 3
 RESET_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
@@ -38,7 +38,8 @@ def with_chip_values(frames: Frames, rows: slice, chip_i: int, values_uT: np.nda
 
 def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | None = None) -> np.ndarray:
     """Feed chunks that end at `ends`, with the default policy; return the mask of frames with a stuck chip."""
-    detector, log = FaultDetector(CHIPS_N, expected_lsb_uT=expected_lsb_uT), FaultLog(AS_USUAL, "stream.bin", "ms")
+    detector = FaultDetector(CHIPS_N, expected_lsb_uT=expected_lsb_uT)
+    log = FaultLog(DEFAULT_POLICY, "stream.bin", "ms")
     masks = []
     for begin, end in pairwise([0, *sorted(ends), len(frames)]):
         rows = (np.arange(len(frames)) >= begin) & (np.arange(len(frames)) < end)

@@ -1,6 +1,6 @@
 """Inject every fault and write the table: python -m tests.faults [--only WORD] [--work FOLDER] [--out FILE].
 
-Clones the last commit, runs a small scene of a few experiments there once, and injects each fault into a copy of it.
+Clones the last commit, runs a small scene with a few experiments there, and injects each fault into a copy of it.
 Needs Linux; faults that mount file systems need root.
 """
 
@@ -55,7 +55,7 @@ def inject(case, template: Checkout, folder: Path) -> tuple[Row, float]:
     at, start_s = copy(template, folder), time.monotonic()
     try:
         row = case(at)
-    except Exception as error:  # the table shows it
+    except Exception as error:  # the table shows the error
         traceback.print_exc()
         row = Row(
             "", None, "not known", "–", [f"the fault could not be injected ({type(error).__name__} {error})"[:300]]
@@ -80,7 +80,7 @@ INTRODUCTION = """\
 This page lists what happens when a process, disk, file or server fails while `dvc repro` runs, and what is lost.
 `make faults` injects each fault into a finished run of a part of scene `ci`, and then runs `dvc repro` again. A row
 is green if a command that fails prints a message and no traceback, no command takes more than ten minutes, no finished
-stage or training is computed again, and all outputs are those of the undisturbed run.
+stage or training run is computed again, and all outputs are those of the undisturbed run.
 
 If you doubt a disk, or a message asks for it, run `reskin check-cache`, then `dvc repro`. DVC restores outputs from its
 cache without reading them; `reskin check-cache` reads every object, sets damaged ones aside and removes their copies.

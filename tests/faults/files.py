@@ -1,4 +1,4 @@
-"""Disks and files: full, read-only, cut, changed."""
+"""Faults of disks and files: full, read-only, truncated, changed."""
 
 import os
 import shutil
@@ -15,7 +15,7 @@ IN_NAMESPACE = ("unshare", "--mount", "--propagation", "private", "sh", "-c")  #
 
 @fault(
     "full disk under trainings",
-    "a tmpfs of 300 kB mounted over `.reskin`; `train_triplet` trains",
+    "a tmpfs of 300 kB is mounted over `.reskin` while `train_triplet` runs",
 )
 def full_cells(at: Checkout) -> Row:
     at.reset(TRIPLET)
@@ -25,7 +25,7 @@ def full_cells(at: Checkout) -> Row:
 
 @fault(
     "full disk under everything",
-    "the checkout on a tmpfs, filled but for 150 kB; room again for the next run",
+    "the checkout is on a tmpfs with 150 kB of free space; the next run has space again",
 )
 def full_disk(at: Checkout) -> Row:
     at.reset(TRIPLET)
@@ -53,13 +53,13 @@ def _fill(disk: Path, *, but_kB: int) -> None:
 
 @fault(
     "read-only `reports/`",
-    "bound to itself read-only; `report` is yet to run, and DVC has its former outputs to remove",
+    "`reports/` is mounted read-only; `report` has to run, and DVC has to remove the former outputs",
 )
 def read_only_reports(at: Checkout) -> Row:
     return _read_only(at, keep=True)
 
 
-@fault("read-only `reports/`, nothing in it", "the same; there is nothing to remove")
+@fault("read-only `reports/`, nothing in it", "the same, without former outputs")
 def read_only_new_reports(at: Checkout) -> Row:
     return _read_only(at, keep=False)
 
@@ -76,10 +76,10 @@ def _read_only(at: Checkout, *, keep: bool) -> Row:
     return judge(at, at.run(*IN_NAMESPACE, script), at.run("dvc", "repro"), may_run=[address("report")])
 
 
-def _cut(file: Path) -> None:
+def _truncate(file: Path) -> None:
     content = file.read_bytes()
     file.chmod(0o644)
-    file.unlink()  # keeps the cache's copy, which may be a hard link
+    file.unlink()  # the cache's copy may be a hard link to this file
     file.write_bytes(content[: len(content) * 2 // 3])
 
 
@@ -97,11 +97,11 @@ CUT = {
 
 @fault(
     "truncated files, `dvc repro`",
-    "a third cut from a capture, a dataset, a table of predictions and a model, of finished stages",
+    "the last third is cut off a capture, a dataset, a table of predictions and a model of finished stages",
 )
 def cut_all(at: Checkout) -> Row:
     for folder, pattern, _ in CUT.values():
-        _cut(_first(at.folder / folder, pattern))
+        _truncate(_first(at.folder / folder, pattern))
     first = at.run("dvc", "repro")
     row = judge(at, first, at.run("dvc", "repro"), may_run=[], fails=False)
     row.message = row.message or f"ran {', '.join(first.ran) or 'no stage: the files are restored from DVC’s cache'}"
@@ -110,19 +110,22 @@ def cut_all(at: Checkout) -> Row:
     return row
 
 
-def cut(what: str, folder: str, pattern: str, reader: str) -> None:
+def add_truncation(what: str, folder: str, pattern: str, reader: str) -> None:
     """Add the fault of a truncated file that is read without DVC."""
 
-    @fault(f"truncated {what}, read", f"a third cut from a `{pattern}` of `{folder}`; stage `{reader}` alone reads it")
+    @fault(
+        f"truncated {what}, read",
+        f"the last third is cut off a `{pattern}` of `{folder}`; `{reader}` runs without DVC",
+    )
     def read(at: Checkout) -> Row:
-        _cut(_first(at.folder / folder, pattern))
+        _truncate(_first(at.folder / folder, pattern))
         row = judge(at, at.run(*at.command(reader)), NOT_RUN)
         row.next_run = "`dvc repro` restores the file, as above"
         return row
 
 
 for what, (folder, pattern, reader) in CUT.items():
-    cut(what, folder, pattern, reader)
+    add_truncation(what, folder, pattern, reader)
 
 
 def _damage(file: Path) -> None:
@@ -134,14 +137,14 @@ def _damage(file: Path) -> None:
 
 
 CHECK = ("python", "-m", "pipeline", "check-cache")
-CACHED = {  # changed output, its file, the stage that wrote it and one that reads it
+CACHED = {  # changed output, its file, the stage that wrote it, a stage that reads it
     "weights": (f"data/models/{SCENE}/train_triplet", "*.safetensors", TRIPLET, address("adapt")),
     "dataset (Parquet)": (f"data/indentations/{SCENE}", "*.parquet", address("ingest_simulated"), address("split")),
 }
 
 
-def _restored(at: Checkout, out: str, pattern: str = "") -> tuple[Path, bytes]:
-    """Change a bit in DVC's cached copy of a file, and delete the output, so that DVC restores it from there."""
+def _damage_cached(at: Checkout, out: str, pattern: str = "") -> tuple[Path, bytes]:
+    """Change a bit in DVC's cached copy of a file, and delete the output, so that DVC restores the changed copy."""
     file = _first(at.folder / out, pattern) if pattern else at.folder / out
     content = file.read_bytes()
     entry = next(
@@ -155,16 +158,16 @@ def _restored(at: Checkout, out: str, pattern: str = "") -> tuple[Path, bytes]:
     return file, content
 
 
-def cached(what: str, folder: str, pattern: str, writer: str, reader: str) -> None:
+def add_cache_damage(what: str, folder: str, pattern: str, writer: str, reader: str) -> None:
     """Add the fault of a damaged object of DVC's cache that is restored for a stage."""
 
     @fault(
         f"corrupted DVC cache entry, {what}",
-        f"a bit changed in the cached copy of a `{pattern}` of `{folder}`; the folder deleted, and "
-        f"`{reader.partition('@')[0]}` is yet to run; `dvc repro`; `reskin check-cache`, then the next run",
+        f"a bit is changed in the cached copy of a `{pattern}` of `{folder}`, the folder is deleted, and "
+        f"`{reader.partition('@')[0]}` has to run; then `dvc repro`, `reskin check-cache` and the next run",
     )
     def case(at: Checkout) -> Row:
-        file, content = _restored(at, folder, pattern)
+        file, content = _damage_cached(at, folder, pattern)
         at.reset(reader, trainings=False)
         first, cells = at.run("dvc", "repro"), at.trainings()
         checked = at.run(*CHECK)
@@ -177,49 +180,50 @@ def cached(what: str, folder: str, pattern: str, writer: str, reader: str) -> No
         return row
 
 
-for what, where in CACHED.items():
-    cached(what, *where)
+for what, paths in CACHED.items():
+    add_cache_damage(what, *paths)
 
 
 @fault(
     "corrupted DVC cache entry, read by no stage",
-    "a bit changed in the cached copy of the folds (JSON); those in the checkout deleted; `dvc repro` restores them "
-    "and runs no stage; `reskin check-cache`, whose message is shown, then the next run",
+    "a bit is changed in the cached copy of the folds (JSON), and the folds in the checkout are deleted; `dvc repro` "
+    "restores them and runs no stage; then `reskin check-cache`, whose message is shown, and the next run",
 )
 def cached_folds(at: Checkout) -> Row:
-    file, content = _restored(at, f"data/models/{SCENE}/folds.json")
+    file, content = _damage_cached(at, f"data/models/{SCENE}/folds.json")
     restored = at.run("dvc", "repro")
     row = judge(at, at.run(*CHECK), at.run("dvc", "repro"), may_run=[address("split")])
-    row.faults += [] if (restored.status, restored.ran) == (0, []) else ["it was to be restored"]
+    row.faults += [] if (restored.status, restored.ran) == (0, []) else ["the folds were not restored"]
     row.faults += [] if file.read_bytes() == content else ["the changed folds are in use"]
-    row.known = "JSON and CSV carry no checksum: what a disk changed there is found by `reskin check-cache` alone"
+    row.known = "JSON and CSV files have no checksum: only `reskin check-cache` finds what a disk changed in them"
     return row
 
 
 @fault(
     "cut DVC cache entry of a folder",
-    "the list of files of `train_triplet` cut in DVC's cache, the folder deleted; `dvc repro`; `reskin check-cache`, "
-    "whose message is shown; `dvc repro`, then the next run",
+    "the list of files of `train_triplet` is truncated in DVC's cache, and the folder is deleted; then `dvc repro`, "
+    "`reskin check-cache`, whose message is shown, `dvc repro` and the next run",
 )
 def cache_folder(at: Checkout) -> Row:
     digest = at.lock()[TRIPLET][f"data/models/{SCENE}/train_triplet"]
     entry = at.folder / ".dvc/cache/files/md5" / digest[:2] / digest[2:]
-    _cut(entry)
+    _truncate(entry)
     entry.chmod(0o444)
     shutil.rmtree(at.folder / f"data/models/{SCENE}/train_triplet")
     before, checked, after = (at.run(*command) for command in (("dvc", "repro"), CHECK, ("dvc", "repro")))
     row = judge(at, checked, at.run("dvc", "repro"), may_run=[], finished=at.trainings())
     row.faults += [] if before.ran == after.ran == [TRIPLET] else [f"ran {before.ran}, {after.ran}"]
     row.known = (
-        "DVC says nothing, and runs the stage at every `dvc repro` until the cache is checked; no training is repeated"
+        "DVC prints nothing, and runs the stage at every `dvc repro` until the cache is checked; no training run is "
+        "repeated"
     )
     return row
 
 
-def damaged_cell(name: str, how: str, damage) -> None:
-    """Add the fault of a damaged finished training."""
+def add_training_damage(name: str, how: str, damage) -> None:
+    """Add the fault of a damaged file of a finished training run."""
 
-    @fault(f"corrupted finished training, {name}", f"{how}, of a file in `.reskin/cells`; `train_triplet` runs again")
+    @fault(f"corrupted finished training, {name}", f"{how} a file in `.reskin/cells`; `train_triplet` runs again")
     def case(at: Checkout) -> Row:
         cells = at.trainings()
         at.reset(TRIPLET, trainings=False)
@@ -229,11 +233,11 @@ def damaged_cell(name: str, how: str, damage) -> None:
         first = at.run("dvc", "repro")
         fresh_n = sum(at.trainings()[cell] != written for cell, written in cells.items())
         row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.trainings(), fails=False)
-        row.lost = f"{len(cells) - len(whole)} training and those of its stack: {fresh_n} trained again"
-        row.faults += [] if 1 <= fresh_n <= 3 else ["not its stack alone is trained again"]
+        row.lost = f"{len(cells) - len(whole)} training run and the others of its stack; {fresh_n} repeated"
+        row.faults += [] if 1 <= fresh_n <= 3 else ["training runs of other stacks are repeated too"]
         row.faults += [] if "is damaged" in row.message else ["no message"]
         return row
 
 
-damaged_cell("cut", "a third cut", _cut)
-damaged_cell("changed", "a bit changed", _damage)
+add_training_damage("cut", "the last third is cut off", _truncate)
+add_training_damage("changed", "a bit is changed in", _damage)

@@ -1,4 +1,4 @@
-"""A checkout whose stages have finished, copies of it that faults are injected into, and the verdict on each fault."""
+"""A finished checkout, its copies into which faults are injected, and the verdict on each fault."""
 
 import os
 import re
@@ -22,18 +22,10 @@ SCENE = "faults"
 EXPERIMENTS = ("single_random", "transfer", "lobo", "triplet", "adapt", "baselines", "sensitivity", "audit")
 PROTOCOLS = ("grid", "glass")  # needed by these experiments
 SECTIONS = (
-    "source",
-    "seed",
-    "selection",
-    "train_single",
-    "train_multi",
-    "train_triplet",
-    "adapt",
-    "train_classical",
-    "audit",
-)
+    "source", "seed", "selection", "train_single", "train_multi", "train_triplet", "adapt", "train_classical", "audit",
+)  # fmt: skip
 SPLIT = ("random_test_fraction", "random_repeats_n", "transfer_skins_n", "pool_passes_n")
-LIMIT_S = 600.0  # longer is a hang
+LIMIT_S = 600.0  # a command that takes longer hangs
 TRACES = "Traceback (most recent call last)"
 
 
@@ -56,7 +48,7 @@ class Checkout:
 
     def __init__(self, folder: Path, output: Path | None = None, template: "Checkout | None" = None) -> None:
         self.folder = folder
-        self.template = template or self  # the finished checkout this is a copy of
+        self.template = template or self  # the finished checkout of which this is a copy
         self._output = output or folder.with_suffix(".output")
 
     def start(self, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
@@ -99,7 +91,7 @@ class Checkout:
         raise AssertionError(f"stage {name} must start within {find_s:.0f} s:\n{self.output()[-2000:]}")
 
     def until(self, happened: Callable[[], bool], process: psutil.Process, limit_s: float = LIMIT_S) -> bool:
-        """Wait for a condition; return False if the process ended before."""
+        """Wait for a condition; return False if the process ends first."""
         until_s = time.monotonic() + limit_s
         while not happened():
             if not alive(process) or time.monotonic() > until_s:
@@ -108,7 +100,7 @@ class Checkout:
         return alive(process)
 
     def trainings(self) -> dict[str, int]:
-        """List the finished trainings with the time at which each was written."""
+        """Return the files of finished training runs and the times at which they were written."""
         return {file.name: file.stat().st_mtime_ns for file in (self.folder / ".reskin/cells").glob("*.safetensors")}
 
     def lock(self) -> dict[str, dict[str, str]]:
@@ -124,7 +116,7 @@ class Checkout:
         return next(entry["cmd"].split() for entry in entries if f" {stage} " in entry["cmd"])
 
     def reset(self, *names: str, trainings: bool = True) -> None:
-        """Remove the entries and outputs of stages, and finished trainings, so that the stages run again."""
+        """Remove the entries and outputs of stages, and finished training runs, so that the stages run again."""
         file = self.folder / "dvc.lock"
         lock = YAML().load(file.read_text())
         for name in names:
@@ -139,7 +131,7 @@ class Checkout:
 
 
 def alive(process: psutil.Process) -> bool:
-    """Whether a process runs and is no zombie."""
+    """Return whether a process runs and is not a zombie."""
     try:
         return process.status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
@@ -159,7 +151,7 @@ def make_template(folder: Path) -> tuple[Checkout, Result]:
     (folder / ".venv").symlink_to(ROOT / ".venv")
     scenes = folder / "pipeline/scenes"
     with (scenes / f"{SCENE}.yaml").open("w") as stream:
-        YAML().dump(small(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)
+        YAML().dump(small_scene(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)
     (folder / "dvc.lock").unlink()
     at = Checkout(folder)
     for command in (["python", "-m", "pipeline", "scenes", "use", SCENE], ["dvc", "repro"]):
@@ -168,11 +160,11 @@ def make_template(folder: Path) -> tuple[Checkout, Result]:
             raise AssertionError(f"{' '.join(command)} failed:\n{done.output[-3000:]}")
     git(folder, "add", "--all")
     git(folder, "commit", "--quiet", "--message", "finished")
-    shutil.rmtree(folder / ".dvc/cache/runs")  # else DVC restores the files that a fault damages
+    shutil.rmtree(folder / ".dvc/cache/runs")  # otherwise, DVC restores the files that a fault damages
     return at, done
 
 
-def small(ci: dict) -> dict:
+def small_scene(ci: dict) -> dict:
     """Return the settings of a few experiments of scene ci."""
     scene = {name: ci[name] for name in SECTIONS} | {"experiments": list(EXPERIMENTS)}
     scene["split"] = {name: ci["split"][name] for name in SPLIT}
@@ -190,15 +182,10 @@ def copy(template: Checkout, folder: Path) -> Checkout:
 
 
 def message_of(output: Sequence[str] | str) -> str:
-    """Return the error message of an output: the stage's own, else DVC's."""
+    """Return the error message in an output: that of the stage or, without one, that of DVC."""
     lines = output.splitlines() if isinstance(output, str) else list(output)
-    for start in (
-        "error:",
-        "warning:",
-        "ERROR:",
-        "WARNING:",
-        "is invalid",
-    ):  # the last is DVC's message on its own files
+    # "is invalid" is DVC's message about its own files.
+    for start in ("error:", "warning:", "ERROR:", "WARNING:", "is invalid"):
         found = [line for line in lines if line.startswith(start) or f" {start} " in f" {line}"]
         if found:
             return re.sub(r"(sh pipeline/run\.sh \w+).*?(, exited|$)", r"\1 …\2", found[0])
@@ -242,35 +229,36 @@ def judge(
 ) -> Row:  # fmt: skip
     """Compare the state after a fault, and after the next run, with the undisturbed run.
 
-    may_run: the stages that the next run may run. finished: the trainings before it. fails: the first run has to fail.
+    may_run: stages that the next run may run. finished: training runs that finished before it. fails: the first run
+    must fail.
     """
     after, undisturbed, reused = at.lock(), at.template.lock(), _whole(finished or {}, at.trainings())
     torn_n = len(finished or {}) - len(reused)
     trained = sum(written != reused.get(name) for name, written in at.trainings().items())
     again_trained = [name for name, written in at.trainings().items() if name in reused and written != reused[name]]
-    unlike = [stage for stage in undisturbed if after.get(stage) != undisturbed[stage]]
-    more = sorted(set(again.ran) - set(may_run)) if may_run is not None else []
+    different = [stage for stage in undisturbed if after.get(stage) != undisturbed[stage]]
+    unexpected = sorted(set(again.ran) - set(may_run)) if may_run is not None else []
     checks = {
         "a traceback": TRACES in first.output + again.output,
         "a hang": first.status is None or again.status is None,
         "no failure": fails and first.status == 0,
         "no message": (first.status or 0) > 0 and not message_of(first.output),  # a killed process prints nothing
         f"the next run fails: {message_of(again.output)}": again.status not in (0, None),
-        f"other results: {', '.join(unlike)}": bool(unlike),
-        f"finished stages ran again: {', '.join(more)}": bool(more),
-        f"{len(again_trained)} finished trainings again": bool(again_trained),
+        f"other results: {', '.join(different)}": bool(different),
+        f"finished stages ran again: {', '.join(unexpected)}": bool(unexpected),
+        f"{len(again_trained)} finished training runs repeated": bool(again_trained),
     }
     next_run = f"ran {', '.join(stage.partition('@')[0] for stage in again.ran) or 'no stage'}"
     if finished is not None:
-        next_run += f"; {len(reused)} trainings reused, {trained} trained"
-    next_run += "" if unlike else "; results equal byte for byte"
+        next_run += f"; {len(reused)} training runs reused, {trained} computed"
+    next_run += "" if different else "; results equal byte for byte"
     faults = [fault for fault, is_true in checks.items() if is_true]
-    lost = f"{torn_n} trainings of a stack whose files were being written" if torn_n else "nothing finished"
+    lost = f"{torn_n} training runs of a stack whose files were being written" if torn_n else "nothing finished"
     return Row(message_of(first.output), first.status, lost, next_run, faults)
 
 
 def _whole(trainings: dict[str, int], later: dict[str, int]) -> dict[str, int]:
-    """Keep the trainings of complete stacks, whose trainings finish together."""
+    """Keep the training runs of complete stacks; the runs of a stack finish together."""
     members = [Counter(name.rpartition("-")[0] for name in each) for each in (trainings, later)]
     whole = {stack for stack, files_n in members[0].items() if members[1][stack] == files_n}
     return {name: written for name, written in trainings.items() if name.rpartition("-")[0] in whole}

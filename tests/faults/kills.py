@@ -1,4 +1,4 @@
-"""Processes that are killed in mid-run: every kind of stage, DVC itself, a worker."""
+"""Faults of processes that are killed in mid-run: every kind of stage, DVC itself, a worker."""
 
 import signal
 import time
@@ -14,15 +14,15 @@ STAGES = (
     "audit", "report", "publish",
 )  # fmt: skip
 ATTEMPTS_N = 4
-AS_MAX = 100 * 2**20  # bytes
+ADDRESS_SPACE_MAX = 100 * 2**20  # bytes
 
 
 def address(stage: str) -> str:
-    """The name of a stage in DVC."""
+    """Return the name of a stage in DVC."""
     return stage if stage == "code" else f"{stage}@{SCENE}"
 
 
-def killed(at: Checkout, stage: str, part: float) -> Result | None:
+def run_and_kill(at: Checkout, stage: str, part: float) -> Result | None:
     """Run a stage through DVC, and kill its process after a part of its earlier duration; None if it ended first."""
     cost = at.folder / ".reskin/costs" / SCENE / f"{stage}.json"
     wait_s = part * (io.read_json(cost)["seconds"] if cost.exists() else 2.0)
@@ -43,17 +43,18 @@ def killed(at: Checkout, stage: str, part: float) -> Result | None:
     return result if result.status else None
 
 
-def kill_in(stage: str) -> None:
+def add_kill(stage: str) -> None:
     """Add the fault of a killed stage."""
 
     @fault(
         f"kill -9 in `{stage}`",
-        "the stage's process, in mid-run" + ("" if stage not in TRAINS else ", as soon as a training is finished"),
+        "SIGKILL to the stage's process in mid-run"
+        + ("" if stage not in TRAINS else ", as soon as a training run is finished"),
     )
     def case(at: Checkout) -> Row:
         for i in range(ATTEMPTS_N):
             at.reset(address(stage))
-            if result := killed(at, stage, 0.5 / 2**i):
+            if result := run_and_kill(at, stage, 0.5 / 2**i):
                 break
         else:
             raise AssertionError(f"{stage} ended before it could be killed")
@@ -62,12 +63,12 @@ def kill_in(stage: str) -> None:
 
 
 for name in STAGES:
-    kill_in(name)
+    add_kill(name)
 
 
 @fault(
     "kill -9 of `dvc repro` itself",
-    "DVC's process, while `train_triplet` trains, which goes on alone; the next run at once",
+    "SIGKILL to DVC while `train_triplet` runs; the stage continues alone, and the next run starts at once",
 )
 def kill_dvc(at: Checkout) -> Row:
     stage = address("train_triplet")
@@ -79,12 +80,12 @@ def kill_dvc(at: Checkout) -> Row:
     repro.send_signal(signal.SIGKILL)
     result, finished = at.end(repro, start_s), at.trainings()
     again = at.run("dvc", "repro")
-    at.until(lambda: False, process, 60.0)  # orphaned processes end
+    at.until(lambda: False, process, 60.0)  # orphaned processes have time to end
     return judge(at, result, again, may_run=[stage], finished=finished)
 
 
 def _worker(at: Checkout, stage: str) -> tuple[psutil.Process, psutil.Process]:
-    """Return a stage's process and one of its workers that has finished a training."""
+    """Return a stage's process and one of its workers, once a training run is finished."""
     process = at.stage(stage)
     at.until(lambda: bool(at.trainings()), process)
     workers = [child for child in process.children(recursive=True) if _is_worker(child)]
@@ -101,7 +102,7 @@ def _is_worker(process: psutil.Process) -> bool:
 
 @fault(
     "worker out of memory, killed by the kernel",
-    "SIGKILL to a worker process of `train_triplet` after a finished training",
+    "SIGKILL to a worker process of `train_triplet` after a finished training run",
 )
 def kill_worker(at: Checkout) -> Row:
     stage = address("train_triplet")
@@ -115,7 +116,7 @@ def kill_worker(at: Checkout) -> Row:
 
 @fault(
     "worker out of memory, reported by the allocator",
-    "RLIMIT_AS of a worker of `train_triplet` set to 100 MB, less than it has, after a finished training",
+    "after a finished training run, RLIMIT_AS of a worker of `train_triplet` is set to 100 MB, less than it uses",
 )
 def starve_worker(at: Checkout) -> Row:
     stage = address("train_triplet")
@@ -123,14 +124,14 @@ def starve_worker(at: Checkout) -> Row:
     start_s = time.monotonic()
     repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
     worker = _worker(at, "train_triplet")[1]
-    worker.rlimit(psutil.RLIMIT_AS, (AS_MAX, AS_MAX))
+    worker.rlimit(psutil.RLIMIT_AS, (ADDRESS_SPACE_MAX, ADDRESS_SPACE_MAX))
     result, finished = at.end(repro, start_s), at.trainings()
     return judge(at, result, at.run("dvc", "repro"), may_run=[stage], finished=finished)
 
 
 @fault(
     "kill -9 of a stage with workers",
-    "the process of `train_triplet`; its workers must end too",
+    "SIGKILL to the process of `train_triplet`; its workers must end too",
 )
 def kill_parent(at: Checkout) -> Row:
     stage = address("train_triplet")

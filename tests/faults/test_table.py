@@ -1,4 +1,4 @@
-"""The committed table has a row for every fault; rows show outcome and message."""
+"""Tests that the committed table has a row for every fault, and that rows show outcome and message."""
 
 from tests.faults import files, kills, together, tracking  # noqa: F401 (each adds its faults)
 from tests.faults.__main__ import OUT

@@ -1,4 +1,4 @@
-"""Concurrent commands, clocks, added recordings, and unfinished git operations."""
+"""Faults of concurrent commands, clocks, added recordings, and unfinished git operations."""
 
 import shutil
 import signal
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-from tests.faults.files import _cut
+from tests.faults.files import _truncate
 from tests.faults.harness import Checkout, Result, Row, fault, judge
 from tests.faults.kills import address
 from tests.recordings.readers.test_lab import PRESSES, write
@@ -22,7 +22,7 @@ INGEST = f"ingest@rig-{CAPTURE}"
 RAW = f"data/raw/rig/{CAPTURE}"
 
 
-@fault("two `dvc repro` at once", "the second begins while `train_triplet` of the first trains")
+@fault("two `dvc repro` at once", "the second starts while the first runs `train_triplet`")
 def two(at: Checkout) -> Row:
     at.reset(TRIPLET)
     start_s = time.monotonic()
@@ -37,7 +37,7 @@ def two(at: Checkout) -> Row:
 
 @fault(
     "two `dvc repro` at once, of different stages",
-    "the second runs `sensitivity` while `train_triplet` of the first trains",
+    "the second runs `sensitivity` while the first runs `train_triplet`",
 )
 def two_stages(at: Checkout) -> Row:
     at.reset(TRIPLET, address("sensitivity"))
@@ -46,7 +46,7 @@ def two_stages(at: Checkout) -> Row:
     at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
     second = other.run("dvc", "repro", address("sensitivity"))
     one, finished = at.end(first, start_s), at.trainings()
-    yet_to_run = [address("sensitivity")] if second.status else []  # a refused one has run nothing
+    yet_to_run = [address("sensitivity")] if second.status else []  # a refused command has run nothing
     row = judge(at, second, at.run("dvc", "repro"), may_run=yet_to_run, finished=finished, fails=False)
     row.faults += [] if one.status == 0 else ["the first fails"]
     row.faults += ["refused, and it ran"] if second.status and second.ran else []
@@ -71,7 +71,7 @@ def _ingest(at: Checkout) -> Result:
 
 @fault(
     "`reskin add` beside a running `dvc repro`",
-    "a recording is added while `train_triplet` trains, and once more after its end",
+    "a recording is added while `train_triplet` runs, and again after its end",
 )
 def add_beside(at: Checkout) -> Row:
     at.reset(TRIPLET)
@@ -89,7 +89,7 @@ def add_beside(at: Checkout) -> Row:
 
 @fault(
     "kill -9 of `reskin add`",
-    "as soon as its folder is there; then `dvc repro`, `reskin add` again, and once more after what it says is done",
+    "SIGKILL as soon as its folder exists; `dvc repro`; `reskin add`; what its message says, and `reskin add` again",
 )
 def kill_add(at: Checkout) -> Row:
     command, start_s = _add(at), time.monotonic()
@@ -111,7 +111,7 @@ def kill_add(at: Checkout) -> Row:
 
 @fault(
     "kill -9 in `ingest`",
-    "the stage's process, as soon as it is there; a recording of layout `lab`",
+    "SIGKILL to the stage's process as soon as it exists; the recording has layout `lab`",
 )
 def kill_ingest(at: Checkout) -> Row:
     at.run(*_add(at))
@@ -129,8 +129,8 @@ def kill_ingest(at: Checkout) -> Row:
 
 @fault(
     "truncated recorded capture",
-    "a third cut from `readings.csv` of an added recording, which is ingested and committed; then `dvc repro`; "
-    "`git restore` of its `.dvc` and `dvc checkout --force` for the next run",
+    "the last third is cut off `readings.csv` of an added recording, which is ingested and committed; "
+    "then `dvc repro`; for the next run, `git restore` of its `.dvc` file and `dvc checkout --force`",
 )
 def cut_recording(at: Checkout) -> Row:
     at.run(*_add(at))
@@ -138,7 +138,7 @@ def cut_recording(at: Checkout) -> Row:
     expected = at.lock()[INGEST]
     git(at.folder, "add", "--all")
     git(at.folder, "commit", "--quiet", "--message", "added")
-    _cut(at.folder / RAW / "readings.csv")
+    _truncate(at.folder / RAW / "readings.csv")
     result = _ingest(at)
     git(at.folder, "restore", f"{RAW}.dvc")
     restored = at.run("dvc", "checkout", "--force", f"{RAW}.dvc")
@@ -149,7 +149,7 @@ def cut_recording(at: Checkout) -> Row:
     return row
 
 
-BACK = """\
+CLOCK_SET_BACK = """\
 import time
 _before = {name: getattr(time, name) for name in ("time", "time_ns")}
 _until = time.monotonic() + 2.0
@@ -162,15 +162,15 @@ _set_back("time_ns", 86400 * 10**9)
 
 @fault(
     "clock set back",
-    "by a day, 2 s after each process of `dvc repro` starts (`time.time` replaced by a sitecustomize); files of "
-    "finished stages then lie in the future; next run with the right clock",
+    "by a day, 2 s after each process of `dvc repro` starts (`time.time` is replaced by a sitecustomize), so that "
+    "files of finished stages are from the future; the next run has the right clock",
 )
 def clock(at: Checkout) -> Row:
     stages = [TRIPLET, address("adapt"), address("report"), address("publish")]
     at.reset(*stages)
     shim = at.folder.with_name("shim")
     shim.mkdir(exist_ok=True)
-    (shim / "sitecustomize.py").write_text(BACK)
+    (shim / "sitecustomize.py").write_text(CLOCK_SET_BACK)
     for file in (at.folder / "data/indentations").rglob("*.parquet"):
         subprocess.run(["touch", "--date", "tomorrow", str(file)], check=True)
     first = at.run("dvc", "repro", PYTHONPATH=f"{shim}:{at.folder}")
@@ -180,48 +180,46 @@ def clock(at: Checkout) -> Row:
     return row
 
 
-def _damaged_then_restored(
-    at: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True
-) -> Row:
+def _damage_and_restore(at: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True) -> Row:
     (at.folder / file).write_text(content)
     result = at.run(*command)
     git(at.folder, "restore", file)
     return judge(at, result, at.run("dvc", "repro"), may_run=[], fails=fails)
 
 
-MARKS = "<<<<<<< HEAD\n{}=======\n{}>>>>>>> other\n"
+CONFLICT = "<<<<<<< HEAD\n{}=======\n{}>>>>>>> other\n"
 
 
 @fault(
     "git: conflict left in dvc.lock",
-    "marks of a merge in `dvc.lock`; `dvc repro`; `git restore dvc.lock` for the next run",
+    "conflict markers in `dvc.lock`; `dvc repro`; `git restore dvc.lock` for the next run",
 )
 def conflict_lock(at: Checkout) -> Row:
     text = (at.folder / "dvc.lock").read_text()
-    return _damaged_then_restored(at, "dvc.lock", MARKS.format(text, text), ("dvc", "repro"))
+    return _damage_and_restore(at, "dvc.lock", CONFLICT.format(text, text), ("dvc", "repro"))
 
 
 @fault(
     "git: conflict left in data/captures.yaml",
-    "marks of a merge; `reskin scenes check`; `git restore` for the next run",
+    "conflict markers; `reskin scenes check`; `git restore` for the next run",
 )
 def conflict_captures(at: Checkout) -> Row:
     command = ("python", "-m", "pipeline", "scenes", "check")
-    text = MARKS.format("captures: {a: {}}\n", "captures: {b: {}}\n")
-    return _damaged_then_restored(at, "data/captures.yaml", text, command)
+    text = CONFLICT.format("captures: {a: {}}\n", "captures: {b: {}}\n")
+    return _damage_and_restore(at, "data/captures.yaml", text, command)
 
 
-@fault("dvc.lock cut", "its last twentieth; `dvc repro`; `git restore dvc.lock` for the next run")
+@fault("dvc.lock cut", "its last twentieth is cut off; `dvc repro`; `git restore dvc.lock` for the next run")
 def cut_lock(at: Checkout) -> Row:
     text = (at.folder / "dvc.lock").read_text()
-    row = _damaged_then_restored(at, "dvc.lock", text[: len(text) * 19 // 20], ("dvc", "repro"), fails=False)
-    row.message = row.message or "nothing: what is not in it is yet to run"
+    row = _damage_and_restore(at, "dvc.lock", text[: len(text) * 19 // 20], ("dvc", "repro"), fails=False)
+    row.message = row.message or "nothing: stages that are missing in it run again"
     return row
 
 
 @fault(
     "git: index.lock left by a killed git",
-    "`.git/index.lock` is there; `split` and what follows are run; next run without it",
+    "`.git/index.lock` exists while `split` and later stages run; it is removed for the next run",
 )
 def index_lock(at: Checkout) -> Row:
     at.reset(address("split"), trainings=False)

@@ -1,4 +1,4 @@
-"""MLflow: servers that are missing, silent or die during a run; a store that is locked."""
+"""Faults of MLflow: servers that are missing, silent or die during a run, and a store that is locked."""
 
 import http.server
 import re
@@ -22,7 +22,7 @@ from tests.faults.harness import NOT_RUN, SCENE, Checkout, Result, Row, fault, j
 def _report(at: Checkout, first: Result, again: Result | None) -> Row:
     """Check that the stage succeeds soon with one warning, and that `reskin publish`, if it ran, sends everything."""
     row, warned_n = judge(at, first, again or NOT_RUN, fails=False), first.output.count("warning:")
-    row.lost, row.next_run = "nothing", "as where it refuses"
+    row.lost, row.next_run = "nothing", "as for a server that refuses"
     if again:
         counts = re.findall(r"MLflow runs (\{.*\})", again.output)
         row.next_run = f"`reskin publish`: {counts[-1] if counts else again.output.strip()[-200:]}"
@@ -39,7 +39,7 @@ def _took_s(at: Checkout) -> float:
     return float(io.read_json(at.folder / f".reskin/costs/{SCENE}/publish.json")["seconds"])
 
 
-def _away(at: Checkout, uri: str) -> Row:
+def _publish_to(at: Checkout, uri: str) -> Row:
     direct = {"no_proxy": "*", "NO_PROXY": "*"}  # otherwise a proxy may respond instead
     return _report(at, at.run(*at.command("publish"), MLFLOW_TRACKING_URI=uri, **direct), None)
 
@@ -56,27 +56,29 @@ def refused(at: Checkout) -> Row:
     return _report(at, first, at.run("python", "-m", "pipeline", "publish"))
 
 
-HOLE = "10.255.255.1"
-IN_HOLE = (  # own network namespace; packets to its only neighbour are discarded
+BLACK_HOLE = "10.255.255.1"
+IN_BLACK_HOLE = (  # own network namespace; packets to its only neighbour are discarded
     "ip link set lo up && ip link add hole0 type veth peer name hole1 && ip address add 10.255.255.2/24 dev hole0 && "
     "ip link set hole1 up && ip link set hole0 up && "
-    f"ip neighbour add {HOLE} lladdr 02:00:00:00:00:01 dev hole0 && exec "
+    f"ip neighbour add {BLACK_HOLE} lladdr 02:00:00:00:00:01 dev hole0 && exec "
 )
 
 
 @fault(
     "tracking server black-holed, nothing comes back",
-    f"a network in which nothing comes back from {HOLE}, as behind a firewall that drops",
+    f"a network that discards all packets to {BLACK_HOLE}, as a firewall may do",
 )
 def no_route(at: Checkout) -> Row:
-    command = ("unshare", "--net", "sh", "-c", IN_HOLE + shlex.join(at.command("publish")))
-    return _report(at, at.run(*command, MLFLOW_TRACKING_URI=f"http://{HOLE}:5000", no_proxy="*", NO_PROXY="*"), None)
+    command = ("unshare", "--net", "sh", "-c", IN_BLACK_HOLE + shlex.join(at.command("publish")))
+    return _report(
+        at, at.run(*command, MLFLOW_TRACKING_URI=f"http://{BLACK_HOLE}:5000", no_proxy="*", NO_PROXY="*"), None
+    )
 
 
-@fault("tracking server black-holed, silent", "a socket that accepts and never responds")
+@fault("tracking server black-holed, silent", "a socket that accepts connections and never responds")
 def silent(at: Checkout) -> Row:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        return _away(at, f"http://127.0.0.1:{server.getsockname()[1]}")
+        return _publish_to(at, f"http://127.0.0.1:{server.getsockname()[1]}")
 
 
 class OnlyHealth(http.server.BaseHTTPRequestHandler):
@@ -104,14 +106,14 @@ def hangs(at: Checkout) -> Row:
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        return _away(at, f"http://127.0.0.1:{server.server_port}")
+        return _publish_to(at, f"http://127.0.0.1:{server.server_port}")
     finally:
         server.shutdown()
 
 
 @contextmanager
-def _served(at: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """Run MLflow's own server on a store of the case."""
+def _mlflow_server(at: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Run MLflow's own server on a store of this checkout."""
     other = Checkout(at.folder, at.folder.with_suffix(".server"))
     store, artifacts = f"sqlite:///{at.folder}/team.db", f"{at.folder}/team"
     server = other.start(
@@ -132,11 +134,11 @@ def _served(at: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]:
         server.wait()
 
 
-def _in_mid_run(at: Checkout, number: signal.Signals) -> Row:
+def _signal_server_in_mid_run(at: Checkout, number: signal.Signals) -> Row:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     uri = f"http://127.0.0.1:{port}"
-    with _served(at, port) as server:
+    with _mlflow_server(at, port) as server:
         start_s = time.monotonic()
         publishing = at.start(*at.command("publish"), MLFLOW_TRACKING_URI=uri)
         process = at.stage("publish")
@@ -144,7 +146,7 @@ def _in_mid_run(at: Checkout, number: signal.Signals) -> Row:
         subprocess.run(["kill", f"-{number.value}", "--", f"-{server.pid}"], check=True)
         first = at.end(publishing, start_s)
     written_n = _finished_n(at.folder / "team.db")
-    with _served(at, port):
+    with _mlflow_server(at, port):
         row = _report(at, first, at.run("python", "-m", "pipeline", "publish", MLFLOW_TRACKING_URI=uri))
     row.next_run += f", {written_n} runs were there"
     return row
@@ -163,7 +165,7 @@ def _finished_n(store: Path) -> int:
     "SIGKILL to `mlflow server` once 3 runs are written; it is started again for the next run",
 )
 def dies(at: Checkout) -> Row:
-    return _in_mid_run(at, signal.SIGKILL)
+    return _signal_server_in_mid_run(at, signal.SIGKILL)
 
 
 @fault(
@@ -171,14 +173,14 @@ def dies(at: Checkout) -> Row:
     "SIGSTOP to `mlflow server` once 3 runs are written",
 )
 def stops(at: Checkout) -> Row:
-    return _in_mid_run(at, signal.SIGSTOP)
+    return _signal_server_in_mid_run(at, signal.SIGSTOP)
 
 
 @fault(
     "MLflow's SQLite held by another program",
     "BEGIN EXCLUSIVE on `mlflow.db` during the whole run",
 )
-def held(at: Checkout) -> Row:
+def locked(at: Checkout) -> Row:
     with closing(sqlite3.connect(at.folder / "mlflow.db")) as other:
         other.execute("BEGIN EXCLUSIVE")
         return _report(at, at.run(*at.command("publish")), None)
@@ -188,7 +190,7 @@ def held(at: Checkout) -> Row:
     "MLflow's SQLite held in mid-run",
     "BEGIN EXCLUSIVE on a new `mlflow.db` once 3 runs are written, until the run has ended",
 )
-def held_in_mid_run(at: Checkout) -> Row:
+def locked_in_mid_run(at: Checkout) -> Row:
     store = at.folder / "mlflow.db"
     store.unlink()
     shutil.rmtree(at.folder / "mlartifacts")

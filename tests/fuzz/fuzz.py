@@ -1,7 +1,7 @@
-"""Fuzz the input of one target or of all: python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP].
+"""Fuzz one target or all: python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP].
 
-With `pip install atheris`, new inputs are guided by code coverage (libFuzzer); without it they are random changes of
-the corpus and of KEEP, which finds less. Inputs that reach new code are kept in the folder KEEP, if given. A failing
+With `pip install atheris`, code coverage guides new inputs (libFuzzer). Without it, inputs are random changes of the
+corpus and of KEEP, which find less. Inputs that reach new code are kept in the folder KEEP, if given. A failing
 input is left in the working directory as `crash-...`; move it to `corpus/TARGET/`.
 """
 
@@ -19,14 +19,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 CORPUS = Path(__file__).parent / "corpus"
 BYTES_MAX_N, MEMORY_MAX_MB, HANG_S = 4096, 2048, 20
 PRINT_EVERY_N = 10_000
-COMPARISONS = (
-    operator.lt,
-    operator.le,
-    operator.eq,
-    operator.ne,
-    operator.gt,
-    operator.ge,
-)  # in the order of Python's opcodes
+# In the order of Python's opcodes.
+COMPARISONS = (operator.lt, operator.le, operator.eq, operator.ne, operator.gt, operator.ge)
 
 
 def fuzz_guided(name: str, seconds: int, keep: Path | None) -> None:
@@ -39,7 +33,7 @@ def fuzz_guided(name: str, seconds: int, keep: Path | None) -> None:
     with atheris.instrument_imports(include=["reskin"]):
         from tests.fuzz.targets import feed
     for file in (CORPUS / name).iterdir():
-        feed(name, file.read_bytes())  # late imports are not a hang
+        feed(name, file.read_bytes())  # import all modules first, so that imports are not taken for a hang
     with tempfile.TemporaryDirectory() as found:
         limits = [f"-max_total_time={seconds}", f"-max_len={BYTES_MAX_N}", f"-rss_limit_mb={MEMORY_MAX_MB}"]
         if keep is not None:
@@ -53,7 +47,7 @@ def fuzz_guided(name: str, seconds: int, keep: Path | None) -> None:
 
 
 def exclude_arrays(atheris: ModuleType) -> None:
-    """Compare arrays without atheris 3.0, which leaks the results and learns nothing from them."""
+    """Compare arrays without atheris 3.0, which leaks memory on such comparisons and learns nothing from them."""
 
     def compare(left: object, right: object, comparison_i: int, *where: object) -> object:
         if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
@@ -65,7 +59,7 @@ def exclude_arrays(atheris: ModuleType) -> None:
 
 
 def resident_MB() -> float:
-    """Memory of this process; NaN if the system has no /proc."""
+    """Return the memory of this process; NaN if the system has no /proc."""
     statm = Path("/proc/self/statm")
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6 if statm.exists() else float("nan")
 

@@ -1,7 +1,7 @@
 """Fuzz targets: one function for each kind of input from outside.
 
-A target takes any bytes and may raise nothing but a `ReskinError`. `fuzz.py` runs them for a given time,
-`test_corpus.py` on the committed corpus.
+A target takes any bytes and may raise only a `ReskinError`. `fuzz.py` runs the targets for a given time,
+`test_corpus.py` runs them on the committed corpus.
 """
 
 import tempfile
@@ -28,7 +28,7 @@ from reskin.recordings.label_sources import Prompts, parse_places
 from reskin.recordings.labels import Dwell, DwellBuilder, GaugeLines, ProbeLogWriter, SampleTable
 from reskin.recordings.readers import READERS, sd_card
 from reskin.seeds import rng_for
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 FOLDER = Path(tempfile.mkdtemp(prefix="reskin-fuzz-"))
 WIRES = get_args(Wire)
@@ -36,7 +36,7 @@ LIVE = Session("none", [], "no board")
 
 
 def stream(data: bytes) -> None:
-    """A stream of any format: every byte is accounted for, and chunks do not matter."""
+    """A stream of any wire format: every byte is accounted for, and chunks do not matter."""
     wire, chips_n, cut_n = WIRES[data[0] % len(WIRES)], 1 + data[1] % 8, 1 + data[2]
     whole, parts = FrameStream(wire, chips_n), FrameStream(wire, chips_n)
     found = [whole.feed(data[3:]), whole.close()]
@@ -52,7 +52,7 @@ def stream(data: bytes) -> None:
 
 
 def page(data: bytes) -> None:
-    """Messages of a page: three commands, everything else is ignored."""
+    """Messages of a page: there are three commands, and everything else is ignored."""
     receive(LIVE, data.decode(errors="replace"))
 
 
@@ -86,7 +86,7 @@ def _reader(layout: str, name: str) -> Callable[[bytes], None]:
         folder = FOLDER / layout
         folder.mkdir(exist_ok=True)
         (folder / name).write_bytes(data)
-        READERS[layout].read(folder, settings, AS_USUAL)
+        READERS[layout].read(folder, settings, DEFAULT_POLICY)
 
     return read
 
@@ -97,7 +97,7 @@ def _log(data: bytes) -> None:
 
 
 def labels(data: bytes) -> None:
-    """Rows of a robot's table, in chunks: they make a valid probe log or none."""
+    """Rows of a robot's table, in chunks: they become a valid probe log or none."""
     table, dwells, cut_n = SampleTable("labels"), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
@@ -107,7 +107,7 @@ def labels(data: bytes) -> None:
 
 
 def gauge(data: bytes) -> None:
-    """Output of a force gauge, a few bytes every 10 ms."""
+    """The output of a force gauge, a few bytes every 10 ms."""
     lines, dwells, cut_n = GaugeLines(), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
@@ -140,7 +140,7 @@ def typed(data: bytes) -> None:
 
 
 def _files(layout: str, names: tuple[str, ...], **options: str) -> Callable[[bytes], None]:
-    """A recording of several files, separated by a line of dashes."""
+    """Return a target for a recording of several files, which are separated by a line of dashes."""
     settings = make_header(layout=layout, chips_n=1, capture="fuzz", options=options)
 
     def read(data: bytes) -> None:
@@ -148,7 +148,7 @@ def _files(layout: str, names: tuple[str, ...], **options: str) -> Callable[[byt
         folder.mkdir(exist_ok=True)
         for name, content in zip_longest(names, data.split(b"----\n")[: len(names)], fillvalue=b""):
             (folder / name).write_bytes(content)
-        READERS[layout].read(folder, settings, AS_USUAL)
+        READERS[layout].read(folder, settings, DEFAULT_POLICY)
 
     return read
 
@@ -173,7 +173,7 @@ TARGETS: Mapping[str, Callable[[bytes], None]] = {
 }  # fmt: skip
 
 
-HEADS_N = {"stream": 3, "labels": 1, "gauge": 1}  # number of first bytes that configure the target
+HEADS_N = {"stream": 3, "labels": 1, "gauge": 1}  # number of leading bytes that configure the target
 
 
 def feed(name: str, data: bytes) -> None:

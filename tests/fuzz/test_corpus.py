@@ -1,4 +1,4 @@
-"""Every fuzz target accepts its corpus or raises a `ReskinError`."""
+"""Test that each fuzz target accepts each input of its corpus or raises a `ReskinError`."""
 
 import pytest
 
@@ -7,6 +7,6 @@ from tests.fuzz.targets import TARGETS, feed
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_corpus(name):
+def test_corpus_raises_only_reskin_errors(name):
     for file in sorted((CORPUS / name).iterdir()):
         feed(name, file.read_bytes())

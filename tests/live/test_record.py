@@ -21,7 +21,7 @@ from reskin.recordings.label_sources import LabelContext
 from reskin.recordings.labels import Dwell
 from reskin.recordings.preparing import CaptureNames, native
 from tests.live.boards import make_script, plugged_in
-from tests.recordings.headers import AS_USUAL
+from tests.recordings.headers import DEFAULT_POLICY
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals")
 PLACES = [(4.0, 8.0), (12.0, 4.0)]
@@ -60,7 +60,7 @@ def read(folder):
 
     header, files = native(folder, CaptureNames("b0", "s0", None), None, ())
     into = folder.parent / "added" / header.capture
-    _, blocks, account = open_capture(write_capture(into, header, files) and into, AS_USUAL)
+    _, blocks, account = open_capture(write_capture(into, header, files) and into, DEFAULT_POLICY)
     return list(blocks), account
 
 

@@ -9,8 +9,8 @@ from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import Header
 
 LAB = {"board": "board1", "skin": "skin1", "layout": "lab", "chips_n": 5, "protocol": "", "note": ""}
-# The fault policy of params.yaml.
-AS_USUAL = parse(FaultPolicy, read_yaml(Path(__file__).parents[2] / "params.yaml")["faults"], "params.yaml: faults")
+PARAMS = read_yaml(Path(__file__).parents[2] / "params.yaml")
+DEFAULT_POLICY = parse(FaultPolicy, PARAMS["faults"], "params.yaml: faults")
 
 
 def make_header(**changed: Any) -> Header:

@@ -1,4 +1,4 @@
-"""Arrival times: a frame's time lies between the chunks around its last byte."""
+"""Tests that a frame's time is between the arrival times of the chunks around its last byte."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -37,9 +37,9 @@ def naive_time_s(end_byte: int, table: Arrivals) -> float:
 def test_frame_times_equal_naive_loop(steps: Steps, first: tuple[int, float]) -> None:
     table = arrivals_of(steps, first)
     end_byte = np.linspace(1, table.byte_end[-1] + 50, 40).astype(np.int64)
-    want_s = [naive_time_s(int(byte), table) for byte in end_byte]
+    expected_s = [naive_time_s(int(byte), table) for byte in end_byte]
     # Sums of up to 31 doubles of size 1e3 to 1e4.
-    np.testing.assert_allclose(clocks.times_of(end_byte, table), want_s, rtol=1e-12, atol=1e-9)
+    np.testing.assert_allclose(clocks.times_of(end_byte, table), expected_s, rtol=1e-12, atol=1e-9)
 
 
 @given(steps=STEPS, first=st.tuples(st.integers(0, 500), st.floats(-1e3, 1e3)))
@@ -58,7 +58,7 @@ def test_frame_past_last_chunk_has_no_time() -> None:
     np.testing.assert_array_equal(t_s, [10 + 0.5 * 0.82, 11.5, np.nan])
 
 
-def test_constant_rate() -> None:
+def test_constant_rate_divides_the_frame_number() -> None:
     t_s = clocks.constant_rate(np.array([1.0, 2.0, 401.0]), 400.0)
     np.testing.assert_allclose(t_s, [0.0025, 0.005, 1.0025], rtol=1e-15)
 
@@ -92,6 +92,6 @@ def test_invalid_arrivals_name_their_line(old: str, new: str, message: str) -> N
         clocks.parse(GOOD.replace(old, new, 1), "arrivals.csv")
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="arrivals.csv: file not found"):
         clocks.parse(tmp_path / "arrivals.csv", "arrivals.csv")

@@ -1,4 +1,4 @@
-"""Synchronisation of the stream's clock with the probe's, from marks or from contacts."""
+"""Tests of synchronising the stream's clock with the probe's, from marks or from contacts."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ JITTER_S = (0.2, 0.5)
 
 
 def log_of(indentations_n: int, dwell_s: float, travel_s: tuple[float, float] = JITTER_S) -> ProbeLog:
-    """A log whose robot travels for a random time between dwells; equal bounds make it periodic."""
+    """Return a log whose robot travels for a random time between dwells; equal bounds make it periodic."""
     gap_s = rng_for(0, "travel").uniform(*travel_s, 2 * indentations_n)
     start_s = np.cumsum(gap_s + dwell_s)
     d = np.arange(2 * indentations_n, dtype=np.int32)
@@ -26,15 +26,15 @@ def log_of(indentations_n: int, dwell_s: float, travel_s: tuple[float, float] = 
     return ProbeLog(d // 2, 0 * d, d % 2 == 1, start_s, start_s + dwell_s, **labels)
 
 
-def line(offset_s: float, rate: float = 1.0) -> ClockMap:
+def clock_map(offset_s: float, rate: float = 1.0) -> ClockMap:
     return ClockMap(offset_s, rate, 0.0, 1.0)
 
 
 def stream_of(log: ProbeLog, truth: ClockMap, margin_s: float = 1.0, faint: float = 0.0) -> Block:
-    """Readings of 15 channels that go from a drifting no-load to a random contact and back.
+    """Return readings of 15 channels that go from a drifting no-load field to a random contact and back.
 
-    The skin is touched from 60 ms before a contact dwell, and until 60 ms after it; the share `faint` of the contacts
-    is not felt.
+    The skin is touched from 60 ms before each contact dwell until 60 ms after it; a share `faint` of the contacts does
+    not change the field.
     """
     rng = rng_for(1, "stream")
     probe_s = np.arange(log.t_start_s[0] - margin_s, log.t_end_s[-1] + margin_s, FRAME_S * truth.rate)
@@ -62,8 +62,8 @@ def worst_s(found: ClockMap, truth: ClockMap, stream_s: np.ndarray) -> float:
 )
 def test_exact_marks_recover_the_line(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
     stream_s = begin_s + np.linspace(3, 3600, marks_n)
-    # A double holds Unix time to 2e-7 s; the line is evaluated between its marks.
-    truth = line(offset_s, 1 + drift_ppm * 1e-6)
+    # A double holds Unix time to 2e-7 s; the clock_map is evaluated between its marks.
+    truth = clock_map(offset_s, 1 + drift_ppm * 1e-6)
     found = from_marks(np.stack([stream_s, truth.probe_s(stream_s)], axis=1), "header.json")
     assert worst_s(found, truth, stream_s) < 3e-6
     assert found.residual_s < 3e-6
@@ -85,7 +85,7 @@ def test_noisy_marks_give_the_least_squares_line() -> None:
 
 
 def test_millisecond_marks_resolve_ten_minutes_of_drift() -> None:
-    truth = line(-37.25, 1 + 50e-6)
+    truth = clock_map(-37.25, 1 + 50e-6)
     stream_s = np.array([2.0, 300.0, 598.0])
     probe_s = truth.probe_s(stream_s) + np.array([1e-3, -1e-3, 1e-3])
     found = from_marks(np.stack([stream_s, probe_s], axis=1), "header.json")
@@ -109,7 +109,7 @@ def test_invalid_marks_are_refused(marks: np.ndarray, message: str) -> None:
 @pytest.mark.parametrize("offset_s", [0.0, 12.345, -250.06, UNIX_S])
 @pytest.mark.parametrize("dwell_s", [0.1, 0.4])
 def test_contacts_give_the_offset(offset_s: float, dwell_s: float) -> None:
-    log, truth = log_of(100, dwell_s), line(offset_s)
+    log, truth = log_of(100, dwell_s), clock_map(offset_s)
     t_s, b_uT = stream_of(log, truth)
     found = from_contacts([(t_s, b_uT)], log, "c")
     assert worst_s(found, truth, t_s) < dwell_s / 4
@@ -118,22 +118,22 @@ def test_contacts_give_the_offset(offset_s: float, dwell_s: float) -> None:
 
 
 def test_contacts_follow_drifting_clocks() -> None:
-    log, truth = log_of(2000, 0.1), line(8.0, 1 + 200e-6)
+    log, truth = log_of(2000, 0.1), clock_map(8.0, 1 + 200e-6)
     t_s, b_uT = stream_of(log, truth)
     blocks = [(t_s[i : i + 20_000], b_uT[i : i + 20_000]) for i in range(0, len(t_s), 20_000)]
     found = from_contacts(blocks, log, "c")
-    assert 200e-6 * np.ptp(t_s) > 0.1  # an offset alone would end up wrong by a dwell
+    assert 200e-6 * np.ptp(t_s) > 0.1  # with an offset alone, the end would be wrong by a dwell
     assert worst_s(found, truth, t_s) < 0.1 / 4
 
 
-def test_contacts_longer_than_pauses() -> None:
-    log, truth = log_of(60, 0.5, (0.13, 0.4)), line(3.0)
+def test_contacts_longer_than_pauses_give_the_offset() -> None:
+    log, truth = log_of(60, 0.5, (0.13, 0.4)), clock_map(3.0)
     t_s, b_uT = stream_of(log, truth)
     assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s) < 0.5 / 4
 
 
 def test_part_of_the_stream_suffices_with_irregular_travel() -> None:
-    log, truth = log_of(100, 0.2), line(3.0)
+    log, truth = log_of(100, 0.2), clock_map(3.0)
     t_s, b_uT = stream_of(log, truth)
     part = slice(np.searchsorted(truth.probe_s(t_s), log.t_start_s[60]), None)
     found = from_contacts([(t_s[part], b_uT[part])], log, "c")
@@ -143,7 +143,7 @@ def test_part_of_the_stream_suffices_with_irregular_travel() -> None:
 @pytest.mark.parametrize("part", [slice(None), slice(5000, 15000)], ids=["whole", "piece"])
 def test_ambiguous_periodic_protocol_is_refused(part: slice) -> None:
     log = log_of(40, 0.25, (0.25, 0.25))
-    t_s, b_uT = stream_of(log, line(7.0), margin_s=3.0)
+    t_s, b_uT = stream_of(log, clock_map(7.0), margin_s=3.0)
     with pytest.raises(CaptureError, match="at two times almost equally well, .* Add sync marks: .*--mark"):
         from_contacts([(t_s[part], b_uT[part])], log, "c")
 
@@ -158,7 +158,7 @@ def test_ambiguous_periodic_protocol_is_refused(part: slice) -> None:
 def test_offset_is_right_or_refused(
     faint: float, travel_s: tuple[float, float], margin_s: float, lost: float, indentations_n: int
 ) -> None:
-    log, truth = log_of(indentations_n, 0.25, travel_s), line(7.0)
+    log, truth = log_of(indentations_n, 0.25, travel_s), clock_map(7.0)
     t_s, b_uT = stream_of(log, truth, margin_s, faint)
     # The stream begins with the robot lifted, wherever it is cut.
     begin_i = np.searchsorted(truth.probe_s(t_s), log.t_start_s[2 * int(lost * indentations_n)])
@@ -171,14 +171,14 @@ def test_offset_is_right_or_refused(
 
 def test_stream_without_contact_signal_is_refused() -> None:
     log = log_of(50, 0.2)
-    t_s, b_uT = stream_of(log, line(0.0))
+    t_s, b_uT = stream_of(log, clock_map(0.0))
     still_uT = rng_for(3, "still").normal(1000, NOISE_UT, b_uT.shape).astype(np.float32)
     with pytest.raises(CaptureError, match="Add sync marks"):
         from_contacts([(t_s, still_uT)], log, "c")
 
 
 def test_contacts_of_another_log_are_refused() -> None:
-    t_s, b_uT = stream_of(log_of(50, 0.2), line(0.0))
+    t_s, b_uT = stream_of(log_of(50, 0.2), clock_map(0.0))
     with pytest.raises(CaptureError, match="Add sync marks"):
         from_contacts([(t_s, b_uT)], log_of(50, 0.2, (0.1, 0.9)), "c")
 
@@ -189,11 +189,11 @@ def test_empty_log_and_empty_stream_are_refused() -> None:
         from_contacts([], log, "c")
     lifted = ProbeLog(**{name: getattr(log, name)[:1] for name in ProbeLog.__dataclass_fields__})
     with pytest.raises(CaptureError, match="no contacts"):
-        from_contacts([stream_of(log, line(0.0))], lifted, "c")
+        from_contacts([stream_of(log, clock_map(0.0))], lifted, "c")
 
 
 def test_failed_reads_do_not_move_the_clock() -> None:
-    log, truth = log_of(60, 0.2), line(1.5)
+    log, truth = log_of(60, 0.2), clock_map(1.5)
     t_s, b_uT = stream_of(log, truth)
     b_uT[::50] = np.nan
     t_s[-5:] = np.nan

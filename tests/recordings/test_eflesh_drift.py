@@ -1,4 +1,4 @@
-"""Drift on a real recording: fresh no-load readings keep a network accurate in later passes."""
+"""Test with a real recording that fresh no-load readings keep a network accurate in later passes."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Faults are counted with their time span, and the policy drops, flags or refuses them."""
+"""Tests that faults are counted with their time span, and that the policy drops, flags or refuses them."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -18,11 +18,11 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.recordings.fault_policy import FaultLog, FaultPolicy, check_rows, override
 from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ, make_script
-from tests.recordings.headers import AS_USUAL
+from tests.recordings.headers import DEFAULT_POLICY
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
 FROM_S, LASTS_S = 2.0, 0.5
-# injected fault, wire, name in the log, number of faulty frames (None: bytes)
+# Injected fault, wire, name in the log, number of faulty frames (None: bytes are counted instead).
 FAULTS = [
     ("failed-read", "binary", "failed_read", 200), ("zeros", "binary", "zeros", 200), ("stuck", "binary", "stuck", 181),
     ("saturated", "binary", "saturated", 200), ("too-hot", "binary", "too_hot", 200),
@@ -44,7 +44,7 @@ def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy
     return log, np.concatenate(kept)
 
 
-def record_fault(name: str, wire: str, policy: FaultPolicy = AS_USUAL):
+def record_fault(name: str, wire: str, policy: FaultPolicy = DEFAULT_POLICY):
     """Record a stream with a fault, in two chunks."""
     script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], parse_fault(f"{name}@{FROM_S}+{LASTS_S}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
@@ -54,7 +54,7 @@ def record_fault(name: str, wire: str, policy: FaultPolicy = AS_USUAL):
 
 
 @pytest.mark.parametrize("wire", SCRIPTS)
-def test_sound_stream_has_no_fault(wire):
+def test_intact_stream_has_no_fault(wire):
     log, kept = record_fault("none", wire)
     assert log.account() == {}
     assert kept.all()
@@ -63,7 +63,7 @@ def test_sound_stream_has_no_fault(wire):
 @pytest.mark.parametrize(("name", "wire", "fault", "frames_n"), FAULTS)
 def test_faults_are_found_and_the_policy_applied(name, wire, fault, frames_n):
     for action in FaultPolicy.model_fields[fault].annotation.__args__:
-        policy = override(AS_USUAL, [f"{fault}={action}"], "test")
+        policy = override(DEFAULT_POLICY, [f"{fault}={action}"], "test")
         if action == "refuse":
             with pytest.raises(CaptureError, match=f"found fault {fault.replace('_', ' ')} "):
                 record_fault(name, wire, policy)
@@ -79,10 +79,10 @@ def test_faults_are_found_and_the_policy_applied(name, wire, fault, frames_n):
         assert (~kept).sum() == (found.count_n if dropped else 0)
 
 
-def test_silent_second_is_an_unplugging():
+def test_silence_of_more_than_a_second_is_an_unplugging():
     script = SCRIPTS["binary"]
     frames = replace(script.frames, end_byte=82 * (1 + np.arange(len(script))))
-    log, _ = record(frames, script.t_s + 1.5 * (script.t_s > 1.0), [], AS_USUAL)
+    log, _ = record(frames, script.t_s + 1.5 * (script.t_s > 1.0), [], DEFAULT_POLICY)
     assert {name: (found.count_n, round(found.first, 1)) for name, found in log.records.items()} == {"unplug": (1, 2.5)}
 
 
@@ -90,48 +90,48 @@ def test_chip_reset_is_refused_or_flagged():
     script = inject(make_script(pokes_n=2), parse_fault("chip-reset@2+5"))
     frames, _ = decode_all(b"".join(script.pieces), "binary", 5, "reset")
     with pytest.raises(CaptureError, match="the LSB of chip 1"):
-        record(frames, script.t_s, [], AS_USUAL)
-    log, kept = record(frames, script.t_s, [], override(AS_USUAL, ["chip_reset=flag"], "test"))
+        record(frames, script.t_s, [], DEFAULT_POLICY)
+    log, kept = record(frames, script.t_s, [], override(DEFAULT_POLICY, ["chip_reset=flag"], "test"))
     assert kept.all()
     assert log.records["chip_reset"].count_n >= 4 * RATE_HZ
     assert 1.0 <= log.records["chip_reset"].first <= 3.0
 
 
-def test_fault_without_time_leaves_the_span():
+def test_fault_without_time_does_not_change_the_span():
     mask, unknown_s = np.ones(2, bool), np.array([3.0, np.nan])
-    log = FaultLog(AS_USUAL, "x", "ms")
+    log = FaultLog(DEFAULT_POLICY, "x", "ms")
     for at_s in (unknown_s * np.nan, unknown_s, unknown_s * np.nan):
         log.record("stuck", mask, at_s)
     assert log.account() == {
         "fault_stuck_dropped_n": 6, "fault_stuck_first_ms": 3000, "fault_stuck_last_ms": 3000,
     }  # fmt: skip
     with pytest.raises(CaptureError, match="2 x, the first at an unknown time"):
-        FaultLog(override(AS_USUAL, ["stuck=refuse"], "t"), "x", "ms").record("stuck", mask, unknown_s * np.nan)
+        FaultLog(override(DEFAULT_POLICY, ["stuck=refuse"], "t"), "x", "ms").record("stuck", mask, unknown_s * np.nan)
 
 
 def test_policy_applies_to_table_rows():
     rng = rng_for(0, "rows")
     b_uT, temperature_degC = rng.normal(300, 5, (200, 6)), np.full((200, 2), 25.0)
     temperature_degC[20:30, 1], b_uT[100] = 150.0, 0.0
-    kept = check_rows(b_uT, temperature_degC, None, where="here", policy=AS_USUAL)
+    kept = check_rows(b_uT, temperature_degC, None, where="here", policy=DEFAULT_POLICY)
     assert np.flatnonzero(~kept.keep).tolist() == [100]
     assert kept.account()["fault_too_hot_flagged_n"] == 10
     assert (kept.account()["fault_too_hot_first_row"], kept.account()["fault_too_hot_last_row"]) == (21, 30)
-    policy = override(AS_USUAL, ["too_hot=drop", "zeros=flag"], "test")
+    policy = override(DEFAULT_POLICY, ["too_hot=drop", "zeros=flag"], "test")
     kept = check_rows(b_uT, temperature_degC, None, where="here", policy=policy)
     assert np.flatnonzero(~kept.keep).tolist() == list(range(20, 30))
     assert kept.account()["dropped_out_of_range_rows_n"] == 10
     with pytest.raises(CaptureError, match="here: found fault zeros 1 x, the first at row 101"):
-        check_rows(b_uT, temperature_degC, None, where="here", policy=override(AS_USUAL, ["zeros=refuse"], "t"))
+        check_rows(b_uT, temperature_degC, None, where="here", policy=override(DEFAULT_POLICY, ["zeros=refuse"], "t"))
 
 
 def test_invalid_overrides_are_refused():
     wrong = {"melted=drop": "NAME=drop", "torn=flag": "torn=drop|refuse", "stuck": "stuck=drop"}
     for text, rule in wrong.items():
         with pytest.raises(ParamsError, match="the action for a fault must be") as error:
-            override(AS_USUAL, [text], "--on-fault")
+            override(DEFAULT_POLICY, [text], "--on-fault")
         assert rule in str(error.value)
-    log = FaultLog(AS_USUAL, "x", "row")
+    log = FaultLog(DEFAULT_POLICY, "x", "row")
     assert not log.record("stuck", np.zeros(3, bool), np.arange(3)).any()
     assert log.account() == {}
 
@@ -140,7 +140,7 @@ CONSTANT = r"Bz of chip 0 \(.*\), Bz of chip 1 \(0 uT\) never changed in the who
 
 
 def constant_z(b_uT: np.ndarray) -> np.ndarray:
-    """Set z of chips 0 and 1 to a constant, of the second one to 0."""
+    """Set z of chip 0 to a constant, and z of chip 1 to 0."""
     changed = b_uT.copy()
     changed[:, 2], changed[:, 5] = b_uT[0, 2], 0.0
     return changed
@@ -150,12 +150,12 @@ def test_constant_channels_of_a_table_are_refused_or_flagged():
     rng = rng_for(0, "constant")
     b_uT, warm_degC = constant_z(rng.normal(300, 5, (200, 9))), np.full((200, 3), 25.0)
     with pytest.raises(CaptureError, match=CONSTANT):
-        check_rows(b_uT, warm_degC, None, where="here", policy=AS_USUAL)
-    flagging = override(AS_USUAL, ["constant_channel=flag"], "test")
+        check_rows(b_uT, warm_degC, None, where="here", policy=DEFAULT_POLICY)
+    flagging = override(DEFAULT_POLICY, ["constant_channel=flag"], "test")
     rows = check_rows(b_uT, warm_degC, None, where="here", policy=flagging)
     assert rows.keep.all()
     assert rows.account()["fault_constant_channel_flagged_n"] == 200
-    few = check_rows(b_uT[:19], warm_degC[:19], None, where="here", policy=AS_USUAL)
+    few = check_rows(b_uT[:19], warm_degC[:19], None, where="here", policy=DEFAULT_POLICY)
     assert few.keep.all()
 
 
@@ -164,8 +164,8 @@ def test_constant_channels_are_found_in_any_chunks(ends):
     frames = SCRIPTS["binary"].frames
     frames = replace(frames, b_uT=constant_z(frames.b_uT), end_byte=82 * (1 + np.arange(len(frames))))
     with pytest.raises(CaptureError, match=CONSTANT):
-        record(frames, SCRIPTS["binary"].t_s, ends, AS_USUAL)
-    log, _ = record(frames, SCRIPTS["binary"].t_s, ends, override(AS_USUAL, ["constant_channel=flag"], "test"))
+        record(frames, SCRIPTS["binary"].t_s, ends, DEFAULT_POLICY)
+    log, _ = record(frames, SCRIPTS["binary"].t_s, ends, override(DEFAULT_POLICY, ["constant_channel=flag"], "test"))
     assert log.account()["fault_constant_channel_last_ms"] > 0
 
 
@@ -184,7 +184,7 @@ CHIPS_N = 5
 
 
 def noisy_fields_uT(rows_n: int) -> np.ndarray:
-    """Fields as five chips at GAIN_SEL 7 send them: 5 uT of noise about 300 uT, on the grid of their LSB."""
+    """Return fields as five chips at GAIN_SEL 7 send them: 5 uT of noise about 300 uT, on the grid of their LSB."""
     lsb_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N)
     b_uT = 300 + 5 * seeds.rng_for(2021, "fields").standard_normal((rows_n, 3 * CHIPS_N))
     return np.round(b_uT / lsb_uT) * lsb_uT
@@ -199,14 +199,14 @@ def test_row_is_valid_if_no_chip_failed(failed: set[tuple[int, int]]) -> None:
         temperature_degC[row_i, chip_i] = faults.FAILED_TEMPERATURE_degC
     rows = {row_i for row_i, _ in failed}
     if len(rows) < 50:
-        whole = check_rows(b_uT, temperature_degC, None, where="here", policy=AS_USUAL).keep
+        whole = check_rows(b_uT, temperature_degC, None, where="here", policy=DEFAULT_POLICY).keep
         assert set(np.flatnonzero(~whole).tolist()) == rows
 
 
 def test_row_with_a_zero_reading_is_invalid():
     b_uT = noisy_fields_uT(50)
     b_uT[7, 3:6] = 0.0
-    rows = check_rows(b_uT, np.full((50, CHIPS_N), 25.0), None, where="here", policy=AS_USUAL)
+    rows = check_rows(b_uT, np.full((50, CHIPS_N), 25.0), None, where="here", policy=DEFAULT_POLICY)
     assert np.flatnonzero(~rows.keep).tolist() == [7]
     assert rows.account()["dropped_failed_read_rows_n"] == 1
 
@@ -217,21 +217,21 @@ def test_chip_with_another_lsb_is_named(chip_i: int) -> None:
     spread = seeds.rng_for(2021, "spread").standard_normal((GRID_ROWS_N, 3))
     b_uT[:, 3 * chip_i : 3 * chip_i + 3] = 300 + 5 * spread
     with pytest.raises(CaptureError, match=f"chip {chip_i} must be"):
-        check_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), None, where="here", policy=AS_USUAL)
+        check_rows(b_uT, np.full((GRID_ROWS_N, CHIPS_N), np.nan), None, where="here", policy=DEFAULT_POLICY)
 
 
 def test_fields_without_grid_are_accepted() -> None:
-    # For example of a recorder that averages: there is no LSB to compare.
+    # For example from a recorder that averages; there is no LSB to compare.
     b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
     unknown_degC = np.full((GRID_ROWS_N, CHIPS_N), np.nan)
-    assert check_rows(b_uT, unknown_degC, None, where="here", policy=AS_USUAL).keep.all()
+    assert check_rows(b_uT, unknown_degC, None, where="here", policy=DEFAULT_POLICY).keep.all()
 
 
-def test_stuck_and_failed_rows_are_counted_apart() -> None:
+def test_stuck_and_failed_rows_are_counted_separately() -> None:
     b_uT, temperature_degC = noisy_fields_uT(100), np.full((100, CHIPS_N), 25.0)
     b_uT[50:, 3:6] = b_uT[50, 3:6]
     b_uT[10, :3], temperature_degC[10, 0] = faults.FAILED_B_uT, faults.FAILED_TEMPERATURE_degC
-    rows = check_rows(b_uT, temperature_degC, None, where="here", policy=AS_USUAL)
+    rows = check_rows(b_uT, temperature_degC, None, where="here", policy=DEFAULT_POLICY)
     assert np.flatnonzero(rows.failed).tolist() == [10]
     assert np.flatnonzero(rows.stuck).tolist() == list(range(50 + faults.STUCK_FRAMES_MIN_N - 1, 100))
     assert rows.account() == {

@@ -1,4 +1,4 @@
-"""Capture headers, and opening captures with the reader of their layout."""
+"""Tests of capture headers, and of opening captures with the reader of their layout."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ from reskin.errors import CaptureError
 from reskin.recordings.header import Clock, check_same_capture, parse, render, write_capture
 from reskin.recordings.ingest import check_losses, open_capture, read_header
 from reskin.recordings.readers import READERS, lab
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.recordings.readers.test_lab import NAMES, PRESSES
 
 
@@ -60,7 +60,7 @@ def test_renamed_folder_is_refused():
         check_same_capture(make_header(), "other")
 
 
-def test_capture_checks_its_files(tmp_path):
+def test_header_has_checksums_of_written_and_copied_files(tmp_path):
     (tmp_path / "source.csv").write_bytes(b"copied")
     header = write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "source.csv"})
     assert header.files == {
@@ -83,7 +83,7 @@ def capture(folder):
 
 
 def test_capture_opens_with_the_reader_of_its_layout(tmp_path):
-    header, blocks, account = open_capture(capture(tmp_path / "c0"), AS_USUAL)
+    header, blocks, account = open_capture(capture(tmp_path / "c0"), DEFAULT_POLICY)
     assert header.layout in READERS
     assert sum(map(len, blocks)) == account["rows_n"] == 4
 
@@ -93,10 +93,10 @@ def test_changed_file_is_refused(tmp_path):
     with (folder / lab.READINGS).open("a") as stream:
         stream.write("\n")
     with pytest.raises(CaptureError, match="has changed since it was added"):
-        open_capture(folder, AS_USUAL)
+        open_capture(folder, DEFAULT_POLICY)
     (folder / lab.READINGS).unlink()
     with pytest.raises(CaptureError, match="file not found, but the header lists it"):
-        open_capture(folder, AS_USUAL)
+        open_capture(folder, DEFAULT_POLICY)
 
 
 def test_folder_without_header_is_refused(tmp_path):

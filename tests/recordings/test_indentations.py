@@ -1,4 +1,4 @@
-"""Frames are matched with dwells as by a naive double loop, in any blocks, and every frame is accounted for."""
+"""Tests of matching frames with dwells, in any blocks, against a double loop; every frame is accounted for."""
 
 import dataclasses
 import tracemalloc
@@ -20,12 +20,12 @@ from tests.recordings.headers import make_header
 CHIPS_N = 2
 CLOCK = ClockMap(offset_s=-5.0, rate=1.25, residual_s=0.0, explained=1.0)
 HEADER = make_header(chips_n=CHIPS_N, contacts_before_n=100)
-# One indentation: its dwells as (gap before, length) in half frames, so that some frames fall on edges.
+# The dwells of one indentation as (gap before, length) in half frames, so that some frames fall on edges.
 DWELLS = st.lists(st.tuples(st.integers(0, 3), st.integers(1, 9)), min_size=1, max_size=3)
 
 
 def log_of(indentations: list[list[tuple[int, int]]]) -> ProbeLog:
-    """A log of these dwells; the first of each indentation is lifted, the others are in contact."""
+    """Return a log of these dwells; the first of each indentation is lifted, the others are in contact."""
     rows = [
         (number, dwell_i > 0, *dwell) for number, one in enumerate(indentations) for dwell_i, dwell in enumerate(one)
     ]
@@ -37,7 +37,7 @@ def log_of(indentations: list[list[tuple[int, int]]]) -> ProbeLog:
 
 
 def timed_of(frames_n: int, faults: dict[int, str] | None = None) -> TimedFrames:
-    """Frames one probe second apart, the first before the log begins, some of them faulty."""
+    """Return frames one probe second apart, starting before the log; some of them are faulty."""
     rng = rng_for(0, "frames", frames_n)
     b_uT = rng.normal(0, 100, (frames_n, 3 * CHIPS_N)).astype(np.float32)
     temperature_degC = rng.normal(25, 1, (frames_n, CHIPS_N)).astype(np.float32)
@@ -63,7 +63,7 @@ def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
     return blocks
 
 
-def joined(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Concatenate the readings of all blocks by column."""
     account: dict[str, int] = {}
     parts = list(join(blocks, log, CLOCK, HEADER, account))
@@ -74,7 +74,7 @@ def joined(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarr
     return {name: np.concatenate([getattr(part, name) for part in [empty, *parts]]) for name in names}, account
 
 
-def naive(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
+def join_naively(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
     """Compare every frame with every dwell; the later dwell takes a frame on a common edge."""
     noload: dict[int, list[np.ndarray]] = {}
     contact: list[tuple[int, int]] = []
@@ -117,13 +117,15 @@ def test_readings_equal_double_loop(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str]
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
-    got, _ = joined([timed], log)
-    want = naive(timed, log)
-    assert len(got["indentation"]) == len(want)
-    for row_i, row in enumerate(want):
+    actual, _ = join_blocks([timed], log)
+    expected = join_naively(timed, log)
+    assert len(actual["indentation"]) == len(expected)
+    for row_i, row in enumerate(expected):
         for name, value in row.items():
-            # the mean is taken in float64; everything else is copied
-            np.testing.assert_allclose(got[name][row_i], value, rtol=1e-6 if name == "noload_uT" else 0, err_msg=name)
+            # the mean is computed in float64; everything else is copied
+            np.testing.assert_allclose(
+                actual[name][row_i], value, rtol=1e-6 if name == "noload_uT" else 0, err_msg=name
+            )
 
 
 @given(
@@ -136,8 +138,8 @@ def test_blocks_do_not_matter(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str], ends: list[int]
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
-    whole, whole_account = joined([timed], log)
-    parts, parts_account = joined(cut(timed, ends), log)
+    whole, whole_account = join_blocks([timed], log)
+    parts, parts_account = join_blocks(cut(timed, ends), log)
     assert parts_account == whole_account
     for name, column in whole.items():
         np.testing.assert_array_equal(parts[name], column, err_msg=name)
@@ -154,7 +156,7 @@ def test_frames_and_indentations_are_accounted_for(
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
     timed.t_s[frames_n - min(untimed_n, frames_n) :] = np.nan
-    rows, account = joined([timed], log)
+    rows, account = join_blocks([timed], log)
     frames = [key for key in account if key.startswith("frames_") or key.endswith("_frames_n")]
     assert account["frames_n"] == frames_n == sum(account[key] for key in frames if key != "frames_n")
     parts = [key for key in account if key.endswith("indentations_n") and key != "logged_indentations_n"]
@@ -169,7 +171,7 @@ def test_losses_are_counted_by_reason() -> None:
     log = log_of([[(0, 4), (2, 2)], [(2, 2), (2, 2)], [(2, 1), (1, 1)], [(60, 2), (2, 2)]])
     timed = timed_of(13, {2: "failed", 3: "field", 7: "field", 8: "failed"})
     timed.t_s[12:] = np.nan
-    rows, account = joined([timed], log)
+    rows, account = join_blocks([timed], log)
     assert account == {
         "frames_n": 13,
         "frames_noload_n": 1,  # at 2 s
@@ -179,7 +181,7 @@ def test_losses_are_counted_by_reason() -> None:
         "dropped_failed_read_frames_n": 2,
         "dropped_stuck_chip_frames_n": 0,
         "dropped_between_dwells_frames_n": 2,  # at -2 and -1 s
-        "dropped_no_noload_frames_n": 2,  # at 7 and 8 s, whose no-load dwell was not read
+        "dropped_no_noload_frames_n": 2,  # at 7 and 8 s; their no-load dwell has no valid frame
         "dropped_no_contact_frames_n": 1,  # at 9 s
         "indentations_n": 1,
         "dropped_no_noload_indentations_n": 1,
@@ -195,7 +197,7 @@ def test_readings_are_released_when_the_next_indentation_begins() -> None:
     timed = timed_of(400)
     joiner = Joiner(log, CLOCK, HEADER)
     rows_n = [len(joiner.feed(block)) for block in cut(timed, list(range(400)))]
-    assert max(rows_n) == 4  # frames at 3 s, both edges included, in one dwell
+    assert max(rows_n) == 4  # a dwell of 3 s has frames on both edges
     assert len(joiner.close()) <= 4
 
 

@@ -1,6 +1,6 @@
-"""Orientation of real chips: recorded changes of field compared with the scenes' skin, nothing fitted.
+"""Tests of the orientation of real chips: recorded field changes against those of the scenes' skin, without any fit.
 
-Labels run along the board's x and against its y.
+The labels' x axis is the board's; their y axis points the other way.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ from tests.physics.test_board import SPREADS, as_tuples
 from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
-DEPTH_M = 0.8e-3  # not recorded; the directions at 0.6 and 1 mm are the same
+DEPTH_M = 0.8e-3  # not recorded; at 0.6 and 1 mm, the directions are the same
 TURNED = np.diag([1.0, -1.0])  # from label axes to board axes
 MIDDLE_MM = 8.0
 
@@ -37,13 +37,13 @@ def design() -> BoardDesign:
 
 @pytest.fixture(scope="module")
 def recorded_uT(shared_data, tmp_path_factory) -> np.ndarray:
-    """Changes of field in the chips' axes: [files, places, chips, 3]; all files have the places of `simulated_uT`."""
+    """Field changes in the chips' axes: [files, places, chips, 3]; all files have the places of `simulated_uT`."""
     return np.stack([_change_uT(_readings(name, shared_data, tmp_path_factory)) for name in LAB])
 
 
 @pytest.fixture(scope="module")
 def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
-    """Changes of field in the board's axes: [places, chips, 3]."""
+    """Field changes in the board's axes: [places, chips, 3]."""
     readings = _readings(LAB[0], shared_data, tmp_path_factory)
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
     pokes_m = np.column_stack([labels_mm @ TURNED * milli, np.full(65, DEPTH_M)])
@@ -62,14 +62,14 @@ def _change_uT(readings: Readings) -> np.ndarray:
     return (readings.b_uT - readings.noload_uT).reshape(65, 100, 5, 3).mean(axis=1)
 
 
-def test_chip_rotations_of_the_scenes(recorded_uT, simulated_uT, design):
-    # Over all files: a rotation from one file alone is up to 40 degrees off, in one case mirrored.
+def test_chip_rotations_equal_those_of_the_scenes(recorded_uT, simulated_uT, design):
+    # All files together: a rotation from one file alone is wrong by up to 40 degrees, in one case mirrored.
     for chip_i, turn_deg in enumerate(design.chips_turn_deg):
         read_uT = recorded_uT[:, :, chip_i].reshape(-1, 3)
         found, _ = orthogonal_procrustes(read_uT, np.tile(simulated_uT[:, chip_i], (len(LAB), 1)))
         turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         assert np.linalg.det(found) > 0, f"chip {chip_i} is mirrored"
-        # A quarter turn would give 1; the rest is due to the skins, which are offset and slide.
+        # A wrong quarter turn would give 1. Smaller differences come from skins that are offset and slide.
         assert np.abs(found.T - turn).max() < 0.35, f"chip {chip_i}"
 
 

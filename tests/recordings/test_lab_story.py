@@ -1,4 +1,4 @@
-"""Real recordings from `reskin add` to a leave-one-board-out table; adding and removing a board."""
+"""Tests of real recordings, from `reskin add` to a leave-one-board-out table, and of adding and removing a board."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Each label source writes a probe log, tested without board, robot or person."""
+"""Tests that each label source writes a probe log, without a board, a robot or a person."""
 
 import re
 import threading
@@ -136,9 +136,9 @@ def test_snake_order_and_invalid_places():
             parse_places(wrong)
 
 
-def wait_until(is_so):
+def wait_until(condition):
     end_s = time.monotonic() + LONG_S
-    while not is_so():
+    while not condition():
         assert time.monotonic() < end_s
         time.sleep(0.002)
 
@@ -176,7 +176,7 @@ def fake_gauge(monkeypatch):
 
 
 class GaugeContext(LabelContext):
-    """Hold each label until the gauge has sent data or is gone, so that a busy machine changes nothing."""
+    """A context that holds each label until the gauge has sent data or is unplugged, also on a busy machine."""
 
     gauge: FakeGauge
 
@@ -187,9 +187,9 @@ class GaugeContext(LabelContext):
 
 
 def with_gauge(context, gauge):
-    beside = GaugeContext(context.writer, context.unix_s, context.stop, context.mark)
-    beside.gauge = gauge
-    return beside
+    gauge_context = GaugeContext(context.writer, context.unix_s, context.stop, context.mark)
+    gauge_context.gauge = gauge
+    return gauge_context
 
 
 def test_gauge_force_is_averaged_over_each_touch(context, tmp_path, fake_gauge):
@@ -216,7 +216,7 @@ def test_labels_continue_without_unplugged_gauge(context, fake_gauge):
 
 def test_gauge_alone_detects_touches(context, tmp_path, fake_gauge):
     fake_gauge([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
-    ticks = count()  # simulated clock: on a stalled machine, a touch of 0.5 s would become several
+    ticks = count()  # a simulated clock: on a stalled machine, a touch of 0.5 s would become several touches
     context = replace(context, unix_s=lambda: 1e9 + 0.002 * next(ticks))
     label_thread = LabelThread(from_gauge("gauge", 9600), context)
     label_thread._thread.join()
@@ -241,17 +241,17 @@ class PollCounter(threading.Event):
         return super().wait(timeout)
 
 
-@pytest.mark.parametrize("there", [False, True])
-def test_growing_table_is_followed(context, tmp_path, there):
+@pytest.mark.parametrize("exists", [False, True])
+def test_growing_table_is_followed(context, tmp_path, exists):
     file, old = tmp_path / "robot.csv", "t_s,phase,x_mm,y_mm\n"
     rows = "".join(f"{7 + 0.1 * i:.1f},{phase},4,8\n" for i, phase in enumerate(["noload"] * 3 + ["contact"] * 3))
-    if there:
+    if exists:
         file.write_text(old + rows.replace("\n7.", "\n1."))
     poll_counter = PollCounter()
     label_thread = LabelThread(from_table(file), replace(context, stop=poll_counter))
     wait_until(lambda: poll_counter.polls_n)
     with file.open("a") as stream:
-        stream.write(rows if there else old + rows)
+        stream.write(rows if exists else old + rows)
     before_n = poll_counter.polls_n
     wait_until(lambda: poll_counter.polls_n > before_n + 1)  # the first poll may have begun before the append
     assert label_thread.end(LONG_S) == "1 touches labelled"

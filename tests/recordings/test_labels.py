@@ -1,4 +1,4 @@
-"""Labels in any chunks become the same dwells and, at any moment, a valid probe log."""
+"""Tests that labels become the same dwells in any chunks, and that the probe log is valid at any time."""
 
 import math
 
@@ -26,9 +26,9 @@ DWELL = st.builds(lambda label, start_s, lasts_s: Dwell(label, start_s, start_s 
                   st.floats(0, 100), st.floats(0.001, 5))  # fmt: skip
 
 
-def test_touch_is_written_after_its_rest(tmp_path):
+def test_touch_is_written_after_its_noload_dwell(tmp_path):
     writer = ProbeLogWriter(tmp_path)
-    writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # no rest before it
+    writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # without a no-load dwell before it
     writer.write(Dwell(Label(False), 1.0, 2.0))
     assert len((tmp_path / PROBE_FILE).read_text().splitlines()) == 1
     writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.5, pass_i=1), 3.0, 4.0))
@@ -42,7 +42,7 @@ def test_touch_is_written_after_its_rest(tmp_path):
     assert math.isnan(log.x_mm[0])
     assert (writer.touches_n, writer.without_noload_n, writer.out_of_order_n) == (1, 1, 1)
     writer.close()
-    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # from a program that was not waited for
+    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # a late label of a program that hangs
 
 
 def test_touch_that_moves_without_lift_is_skipped(tmp_path):

@@ -1,4 +1,4 @@
-"""A native capture from bytes to readings: indentations are recovered, and every byte and frame is accounted for."""
+"""Tests that native captures become the right indentations, and that every byte and frame is accounted for."""
 
 import dataclasses
 from pathlib import Path
@@ -18,7 +18,7 @@ from reskin.recordings.ingest import read_native
 from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.schema import Readings
 from reskin.seeds import rng_for
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 RATE_HZ = 100.0
 OFFSET_S = 40.0  # probe minus stream
@@ -27,8 +27,8 @@ NOLOAD_N, MOVE_N, CONTACT_N = 4, 3, 5  # frames of one indentation: lifted, down
 CHIPS_N = 5
 
 
-def press() -> tuple[Frames, ProbeLog]:
-    """Simulate random presses: frames at `RATE_HZ` in hundredths of uT, and the probe log."""
+def simulate_presses() -> tuple[Frames, ProbeLog]:
+    """Simulate random presses: frames at `RATE_HZ`, rounded to 0.01 uT, and the probe log."""
     rng = rng_for(0, "press")
     move_n = rng.integers(MOVE_N, 3 * MOVE_N, (INDENTATIONS_N, 2))
     parts, rows, begin = [], [], 10
@@ -62,7 +62,7 @@ def press() -> tuple[Frames, ProbeLog]:
     return frames, ProbeLog(number, number // 20, contact.astype(bool), start_s, end_s, **labels)
 
 
-FRAMES, LOG = press()
+FRAMES, LOG = simulate_presses()
 MARKS = ((0.5, OFFSET_S + 0.5), (8.0, OFFSET_S + 8.0))
 
 
@@ -90,13 +90,13 @@ def write(folder: Path, wire: Wire, frames: Frames = FRAMES, **files: bytes) -> 
 
 
 def read(folder: Path, header: Header) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    blocks, account = read_native(folder, header, AS_USUAL)
+    blocks, account = read_native(folder, header, DEFAULT_POLICY)
     parts = list(blocks)
     names = [field.name for field in dataclasses.fields(Readings)[4:]]
     return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}, account
 
 
-def expected() -> dict[str, np.ndarray]:
+def expected_readings() -> dict[str, np.ndarray]:
     """Expected readings, from a loop over dwells and the frames before encoding."""
     columns: dict[str, list[Any]] = {
         name: [] for name in ("indentation", "reading_i", "x_mm", "b_uT", "noload_uT", "t_s")
@@ -123,7 +123,7 @@ def test_indentations_are_recovered(
     tmp_path: Path, wire: Wire, kind: str, marks: tuple[tuple[float, float], ...]
 ) -> None:
     got, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
-    for name, column in expected().items():
+    for name, column in expected_readings().items():
         # Exact except the mean (float32) and the time (text lines differ in length within a chunk: half a frame).
         atol = {"t_s": 0.5 / RATE_HZ, "noload_uT": 1e-3}.get(name, 0)
         np.testing.assert_allclose(got[name], column, rtol=0, atol=atol, err_msg=name)
@@ -131,7 +131,7 @@ def test_indentations_are_recovered(
     assert account["frames_n"] == len(FRAMES)
 
 
-def test_broken_stream_is_accounted_for(tmp_path: Path) -> None:
+def test_bytes_of_a_damaged_stream_are_accounted_for(tmp_path: Path) -> None:
     b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
     b_uT[20:23, 3:6], temperature_degC[20:23, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     b_uT[40] = np.nan
@@ -149,7 +149,7 @@ def test_broken_stream_is_accounted_for(tmp_path: Path) -> None:
     assert account["skipped_resync_bytes_n"] > 0
 
 
-def with_chip(rows: slice, values_uT: np.ndarray) -> Frames:
+def with_chip_1(rows: slice, values_uT: np.ndarray) -> Frames:
     b_uT = FRAMES.b_uT.copy()
     b_uT[rows, 3:6] = values_uT
     return dataclasses.replace(FRAMES, b_uT=b_uT)
@@ -158,7 +158,7 @@ def with_chip(rows: slice, values_uT: np.ndarray) -> Frames:
 @pytest.mark.parametrize("marks", [MARKS, ()], ids=["marks", "contacts"])
 def test_stuck_chip_loses_its_frames(tmp_path: Path, marks: tuple[tuple[float, float], ...]) -> None:
     begin = len(FRAMES) // 3
-    frozen = with_chip(slice(begin, None), FRAMES.b_uT[begin, 3:6])
+    frozen = with_chip_1(slice(begin, None), FRAMES.b_uT[begin, 3:6])
     _, account = read(write(tmp_path, "binary", frozen), header_of("binary", marks=marks))
     assert account["dropped_stuck_chip_frames_n"] == len(FRAMES) - begin - STUCK_FRAMES_MIN_N + 1
     dropped = [key for key in account if key.startswith("dropped_") and key.endswith("_frames_n")]
@@ -177,9 +177,9 @@ def test_reset_chip_is_named(tmp_path: Path) -> None:
         read(folder, header_of("binary"))
 
 
-@pytest.mark.parametrize("of_a_uT", [1e-2, 1e-3, 1e-6])
-def test_stream_in_another_unit_is_refused(tmp_path: Path, of_a_uT: float) -> None:
-    other = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(of_a_uT))
+@pytest.mark.parametrize("factor", [1e-2, 1e-3, 1e-6])
+def test_stream_in_another_unit_is_refused(tmp_path: Path, factor: float) -> None:
+    other = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(factor))
     with pytest.raises(CaptureError, match="stream.bin: field must be .* G to uT"):
         read(write(tmp_path, "binary", other), header_of("binary"))
 
@@ -210,7 +210,7 @@ def test_block_size_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_frames_without_arrival_time_are_dropped(tmp_path: Path) -> None:
     b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
-    b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC  # a fault without time
+    b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC  # a fault in a frame without a time
     frames = dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC)
     folder = write(tmp_path, "binary", frames)
     rows = (folder / ARRIVALS_FILE).read_text().splitlines(keepends=True)
@@ -223,14 +223,14 @@ def test_frames_without_arrival_time_are_dropped(tmp_path: Path) -> None:
 
 
 def test_parquet_round_trip(tmp_path: Path) -> None:
-    blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"), AS_USUAL)
+    blocks, account = read_native(write(tmp_path, "binary"), header_of("binary"), DEFAULT_POLICY)
     io.write_readings(tmp_path / "c.parquet", blocks, account)
     assert len(io.read_readings(tmp_path / "c.parquet")) == INDENTATIONS_N * CONTACT_N
     assert io.read_ingest_counts(tmp_path / "c.parquet")["indentations_n"] == INDENTATIONS_N
 
 
 @pytest.mark.parametrize(
-    ("files", "kind", "says"),
+    ("files", "kind", "message"),
     [
         ({"stream": b""}, "rate", "stream.bin: no frame found in 0 bytes"),
         ({"stream": b"\x00"}, "rate", "stream.bin: no frame found in 1 bytes"),
@@ -245,15 +245,15 @@ def test_parquet_round_trip(tmp_path: Path) -> None:
         ({}, "recording", "clock.kind must be 'arrivals' or 'rate'"),
     ],
 )
-def test_broken_capture_is_refused(tmp_path: Path, files: dict[str, bytes], kind: str, says: str) -> None:
+def test_broken_capture_is_refused(tmp_path: Path, files: dict[str, bytes], kind: str, message: str) -> None:
     write(tmp_path, "binary", **files)
     for marks in (MARKS, ()):
-        with pytest.raises(CaptureError, match=says):
+        with pytest.raises(CaptureError, match=message):
             read(tmp_path, header_of("binary", kind, marks))
 
 
 @pytest.mark.parametrize("name", [STREAM_FILE, ARRIVALS_FILE, PROBE_FILE])
-def test_missing_file(tmp_path: Path, name: str) -> None:
+def test_missing_file_is_an_error(tmp_path: Path, name: str) -> None:
     (write(tmp_path, "binary") / name).unlink()
     with pytest.raises(CaptureError, match=f"{name}: file not found"):
         read(tmp_path, header_of("binary"))

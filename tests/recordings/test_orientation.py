@@ -1,4 +1,4 @@
-"""Swapped, mirrored and turned labels are detected by comparison with captures of other skins."""
+"""Tests that swapped, mirrored and turned labels are detected by comparison with captures of other skins."""
 
 import shutil
 
@@ -8,14 +8,14 @@ import pytest
 from reskin.recordings.orientation import WAYS, Presses, other_orientation, presses_of
 from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.universal.skins import fields_uT
 
 DEPARTURES = [name for name in WAYS if name != "as they are"]
 
 
 def board(name: str, presses_n: int = 60) -> Presses:
-    """Presses of a skin with its own gains, with noise."""
+    """Return noisy presses of a skin whose channels have random gains."""
     rng = rng_for(0, "orientation", name)
     place_mm = rng.uniform(-8, 8, (presses_n, 2))
     db_uT = fields_uT(place_mm, rng.uniform(1, 5, presses_n)) * rng.normal(1, 0.1, 15)
@@ -23,7 +23,7 @@ def board(name: str, presses_n: int = 60) -> Presses:
     return Presses(place_mm, db_uT / np.linalg.norm(db_uT, axis=1, keepdims=True))
 
 
-def relabelled(presses: Presses, way: str) -> Presses:
+def relabel(presses: Presses, way: str) -> Presses:
     return Presses(presses.place_mm @ np.array(WAYS[way]).T, presses.direction)
 
 
@@ -34,17 +34,17 @@ def inverse_of(way: str) -> str:
 
 @pytest.mark.parametrize("way", DEPARTURES)
 def test_changed_labels_are_named_with_their_inverse(way):
-    assert other_orientation(relabelled(board("one"), way), board("other")) == inverse_of(way)
+    assert other_orientation(relabel(board("one"), way), board("other")) == inverse_of(way)
 
 
 def test_no_false_alarm():
     one, other = board("one"), board("other")
     assert other_orientation(one, other) is None
-    assert other_orientation(relabelled(board("few", 19), "with x mirrored"), other) is None
+    assert other_orientation(relabel(board("few", 19), "with x mirrored"), other) is None
     fewer_chips = Presses(other.place_mm, other.direction[:, :9])
-    assert other_orientation(relabelled(one, "with x mirrored"), fewer_chips) is None
+    assert other_orientation(relabel(one, "with x mirrored"), fewer_chips) is None
     noise = Presses(other.place_mm, rng_for(0, "noise").normal(size=other.direction.shape))
-    assert other_orientation(relabelled(one, "with x mirrored"), noise) is None
+    assert other_orientation(relabel(one, "with x mirrored"), noise) is None
 
 
 def test_every_change_is_found_on_recorded_boards(shared_data, tmp_path):
@@ -52,9 +52,9 @@ def test_every_change_is_found_on_recorded_boards(shared_data, tmp_path):
     boards = {}
     for number in (1, 2):
         shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)
-        readings, _ = lab.read(tmp_path, make_header(layout="lab", chips_n=5), AS_USUAL)
+        readings, _ = lab.read(tmp_path, make_header(layout="lab", chips_n=5), DEFAULT_POLICY)
         boards[number] = presses_of([readings])
     for own, other in ((1, 2), (2, 1)):
         assert other_orientation(boards[own], boards[other]) is None
         for way in DEPARTURES:
-            assert other_orientation(relabelled(boards[own], way), boards[other]) == inverse_of(way)
+            assert other_orientation(relabel(boards[own], way), boards[other]) == inverse_of(way)

@@ -1,4 +1,4 @@
-"""The probe log as CSV; errors name the row."""
+"""Tests of the probe log as CSV; errors name the row."""
 
 import dataclasses
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""Public recordings of real hardware have the contents that data/README.md describes.
+"""Tests that public recordings of real hardware have the contents that data/README.md describes.
 
-Copies stand in a capture folder under their names of `collect`, as `reskin add` puts them.
+They are copied into a capture folder under the names that `collect` gives them, as `reskin add` does.
 """
 
 import shutil
@@ -15,7 +15,7 @@ from reskin.recordings.header import Header
 from reskin.recordings.readers import eflash7, eflesh, ini, lab
 from reskin.recordings.tables import read_cells
 from reskin.schema import Readings
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 SPATIAL = "eflesh/spatial_resolution/20250316_155729_probe"
 NORMAL = "eflesh/normal_force/20250401_014340_probe"
@@ -33,7 +33,7 @@ def ingest(reader: ModuleType, recording: Path, folder: Path, **changed: object)
 
 
 def read_checked(reader: ModuleType, folder: Path, header: Header) -> tuple[Readings, dict[str, int]]:
-    readings, account = reader.read(folder, header, AS_USUAL)
+    readings, account = reader.read(folder, header, DEFAULT_POLICY)
     lost_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
     assert account["rows_n"] + lost_n + account["noload_rows_n"] == account["rows_read_n"]
     assert account["rows_n"] == len(readings)
@@ -67,15 +67,15 @@ def test_lab_forces_reach_ten_newtons(shared_data: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", LAB)
-def test_lab_tip_pushes_the_skin_as_the_fields_show(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # Experiment compare, from fields alone: pokes of both boards carry the skin by 48 um along the labels' +x.
+def test_lab_tip_pushes_the_skin_along_x(shared_data: Path, tmp_path: Path, name: str) -> None:
+    # Experiment compare finds from fields alone that pokes move the skins of both boards by 48 um along the labels' +x.
     readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert 0.08 < readings.Fx_N.mean() < 0.6
 
 
 @pytest.mark.parametrize("name", LAB)
 def test_lab_noise_matches_the_data_sheet(shared_data: Path, name: str) -> None:
-    # Noise about the press's own mean, 65 x 9 degrees of freedom a channel: relative error of the deviation 3 %.
+    # Noise about the mean of each press: 65 x 9 degrees of freedom per channel, so 3 % error of the standard deviation.
     trials = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
     names, rows = trials[0], [row for row in trials[1:] if row[1] == "noload"]
     columns = [names.index(f"B{axis}{chip}") for chip in range(5) for axis in "xyz"]
@@ -155,7 +155,7 @@ def test_eflesh_gauge_recorded_ten_strokes(shared_data: Path, tmp_path: Path, na
     assert 0.48 < account["no_new_force_rows_n"] / account["rows_n"] < 0.49
     assert set(readings.x_mm) == set(readings.y_mm) == {0.0}
     assert 11.9 < readings.depth_mm.max() < 12.1
-    # 3.3 and 3.5 kg at the deepest
+    # 3.3 and 3.5 kg at the greatest depth
     assert 32 < np.nanmax(readings.Fz_N) < 34.5
 
 
@@ -180,17 +180,17 @@ def test_eflesh_shear_recording_has_ten_chips(shared_data: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("name", "places", "zero_rows_n", "presses_N"),
+    ("name", "places", "zero_rows_n", "force_max_N"),
     [("position_1_20251028_003401", {1}, 18, 3.5), ("multi_touch_2_7_20251109_234435", {2, 7}, 41, 12.7)],
 )
 def test_eflash7_places_are_numbered_and_zeros_dropped(
-    shared_data: Path, tmp_path: Path, name: str, places: set[int], zero_rows_n: int, presses_N: float
+    shared_data: Path, tmp_path: Path, name: str, places: set[int], zero_rows_n: int, force_max_N: float
 ) -> None:
     readings, account = ingest(eflash7, shared_data / "eflash7" / f"{name}.csv", tmp_path)
     assert {n for n in range(1, 10) if f"place_{n}_rows_n" in account} == places
     assert account["dropped_zero_rows_n"] == zero_rows_n
     assert np.isnan(readings.x_mm).all()
-    np.testing.assert_allclose(readings.Fz_N.max(), presses_N, atol=0.1)
+    np.testing.assert_allclose(readings.Fz_N.max(), force_max_N, atol=0.1)
 
 
 def test_eflash7_starts_untouched_with_a_residual_baseline(shared_data: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""SD card logs: round trip, faults and errors."""
+"""Tests of SD card logs: round trip, faults and errors."""
 
 import numpy as np
 import pytest
@@ -50,17 +50,17 @@ def test_header_is_that_of_the_text_firmware(log):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda all_: all_[1:], r"log\.csv: row 1, the column names, must be t_s,T0,Bx0,By0,Bz0"),
-        (lambda all_: [all_[0].replace("Bx0,By0", "By0,Bx0"), *all_[1:]], "row 1, the column names"),
-        (lambda all_: [*all_[:-1], all_[-1].rstrip()], "the last line is cut"),
-        (lambda all_: [*all_[:-1], all_[-1][:20] + "\n"], "not a CSV with columns"),
-        (lambda all_: [*all_[:9], all_[9].replace("0.0360", "0.0300"), *all_[10:]], "row 10: t_s must be later"),
-        (lambda all_: [*all_[:9], all_[8], *all_[9:]], "row 10: t_s must be later"),
-        (lambda all_: [*all_[:5], all_[5][: all_[5].rindex(",")] + ",nan\n", *all_[6:]], "row 6: Bz1 must be a finite"),
-        (lambda all_: [*all_[:5], all_[5][: all_[5].rindex(",")] + ",\n", *all_[6:]], "row 6: Bz1 must be a finite"),
-        (lambda all_: [*all_[:5], all_[5].replace(".", "x"), *all_[6:]], "not a CSV"),
-        (lambda all_: all_[:1], "the log has no lines"),
-        (lambda all_: all_[:2], "fewer than two lines"),
+        (lambda rows: rows[1:], r"log\.csv: row 1, the column names, must be t_s,T0,Bx0,By0,Bz0"),
+        (lambda rows: [rows[0].replace("Bx0,By0", "By0,Bx0"), *rows[1:]], "row 1, the column names"),
+        (lambda rows: [*rows[:-1], rows[-1].rstrip()], "the last line is cut"),
+        (lambda rows: [*rows[:-1], rows[-1][:20] + "\n"], "not a CSV with columns"),
+        (lambda rows: [*rows[:9], rows[9].replace("0.0360", "0.0300"), *rows[10:]], "row 10: t_s must be later"),
+        (lambda rows: [*rows[:9], rows[8], *rows[9:]], "row 10: t_s must be later"),
+        (lambda rows: [*rows[:5], rows[5][: rows[5].rindex(",")] + ",nan\n", *rows[6:]], "row 6: Bz1 must be a finite"),
+        (lambda rows: [*rows[:5], rows[5][: rows[5].rindex(",")] + ",\n", *rows[6:]], "row 6: Bz1 must be a finite"),
+        (lambda rows: [*rows[:5], rows[5].replace(".", "x"), *rows[6:]], "not a CSV"),
+        (lambda rows: rows[:1], "the log has no lines"),
+        (lambda rows: rows[:2], "fewer than two lines"),
         (lambda _: [], "the file is empty"),
     ],
 )
@@ -71,14 +71,14 @@ def test_broken_log_is_refused(log, change, message):
     assert "\n" not in str(refused.value)
 
 
-def test_missing_log(tmp_path):
+def test_missing_log_is_an_error(tmp_path):
     with pytest.raises(CaptureError, match="file not found"):
         read_log(tmp_path / "log.csv")
 
 
 def test_missing_frames_are_counted(log):
-    all_ = lines(log)
-    log.write_text("".join([*all_[:10], *all_[13:30], *all_[31:]]))
+    rows = lines(log)
+    log.write_text("".join([*rows[:10], *rows[13:30], *rows[31:]]))
     account = read_log(log)[3]
     assert (account["gaps_n"], account["gap_frames_n"]) == (2, 4)
 

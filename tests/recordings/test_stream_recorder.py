@@ -1,4 +1,4 @@
-"""Recording from a serial port, over a pseudo-terminal."""
+"""Tests of recording from a serial port, with a pseudo-terminal as the port."""
 
 import math
 import os
@@ -40,34 +40,34 @@ SETTINGS = PortSettings(
 class Board:
     """The board's end of a pseudo-terminal: what it sends can be read at `name`."""
 
-    far: int
-    near: int
+    board_fd: int
+    port_fd: int
     name: str
 
     def send(self, *chunks: bytes) -> None:
         with suppress(OSError):  # nobody reads any more
             for chunk in chunks:
-                os.write(self.far, chunk)
+                os.write(self.board_fd, chunk)
 
     def unplug(self) -> None:
-        os.close(self.far)
-        self.far = -1
+        os.close(self.board_fd)
+        self.board_fd = -1
 
 
 @pytest.fixture
 def board() -> Iterator[Board]:
-    far, near = os.openpty()
-    tty.setraw(near)
-    end = Board(far, near, os.ttyname(near))
+    board_fd, port_fd = os.openpty()
+    tty.setraw(port_fd)
+    end = Board(board_fd, port_fd, os.ttyname(port_fd))
     yield end
-    for handle in (end.far, end.near):
+    for handle in (end.board_fd, end.port_fd):
         if handle >= 0:
             os.close(handle)
 
 
 @dataclass
 class ManualClock:
-    """The recorder's clock, advanced only by the test, so that a busy machine changes nothing."""
+    """The recorder's clock, advanced only by the test, so that the load of the machine does not matter."""
 
     s: float = 0.0
 
@@ -96,9 +96,9 @@ def record(board: Board, folder: Path, act: Callable[[threading.Event], None], *
         actor.join()
 
 
-def wait_until(is_so: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     end_s = time.monotonic() + LONG_s
-    while not is_so():
+    while not condition():
         assert time.monotonic() < end_s
         time.sleep(0.02)
 
@@ -148,7 +148,7 @@ def test_report_counts_frames(board, tmp_path):
     assert seen[-1] >= 1
 
 
-def test_arrival_times(board, clock, tmp_path):
+def test_pause_is_in_the_arrival_times(board, clock, tmp_path):
     data, pause_s = encode(FRAMES, "binary"), 0.4
 
     def act(_: threading.Event) -> None:
@@ -293,17 +293,11 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # like a full disk
 
 
 def test_full_disk_keeps_a_readable_recording(board, tmp_path):
-    command = [
-        sys.executable,
-        "-B",
-        "-c",
-        FULL_DISK + RECORD,
-        board.name,
-        str(tmp_path),
-    ]  # -B: no cut .pyc
+    # -B: Python would leave truncated .pyc files.
+    command = [sys.executable, "-B", "-c", FULL_DISK + RECORD, board.name, str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         wait_until((tmp_path / STREAM_FILE).exists)
-        os.set_blocking(board.far, False)  # the recorder stops reading when it ends
+        os.set_blocking(board.board_fd, False)  # the recorder stops reading when it ends
 
         def ended() -> bool:
             board.send(encode(FRAMES, "binary")[:820])
@@ -323,7 +317,7 @@ class TestErrors:
             stream_recorder.record("/dev/tty-none", tmp_path, settings=SETTINGS, stop=threading.Event())
         assert list(tmp_path.iterdir()) == []
 
-    def test_file_is_no_port(self, tmp_path):
+    def test_file_is_not_a_port(self, tmp_path):
         file = tmp_path / "no_port"
         file.touch()
         with pytest.raises(CaptureError, match="no_port: cannot open the port"):
@@ -339,10 +333,10 @@ class TestErrors:
 
     def test_no_frame_suggests_wrong_baud_rate(self, board, tmp_path):
         noise = bytes(range(128)) * 4
-        os.set_blocking(board.far, False)  # nobody reads while the error is built
+        os.set_blocking(board.board_fd, False)  # nobody reads while the error is built
 
         def act(stop: threading.Event) -> None:
-            while not stop.wait(0.05) and board.far >= 0:
+            while not stop.wait(0.05) and board.board_fd >= 0:
                 board.send(noise)
 
         stop = threading.Event()

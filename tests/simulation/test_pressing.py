@@ -21,7 +21,7 @@ from reskin.simulation.protocols import (
     half_sine,
     load_steps_N,
 )
-from tests.recordings.headers import AS_USUAL
+from tests.recordings.headers import DEFAULT_POLICY
 from tests.simulation.scene import synthesis, with_protocol
 
 SHARED = {"boards": "rigid", "skins_n": 1, "terms": []}
@@ -178,14 +178,14 @@ def test_walk_is_an_sd_card_log_and_no_capture(tmp_path):
     np.testing.assert_allclose(temperature_degC, capture.temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == len(t_s)
     with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):
-        open_capture(tmp_path / capture.name, AS_USUAL)
+        open_capture(tmp_path / capture.name, DEFAULT_POLICY)
 
 
 def test_presses_and_fillings_are_valid_captures(tmp_path):
     for name, protocol in (("press", PRESS), ("glass", GLASS)):
         capture = capture_of(name, protocol)
         write_capture(tmp_path / capture.name, *to_files(capture, with_protocol(name, protocol)))
-        opened = open_capture(tmp_path / capture.name, AS_USUAL)
+        opened = open_capture(tmp_path / capture.name, DEFAULT_POLICY)
         blocks = list(opened.blocks)
         logged_N = capture.probe.Fz_N[capture.probe.contact]
         readings_n = 1 if name == "press" else 3

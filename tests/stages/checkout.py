@@ -16,8 +16,8 @@ NOT_COPIED = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlart
 TEST_BYTECODE = ("*.opt-jaxtyping*.pyc", "*-pytest-*.pyc")  # stages do not read it
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1",
-    "RESKIN_EXECUTOR": "here",  # starting workers takes longer than these trainings
-    "PYTHONDONTWRITEBYTECODE": "",  # keep the bytecode for a hundred starts of stages
+    "RESKIN_EXECUTOR": "here",  # starting workers takes longer than these training runs
+    "PYTHONDONTWRITEBYTECODE": "",  # write bytecode, because stages start a hundred times
 }  # fmt: skip
 
 DONE, FAILED = "these stages ended", "these stages did not end"  # printed by warm.py
@@ -53,7 +53,7 @@ def copy_checkout(folder: Path) -> Path:
 
 
 def variables(folder: Path, **environment: str) -> dict[str, str]:
-    """Return the environment variables of programs in the copy: its own code, and its own MLflow store."""
+    """Return the environment variables of programs in the copy, which use its code and its MLflow store."""
     inherited = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
     path = f"{folder / '.venv/bin'}{os.pathsep}{inherited['PATH']}"  # stages run `python`
     return {**inherited, **ENVIRONMENT, "PYTHONPATH": str(folder), "PATH": path, **environment}
@@ -61,22 +61,24 @@ def variables(folder: Path, **environment: str) -> dict[str, str]:
 
 @contextmanager
 def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
-    """Yield a function that runs the named stages, or all, in one preloaded process, and returns their output."""
+    """Yield a function that runs the named stages, or all, in forks of a preloaded process and returns their output."""
     command = [str(folder / ".venv/bin/python"), "tests/stages/warm.py"]
     with subprocess.Popen(
         command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         env=variables(folder),
     ) as warm:  # fmt: skip
 
-        def run_stages(*names: str, end: bool = True) -> str:
+        def run_stages(*names: str, succeed: bool = True) -> str:
             print(*names, file=warm.stdin, flush=True)
             output = []
             for line in warm.stdout:
                 if line.strip() in (DONE, FAILED):
                     break
                 output.append(line)
-            if line.strip() != (DONE if end else FAILED):
-                raise AssertionError(f"{names or 'stages'} must {'' if end else 'not '}end:\n{''.join(output)[-3000:]}")
+            if line.strip() != (DONE if succeed else FAILED):
+                raise AssertionError(
+                    f"{names or 'stages'} must {'' if succeed else 'not '}end:\n{''.join(output)[-3000:]}"
+                )
             return "".join(output)
 
         yield run_stages

@@ -1,4 +1,4 @@
-"""Tests of the stage that reads all recorded captures of a scene, each once."""
+"""Tests of the stage that reads all recorded captures of a scene, each of them once."""
 
 import pytest
 
@@ -61,23 +61,23 @@ def test_finished_captures_survive_a_broken_one(run):
     io.write_text(run.folder / "raw/c2/stream.bin", "broken")
     with pytest.raises(CaptureError):
         run()
-    io.write_text(run.folder / "raw/c2/stream.bin", "mended")
+    io.write_text(run.folder / "raw/c2/stream.bin", "repaired")
     assert run() == ["c2"]
 
 
 def test_damaged_cached_file_is_read_again(run, capsys):
     run()
-    (kept,) = [file for file in (run.folder / stage.CACHE / "lab").iterdir() if file.read_text() == "c1"]
-    kept.write_text("c9")
+    (cached,) = [file for file in (run.folder / stage.CACHE / "lab").iterdir() if file.read_text() == "c1"]
+    cached.write_text("c9")
     assert run() == ["c1"]
-    assert f"{kept.name}: other content than was written" in capsys.readouterr().err
+    assert f"{cached.name}: other content than was written" in capsys.readouterr().err
     assert run() == []
 
 
 def test_partial_file_of_a_killed_stage_is_read_again(run):
     run()
-    kept = run.folder / stage.CACHE / "lab"
-    (file,) = [file for file in kept.iterdir() if file.read_text() == "c2"]
-    file.rename(kept / f"{file.stem.partition('-')[0]}.parquet").write_text("half")
+    cached = run.folder / stage.CACHE / "lab"
+    (file,) = [file for file in cached.iterdir() if file.read_text() == "c2"]
+    file.rename(cached / f"{file.stem.partition('-')[0]}.parquet").write_text("half")
     assert run() == ["c2"]
-    assert len(list(kept.iterdir())) == 3
+    assert len(list(cached.iterdir())) == 3

@@ -36,23 +36,18 @@ LEARNING = (
     "few_labels", "audit",
 )  # fmt: skip
 RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
-OF_CI = set(ANALYSES) - {
-    "compare",
-    "reference_methods",
-    "touches",
-    "population",
-    "worlds",
-}  # experiments on recordings or on many skins
-OUTPUT = "output.txt"  # of the first run
-pytestmark = pytest.mark.timeout(1800)  # against hanging; a busy machine takes four times as long as an idle one
+# Scene ci does not run the experiments on recordings and on many skins.
+OF_CI = set(ANALYSES) - {"compare", "reference_methods", "touches", "population", "worlds"}
+OUTPUT = "output.txt"  # output of the first run
+pytestmark = pytest.mark.timeout(1800)  # ends tests that hang; a busy machine takes four times as long as an idle one
 
 
 def compile_kernels() -> None:
     """Compile the kernels of simulated presses and of the universal model once, for all stages."""
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), [[8.0, 8.0, 1.0]])
-    shipped = reskin.load_universal().zero(noload_uT)
-    shipped.label(np.array([[8.0, 8.0]]), force_N, b_uT)
-    shipped.predict(b_uT)
+    universal = reskin.load_universal().zero(noload_uT)
+    universal.label(np.array([[8.0, 8.0]]), force_N, b_uT)
+    universal.predict(b_uT)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +113,7 @@ def test_dvc_metrics_are_numbers_of_the_report(story, numbers):
     assert scores["table2"]["multi"]["mse_xy_mm2"] == numbers["table2"]["multi"]["mse_xy_mm2"]["mean"]
 
 
-def test_stage_costs_count_trainings(story):
+def test_stage_costs_count_training_runs(story):
     stages = json.loads((story / "reports/ci/provenance.json").read_text())["runtime"]["stages"]
     for stage_name in ("train_single", "train_multi", "train_triplet", "adapt", "sweep_sensors", "drift", "few_labels"):
         assert stages[stage_name]["trainings_n"] > 0
@@ -294,9 +289,8 @@ def test_score_equals_a_naive_loop(story):
     truths = []
     for skin in ("b1_s0", "b1_s1"):
         for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():
-            if (
-                reading["pass_i"] >= 1 and reading["Fz_N"] >= 0
-            ):  # the first pass is the pool; the selection of the scene
+            # The first pass is the pool; the scene selects forces of 0 N or more.
+            if reading["pass_i"] >= 1 and reading["Fz_N"] >= 0:
                 truths.append((skin, reading["x_mm"], reading["y_mm"], reading["Fz_N"]))
     assert [(row["skin"], row["true_x_mm"], row["true_y_mm"], row["true_Fz_N"]) for row in predicted] == truths
     hits = sum(
@@ -306,7 +300,7 @@ def test_score_equals_a_naive_loop(story):
     assert card["scores"]["all"]["accuracy_pct"] == pytest.approx(100 * hits / len(truths))
 
 
-def test_predictions_follow_from_the_saved_model(story):
+def test_predictions_equal_those_of_the_saved_model(story):
     folder = story / "data/models/ci/train_multi"
     tensors, _ = io.read_tensors(folder / "lobo.paper.b1.seed0.safetensors")
     reading = pq.read_table(story / "data/indentations/ci/b1_s0.parquet").filter(pc.field("pass_i") == 1).slice(0, 1)
@@ -337,7 +331,7 @@ def test_mlflow_model_predicts_the_same(story, monkeypatch):
 def test_repeated_training_gives_the_same_lock_file(story, run_stages):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
-        file.unlink()  # finished trainings are reused otherwise
+        file.unlink()  # otherwise, finished training runs are reused
     stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *RANDOM, "report")]
     run_stages(*stages)
     assert (story / "dvc.lock").read_text() == before
@@ -376,7 +370,7 @@ def test_killed_stage_keeps_finished_folds(story):
     for file in trials.glob("*.safetensors"):
         file.unlink()
 
-    def finished() -> int:  # a stack of three trainings is finished with its last file
+    def finished() -> int:  # a stack of three training runs is finished with its last file
         stacks = Counter(file.stem.rpartition("-")[0] for file in trials.glob("*.safetensors"))
         return sum(written_n for written_n in stacks.values() if written_n == 3)
 
@@ -388,7 +382,7 @@ def test_killed_stage_keeps_finished_folds(story):
     stage.wait()
     finished_n = finished()
     assert not models.exists()
-    environment |= ENVIRONMENT  # the other trainings run in this process
+    environment |= ENVIRONMENT  # the remaining training runs use the stage's own process
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
     assert f"{finished_n} of 6 training runs were finished before" in again.stderr
     assert len(list(models.glob("*.safetensors"))) == 6
@@ -403,7 +397,7 @@ def test_missing_tracking_server_is_reported_quickly(story):
     assert time.monotonic() - start_s < 100  # MLflow itself retries for minutes
 
 
-def test_removed_experiment_leaves_nothing(story, run_stages):
+def test_removed_experiment_leaves_no_files(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     settings = YAML(typ="safe").load(scene.read_text())
     settings["experiments"].remove("sleeve")
@@ -416,10 +410,8 @@ def test_removed_experiment_leaves_nothing(story, run_stages):
     assert "removed sleeve@ci: data/results/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
     run_stages("report@ci")
-    assert [
-        *story.glob("data/[!c]*/**/*sleeve*"),
-        *story.glob("reports/ci/**/*sleeve*"),
-    ] == []  # data/code has the digests of all stages
+    # data/code has the digests of all stages.
+    assert [*story.glob("data/[!c]*/**/*sleeve*"), *story.glob("reports/ci/**/*sleeve*")] == []
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert "sleeve" not in numbers
     provenance = json.loads((story / "reports/ci/provenance.json").read_text())
@@ -427,11 +419,11 @@ def test_removed_experiment_leaves_nothing(story, run_stages):
     assert not any("sleeve" in stage for stage in YAML(typ="safe").load((story / "dvc.lock").read_text())["stages"])
 
 
-def test_unknown_parameter_is_one_line(story, run_stages):
+def test_unknown_parameter_is_reported_without_traceback(story, run_stages):
     scene = story / "pipeline/scenes/ci.yaml"
     before = scene.read_text()
     scene.write_text(before.replace("random_repeats_n:", "random_repeets_n:"))
-    output = run_stages("split@ci", end=False)
+    output = run_stages("split@ci", succeed=False)
     scene.write_text(before)
     assert "split: random_repeets_n is not a known parameter (its value: 2)" in output
     assert "Traceback" not in output

@@ -1,4 +1,4 @@
-"""Run stages as DVC does, each in a fork of one process that has imported everything.
+"""Run stages as DVC does, each in a fork of one process that has imported all modules.
 
 `warm_stages` starts it in a checkout. Each line of input names stages (`drift@ci sleeve@ci`; none: all). They run in
 DVC's order and are committed as by `dvc commit`; then it prints `DONE` or `FAILED`, and reads the next line. Most of a
@@ -48,7 +48,7 @@ def run_stage(name: str, command: str) -> int:
 
 def preload(protocols: set[tuple[str, str]]) -> None:
     """Import the modules of all stages, and compute the deformation tables of skins for (scene, protocol) pairs."""
-    importlib.import_module("pipeline")  # first: it selects the instructions of NumPy
+    importlib.import_module("pipeline")  # first: it sets variables that NumPy reads when imported
     import numpy as np
 
     from pipeline.settings import read_settings
@@ -61,10 +61,12 @@ def preload(protocols: set[tuple[str, str]]) -> None:
         importlib.import_module(name)
     for scene, protocol in protocols:
         settings = read_settings(scene)
-        of = simulation_settings(settings)
-        kind = of.boards[of.protocols[protocol].boards]
+        simulation = simulation_settings(settings)
+        kind = simulation.boards[simulation.protocols[protocol].boards]
         rule, name = kind.quadrature.in_si(), f"{kind.letter}0_s0"
-        skin = draw_skin(of.skin, of.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m)
+        skin = draw_skin(
+            simulation.skin, simulation.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m
+        )
         list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # caches its tables
     gc.freeze()  # keeps forks from copying all pages in garbage collection
 

@@ -1,4 +1,4 @@
-"""Layout `eflash7`: numbered places, touched and untouched rows, dropped zeros."""
+"""Tests of layout `eflash7`: numbered places, touched and untouched rows, dropped zeros."""
 
 from pathlib import Path
 
@@ -9,25 +9,25 @@ from reskin.board.faults import FAILED_B_uT
 from reskin.errors import CaptureError
 from reskin.recordings.header import Header
 from reskin.recordings.readers import eflash7
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 CHIPS_N = 2
-STEP_uT = 2.4  # of the recorded chips along x and y
+STEP_uT = 2.4  # LSB of the recorded chips along x and y
 FIELDS = [f"mag{chip}_{axis}" for chip in range(CHIPS_N) for axis in "xyz"]
 NAMES = ["timestamp", "position", "x_pos", "y_pos", "fx", "fy", "fz", "tx", *FIELDS]
 NAMES_OF_TWO = ["timestamp", "fz", "ty", "pos1_x", "pos1_y", "pos2_x", "pos2_y", *FIELDS]
 HEADER = make_header(layout="eflash7", chips_n=CHIPS_N, contacts_before_n=7)
-# Steps of the chips in each row: untouched, a touch, untouched, a touch that begins with a row of zeros.
+# Field in steps, per row: untouched, a touch, untouched, a touch that begins with a row of zeros (None).
 LEVELS = [0, 1, 0, 1, 0, 1, 40, 80, 41, 2, 1, None, 90]
 GAUGE_N = [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, -0.9, -1.9, -0.9, 0.1, 0.1, -0.4, -2.4]
 
 
-def rows_of(place: str, forces: str) -> list[str]:
-    """Lines of one place or pair; `forces` is filled with fz."""
+def rows_of(place: str, template: str) -> list[str]:
+    """Return lines of one place or pair; `template` is filled with the place and fz."""
     lines = []
     for row_i, (level, fz_N) in enumerate(zip(LEVELS, GAUGE_N, strict=True)):
         b_uT = [0.0] * len(FIELDS) if level is None else [STEP_uT * (level + 5 * i + 1) for i in range(len(FIELDS))]
-        cells = [f"{100 + 0.1 * row_i:.1f}", *[word.format(place=place, fz=fz_N) for word in forces.split()]]
+        cells = [f"{100 + 0.1 * row_i:.1f}", *[word.format(place=place, fz=fz_N) for word in template.split()]]
         lines.append(",".join([*cells, *(f"{one:.2f}" for one in b_uT)]))
     return lines
 
@@ -43,7 +43,7 @@ def write(folder: Path, rows: list[str] = ONE, names: list[str] = NAMES) -> Path
 
 def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        eflash7.read(folder, header, AS_USUAL)
+        eflash7.read(folder, header, DEFAULT_POLICY)
     message = str(caught.value)
     assert "\n" not in message
     assert eflash7.READINGS in message
@@ -51,7 +51,7 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
 
 
 def test_rows_from_the_first_touch_on_are_readings(tmp_path: Path) -> None:
-    readings, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
+    readings, account = eflash7.read(write(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.t_s.tolist() == [100.6, 100.7, 100.8, 100.9, 101.0, 101.2]
     np.testing.assert_allclose(readings.b_uT[:, 0], STEP_uT * np.array([41, 81, 42, 3, 2, 91]), rtol=1e-6)
     np.testing.assert_allclose(readings.noload_uT[:, 0], 1.5 * STEP_uT, rtol=1e-6)  # mean of 1 and 2
@@ -59,7 +59,7 @@ def test_rows_from_the_first_touch_on_are_readings(tmp_path: Path) -> None:
 
 
 def test_zero_rows_are_dropped_and_counted(tmp_path: Path) -> None:
-    _, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
+    _, account = eflash7.read(write(tmp_path), HEADER, DEFAULT_POLICY)
     dropped_n = sum(count for name, count in account.items() if name.startswith("dropped_"))
     assert account["dropped_zero_rows_n"] == dropped_n == 1
     assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == len(LEVELS)
@@ -67,42 +67,42 @@ def test_zero_rows_are_dropped_and_counted(tmp_path: Path) -> None:
 
 def test_errors_count_the_rows_of_the_file(tmp_path: Path) -> None:
     failed = ",".join([*ONE[-1].split(",")[:-3], *map(str, FAILED_B_uT)])
-    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], failed]), HEADER, AS_USUAL)
+    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], failed]), HEADER, DEFAULT_POLICY)
     assert account["fault_zeros_of_all_chips_first_row"] == len(ONE) - 1
     assert account["fault_failed_read_first_row"] == account["fault_failed_read_last_row"] == len(ONE)
 
 
-def test_zeros_of_one_chip_are_counted_apart(tmp_path: Path) -> None:
+def test_zeros_of_one_chip_are_counted_separately(tmp_path: Path) -> None:
     one_chip = ",".join([*ONE[-1].split(",")[:-3], "0.0", "0.0", "0.0"])
-    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], one_chip]), HEADER, AS_USUAL)
+    _, account = eflash7.read(write(tmp_path, [*ONE[:-1], one_chip]), HEADER, DEFAULT_POLICY)
     assert (account["fault_zeros_of_all_chips_dropped_n"], account["fault_zeros_dropped_n"]) == (1, 1)
     assert (account["dropped_zero_rows_n"], account["dropped_failed_read_rows_n"]) == (1, 1)
     assert account["fault_zeros_first_row"] == account["fault_zeros_last_row"] == len(ONE)
 
 
 def test_forces_are_relative_and_compression_is_positive(tmp_path: Path) -> None:
-    readings, account = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
+    readings, account = eflash7.read(write(tmp_path), HEADER, DEFAULT_POLICY)
     np.testing.assert_allclose(readings.Fz_N, [1, 2, 1, 0, 0, 2.5], atol=1e-6)  # float32
     np.testing.assert_allclose(readings.Fx_N, 0, atol=1e-7)
     assert account["force_sign_unknown_rows_n"] == 6
 
 
 def test_touch_begins_where_the_force_rises(tmp_path: Path) -> None:
-    readings, _ = eflash7.read(write(tmp_path), HEADER, AS_USUAL)
+    readings, _ = eflash7.read(write(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.indentation.tolist() == [0, 0, 0, 0, 0, 1]
     assert readings.n_contacts.tolist() == [7, 7, 7, 7, 7, 8]
 
 
 def test_places_have_numbers_and_no_millimetres(tmp_path: Path) -> None:
     for rows, names, places in ((ONE, NAMES, {6}), (TWO, NAMES_OF_TWO, {3, 8})):
-        readings, account = eflash7.read(write(tmp_path, rows, names), HEADER, AS_USUAL)
+        readings, account = eflash7.read(write(tmp_path, rows, names), HEADER, DEFAULT_POLICY)
         assert np.isnan([readings.x_mm, readings.y_mm, readings.depth_mm]).all()
         assert {n for n in range(1, 10) if f"place_{n}_rows_n" in account} == places
         assert all(account[f"place_{n}_rows_n"] == account["rows_n"] for n in places)
 
 
 def test_multi_touch_has_normal_force_only(tmp_path: Path) -> None:
-    readings, account = eflash7.read(write(tmp_path, TWO, NAMES_OF_TWO), HEADER, AS_USUAL)
+    readings, account = eflash7.read(write(tmp_path, TWO, NAMES_OF_TWO), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.Fx_N).all()
     assert readings.Fz_N.max() == np.float32(2.5)
     assert account["force_sign_unknown_rows_n"] == 0
@@ -110,7 +110,7 @@ def test_multi_touch_has_normal_force_only(tmp_path: Path) -> None:
 
 def test_late_and_repeated_rows_are_counted(tmp_path: Path) -> None:
     rows = [*ONE[:10], ONE[9].replace("100.9", "103.9"), *[row.replace("101.", "104.") for row in ONE[10:]]]
-    _, account = eflash7.read(write(tmp_path, rows), HEADER, AS_USUAL)
+    _, account = eflash7.read(write(tmp_path, rows), HEADER, DEFAULT_POLICY)
     assert (account["gap_rows_n"], account["repeated_rows_n"]) == (1, 1)
 
 

@@ -1,4 +1,4 @@
-"""Layout `eflesh`: a folder of three arrays becomes presses and strokes."""
+"""Tests of layout `eflesh`: a folder of three arrays becomes presses and strokes."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reskin.errors import CaptureError
 from reskin.recordings.header import Header
 from reskin.recordings.readers import eflesh
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 CHIPS_N = 2
 GRID = [(274.0, -115.0), (274.0, -114.000061), (275.0, -115.0), (275.0, -113.999992)]
@@ -48,7 +48,7 @@ def strokes(folder: Path, strokes_n: int = 3) -> Path:
 
 def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        eflesh.read(folder, header, AS_USUAL)
+        eflesh.read(folder, header, DEFAULT_POLICY)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -61,25 +61,25 @@ def edit(path: Path, line_n: int, column_i: int, cell: str) -> None:
 
 
 def test_places_count_from_the_corner_of_the_scan(tmp_path: Path) -> None:
-    readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
+    readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.x_mm[:4].tolist() == [0, 0, 1, 1]
     assert readings.y_mm[:4].tolist() == [0, 1, 0, 1]
 
 
 def test_depth_counts_from_the_highest_place(tmp_path: Path) -> None:
-    readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
+    readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.depth_mm[:4].tolist() == [0.75, 0.5, 0.25, 0]
 
 
 def test_noload_is_the_subtracted_baseline(tmp_path: Path) -> None:
-    readings, _ = eflesh.read(scan(tmp_path), HEADER, AS_USUAL)
+    readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     np.testing.assert_array_equal(readings.b_uT[5], 505 + 10 * np.arange(6))
     # 300 + i and the differences are exact in float32.
     np.testing.assert_array_equal(readings.noload_uT[5], np.full(6, 305))
 
 
 def test_repeated_places_begin_a_pass(tmp_path: Path) -> None:
-    readings, account = eflesh.read(scan(tmp_path, passes_n=3), HEADER, AS_USUAL)
+    readings, account = eflesh.read(scan(tmp_path, passes_n=3), HEADER, DEFAULT_POLICY)
     assert readings.pass_i.tolist() == [0] * 4 + [1] * 4 + [2] * 4
     assert account["passes_n"] == 3
     assert readings.n_contacts.tolist() == list(range(12))
@@ -87,14 +87,14 @@ def test_repeated_places_begin_a_pass(tmp_path: Path) -> None:
 
 
 def test_fresh_baseline_begins_a_stroke(tmp_path: Path) -> None:
-    readings, account = eflesh.read(strokes(tmp_path), GAUGED, AS_USUAL)
+    readings, account = eflesh.read(strokes(tmp_path), GAUGED, DEFAULT_POLICY)
     assert readings.pass_i.tolist() == [0] * 5 + [1] * 5 + [2] * 5
     assert account["passes_n"] == 3
     assert readings.n_contacts.tolist() == readings.pass_i.tolist()
 
 
 def test_grams_become_newtons_and_masked_values_nan(tmp_path: Path) -> None:
-    readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, AS_USUAL)
+    readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, DEFAULT_POLICY)
     expected = np.float32([np.nan, 0.980665, 9.80665, 1.4709975, np.nan])
     # float32 holds seven digits
     np.testing.assert_allclose(readings.Fz_N, expected, rtol=1e-6)
@@ -107,7 +107,7 @@ def test_grams_become_newtons_and_masked_values_nan(tmp_path: Path) -> None:
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_gauge_axis_comes_from_the_header(tmp_path: Path, axis: str) -> None:
     readings, account = eflesh.read(
-        strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}), AS_USUAL
+        strokes(tmp_path), GAUGED.model_copy(update={"options": {"force_axis": axis}}), DEFAULT_POLICY
     )
     felt = np.isfinite(getattr(readings, f"F{axis}_N"))
     assert account["force_sign_unknown_rows_n"] == felt.sum() > 0
@@ -125,7 +125,7 @@ def test_weight_without_axis_is_refused(tmp_path: Path, options: dict[str, str])
 @settings(max_examples=20, deadline=None)
 @given(passes_n=st.integers(1, 6))
 def test_every_row_is_a_reading(tmp_path_factory: pytest.TempPathFactory, passes_n: int) -> None:
-    readings, account = eflesh.read(scan(tmp_path_factory.mktemp("eflesh"), passes_n), HEADER, AS_USUAL)
+    readings, account = eflesh.read(scan(tmp_path_factory.mktemp("eflesh"), passes_n), HEADER, DEFAULT_POLICY)
     assert account["rows_n"] == account["rows_read_n"] == len(readings) == 4 * passes_n
     assert account["noload_rows_n"] == 0
     assert (np.diff(readings.t_s) > 0).all()
@@ -138,7 +138,7 @@ def test_three_files_are_collected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", eflesh.FILES)
-def test_missing_file(tmp_path: Path, name: str) -> None:
+def test_missing_file_is_an_error(tmp_path: Path, name: str) -> None:
     (scan(tmp_path) / name).unlink()
     with pytest.raises(CaptureError, match=f"no {name}"):
         eflesh.collect(tmp_path)
@@ -201,7 +201,7 @@ def rescale(path: Path, columns: slice, factor: float) -> None:
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_places_in_metres_or_micrometres_are_refused(tmp_path: Path, factor: float) -> None:
     folder = write(tmp_path, [[5.0 * i, 0.0, 142.0] for i in range(4)], [300.0] * 4)
-    eflesh.read(folder, HEADER, AS_USUAL)
+    eflesh.read(folder, HEADER, DEFAULT_POLICY)
     rescale(folder / eflesh.STATES, slice(1, 4), factor)
     assert "states.csv: places must be one, or spread over 1 to 200 mm" in error_of(folder)
 
@@ -224,17 +224,19 @@ def test_weights_in_kilograms_are_refused(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("of_a_uT", [1e-2, 1e-3, 1e-6])
-def test_fields_in_other_units_are_refused(tmp_path: Path, of_a_uT: float) -> None:
+@pytest.mark.parametrize("factor", [1e-2, 1e-3, 1e-6])
+def test_fields_in_other_units_are_refused(tmp_path: Path, factor: float) -> None:
     scan(tmp_path)
     for name in (eflesh.SENSOR, eflesh.CHANGES):
-        rescale(tmp_path / name, slice(1, None), of_a_uT)
+        rescale(tmp_path / name, slice(1, None), factor)
     assert "G to uT" in error_of(tmp_path)
 
 
 def test_constant_height_gives_no_depth(tmp_path):
     places = [[x, y, 142.0] for x, y in GRID] * 3
-    readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, AS_USUAL)
+    readings, account = eflesh.read(
+        write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, DEFAULT_POLICY
+    )
     assert np.isnan(readings.depth_mm).all()
     assert account["no_depth_rows_n"] == len(readings) == len(places)
 
@@ -242,6 +244,8 @@ def test_constant_height_gives_no_depth(tmp_path):
 def test_nearly_constant_height_gives_no_depth(tmp_path):
     z_mm = np.linspace(143.0, 143.0177, 3 * len(GRID))
     places = [[x, y, z] for (x, y), z in zip(GRID * 3, z_mm, strict=True)]
-    readings, account = eflesh.read(write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, AS_USUAL)
+    readings, account = eflesh.read(
+        write(tmp_path, places, [300.0 + i for i in range(len(places))]), HEADER, DEFAULT_POLICY
+    )
     assert np.isnan(readings.depth_mm).all()
     assert account["no_depth_rows_n"] == len(places)

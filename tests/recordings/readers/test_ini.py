@@ -1,4 +1,4 @@
-"""Layout `ini`: two text files become passes over a raster."""
+"""Tests of layout `ini`: two text files become passes over a raster."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reskin.errors import CaptureError
 from reskin.recordings.header import Firmware, Header
 from reskin.recordings.readers import ini
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
@@ -31,7 +31,7 @@ FAILED = "8028.16 5194.0 12943.36 -880.49"
 
 
 def chip_line(row_i: int, chip_i: int, lsb_xy_uT: float = LSB_XY_uT, lsb_z_uT: float = LSB_Z_uT) -> str:
-    """X, Y, Z, T of one chip, in single steps of the LSB over all rows."""
+    """Return X, Y, Z, T of one chip; from row to row, the field rises by one LSB."""
     steps = 1000 + row_i + 100 * chip_i
     return f"{steps * lsb_xy_uT:.2f} {(steps + 1) * lsb_xy_uT:.2f} {(steps + 2) * lsb_z_uT:.2f} {28 + chip_i}.5"
 
@@ -59,14 +59,14 @@ def edit(path: Path, line_n: int, line: str) -> None:
 
 def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        ini.read(folder, header, AS_USUAL)
+        ini.read(folder, header, DEFAULT_POLICY)
     message = str(caught.value)
     assert "\n" not in message
     return message
 
 
 def test_every_row_is_a_press_of_its_pass(tmp_path: Path) -> None:
-    readings, account = ini.read(write(tmp_path, ONE_PASS * 3), HEADER, AS_USUAL)
+    readings, account = ini.read(write(tmp_path, ONE_PASS * 3), HEADER, DEFAULT_POLICY)
     assert readings.pass_i.tolist() == [0] * 8 + [1] * 8 + [2] * 8
     assert account["passes_n"] == 3
     assert readings.indentation.tolist() == list(range(24))
@@ -75,7 +75,7 @@ def test_every_row_is_a_press_of_its_pass(tmp_path: Path) -> None:
 
 
 def test_contact_is_decided_by_force(tmp_path: Path) -> None:
-    readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
+    readings, account = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.x_mm).tolist() == [True, True, False, False, True, False, False, True]
     assert np.isnan(readings.y_mm).tolist() == np.isnan(readings.x_mm).tolist()
     np.testing.assert_array_equal(readings.Fz_N, np.float32([0, 0, 0.08, 0.3, 0, 0.52, 1.5, 0]))
@@ -85,7 +85,7 @@ def test_contact_is_decided_by_force(tmp_path: Path) -> None:
 
 
 def test_noload_is_the_mean_of_the_first_rows_of_a_pass(tmp_path: Path) -> None:
-    readings, account = ini.read(write(tmp_path, ONE_PASS * 2), HEADER, AS_USUAL)
+    readings, account = ini.read(write(tmp_path, ONE_PASS * 2), HEADER, DEFAULT_POLICY)
     for pass_i in (0, 1):
         corner_uT = (field_uT(8 * pass_i) + field_uT(8 * pass_i + 1)) / 2
         expected = np.tile(corner_uT, (8, 1)).astype(np.float32)
@@ -94,12 +94,12 @@ def test_noload_is_the_mean_of_the_first_rows_of_a_pass(tmp_path: Path) -> None:
 
 
 def test_places_that_never_repeat_are_one_pass(tmp_path: Path) -> None:
-    _, account = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
+    _, account = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     assert account["passes_n"] == 1
 
 
 def test_unrecorded_quantities_are_nan(tmp_path: Path) -> None:
-    readings, _ = ini.read(write(tmp_path, ONE_PASS), HEADER, AS_USUAL)
+    readings, _ = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     for name in ("depth_mm", "Fx_N", "Fy_N", "t_s"):
         assert np.isnan(getattr(readings, name)).all()
 
@@ -113,7 +113,7 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS * 2)
     edit(tmp_path / ini.READINGS, 2, f"{chip_line(1, 0)} {FAILED} {chip_line(1, 2)}")
     edit(tmp_path / ini.READINGS, 4, f"{FAILED} {FAILED} {FAILED}")
-    readings, account = ini.read(tmp_path, HEADER, AS_USUAL)
+    readings, account = ini.read(tmp_path, HEADER, DEFAULT_POLICY)
     assert account["dropped_failed_read_rows_n"] == 2
     assert readings.indentation.tolist() == [0, 2, *range(4, 16)]
     # The failed corner row is not part of the no-load mean.
@@ -128,13 +128,13 @@ def test_every_row_is_a_reading_or_counted(
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * passes_n)
     for row_i in failed:
         edit(folder / ini.READINGS, row_i + 1, f"{FAILED} {chip_line(row_i, 1)} {chip_line(row_i, 2)}")
-    readings, account = ini.read(folder, HEADER, AS_USUAL)
+    readings, account = ini.read(folder, HEADER, DEFAULT_POLICY)
     assert account["rows_n"] == len(readings) == 8 * passes_n - len(failed)
     dropped_n = account["dropped_failed_read_rows_n"]
     assert account["rows_n"] + account["noload_rows_n"] + dropped_n == account["rows_read_n"] == 8 * passes_n
 
 
-def late(rows_late: str) -> Header:
+def header_with_lateness(rows_late: str) -> Header:
     return HEADER.model_copy(update={"options": {"rows_late": rows_late}})
 
 
@@ -156,7 +156,7 @@ def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: i
 def test_lateness_of_the_fields_is_reported(tmp_path_factory: pytest.TempPathFactory, late_n: int) -> None:
     folder = write_late(tmp_path_factory.mktemp("ini"), ONE_PASS * 5, late_n)
     for declared in ("0", str(late_n)):
-        _, account = ini.read(folder, late(declared), AS_USUAL)
+        _, account = ini.read(folder, header_with_lateness(declared), DEFAULT_POLICY)
         assert account["best_rows_late_n"] == late_n
         assert account["rows_late_n"] == int(declared)
 
@@ -164,7 +164,7 @@ def test_lateness_of_the_fields_is_reported(tmp_path_factory: pytest.TempPathFac
 @pytest.mark.parametrize("late_n", [0, 1, 4])
 @pytest.mark.parametrize(("passes_n", "is_long"), [(13, True), (5, False)])  # 104 and 40 rows
 def test_lateness_is_estimated_if_the_recording_is_long_enough(tmp_path, late_n, passes_n, is_long):
-    _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER, AS_USUAL)
+    _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER, DEFAULT_POLICY)
     assert account["best_rows_late_n"] == late_n
     assert account["rows_late_n"] == account["dropped_no_partner_rows_n"] == (late_n if is_long else 0)
 
@@ -177,7 +177,7 @@ def test_late_fields_are_paired_with_their_presses(
     folder = write(tmp_path_factory.mktemp("ini"), ONE_PASS * 3)
     for row_i in failed:
         edit(folder / ini.READINGS, row_i + 1, f"{FAILED} {chip_line(row_i, 1)} {chip_line(row_i, 2)}")
-    readings, account = ini.read(folder, late(str(late_n)), AS_USUAL)
+    readings, account = ini.read(folder, header_with_lateness(str(late_n)), DEFAULT_POLICY)
     truths_i = [i for i in range(24 - late_n) if i + late_n not in failed]
     assert readings.indentation.tolist() == truths_i
     np.testing.assert_array_equal(
@@ -196,11 +196,13 @@ def test_late_fields_are_paired_with_their_presses(
 
 @pytest.mark.parametrize("rows_late", ["6", "-1", "one", ""])
 def test_invalid_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
-    assert "option rows_late must be 0 to 5" in error_of(write(tmp_path, ONE_PASS), late(rows_late))
+    assert "option rows_late must be 0 to 5" in error_of(write(tmp_path, ONE_PASS), header_with_lateness(rows_late))
 
 
 def test_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
-    assert "4 rows are not more than the 5 of option rows_late" in error_of(write(tmp_path, ONE_PASS[:4]), late("5"))
+    assert "4 rows are not more than the 5 of option rows_late" in error_of(
+        write(tmp_path, ONE_PASS[:4]), header_with_lateness("5")
+    )
 
 
 def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> None:
@@ -209,7 +211,7 @@ def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> 
         (ini.TRUTHS, "truths_artillery_AFG_board2_50_screw.txt"),
     ):
         (tmp_path / name).write_bytes((shared_data / "ini" / source).read_bytes())
-    _, account = ini.read(tmp_path, make_header(layout="ini"), AS_USUAL)
+    _, account = ini.read(tmp_path, make_header(layout="ini"), DEFAULT_POLICY)
     assert account["best_rows_late_n"] == account["rows_late_n"] == 1
     assert account["passes_n"] == 50
     assert account["rows_n"] + account["dropped_no_partner_rows_n"] == account["rows_read_n"] == 23300

@@ -1,4 +1,4 @@
-"""Layout `lab`: one CSV file becomes presses."""
+"""Tests of layout `lab`: one CSV file becomes presses."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reskin.errors import CaptureError
 from reskin.recordings.header import Header
 from reskin.recordings.readers import lab
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 CHIPS_N = 2
 NAMES = "indent,phase,x_mm,y_mm,T0,Bx0,By0,Bz0,T1,Bx1,By1,Bz1,Fx,Fy,Fz"
@@ -18,7 +18,7 @@ HEADER = make_header(layout="lab", chips_n=CHIPS_N, contacts_before_n=7)
 
 
 def row(indent: int, phase: str, b_uT: float, *, place: str = "4,6", force: str = "0.1,-0.2,-3.5") -> str:
-    """One line; channel c reads b_uT + 10 c."""
+    """Return one line; channel c reads b_uT + 10 c."""
     c = [f"{b_uT + 10 * i:.4f}" for i in range(3 * CHIPS_N)]
     return f"{indent},{phase},{place},21.5,{','.join(c[:3])},22.5,{','.join(c[3:])},{force}"
 
@@ -41,7 +41,7 @@ def write(folder: Path, *rows: str, names: str = NAMES) -> Path:
 
 def error_of(folder: Path, header: Header = HEADER) -> str:
     with pytest.raises(CaptureError) as caught:
-        lab.read(folder, header, AS_USUAL)
+        lab.read(folder, header, DEFAULT_POLICY)
     message = str(caught.value)
     assert "\n" not in message
     assert lab.READINGS in message
@@ -49,7 +49,7 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
 
 
 def test_contact_rows_become_readings(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert readings.indentation.tolist() == [0, 0, 0, 1]
     assert readings.reading_i.tolist() == [0, 1, 2, 0]
     assert readings.b_uT[:, 0].tolist() == [160, 161, 162, 50]
@@ -61,20 +61,20 @@ def test_contact_rows_become_readings(tmp_path: Path) -> None:
 
 
 def test_noload_is_the_mean_of_the_same_press(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert readings.noload_uT[:, 0].tolist() == [102, 102, 102, 90]
     assert readings.noload_uT[0].tolist() == [102, 112, 122, 132, 142, 152]
 
 
 def test_forces_are_turned_from_gauge_to_skin_axes(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     np.testing.assert_array_equal(readings.Fz_N, np.float32([3.5, 3.5, 3.5, 0.5]))
     np.testing.assert_array_equal(readings.Fx_N[:3], np.float32([-0.1] * 3))
     np.testing.assert_array_equal(readings.Fy_N[:3], np.float32([0.2] * 3))
 
 
 def test_missing_quantities_are_nan(tmp_path: Path) -> None:
-    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
+    readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     assert np.isnan(readings.depth_mm).all()
     assert np.isnan(readings.t_s).all()
 
@@ -87,7 +87,7 @@ def test_every_row_is_a_reading_or_noload(
     rows = []
     for indent, (noload_n, contact_n) in enumerate(counts):
         rows += [row(indent, "noload", 100.0)] * noload_n + [row(indent, "contact", 150.0)] * contact_n
-    readings, account = lab.read(write(tmp_path_factory.mktemp("lab"), *rows), HEADER, AS_USUAL)
+    readings, account = lab.read(write(tmp_path_factory.mktemp("lab"), *rows), HEADER, DEFAULT_POLICY)
     assert account["rows_read_n"] == len(rows)
     assert account["rows_n"] == len(readings) == sum(contact_n for _, contact_n in counts)
     assert account["noload_rows_n"] == sum(noload_n for noload_n, _ in counts)
@@ -100,7 +100,7 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
             rows[row_i].split(",22.5,")[0].rsplit(",", 4)[0]
             + ",-880.49,8028.16,5194.00,12943.36,22.5,130,140,150,0,0,-3"
         )
-    readings, account = lab.read(write(tmp_path, *rows), HEADER, AS_USUAL)
+    readings, account = lab.read(write(tmp_path, *rows), HEADER, DEFAULT_POLICY)
     assert account["dropped_failed_read_rows_n"] == 2
     assert (account["rows_n"], account["noload_rows_n"], account["rows_read_n"]) == (3, 2, 7)
     assert readings.b_uT[:, 0].tolist() == [160, 162, 50]
@@ -111,15 +111,17 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
 def test_column_order_does_not_matter(tmp_path: Path) -> None:
     names = NAMES.split(",")
     order = np.roll(np.arange(len(names)), 4)
-    turned = [",".join(np.array(line.split(","))[order]) for line in PRESSES]
-    (tmp_path / "turned").mkdir()
-    straight, _ = lab.read(write(tmp_path, *PRESSES), HEADER, AS_USUAL)
-    folder = write(tmp_path / "turned", *turned, names=",".join(np.array(names)[order]))
-    np.testing.assert_array_equal(lab.read(folder, HEADER, AS_USUAL)[0].b_uT, straight.b_uT)
+    reordered = [",".join(np.array(line.split(","))[order]) for line in PRESSES]
+    (tmp_path / "reordered").mkdir()
+    original, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
+    folder = write(tmp_path / "reordered", *reordered, names=",".join(np.array(names)[order]))
+    np.testing.assert_array_equal(lab.read(folder, HEADER, DEFAULT_POLICY)[0].b_uT, original.b_uT)
 
 
 def test_unknown_column_is_counted(tmp_path: Path) -> None:
-    _, account = lab.read(write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Mz"), HEADER, AS_USUAL)
+    _, account = lab.read(
+        write(tmp_path, *[f"{line},1" for line in PRESSES], names=f"{NAMES},Mz"), HEADER, DEFAULT_POLICY
+    )
     assert account["ignored_columns_n"] == 1
 
 
@@ -175,8 +177,8 @@ def test_millitesla_is_refused(tmp_path: Path) -> None:
     assert "Convert mT or G to uT" in error_of(write(tmp_path, *tiny))
 
 
-def scaled(column: str, factor: float) -> list[str]:
-    """The presses with one kind of column (B, place or F) in another unit."""
+def scale_column(column: str, factor: float) -> list[str]:
+    """Return the presses with one kind of column (B, place or F) in another unit."""
     names = NAMES.split(",")
     chosen = {i for i, name in enumerate(names) if name.startswith(column) or name.endswith(column)}
     return [
@@ -200,7 +202,7 @@ def scaled(column: str, factor: float) -> list[str]:
     ],
 )
 def test_other_units_and_signs_are_refused(tmp_path: Path, column: str, factor: float, expected: str) -> None:
-    assert expected in error_of(write(tmp_path, *scaled(column, factor)))
+    assert expected in error_of(write(tmp_path, *scale_column(column, factor)))
 
 
 def test_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> None:

@@ -1,4 +1,4 @@
-"""A row missing from one of two joined files is detected; sound recordings raise no alarm."""
+"""Tests that a row missing from one of two joined files is detected, and that complete recordings raise no alarm."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ from reskin.errors import CaptureError
 from reskin.recordings.readers import ini
 from reskin.recordings.readers.alignment import find_change
 from reskin.seeds import rng_for
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")
 AT_END_ROWS_N = 100  # a row lost nearer to either end may go undetected
@@ -21,10 +21,10 @@ LATE_N = 1
 
 
 def synthetic_recording(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Fields and labels like those of a printer and a gauge: |dB| 70 uT, noise 25 uT, drift, one row late."""
+    """Return fields and labels like those of a printer and a gauge: |dB| 70 uT, noise 25 uT, drift, one row late."""
     rng = rng_for(seed, "lateness")
     places_mm = np.stack(np.meshgrid(np.arange(2, 19, 4.0), np.arange(2, 19, 4.0)), axis=-1).reshape(-1, 2)
-    presses_n = rng.integers(3, 8, len(places_mm))  # at each place: deeper and deeper, then one off the skin
+    presses_n = rng.integers(3, 8, len(places_mm))  # at each place: one off the skin, then deeper and deeper
     of_place = np.repeat(np.arange(len(places_mm)), presses_n)
     step = np.concatenate([np.arange(n) for n in presses_n])
     force_N = np.where(step == 0, 0.0, 0.4 * step)
@@ -48,12 +48,12 @@ def change_of(b_uT: np.ndarray, label: np.ndarray):
 
 @settings(max_examples=25)
 @given(st.integers(AT_END_ROWS_N, 1200 - AT_END_ROWS_N), st.booleans(), st.integers(0, 5))
-def test_lost_row_is_found_in_either_file(row, of_fields, seed):
+def test_lost_row_is_found_in_either_file(row, in_fields, seed):
     b_uT, label = synthetic_recording(seed)
     assert len(label) == 1200
-    change = change_of(without_row(b_uT, row), label) if of_fields else change_of(b_uT, without_row(label, row))
+    change = change_of(without_row(b_uT, row), label) if in_fields else change_of(b_uT, without_row(label, row))
     assert change is not None
-    assert change.after - change.before == (-1 if of_fields else 1)
+    assert change.after - change.before == (-1 if in_fields else 1)
     assert abs(change.row - row) <= ROW_OFF_MAX
 
 
@@ -77,12 +77,12 @@ def test_uninformative_fields_raise_no_alarm():
 def test_ini_recording_with_lost_row_is_refused(tmp_path):
     b_uT, label = synthetic_recording()
     chips = np.concatenate([without_row(b_uT, 700).reshape(-1, 5, 3), np.full((1200, 5, 1), 25.0)], axis=2)
-    # Values on the LSB grid of a chip, which the reader checks.
+    # The reader checks that values are on the LSB grid of a chip.
     chips[..., :3] = np.round(chips[..., :3] / [0.15, 0.15, 0.242]) * [0.15, 0.15, 0.242] + [600, -900, 1452]
     np.savetxt(tmp_path / ini.READINGS, chips.reshape(1200, -1), fmt="%.3f")
     np.savetxt(tmp_path / ini.TRUTHS, label, fmt="%.3f")
     with pytest.raises(CaptureError) as caught:
-        ini.read(tmp_path, make_header(layout="ini", chips_n=5), AS_USUAL)
+        ini.read(tmp_path, make_header(layout="ini", chips_n=5), DEFAULT_POLICY)
     message = str(caught.value)
     found = re.search(r"by 1 rows before about row (\d+), by 0 from there on. 1 row of readings seem", message)
     assert found is not None
@@ -90,7 +90,7 @@ def test_ini_recording_with_lost_row_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_public_recordings_are_sound(shared_data: Path, name):
+def test_public_recordings_are_complete(shared_data: Path, name):
     folder = shared_data / "ini"
     label = np.loadtxt(folder / f"truths_{name}.txt")
     values = np.loadtxt(folder / f"b20_{name}.txt").reshape(len(label), -1, 4)

@@ -1,4 +1,4 @@
-"""Passes are found where a synthetic protocol repeats."""
+"""Tests that passes are found where a synthetic protocol repeats."""
 
 import time
 from itertools import pairwise
@@ -12,7 +12,7 @@ from reskin.recordings.readers.alignment import find_passes
 
 
 def raster(columns_n: int, rows_n: int, presses_n: int) -> np.ndarray:
-    """One pass over a grid of 2 mm, `presses_n` rows a place."""
+    """Return one pass over a grid of 2 mm, with `presses_n` rows per place."""
     places = [(2.0 * x, 2.0 * y) for x in range(columns_n) for y in range(rows_n)]
     return np.repeat(np.array(places), presses_n, axis=0)
 

@@ -1,4 +1,4 @@
-"""Layout `table`: CSV and Parquet tables, unknown columns, and errors with their place."""
+"""Tests of layout `table`: CSV and Parquet tables, unknown columns, and errors that name their line."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ from reskin.cli import app
 from reskin.errors import CaptureError
 from reskin.recordings.readers import eflesh
 from reskin.recordings.readers import table as plain
-from tests.recordings.headers import AS_USUAL, make_header
+from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 ROOT = Path(__file__).resolve().parents[3]
 CHIPS_N = 2
@@ -42,7 +42,7 @@ def write(folder: Path) -> Path:
 
 def error_of(folder: Path) -> str:
     with pytest.raises(CaptureError) as caught:
-        plain.read(folder, make_header(layout="table", chips_n=CHIPS_N), AS_USUAL)
+        plain.read(folder, make_header(layout="table", chips_n=CHIPS_N), DEFAULT_POLICY)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -56,17 +56,17 @@ def read(folder: Path, rows: pd.DataFrame, name: str = "mine.csv"):
     capture.mkdir(exist_ok=True)
     for kept, source in files.items():
         (capture / kept).write_bytes(source.read_bytes())
-    return plain.read(capture, make_header(layout="table", chips_n=plain.count_chips(files)), AS_USUAL)
+    return plain.read(capture, make_header(layout="table", chips_n=plain.count_chips(files)), DEFAULT_POLICY)
 
 
 def test_byte_order_mark_changes_nothing(tmp_path):
-    plainly, _ = read(tmp_path / "a", table())
+    without_mark, _ = read(tmp_path / "a", table())
     table().to_csv(tmp_path / "mine.csv", index=False, encoding="utf-8-sig")
     (tmp_path / "b").mkdir()
     for kept, source in plain.collect(tmp_path / "mine.csv").items():
         (tmp_path / "b" / kept).write_bytes(source.read_bytes())
-    marked, _ = plain.read(tmp_path / "b", make_header(layout="table", chips_n=CHIPS_N), AS_USUAL)
-    np.testing.assert_array_equal(marked.b_uT, plainly.b_uT)
+    with_mark, _ = plain.read(tmp_path / "b", make_header(layout="table", chips_n=CHIPS_N), DEFAULT_POLICY)
+    np.testing.assert_array_equal(with_mark.b_uT, without_mark.b_uT)
 
 
 def test_contact_rows_become_readings_with_noload_mean(tmp_path):
@@ -122,7 +122,7 @@ def test_noload_places_may_be_empty(tmp_path):
     assert np.isfinite(readings.x_mm).all()
 
 
-def test_constant_zero_depth_is_no_depth(tmp_path):
+def test_constant_zero_depth_is_unknown(tmp_path):
     still, account = read(tmp_path / "still", table().assign(depth_mm=0.0))
     assert np.isnan(still.depth_mm).all()
     assert account["no_depth_rows_n"] == len(still)
@@ -159,13 +159,13 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("what", MISTAKES)
-def test_error_names_the_place(tmp_path, what):
+def test_error_names_the_line_or_column(tmp_path, what):
     change, message = MISTAKES[what]
     with pytest.raises(CaptureError, match=re.escape(message)):
         read(tmp_path, change(table()))
 
 
-def test_conversion_script_of_the_docs(tmp_path, shared_data, monkeypatch):
+def test_conversion_script_of_the_docs_reads_like_eflesh(tmp_path, shared_data, monkeypatch):
     recording = shared_data / "eflesh/normal_force/20250401_014340_probe"
     script = re.search(r"```python\n(import pandas as pd.*?)```", (ROOT / "data/README.md").read_text(), re.DOTALL)
     for file in recording.glob("*.csv"):
@@ -175,7 +175,7 @@ def test_conversion_script_of_the_docs(tmp_path, shared_data, monkeypatch):
     ours, _ = read(tmp_path, pd.read_csv("mine.csv"))
     chips_n = eflesh.count_chips(eflesh.collect(recording))
     header = make_header(layout="eflesh", chips_n=chips_n, options={"force_axis": "z"})
-    theirs, _ = eflesh.read(recording, header, AS_USUAL)
+    theirs, _ = eflesh.read(recording, header, DEFAULT_POLICY)
     np.testing.assert_allclose(ours.b_uT, theirs.b_uT, rtol=1e-6)
     np.testing.assert_allclose(ours.noload_uT, theirs.noload_uT, rtol=1e-4, atol=1e-2)
     np.testing.assert_allclose(ours.x_mm, theirs.x_mm, atol=1e-3)
@@ -190,10 +190,10 @@ def test_template_is_the_header_line(tmp_path):
     capture.mkdir()
     (capture / plain.CSV).write_text(out.read_text())
     with pytest.raises(CaptureError, match="rows of phase contact"):
-        plain.read(capture, make_header(layout="table", chips_n=3), AS_USUAL)
+        plain.read(capture, make_header(layout="table", chips_n=3), DEFAULT_POLICY)
 
 
-def test_passes_from_repeats_or_column(tmp_path):
+def test_passes_come_from_repeats_or_the_column(tmp_path):
     one = table(presses_n=9)
     three = pd.concat([one] * 3, ignore_index=True)
     found, account = read(tmp_path / "found", three)

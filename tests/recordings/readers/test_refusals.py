@@ -1,4 +1,4 @@
-"""Invalid files of every layout: random bytes, no rows, cut lines."""
+"""Tests that every layout refuses invalid files: random bytes, no rows, truncated lines."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,19 +30,21 @@ def refuse(folder: Path, layout: str, name: str, change: Callable[[bytes], bytes
 
 @pytest.mark.parametrize(("layout", "name"), FILES)
 @pytest.mark.parametrize("content", ROWLESS, ids=repr)
-def test_file_without_rows(tmp_path: Path, layout: str, name: str, content: bytes) -> None:
+def test_file_without_rows_is_refused(tmp_path: Path, layout: str, name: str, content: bytes) -> None:
     assert name in refuse(tmp_path, layout, name, lambda _: content)
 
 
 @settings(max_examples=100, deadline=None)
 @given(content=st.binary(max_size=200), file=st.sampled_from(FILES))
-def test_random_bytes(tmp_path_factory: pytest.TempPathFactory, content: bytes, file: tuple[str, str]) -> None:
+def test_random_bytes_are_refused(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes, file: tuple[str, str]
+) -> None:
     refuse(tmp_path_factory.mktemp("random"), *file, lambda _: content)
 
 
 @settings(max_examples=120, deadline=None)
 @given(data=st.data(), file=st.sampled_from(FILES))
-def test_file_cut_within_a_line(
+def test_file_truncated_within_a_line_is_refused(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, file: tuple[str, str]
 ) -> None:
     def cut(whole: bytes) -> bytes:

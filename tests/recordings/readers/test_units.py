@@ -1,4 +1,4 @@
-"""Checks of units: implausible values are refused."""
+"""Tests of the checks of units, which refuse implausible values."""
 
 from typing import get_args
 
@@ -22,7 +22,7 @@ BOARDS_uT = {"ini": (0.15, 400.0), "lab": (0.2, 1500.0), "eflesh": (2.4, 9000.0)
 
 
 def fields_uT(step_uT: float, usual_uT: float, seed: int = 0) -> np.ndarray:
-    """1000 noisy rows of five chips whose field has about the usual size."""
+    """Return 1000 noisy rows of five chips whose fields have about the size `usual_uT`."""
     rng = seeds.rng_for(seed, "fields")
     axes = rng.standard_normal((5, 3))
     rest_uT = usual_uT * axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -43,9 +43,9 @@ def test_skin_field_passes_in_microtesla_only() -> None:
 def test_board_passes_in_microtesla_only(name: str, seed: int) -> None:
     b_uT = fields_uT(*BOARDS_uT[name], seed)
     check_fields(b_uT, "here", first_line_n=1)
-    for of_a_uT in (1e-2, 1e-3, 1e-6, 1e3):
+    for factor in (1e-2, 1e-3, 1e-6, 1e3):
         with pytest.raises(CaptureError, match=r"^here: field must be .* got .*uT"):
-            check_fields(of_a_uT * b_uT, "here", first_line_n=1)
+            check_fields(factor * b_uT, "here", first_line_n=1)
 
 
 def test_gauss_is_recognised_by_its_lsb_in_strong_fields() -> None:
@@ -104,11 +104,11 @@ def test_one_place_passes_with_rounding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("deepest_mm", "fine"), [(1.2, True), (0.0, True), (12.0, True), (0.0012, False), (1200, False)]
+    ("deepest_mm", "accepted"), [(1.2, True), (0.0, True), (12.0, True), (0.0012, False), (1200, False)]
 )
-def test_depths_pass_in_millimetres_only(deepest_mm: float, fine: bool) -> None:
+def test_depths_pass_in_millimetres_only(deepest_mm: float, accepted: bool) -> None:
     depth_mm = np.array([0.0, deepest_mm / 2, deepest_mm, np.nan])
-    if fine:
+    if accepted:
         check_depths(depth_mm, "here")
     else:
         with pytest.raises(CaptureError, match="^here: depth must be 0.05 to 100 mm where it is greatest"):
