@@ -1,6 +1,6 @@
-"""Benchmarks. `make bench` runs them at full size; in the test suite each runs at a tiny size, so that none rots.
+"""Benchmarks. `make bench` runs them at full size; the test suite runs each at a tiny size, so that it keeps working.
 
-Sizes are written `size(FULL, TINY)`. What is asserted about times or learnt results is asserted at full size only.
+Sizes are written `size(FULL, TINY)`. Times and learnt results are asserted at full size only.
 """
 
 import os

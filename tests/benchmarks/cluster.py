@@ -1,7 +1,8 @@
-"""The same sweep of trainings here and on a Dask cluster in network namespaces, with what goes wrong there.
+"""Run one sweep of training runs on this machine and on a Dask cluster in network namespaces, including failures.
 
-make cluster-test, as root (namespaces), or python -m tests.benchmarks.cluster. The programs are those that deploy/
-starts on SLURM and Kubernetes (deploy/dask.sh). Tables -> docs/measured/cluster.md, scaling.md and scaling.svg.
+Run `make cluster-test` or `python -m tests.benchmarks.cluster` as root, which network namespaces need. The programs
+are those that deploy/ starts on SLURM and Kubernetes (deploy/dask.sh). Writes docs/measured/cluster.md, scaling.md and
+scaling.svg.
 """
 
 import argparse
@@ -20,19 +21,19 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.cluster_sweep import STEPS_N, TASKS_N
-from tests.benchmarks.namespaces import Node, kill, network, why_not
+from tests.benchmarks.namespaces import Node, kill, network, unsupported_reason
 from tests.benchmarks.scaling import Measurements, write_scaling
 from tests.benchmarks.steps import ROOT, Steps, end_on_signals, require
 
 WORKERS = ("w1", "w2", "w3")
 PORT = 8786
 STARTED_MAX_s, SWEEP_MAX_s = 240.0, 900.0
-DUTY_s = (1.5, 0.5)  # a slow machine: stopped, running
+DUTY_s = (1.5, 0.5)  # a slow machine is stopped, then runs
 SWEEP = [sys.executable, "-W", "ignore", "-m", "tests.benchmarks.cluster_sweep"]
 
 
 class Sweep:
-    """A sweep that runs or has run, and what it left in its folder."""
+    """A running or finished sweep and the files in its folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -48,17 +49,17 @@ class Sweep:
         self.found = json.loads((self.folder / "found.json").read_text())
         return self
 
-    def per_worker(self) -> Counter[str]:
+    def tasks_per_worker(self) -> Counter[str]:
         return Counter(line[2] for line in self.lines("ended"))
 
     def task_s(self) -> list[float]:
-        """Give the seconds of CPU of each task but the first, which loads the libraries."""
+        """Return the CPU seconds of each task except the first, which loads the libraries."""
         begun = {(name, by): float(at) for _, name, by, at in self.lines("begun")}
         return [float(at) - begun[name, by] for _, name, by, at in self.lines("ended")][1:]
 
 
 class Cluster:
-    """A scheduler, workers and a user, each on an address of its own, by deploy/dask.sh."""
+    """A scheduler, workers and a user, each with its own address, started by deploy/dask.sh."""
 
     def __init__(self, nodes: Mapping[str, Node], folder: Path) -> None:
         self._nodes, self._folder = nodes, folder
@@ -76,14 +77,14 @@ class Cluster:
         self.wait_for(len(WORKERS))
 
     def wait_for(self, workers_n: int) -> None:
-        """Wait until so many workers are there, as the user sees it."""
+        """Wait until the user can reach this many workers."""
         words = (
             f"from distributed import Client as C; C({self.address!r}, timeout=60).wait_for_workers({workers_n}, 120)"
         )
         process = self._nodes["user"].popen(
             [sys.executable, "-W", "ignore", "-c", words], self._folder / "wait.log", ROOT
         )
-        require(process.wait(STARTED_MAX_s) == 0, f"{workers_n} workers did not come: {self._folder}/wait.log")
+        require(process.wait(STARTED_MAX_s) == 0, f"{workers_n} workers did not start: see {self._folder}/wait.log")
 
     def end(self, name: str) -> None:
         kill(self.up.pop(name))
@@ -105,8 +106,8 @@ def sweep_here(folder: Path, place: str) -> Sweep:
     return Sweep(folder).read()
 
 
-def ended(process: subprocess.Popen[bytes], folder: Path) -> Sweep:
-    """Wait for a sweep on the cluster, which must end well."""
+def wait_for_sweep(process: subprocess.Popen[bytes], folder: Path) -> Sweep:
+    """Wait for a sweep on the cluster, which must succeed."""
     process.wait(SWEEP_MAX_s)
     require(process.returncode == 0, (folder / "said.txt").read_text()[-600:])
     return Sweep(folder).read()
@@ -120,53 +121,55 @@ def wait_until(ready: Any, seconds: float, what: str) -> None:
         time.sleep(0.05)
 
 
-def locally(steps: Steps, folder: Path) -> dict[str, Sweep]:
+def sweep_locally(steps: Steps, folder: Path) -> dict[str, Sweep]:
     found = {}
     for place in ("here", "processes:1", "processes:2"):
-        with steps.step(f"`{place}`, on this machine") as see:
+        with steps.step(f"`{place}`, on this machine") as note:
             sweep = found[place] = sweep_here(folder / place, place)
-            see(f"{len(sweep.lines('ended'))} tasks, sweep {sweep.found['sweep_s']:.1f} s")
+            note(f"{len(sweep.lines('ended'))} tasks, sweep {sweep.found['sweep_s']:.1f} s")
             require(sweep.found["sha256"] == found["here"].found["sha256"], "bytes differ")
     return found
 
 
-def whole(steps: Steps, cluster: Cluster, nodes: Mapping[str, Node], folder: Path, expected: str) -> Sweep:
-    """The sweep on three workers: same bytes; what came to each."""
-    with steps.step("three workers") as see:
+def sweep_on_three_workers(
+    steps: Steps, cluster: Cluster, nodes: Mapping[str, Node], folder: Path, expected: str
+) -> Sweep:
+    """Run the sweep on three workers: equal bytes, and the bytes that each worker received."""
+    with steps.step("three workers") as note:
         before = {name: nodes[name].received_bytes() for name in WORKERS}
-        sweep = ended(cluster.sweep(folder / "whole", "--empty"), folder / "whole")
+        sweep = wait_for_sweep(cluster.sweep(folder / "whole", "--empty"), folder / "whole")
         require(sweep.found["sha256"] == expected, "bytes differ")
         came = {name: nodes[name].received_bytes() - before[name] for name in WORKERS}
-        ran = sweep.per_worker()
+        ran = sweep.tasks_per_worker()
         sweep.found["received_bytes"] = sum(came.values())
         require(len(sweep.lines("begun")) == TASKS_N, f"begun {len(sweep.lines('begun'))}")
-        see(f"{TASKS_N} tasks, by worker {sorted(ran.values())}; received kB by worker "
+        note(f"{TASKS_N} tasks, by worker {sorted(ran.values())}; received kB by worker "
             f"{sorted(round(n / 1e3) for n in came.values())}; equal bytes")  # fmt: skip
         reads = Counter(line[1] for line in sweep.lines("read"))
         require(set(reads.values()) <= {1}, f"rows read {reads}")
-        see(f"rows ({sweep.found['rows_bytes'] / 1e6:.1f} MB) read once by each of {len(reads)} workers")
+        note(f"rows ({sweep.found['rows_bytes'] / 1e6:.1f} MB) read once by each of {len(reads)} workers")
     return sweep
 
 
-def killed_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> Sweep:
-    with steps.step("a worker is killed during the sweep (SIGKILL)") as see:
+def kill_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> Sweep:
+    with steps.step("a worker is killed during the sweep (SIGKILL)") as note:
         process, at = cluster.sweep(folder / "killed"), Sweep(folder / "killed")
         wait_until(lambda: len(at.lines("ended")) >= 3, SWEEP_MAX_s, "three tasks")
         cluster.end("w1")
         ended_n = len(at.lines("ended"))
-        sweep = ended(process, folder / "killed")
+        sweep = wait_for_sweep(process, folder / "killed")
         begun_n = len(sweep.lines("begun"))
         require(sweep.found["sha256"] == expected, "bytes differ")
         require(begun_n <= TASKS_N + 1, f"{begun_n} tasks begun")
-        see(f"after {ended_n} of {TASKS_N} tasks; {begun_n - TASKS_N} tasks ran twice; equal bytes")
+        note(f"after {ended_n} of {TASKS_N} tasks; {begun_n - TASKS_N} tasks ran twice; equal bytes")
     cluster.start("w1")
     cluster.wait_for(len(WORKERS))
     return sweep
 
 
-def restarted_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
+def restart_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
     place = folder / "restarted"
-    with steps.step("the scheduler is killed during the sweep") as see:
+    with steps.step("the scheduler is killed during the sweep") as note:
         process, at = cluster.sweep(place), Sweep(place)
         wait_until(lambda: len(at.lines("ended")) >= 4, SWEEP_MAX_s, "four tasks")
         cluster.end("scheduler")
@@ -174,22 +177,22 @@ def restarted_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: 
         process.wait(120)
         said = (place / "said.txt").read_text().splitlines()[-1]
         require(process.returncode == 1 and "Finished trainings are cached" in said, said)
-        see(f"after {time.monotonic() - start_s:.1f} s: `{said}`")
+        note(f"after {time.monotonic() - start_s:.1f} s: `{said}`")
         cluster.end_all()
-    with steps.step("restart scheduler and workers, repeat the command") as see:
+    with steps.step("restart scheduler and workers, repeat the command") as note:
         finished = {line[1] for line in at.lines("ended")}
         before_n = len(at.lines("begun"))
         cluster.start_all()
-        sweep = ended(cluster.sweep(place), place)
+        sweep = wait_for_sweep(cluster.sweep(place), place)
         again = [line[1] for line in sweep.lines("begun")[before_n:]]
-        require(not finished & {*again}, "a finished training ran again")
+        require(not finished & {*again}, "a finished training run was repeated")
         require(sweep.found["sha256"] == expected, "bytes differ")
-        see(f"{len(finished)} tasks were finished, {len(again)} of {TASKS_N} ran; equal bytes")
+        note(f"{len(finished)} tasks were finished, {len(again)} of {TASKS_N} ran; equal bytes")
 
 
 @contextmanager
-def slowed(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """Let a worker run for a quarter of the time."""
+def slow_down(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Let a worker run for a quarter of the time only."""
     done = threading.Event()
 
     def stop_and_go() -> None:
@@ -207,12 +210,15 @@ def slowed(process: subprocess.Popen[bytes]) -> Iterator[None]:
         thread.join()
 
 
-def slow_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
-    with steps.step("one worker four times as slow (stopped for 1.5 s of every 2 s)") as see, slowed(cluster.up["w2"]):
-        sweep = ended(cluster.sweep(folder / "slow"), folder / "slow")
+def sweep_with_slow_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
+    with (
+        steps.step("one worker four times as slow (stopped for 1.5 s of every 2 s)") as note,
+        slow_down(cluster.up["w2"]),
+    ):
+        sweep = wait_for_sweep(cluster.sweep(folder / "slow"), folder / "slow")
         require(sweep.found["sha256"] == expected, "bytes differ")
-        by_worker = sorted(sweep.per_worker().values())
-        see(f"sweep {sweep.found['sweep_s']:.1f} s, tasks by worker {by_worker}; equal bytes")
+        by_worker = sorted(sweep.tasks_per_worker().values())
+        note(f"sweep {sweep.found['sweep_s']:.1f} s, tasks by worker {by_worker}; equal bytes")
 
 
 SRUN = """#!/bin/sh
@@ -223,15 +229,15 @@ wait
 """
 
 
-def slurm_script(steps: Steps, folder: Path, expected: str) -> None:
-    """Run the SLURM script as a job of three tasks on this machine; only `srun` is a stand-in."""
+def run_slurm_script(steps: Steps, folder: Path, expected: str) -> None:
+    """Run the SLURM script as a job of three tasks on this machine, with a substitute for `srun`."""
     place, srun = folder / "slurm", folder / "bin/srun"
     srun.parent.mkdir()
     srun.write_text(SRUN)
     srun.chmod(0o755)
     job = {"SLURM_SUBMIT_DIR": str(ROOT), "SLURM_JOB_ID": str(os.getpid()), "SLURM_NTASKS": "3"}
     environment = {**os.environ, **job, "PATH": f"{srun.parent}:{os.environ['PATH']}"}
-    with steps.step("`deploy/slurm/reskin.sbatch` with a substitute for `srun`, two workers") as see:
+    with steps.step("`deploy/slurm/reskin.sbatch` with a substitute for `srun`, two workers") as note:
         words = ["bash", str(ROOT / "deploy/slurm/reskin.sbatch"), *SWEEP, str(place)]
         with (folder / "slurm.log").open("wb") as said:
             process = subprocess.Popen(words, env=environment, stdout=said, stderr=said, start_new_session=True)
@@ -242,48 +248,51 @@ def slurm_script(steps: Steps, folder: Path, expected: str) -> None:
         require(code == 0, (folder / "slurm.log").read_text()[-600:])
         sweep = Sweep(place).read()
         require(sweep.found["sha256"] == expected, "bytes differ")
-        see(f"tasks by worker {sorted(sweep.per_worker().values())}; equal bytes")
+        note(f"tasks by worker {sorted(sweep.tasks_per_worker().values())}; equal bytes")
 
 
-def play(steps: Steps, folder: Path) -> Measurements:
-    local = locally(steps, folder)
+def run_steps(steps: Steps, folder: Path) -> Measurements:
+    local = sweep_locally(steps, folder)
     expected = local["here"].found["sha256"]
     with ExitStack() as down:
         nodes = down.enter_context(network(["scheduler", "user", *WORKERS]))
         cluster = Cluster(nodes, folder)
         down.callback(cluster.end_all)
-        with steps.step("scheduler, user and three workers, each in a network namespace") as see:
+        with steps.step("scheduler, user and three workers, each in a network namespace") as note:
             cluster.start_all()
-            see(", ".join(f"{name} {node.address}" for name, node in nodes.items()))
-        sweep = whole(steps, cluster, nodes, folder, expected)
-        warm = killed_worker(steps, cluster, folder, expected)
-        restarted_scheduler(steps, cluster, folder, expected)
-        slow_worker(steps, cluster, folder, expected)
-    slurm_script(steps, folder, expected)
+            note(", ".join(f"{name} {node.address}" for name, node in nodes.items()))
+        sweep = sweep_on_three_workers(steps, cluster, nodes, folder, expected)
+        warm = kill_worker(steps, cluster, folder, expected)
+        restart_scheduler(steps, cluster, folder, expected)
+        sweep_with_slow_worker(steps, cluster, folder, expected)
+    run_slurm_script(steps, folder, expected)
     seconds = {place: found.found["sweep_s"] for place, found in local.items()}
-    first = [line for line in sweep.lines("begun")]
+    begun = sweep.lines("begun")
     return Measurements(
         task_s=tuple(local["here"].task_s()), processes_s=(seconds["processes:1"], seconds["processes:2"]),
         call_s=sweep.found["empty_s"], connect_s=warm.found["connect_s"], rows_bytes=sweep.found["rows_bytes"],
-        task_bytes=sweep.found["received_bytes"] / len(first),
+        task_bytes=sweep.found["received_bytes"] / len(begun),
     )  # fmt: skip
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "docs/measured")
-    parser.add_argument("--keep", type=Path, help="work in this folder, and leave it there")
-    asked = parser.parse_args()
-    if reason := why_not():
-        print(f"not tested: network namespaces need root on Linux and `ip`; here: {reason}.")
+    parser.add_argument("--keep", type=Path, help="work in this folder and keep it")
+    arguments = parser.parse_args()
+    if reason := unsupported_reason():
+        print(f"not tested: network namespaces need root on Linux and the command `ip`; on this machine: {reason}.")
         return
     end_on_signals()
     steps = Steps()
     with ExitStack() as kept:
-        folder = asked.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
-        measurements = play(steps, folder.resolve())
-    steps.write(asked.out / "cluster.md", f"`make cluster-test`: {TASKS_N} tasks of three trainings, {STEPS_N} steps.")
-    write_scaling(measurements, asked.out)
+        folder = arguments.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
+        measurements = run_steps(steps, folder.resolve())
+    steps.write(
+        arguments.out / "cluster.md",
+        f"`make cluster-test`: {TASKS_N} tasks of three training runs, {STEPS_N} steps each.",
+    )
+    write_scaling(measurements, arguments.out)
 
 
 if __name__ == "__main__":

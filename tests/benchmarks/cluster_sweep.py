@@ -1,6 +1,7 @@
-"""One sweep of trainings by RESKIN_EXECUTOR, with a note of every task that was begun: `python -m ... FOLDER`.
+"""Run one sweep of training runs on RESKIN_EXECUTOR and log every task: `python -m ... FOLDER`.
 
-Run by cluster.py, here or in a network namespace. Out: FOLDER/found.json, and FOLDER/ran.txt, a line a task.
+cluster.py runs it on this machine and in network namespaces. Writes the results to FOLDER/found.json and the log of
+tasks to FOLDER/ran.txt.
 """
 
 import hashlib
@@ -27,21 +28,21 @@ TASKS_N = SEEDS_N * BOARDS_N // 3  # stacks of three
 EMPTY_N = 300
 
 
-class Noted(Executor):
-    """Passes calls on to an executor, and has each of them noted where it runs."""
+class LoggingExecutor(Executor):
+    """Executor that forwards calls to another one; each call is logged where it runs."""
 
     def __init__(self, inner: Executor, log: Path) -> None:
         self._inner, self._log = inner, log
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        return self._inner.submit(noted, self._log, fn, *args, **kwargs)
+        return self._inner.submit(call_and_log, self._log, fn, *args, **kwargs)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._inner.shutdown(wait=wait, cancel_futures=cancel_futures)
 
 
-def noted(log: Path, fn: Callable[..., Any], *args: Any) -> Any:
-    """Call, and write when it began and ended, by whom, with the seconds of CPU that its process has had."""
+def call_and_log(log: Path, fn: Callable[..., Any], *args: Any) -> Any:
+    """Call a function and log its begin and end, each with the process id and the CPU seconds of that process."""
     name = hashlib.sha256(repr(args[-1]).encode()).hexdigest()[:8]
     _note(log, "begun", name)
     before_n = _read_rows.cache_info().misses
@@ -53,15 +54,15 @@ def noted(log: Path, fn: Callable[..., Any], *args: Any) -> Any:
 
 
 def _note(log: Path, word: str, name: str) -> None:
-    with log.open("a") as stream:  # one short line: written whole beside those of others
+    with log.open("a") as stream:  # a line this short is appended atomically while other processes write
         stream.write(f"{word} {name} {os.getpid()} {time.process_time():.4f}\n")
 
 
-def nothing() -> None:
-    """The task that shows what a task costs beside its work."""
+def empty_task() -> None:
+    """Do nothing, to time the overhead of a task."""
 
 
-def measured() -> TrainingData:
+def make_rows() -> TrainingData:
     rng = rng_for(0, "cluster")
     place_mm = 2.0 * rng.integers(0, 9, (ROWS_N, 2))
     target = np.column_stack([place_mm, rng.uniform(0, 3, ROWS_N)])
@@ -69,7 +70,7 @@ def measured() -> TrainingData:
     return TrainingData(db_uT.astype(np.float32), target.astype(np.float32), np.arange(ROWS_N) * BOARDS_N // ROWS_N)
 
 
-def jobs(rows: TrainingData) -> list[TrainingJob]:
+def make_jobs(rows: TrainingData) -> list[TrainingJob]:
     recipe = Recipe(
         architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=128,
         rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
@@ -85,20 +86,20 @@ def jobs(rows: TrainingData) -> list[TrainingJob]:
 def main() -> None:
     folder, empty = Path(sys.argv[1]).resolve(), "--empty" in sys.argv
     folder.mkdir(parents=True, exist_ok=True)
-    rows, start_s = measured(), time.monotonic()
+    rows, start_s = make_rows(), time.monotonic()
     found: dict[str, object] = {}
     with make_executor(imports="reskin.models.train") as executor:
-        connected_s = time.monotonic()
-        executor.submit(nothing).result()  # local workers have loaded what tasks need
+        connect_end_s = time.monotonic()
+        executor.submit(empty_task).result()  # local workers have imported their modules
         ready_s = time.monotonic()
-        noting = Noted(executor, folder / "ran.txt")
-        done = run_jobs(jobs(rows), rows, executor=noting, cache=folder / "cells", log=lambda line: None)
-        swept_s = time.monotonic()
+        logged = LoggingExecutor(executor, folder / "ran.txt")
+        done = run_jobs(make_jobs(rows), rows, executor=logged, cache=folder / "cells", log=lambda line: None)
+        sweep_end_s = time.monotonic()
         if empty:
-            for future in [executor.submit(nothing) for _ in range(EMPTY_N)]:
+            for future in [executor.submit(empty_task) for _ in range(EMPTY_N)]:
                 future.result()
-            found["empty_s"] = (time.monotonic() - swept_s) / EMPTY_N
-    found |= {"connect_s": connected_s - start_s, "sweep_s": swept_s - ready_s}
+            found["empty_s"] = (time.monotonic() - sweep_end_s) / EMPTY_N
+    found |= {"connect_s": connect_end_s - start_s, "sweep_s": sweep_end_s - ready_s}
     digest = hashlib.sha256()
     for trained in done:
         for name in sorted(trained.weights):
@@ -107,7 +108,7 @@ def main() -> None:
     end_workers()
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     found |= {"sha256": digest.hexdigest(), "children_cpu_s": used.ru_utime + used.ru_stime}
-    numbers_n = BOARDS_N * ROWS_N  # each row is trained or tested on in each fold
+    numbers_n = BOARDS_N * ROWS_N  # each fold uses each row for training or for testing
     found["rows_bytes"] = sum(part.nbytes for part in (rows.db_uT, rows.target, rows.skin)) + 8 * numbers_n
     (folder / "found.json").write_text(json.dumps(found))
 

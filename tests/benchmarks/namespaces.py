@@ -1,6 +1,7 @@
 """A small network on one machine: network namespaces, each with its own address, on one bridge.
 
-Programs run in them by name. It needs root and `ip`; the context manager removes everything at its end.
+Each namespace runs programs as if it were a machine. Needs root and the command `ip`; the context manager removes
+all namespaces on exit.
 """
 
 import os
@@ -15,8 +16,8 @@ from pathlib import Path
 SUBNET = "10.77.31"
 
 
-def why_not() -> str | None:
-    """Say what keeps this machine from having network namespaces; None if nothing does."""
+def unsupported_reason() -> str | None:
+    """Return why this machine cannot make network namespaces, or None if it can."""
     if shutil.which("ip") is None:
         return "command `ip` (package iproute2) is not installed"
     done = subprocess.run(["unshare", "--net", "true"], capture_output=True, text=True, check=False)
@@ -30,20 +31,20 @@ class Node:
         self.namespace, self.address = namespace, address
 
     def popen(self, words: Sequence[str], log: Path, folder: Path) -> subprocess.Popen[bytes]:
-        """Start a program there, with a process group of its own."""
+        """Start a program on this node, in its own process group."""
         with log.open("ab") as said:
             command = ["ip", "netns", "exec", self.namespace, *words]
             return subprocess.Popen(command, stdout=said, stderr=said, cwd=folder, start_new_session=True)
 
     def received_bytes(self) -> int:
-        """Read how many bytes have come to it."""
+        """Return the number of bytes that this node has received."""
         file = "/sys/class/net/eth0/statistics/rx_bytes"
         return int(subprocess.check_output(["ip", "netns", "exec", self.namespace, "cat", file]))
 
 
 @contextmanager
 def network(names: Sequence[str]) -> Iterator[dict[str, Node]]:
-    """Make machines that reach each other, and nothing else."""
+    """Make machines that reach only each other."""
     tag = f"reskin-{uuid.uuid4().hex[:6]}"
     with ExitStack() as down:
 

@@ -1,8 +1,8 @@
 """Simulate 1 to 256 workers from measured times and sizes: where more workers stop helping, and why.
 
-Reads the measurements of cluster.py and the times of each stage's trainings (reports/<scene>/provenance.json); writes a
-table and a figure. The simulation is event by event: one client sends tasks one after another over one network, each
-worker reads the rows once, and tasks take as long as those of the stages, with the measured spread.
+Reads the measurements of cluster.py and the times of each stage's training runs (reports/<scene>/provenance.json);
+writes a table and a figure. In this discrete-event simulation one client sends tasks one after another over one
+network, each worker reads the rows once, and a task takes the time of a task of its stage, with the measured spread.
 """
 
 import heapq
@@ -23,50 +23,50 @@ from tests.benchmarks.steps import ROOT
 
 WORKERS_N = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 NETWORK_bytes_s = 1.25e8  # assumed: 1 Gbit/s, shared by all workers
-WIDE_N = 10_000  # tasks of a sweep that is wide enough for any of these
+WIDE_N = 10_000  # tasks of a sweep that keeps any of these numbers of workers busy
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Of the cluster test: seconds of single tasks, of the sweep on one and two processes, of the engine's parts."""
+    """Times and sizes that the cluster test measured."""
 
-    task_s: tuple[float, ...]  # of CPU
-    processes_s: tuple[float, float]
-    call_s: float  # a call that does nothing, one after another
-    connect_s: float  # of a stage to a cluster whose workers have loaded their libraries
-    rows_bytes: float  # what each worker reads once
-    task_bytes: float  # what comes to a worker for each task, all included
+    task_s: tuple[float, ...]  # CPU time of single tasks
+    processes_s: tuple[float, float]  # the sweep on one and on two processes
+    call_s: float  # an empty task, one after another
+    connect_s: float  # connecting a stage to a cluster whose workers have loaded their libraries
+    rows_bytes: float  # read once by each worker
+    task_bytes: float  # received by a worker per task, everything included
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Trainings of a stage: how many tasks, and the mean seconds of one."""
+    """The training runs of a stage: number of tasks and mean seconds per task."""
 
     tasks_n: int
     task_s: float
 
 
 def simulate(sweep: Sweep, workers_n: int, of: Measurements, spread: Sequence[float]) -> float:
-    """Give the seconds of a sweep on so many workers."""
+    """Return the seconds of a sweep on this number of workers."""
     rng = rng_for(0, "scaling", str(sweep.tasks_n))
     tasks_s = sweep.task_s * rng.choice(np.asarray(spread), sweep.tasks_n)
-    free_s, rows_there = [(of.connect_s, i) for i in range(workers_n)], set[int]()
-    handed_s = carried_s = of.connect_s
+    free_s, has_rows = [(of.connect_s, i) for i in range(workers_n)], set[int]()
+    sent_s = arrived_s = of.connect_s
     end_s = 0.0
     for task_s in tasks_s:
         at_s, worker = heapq.heappop(free_s)
-        handed_s = max(handed_s, at_s) + of.call_s
-        load_bytes = of.task_bytes + (0.0 if worker in rows_there else of.rows_bytes)
-        rows_there.add(worker)
-        carried_s = max(carried_s, handed_s) + load_bytes / NETWORK_bytes_s
-        done_s = carried_s + task_s
+        sent_s = max(sent_s, at_s) + of.call_s
+        load_bytes = of.task_bytes + (0.0 if worker in has_rows else of.rows_bytes)
+        has_rows.add(worker)
+        arrived_s = max(arrived_s, sent_s) + load_bytes / NETWORK_bytes_s
+        done_s = arrived_s + task_s
         end_s = max(end_s, done_s)
         heapq.heappush(free_s, (done_s, worker))
     return end_s
 
 
-def sweeps_of(scene: str) -> tuple[list[Sweep], float]:
-    """Read what each stage's trainings took, and the seconds of all other stages."""
+def read_sweeps(scene: str) -> tuple[list[Sweep], float]:
+    """Return the sweeps of the stages that train, and the total seconds of all other stages."""
     stages = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["runtime"]["stages"].values()
     sweeps, rest_s = [], 0.0
     for stage in stages:
@@ -79,16 +79,16 @@ def sweeps_of(scene: str) -> tuple[list[Sweep], float]:
 
 
 def write_scaling(of: Measurements, folder: Path) -> None:
-    """Write the table and the figure, and the measurements that they rest on."""
+    """Write the table, the measurements that it is based on, and the figure."""
     spread = np.asarray(of.task_s) / np.mean(of.task_s)
-    paper, rest_s = sweeps_of("paper")
+    paper, rest_s = read_sweeps("paper")
     largest = max(paper, key=lambda sweep: sweep.tasks_n)
     wide = Sweep(WIDE_N, largest.task_s)
-    quick, quick_rest_s = sweeps_of("quick")
+    quick, quick_rest_s = read_sweeps("quick")
     cases = {
         f"a sweep of {WIDE_N:,} tasks": ([wide], 0.0),
         f"largest sweep of `paper`, {largest.tasks_n} tasks": ([largest], 0.0),
-        "all trainings of `paper`": (paper, 0.0),
+        "all training runs of `paper`": (paper, 0.0),
         "`paper` in full": (paper, rest_s),
         "`quick` in full": (quick, quick_rest_s),
     }

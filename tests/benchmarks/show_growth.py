@@ -1,7 +1,7 @@
-"""The page of what time_growth measured: docs/measured/growth.json -> docs/growth.md and its figure.
+"""Write docs/growth.md and its figure from the measurements of time_growth in docs/measured/growth.json.
 
-python -m tests.benchmarks.show_growth. Two exponents: the slope in the log-log figure, in which a fixed start counts,
-and that of what grows beside it.
+Run `python -m tests.benchmarks.show_growth`. The page has two exponents: the slope in the log-log figure, which
+includes fixed costs, and the exponent of the growing part alone.
 """
 
 import json
@@ -20,28 +20,28 @@ from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 
 FIGURE = "docs/img/growth.svg"
 MANY_N = 100_000
-TOLD = 1.25  # growth from a count to the next that is more than the noise of a busy machine
-# What makes a stage's exponent what it is; a stage that is not named here fails.
+GROWTH_MIN = 1.25  # growth from one count to the next that exceeds the noise of a busy machine
+# The reason for each exponent; a stage that is missing here raises a KeyError.
 CAUSES = {
-    "ingest_simulated": "one capture after another, each by itself: bytes, Parquet",
+    "ingest_simulated": "one capture after another, independently: bytes to Parquet",
     "describe": "one skin after another; medians over skins sort them",
-    "split": "reads and stacks all rows; names of skins stand in each fold",
-    "train_multi": "steps are as many whatever the rows: reading and stacking them, and scoring each tested skin, grow",
-    "report": "an account and a row of tables a capture",
-    "dvc": "hashes what each stage reads and writes, a file at a time",
+    "split": "reads and stacks all rows; each fold lists the names of its skins",
+    "train_multi": "the number of steps is fixed; reading and stacking rows and scoring each tested skin grow",
+    "report": "one account and one table row per capture",
+    "dvc": "hashes the inputs and outputs of each stage, file by file",
     "dvc, raw captures": "hashes and stores the files of each capture",
-    "dvc, nothing to do": "looks at the time and size of every file",
+    "dvc, nothing to do": "checks the time and size of every file",
     "whole": "the sum",
-    "add one": "DVC parses the .dvc file of every capture; the registry and the plan are written anew",
-    "ingest and split all": "one capture after another in one stage, DVC's files",
-    "nothing to do": "DVC parses the .dvc file of every capture, and looks at its files",
-    "ingest one more, split": "as nothing to do; DVC hashes and stores the folder of readings anew, split reads it",
+    "add one": "DVC parses the .dvc file of every capture; the registry and the plan are rewritten",
+    "ingest and split all": "one capture after another in one stage, and DVC's files",
+    "nothing to do": "DVC parses the .dvc file of every capture and checks its files",
+    "ingest one more, split": "as `nothing to do`; DVC hashes and stores the readings again, and split reads them",
 }
 Points = list[tuple[int, float]]
 
 
 def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: str) -> dict[str, Points]:
-    """Collect a quantity of each stage by count."""
+    """Collect one quantity of each stage by count."""
     found: dict[str, Points] = {}
     for row in rows:
         for name, values in row[part].items():
@@ -51,23 +51,23 @@ def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: st
 
 
 def memory_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Points]:
-    """Take the stages' own: that of a program started here begins with what this process held."""
+    """Collect the peak memory of stages; that of a program started here would include memory of this process."""
     found = points_of(rows, "skins_n", "stages", "peak_MB")
     return {name: points for name, points in found.items() if not name.startswith("dvc") and name != "whole"}
 
 
 def slopes(points: Points) -> list[float]:
-    """Give the slope in the figure from each count to the next."""
+    """Return the slope in the figure from each count to the next."""
     steps = pairwise(points)
     return [log(after / before) / log(n / m) for (m, before), (n, after) in steps if before > 0 and after > 0]
 
 
 def exponent(points: Points) -> float | None:
-    """Solve the last three points for p in a + b n^p; None where what grows is not told from what is fixed."""
+    """Solve the last three points for p in a + b n^p; None if fixed and growing costs cannot be separated."""
     if len(points) < 3:
         return None
     (k, first), (m, second), (n, third) = points[-3:]
-    if second <= TOLD * first or third <= second:
+    if second <= GROWTH_MIN * first or third <= second:
         return None
     ratio = (third - second) / (second - first)
     return float(brentq(lambda p: (n**p - m**p) / (m**p - k**p) - ratio, 0.01, 6.0))
@@ -76,19 +76,19 @@ def exponent(points: Points) -> float | None:
 def rows_of(points: Mapping[str, Points]) -> Iterable[dict[str, str]]:
     for name, own in points.items():
         (m, before), (n, last) = own[-2:]
-        power, each = exponent(own), max(last - before, 0.0) / (n - m)
+        power, per_item = exponent(own), max(last - before, 0.0) / (n - m)
         yield {
             "what": name,
             **{f"{count:,}": short(value) for count, value in own},
             "slope, last step": f"{slopes(own)[-1]:.2f}",
             "exponent beyond the fixed start": "–" if power is None else f"{power:.2f}",
-            f"at {MANY_N:,}": short(last + each * (MANY_N - n)),
+            f"at {MANY_N:,}": short(last + per_item * (MANY_N - n)),
             "why": CAUSES[name],
         }
 
 
 def draw(panels: Mapping[str, tuple[str, Mapping[str, Points]]]) -> str:
-    """Draw quantities against counts, log-log: a panel a quantity, a colour and a marker a stage."""
+    """Plot quantities against counts, log-log: one panel per quantity, one colour and marker per stage."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.6, 3.1 * len(panels)), layout="constrained")
         for axes, (title, (count, points)) in zip(
@@ -122,7 +122,7 @@ def main() -> None:
     for title, (_, points) in of.items():
         parts += [f"**{title}**", table(list(rows_of(points)))]
     before = points_of(found["stage_each"], "captures_n", "steps", "cpu_s")
-    parts += ["**CPU seconds, recorded captures, a stage each**", table(list(rows_of(before)))]
+    parts += ["**CPU seconds, recorded captures, one stage per capture**", table(list(rows_of(before)))]
     write_block("growth.md", "growth", parts)
 
 

@@ -1,4 +1,4 @@
-"""A run in steps, each with its seconds and what was seen: a table in Markdown, printed as it grows."""
+"""Time a run step by step and print a Markdown table of seconds and results, row by row."""
 
 import os
 import platform
@@ -15,7 +15,7 @@ HEAD = "| step | seconds | result |\n|---|---|---|\n"
 
 
 class Steps:
-    """Rows of a table: what was done, how long it took, what was seen."""
+    """Table of steps: what was done, the time it took and the result."""
 
     def __init__(self) -> None:
         self.rows: list[str] = []
@@ -24,19 +24,19 @@ class Steps:
 
     @contextmanager
     def step(self, what: str) -> Iterator[Callable[[str], None]]:
-        """Time a block; what it is given is called with what was seen. A step that fails is a row too."""
-        seen, start_s = [], time.monotonic()
+        """Time a block and add its row, also if it fails; the block calls the yielded function with its results."""
+        results, start_s = [], time.monotonic()
         try:
-            yield seen.append
+            yield results.append
         except BaseException as error:
-            seen.append(f"FAILED: {type(error).__name__}: {' '.join(str(error).split())[:200]}")
+            results.append(f"FAILED: {type(error).__name__}: {' '.join(str(error).split())[:200]}")
             raise
         finally:
-            self.rows.append(f"| {what} | {time.monotonic() - start_s:.1f} | {'; '.join(seen)} |")
+            self.rows.append(f"| {what} | {time.monotonic() - start_s:.1f} | {'; '.join(results)} |")
             print(self.rows[-1], flush=True)
 
     def write(self, file: Path, title: str) -> None:
-        """Write the table, under what made it and where."""
+        """Write the table below a line with its title, the commit and the machine."""
         machine = f"{platform.machine()}, {os.cpu_count()} shared cores, Python {platform.python_version()}"
         file.parent.mkdir(parents=True, exist_ok=True)
         words = f"{title} Commit {self._commit}, {machine}, load {os.getloadavg()[0]:.1f} at the end.\n\n"
@@ -44,11 +44,11 @@ class Steps:
 
 
 def end_on_signals() -> None:
-    """Let SIGTERM end this process as Ctrl-C does, so that what it started ends with it."""
+    """Let SIGTERM end this process as Ctrl-C does, so that its child processes are stopped too."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
 
 
 def require(condition: bool, what: str) -> None:
-    """Fail a step where an `assert` could be switched off."""
+    """Fail a step, also under `python -O`, which removes `assert`."""
     if not condition:
         raise AssertionError(what)

@@ -1,7 +1,7 @@
-"""What a team does, for real, on loopback: PostgreSQL, MLflow, DVC remotes, two people's recordings merged.
+"""Run the workflow of a team on loopback: PostgreSQL, MLflow, DVC remotes, recordings of two people merged.
 
-make teams, or python -m tests.benchmarks.teams. Starts its servers and ends them, after a failure too; all files lie
-in a folder of their own, which goes at the end. A table of what was done, with seconds -> docs/measured/teams.md.
+Run `make teams` or `python -m tests.benchmarks.teams`. Starts its own servers and stops them, also after a failure; all
+files are in one temporary folder. Writes a table of the steps with their seconds to docs/measured/teams.md.
 """
 
 import argparse
@@ -42,7 +42,7 @@ RAN, KEPT = re.compile(r"^Running stage '(.*?)(?:@.*)?'", re.M), re.compile(r"di
 
 
 class Clone:
-    """One person's clone of the team's repository, with this environment."""
+    """One person's clone of the team's repository, with the virtual environment of this process."""
 
     def __init__(self, folder: Path, origin: Path, variables: Mapping[str, str]) -> None:
         self.folder = folder
@@ -60,14 +60,14 @@ class Clone:
         return run([sys.executable, "-m", "pipeline", *words], self.folder, self._variables)
 
     def add(self, skin_i: int) -> None:
-        """Add one skin on a board of its own: a simulated one, as a plain table of readings."""
+        """Add a simulated skin on its own board, as a plain table of readings."""
         file = self.folder.parent / f"skin{skin_i}.csv"
         recording(skin_i).to_csv(file, index=False)
         labels = ["--board", f"board{skin_i}", "--skin", f"skin{skin_i}", "--scene", SCENE]
         self.reskin("add", str(file), "--layout", "table", *labels)
 
     def repro(self) -> Counter[str]:
-        """Run what is to be run; give the stages that ran, by name."""
+        """Run `dvc repro`; return how often each stage ran."""
         return Counter(RAN.findall(self.dvc("repro")))
 
     def commit(self, sentence: str) -> None:
@@ -83,7 +83,7 @@ def run(words: list[str], folder: Path, variables: Mapping[str, str], *, check: 
 
 
 def recording(skin_i: int) -> pd.DataFrame:
-    """81 places, two depths: a row at rest before each touch."""
+    """Simulate presses at 81 places and two depths, each after a no-load row."""
     grid = np.stack(np.meshgrid(np.arange(0, 18, 2.0), np.arange(0, 18, 2.0), [0.6, 1.2]), -1).reshape(-1, 3)
     skin = reskin.draw_skin(f"b{skin_i}_s0", seed=skin_i)
     noload_uT, b_uT, force_N = reskin.simulate_pokes(skin, grid, board=reskin.draw_board(f"b{skin_i}", seed=skin_i))
@@ -96,7 +96,7 @@ def recording(skin_i: int) -> pd.DataFrame:
 
 
 def make_origin(folder: Path, address: str) -> Path:
-    """Make the team's bare repository: this commit, one small scene, both remotes."""
+    """Make the team's bare repository with this commit, one small scene and both remotes."""
     seed = Clone(folder / "seed", ROOT, {})
     seed.git("checkout", "--quiet", "-B", "main")
     with (seed.folder / f"pipeline/scenes/{SCENE}.yaml").open("w") as stream:
@@ -112,111 +112,111 @@ def make_origin(folder: Path, address: str) -> Path:
     return origin
 
 
-def transferred(said: str) -> str:
-    """What DVC says of a push or a pull, in a few words."""
+def transfer_summary(said: str) -> str:
+    """Return the summary of a push or pull from DVC's output."""
     found = re.search(r"(\d+ files? (?:pushed|fetched)[^\n]*)|Everything is up to date", said)
-    return found[0] if found else "no message of DVC"
+    return found[0] if found else "no message from DVC"
 
 
-def words(ran: Counter[str]) -> str:
+def list_stages(ran: Counter[str]) -> str:
     return ", ".join(f"{n} {name}" if n > 1 else name for name, n in ran.items()) or "0 stages"
 
 
-def with_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) -> tuple[Clone, Clone]:
-    """Push, fresh clone, pull, nothing to run; from the S3-compatible server and from the folder."""
+def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) -> tuple[Clone, Clone]:
+    """Push, clone and pull from the S3-compatible server and from the folder; then no stage needs to run."""
     at = {"MLFLOW_TRACKING_URI": tracking}
-    with steps.step("Ana: clone, `reskin add` two skins, `dvc repro`") as see:
+    with steps.step("Ana: clone, `reskin add` two skins, `dvc repro`") as note:
         ana = Clone(folder / "ana", origin, at)
         for skin_i in (1, 2):
             ana.add(skin_i)
         ran = ana.repro()
         require(ran["train_multi"] == ran["publish"] == 1, f"ran {ran}")
-        see(f"{sum(ran.values())} stages ran")
+        note(f"{sum(ran.values())} stages ran")
         ana.commit("Add two skins")
     for remote in (REMOTE, "folder"):
-        with steps.step(f"Ana: `dvc push -r {remote}`") as see:
-            see(transferred(ana.dvc("push", "-r", remote)))
+        with steps.step(f"Ana: `dvc push -r {remote}`") as note:
+            note(transfer_summary(ana.dvc("push", "-r", remote)))
     ana.git("push", "--quiet", "origin", "main")
     fresh = []
     for remote in (REMOTE, "folder"):
-        with steps.step(f"fresh clone, `dvc pull -r {remote}`") as see:
+        with steps.step(f"fresh clone, `dvc pull -r {remote}`") as note:
             fresh.append(Clone(folder / f"fresh-{remote}", origin, at))
-            see(transferred(fresh[-1].dvc("pull", "-r", remote)))
-        with steps.step("`dvc repro` in this clone") as see:
+            note(transfer_summary(fresh[-1].dvc("pull", "-r", remote)))
+        with steps.step("`dvc repro` in this clone") as note:
             before = fresh[-1].git("status", "--porcelain")
             ran = fresh[-1].repro()
-            see(f"{sum(ran.values())} stages ran")
+            note(f"{sum(ran.values())} stages ran")
             require(not ran, f"ran {ran}")
             require(before == fresh[-1].git("status", "--porcelain") == "", "files changed")
     return ana, fresh[0]
 
 
 def merge_two(steps: Steps, ana: Clone, ben: Clone) -> None:
-    """Two people add a skin each, run, push; the second merges, and the first takes it over."""
+    """Two people each add a skin, run and push; the second merges, and the first pulls the merge."""
     for name, clone, skin_i in (("Ana", ana, 3), ("Ben", ben, 4)):
-        with steps.step(f"{name}: `reskin add` skin {skin_i}, `dvc repro`, commit, `dvc push`") as see:
+        with steps.step(f"{name}: `reskin add` skin {skin_i}, `dvc repro`, commit, `dvc push`") as note:
             clone.add(skin_i)
             ran = clone.repro()
             require(ran["ingest"] == 1, f"ran {ran}")
-            see(words(ran))
+            note(list_stages(ran))
             clone.commit(f"Add skin {skin_i}")
             clone.dvc("push")
     ana.git("push", "--quiet", "origin", "main")
-    with steps.step("Ben: `git pull`, `reskin merge`, `git commit`") as see:
+    with steps.step("Ben: `git pull`, `reskin merge`, `git commit`") as note:
         ben.git("pull", "--quiet", "--no-rebase", "origin", "main", check=False)
         conflicts = ben.git("diff", "--name-only", "--diff-filter=U").split()
         require({"dvc.lock", "data/captures.yaml", "pipeline/plan.yaml"} <= {*conflicts}, f"in conflict: {conflicts}")
-        see(f"{len(conflicts)} files in conflict, none after")
+        note(f"{len(conflicts)} files in conflict, none after")
         ben.reskin("merge")
         ben.git("commit", "--quiet", "-m", "Merge both skins")
-    with steps.step("Ben: `dvc pull`, `dvc repro`, commit, push") as see:
-        pulled = transferred(ben.dvc("pull"))
+    with steps.step("Ben: `dvc pull`, `dvc repro`, commit, push") as note:
+        pulled = transfer_summary(ben.dvc("pull"))
         ran = ben.repro()
         require(ran["ingest"] == 0, f"ran {ran}")
         require(ran["train_multi"] == 1, f"ran {ran}")
-        see(f"{pulled}; {words(ran)}; no recording is read again")
+        note(f"{pulled}; {list_stages(ran)}; no recording is read again")
         ben.commit("Results of four skins")
         ben.dvc("push")
         ben.git("push", "--quiet", "origin", "main")
-    take_over(steps, ana)
+    pull_merge(steps, ana)
 
 
-def take_over(steps: Steps, ana: Clone) -> None:
-    """Take over what somebody else merged and ran."""
-    with steps.step("Ana: `git pull`, `dvc pull`, `dvc repro`") as see:
+def pull_merge(steps: Steps, ana: Clone) -> None:
+    """Pull what somebody else merged and ran; no stage needs to run."""
+    with steps.step("Ana: `git pull`, `dvc pull`, `dvc repro`") as note:
         ana.git("pull", "--quiet", "origin", "main")
         ana.dvc("pull")
         ran = ana.repro()
         require(not ran, f"ran {ran}")
-        see("0 stages ran; 4 captures")
+        note("0 stages ran; 4 captures")
 
 
-def runs_of(tracking: str) -> pd.DataFrame:
+def search_runs(tracking: str) -> pd.DataFrame:
     mlflow.set_tracking_uri(tracking)
     return mlflow.search_runs(experiment_names=[SCENE])
 
 
-def with_mlflow(steps: Steps, ana: Clone, ben: Clone, tracking: str, database: str) -> int:
-    """Runs are in PostgreSQL, once each; a model comes back through the server; give how many runs there are."""
-    with steps.step("publish again from both clones at once") as see:
+def share_by_mlflow(steps: Steps, ana: Clone, ben: Clone, tracking: str, database: str) -> int:
+    """Check that PostgreSQL has each run once and that the server returns a model; return the number of runs."""
+    with steps.step("publish again from both clones at once") as note:
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(lambda clone: clone.reskin("publish"), (ana, ben)))
-        runs = runs_of(tracking)
+        runs = search_runs(tracking)
         current = runs[(runs["tags.kind"] == "training") & (runs["tags.current"] == "true")]
-        require(runs["tags.run_key"].is_unique, "a result stands there twice")
-        require(len(current) == 4, f"{len(current)} current trainings")
-        see(f"{len(runs)} MLflow runs, no duplicates, {len(current)} current trainings")
-    with steps.step("query PostgreSQL") as see:
+        require(runs["tags.run_key"].is_unique, "a result was published twice")
+        require(len(current) == 4, f"{len(current)} current training runs")
+        note(f"{len(runs)} MLflow runs, no duplicates, {len(current)} current training runs")
+    with steps.step("query PostgreSQL") as note:
         rows_n = count_rows(database)
         require(rows_n == len(runs), f"{rows_n} rows, {len(runs)} runs")
-        see(f"{rows_n} rows in table runs")
-    with steps.step("load a model from the server and from its file") as see:
+        note(f"{rows_n} rows in table runs")
+    with steps.step("load a model from the server and from its file") as note:
         run_id, name = current.iloc[0][["run_id", "tags.mlflow.runName"]]
         pokes = np.random.default_rng(0).normal(0, 50, (5, 15)).astype(np.float32)
         theirs = np.asarray(mlflow.pyfunc.load_model(f"runs:/{run_id}/model").predict(pokes))
         ours = reskin.load_model(ben.folder / f"data/models/{SCENE}/train_multi/{name}.safetensors")
-        require(np.array_equal(theirs, ours.zero(np.zeros(15)).predict(pokes)), "answers differ")
-        see("same predictions")
+        require(np.array_equal(theirs, ours.zero(np.zeros(15)).predict(pokes)), "predictions differ")
+        note("same predictions")
     return rows_n
 
 
@@ -230,8 +230,8 @@ def count_rows(database: str) -> int:
         connection.close()
 
 
-def play(steps: Steps, folder: Path) -> None:
-    """All of it, in a folder; servers end with their blocks."""
+def run_steps(steps: Steps, folder: Path) -> None:
+    """Run all steps in a folder; the context managers stop the servers."""
     os.environ.update(KEYS, MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR="false")
     at, ports = [], [servers.free_port() for _ in range(3)]
     try:
@@ -244,33 +244,33 @@ def play(steps: Steps, folder: Path) -> None:
                 store = up.enter_context(servers.s3(folder / "s3", ports[2]))
                 at += [tracking, store]
                 boto3.client("s3", endpoint_url=store).create_bucket(Bucket=BUCKET)
-            ana, ben = with_remotes(steps, folder, make_origin(folder, store), tracking)
+            ana, ben = share_by_remotes(steps, folder, make_origin(folder, store), tracking)
             merge_two(steps, ana, ben)
-            rows_n = with_mlflow(steps, ana, ben, tracking, database)
-            with steps.step("restart MLflow on the same database") as see:
+            rows_n = share_by_mlflow(steps, ana, ben, tracking, database)
+            with steps.step("restart MLflow on the same database") as note:
                 down.close()
                 up.enter_context(servers.mlflow(folder / "mlflow", database, ports[1]))
-                require(len(runs_of(tracking)) == rows_n, "runs are gone")
-                see(f"{rows_n} runs, as before")
+                require(len(search_runs(tracking)) == rows_n, "runs are lost")
+                note(f"{rows_n} runs, as before")
     finally:
-        with steps.step("stop all servers") as see:
+        with steps.step("stop all servers") as note:
             left = [address.split("@")[-1] for address in at if servers.listens(address)]
-            require(not left, f"still there: {left}")
-            see(f"{len(at)} ports are closed")
+            require(not left, f"still listening: {left}")
+            note(f"{len(at)} ports are closed")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "docs/measured/teams.md")
-    parser.add_argument("--keep", type=Path, help="work in this folder, and leave it there")
-    asked = parser.parse_args()
+    parser.add_argument("--keep", type=Path, help="work in this folder and keep it")
+    arguments = parser.parse_args()
     end_on_signals()
     steps = Steps()
     with ExitStack() as kept:
-        folder = asked.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
-        folder.chmod(0o755)  # PostgreSQL's user comes through
-        play(steps, folder.resolve())
-    steps.write(asked.out, "`make teams`: two people share runs and simulated recordings, on one machine.")
+        folder = arguments.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
+        folder.chmod(0o755)  # for PostgreSQL's user
+        run_steps(steps, folder.resolve())
+    steps.write(arguments.out, "`make teams`: two people share runs and simulated recordings, on one machine.")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
-"""How much faster whole blocks decode than one frame at a time, over the same bytes in the same run.
+"""How much faster whole blocks decode than one frame at a time, for the same bytes in the same run.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_decode_benchmark.py`.
-The loops run over a tenth of the frames, and their
-time counts tenfold; every time is the best of three. Nothing but equality of the values is asserted.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_decode_benchmark.py`. The loops run over a tenth of the
+frames, and their times are scaled by ten; every time is the best of three. Only the equality of the values is asserted.
 """
 
 import io
@@ -31,12 +30,12 @@ Sample = namedtuple("Sample", "time_s, delay_s, values, device")
 
 
 def bare_loop(data: bytes) -> list[tuple[float, ...]]:
-    """Unpack frame after frame where each is known to be: no check, no array."""
+    """Unpack frames at their known positions, without checks and without arrays."""
     return [struct.unpack_from("<20f", data, first) for first in range(0, len(data), FRAME_BYTES_N)]
 
 
 def loop_to_arrays(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Unpack frame after frame, checking each end, into the arrays that a model needs."""
+    """Unpack frame after frame into the arrays that a model needs, and check the end of each frame."""
     b_uT, temperature_degC = [], []
     for first in range(0, len(data), FRAME_BYTES_N):
         frame = data[first : first + FRAME_BYTES_N]
@@ -48,13 +47,13 @@ def loop_to_arrays(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reader_loop(data: bytes) -> list[Sample]:
-    """Do for each frame what the sensor's public reader does, from memory in place of its port."""
+    """Read each frame as the sensor's public reader does, from memory instead of its port."""
     port, samples = io.BytesIO(data), []
     for _ in range(len(data) // FRAME_BYTES_N):
         start_s = time.time()
         frame = port.read(FRAME_BYTES_N)
         if frame[-2:] == b"\r\n":
-            values = struct.unpack("@{}fcc".format(4 * CHIPS_N), frame)[: 4 * CHIPS_N]  # noqa: UP032 - as it does
+            values = struct.unpack("@{}fcc".format(4 * CHIPS_N), frame)[: 4 * CHIPS_N]  # noqa: UP032 - as the reader does
             samples.append(Sample(start_s, time.time() - start_s, values, -1))
     return samples
 
@@ -77,7 +76,7 @@ def peak_MB(call: Callable[[], Any]) -> float:
 
 
 def bare_copy(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Move every value to where decoding puts it and do nothing else: what the memory itself takes."""
+    """Move every value to where decoding puts it and do nothing else: the cost of memory access alone."""
     frames = np.frombuffer(data, np.dtype([("chips", "<f4", (CHIPS_N, 4)), ("end", "V2")]))["chips"]
     return frames[:, :, 1:].reshape(len(frames), -1).copy(), frames[:, :, 0].copy()
 
@@ -99,9 +98,9 @@ def test_binary(crlf_share):
     copy_s, flat_s = best_s(lambda: bare_copy(data)), best_s(lambda: np.frombuffer(data, np.uint8).copy())
     print(f"\n{FRAMES_N} binary frames, {len(data) / 1e6:.0f} MB, {crlf_share:.0%} of values hold CR LF")
     print(f"  blocks: {ours_s:.3f} s, {FRAMES_N / ours_s:.3g} frames/s, ", end="")
-    print(f"peak {peak_MB(lambda: decode_all(data, 'binary', CHIPS_N, 'benchmark')):.0f} MB beside the bytes")
+    print(f"peak {peak_MB(lambda: decode_all(data, 'binary', CHIPS_N, 'benchmark')):.0f} MB in addition to the bytes")
     print(f"  blocks, fed {PORTION_BYTES_N} bytes at a time: {best_s(lambda: feed_in_portions(data, 'binary')):.3f} s")
-    print(f"  moving the values alone: {copy_s:.3f} s; copying the bytes as they lie: {flat_s:.3f} s")
+    print(f"  moving the values alone: {copy_s:.3f} s; copying the bytes unchanged: {flat_s:.3f} s")
     some = data[: LOOP_FRAMES_N * FRAME_BYTES_N]
     for loop in (bare_loop, reader_loop, loop_to_arrays):
         loop_s = best_s(lambda loop=loop: loop(some)) * FRAMES_N / LOOP_FRAMES_N
@@ -116,6 +115,6 @@ def test_text(wire):
     np.testing.assert_array_equal(decoded.b_uT, frames.b_uT.astype(float).round(2).astype(np.float32))
     ours_s = best_s(lambda: decode_all(data, wire, CHIPS_N, "benchmark"))
     print(f"\n{LOOP_FRAMES_N} frames of {wire}: {ours_s:.3f} s, {LOOP_FRAMES_N / ours_s:.3g} frames/s")
-    if wire == "text-xyzt":  # nothing splits the other at white space
+    if wire == "text-xyzt":  # the other format is not separated by white space
         loop_s = best_s(lambda: [[float(word) for word in line.split()] for line in data.decode().splitlines()])
         print(f"  a loop over lines and words: {loop_s:.3f} s, ratio {loop_s / ours_s:.1f}")

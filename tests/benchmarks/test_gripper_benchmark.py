@@ -1,7 +1,7 @@
-"""How well a force is held with our estimate as feedback, on a simulated skin between fingers.
+"""How well a simulated gripper holds a force with our estimate as feedback.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_gripper_benchmark.py`.
-Nothing is asserted: it prints the numbers.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_gripper_benchmark.py`, which prints the numbers. Nothing is
+asserted.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ POKES_N, SECONDS = size(600, 20), size(PERIOD_S, SETTLED_S + 0.1)
 @pytest.mark.parametrize(
     ("feedback", "aim_N"), [("network of this skin", AIM_N), ("map of simulated skins", 2 * AIM_N)]
 )
-def test_a_force_is_held(feedback, aim_N):
+def test_errors_of_the_held_force(feedback, aim_N):
     errors, within = [], []
     for seed in range(SKINS_N):
         models = [fit(seed, POKES_N)] if feedback.startswith("network") else load_universal()
@@ -31,6 +31,4 @@ def test_a_force_is_held(feedback, aim_N):
             within.append((error < 0.1).mean())
     print(f"\n{feedback}, {aim_N:g} N, {SKINS_N} skins at {len(PLACES_MM)} places each:")
     print(f"  error of the true force: median {np.median(errors):.1%}, worst {max(errors):.1%}")
-    print(
-        f"  time within 10 %: mean {np.mean(within):.0%}; all of it in {np.sum(np.array(within) == 1)} of {len(within)}"
-    )
+    print(f"  time within 10 %: mean {np.mean(within):.0%}; always in {np.sum(np.array(within) == 1)} of {len(within)}")

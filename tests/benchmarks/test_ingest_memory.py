@@ -1,8 +1,7 @@
-"""A million indentations go from bytes to Parquet in bounded memory, and a capture larger than the memory allowed.
+"""A million indentations, and a capture larger than the allowed memory, are ingested in bounded memory.
 
-Frames a second and the peak are printed.
-
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_ingest_memory.py` writes 2 GB below pytest's folder.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_ingest_memory.py`, which prints frames per second and the
+peak memory and writes 2 GB below pytest's folder.
 """
 
 import resource
@@ -25,17 +24,17 @@ from tests.benchmarks import FULL, size
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 INDENTATIONS_N = size(1_000_000, 800)
-TILE_N = size(4_000, 400)  # indentations whose bytes are written again and again
+TILE_N = size(4_000, 400)  # indentations whose bytes are written repeatedly
 QUIET_N = 400  # frames before the first and after the last
-SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # of an indentation's change of field, frame by frame
-TRAVEL_N = 8  # frames at most, at random, until the next: what the clocks are aligned by without marks
+SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # of the field change of an indentation, frame by frame
+TRAVEL_N = 8  # random number of frames until the next indentation, at most; aligns the clocks without marks
 RATE_HZ = 400.0
 ALLOWED_MB, LARGE_N, LARGE_TRAVEL_N = (
     size(800, 2000),
     size(240_000, 800),
     80,
 )  # a stream of about 1 GB, in less memory than that
-PEAK_MAX_MB = 1500  # the log of 2e6 dwells is 0.1 GB, its text 0.15 GB and what parses them the rest
+PEAK_MAX_MB = 1500  # the log of 2e6 dwells takes 0.1 GB, its text 0.15 GB, and parsing the rest
 
 
 def write_capture(folder: Path, indentations_n: int = INDENTATIONS_N, travel_n: int = TRAVEL_N) -> None:

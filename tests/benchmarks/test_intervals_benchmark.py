@@ -1,9 +1,10 @@
-"""Coverage of the nominal variant's 90 % intervals on simulated skins with errors of the law unlike those in training.
+"""Coverage of the nominal variant's 90 % intervals on simulated skins whose law errors are unlike those in training.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_intervals_benchmark.py`, three minutes of processor time. The
-network is that of scene lab, simulated alone. For each error: the misfit of the unlabelled presses; then by labels the
-coverage of map | map and network at the assumed power and at the calibrated one (half width behind it), and the
-accuracy. Asserted: larger errors widen intervals.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_intervals_benchmark.py`, three minutes of processor time.
+The network has the settings of scene lab and is trained on simulated skins alone. For each law error the benchmark
+prints the misfit of the unlabelled presses. For each number of labels it prints, for the map | for map and network, the
+coverage at the assumed power and at the calibrated power, the half width at the latter in brackets, and the accuracy.
+The test asserts that larger errors widen the intervals.
 """
 
 import numpy as np
@@ -38,7 +39,7 @@ SKINS_N, LABELS_N = size(12, 1), size((0, 5, 10, 20, 40), (0,))
 
 
 def law_error(part: float, over_mm: tuple[float, float] = training.ERROR_MM) -> LawError:
-    """As in training, but of this size and length scale."""
+    """Return the law error of training with another size and length scale."""
 
     def add(skins: Population, rng: np.random.Generator) -> np.ndarray:
         with pytest.MonkeyPatch.context() as patch:
@@ -48,20 +49,20 @@ def law_error(part: float, over_mm: tuple[float, float] = training.ERROR_MM) -> 
     return add
 
 
-def chips_mixed(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """Every chip's gain matrix is off by a quarter."""
+def mix_chips(skins: Population, rng: np.random.Generator) -> np.ndarray:
+    """Change the gain matrix of every chip by random entries with a standard deviation of 0.25."""
     gain = np.eye(3) + 0.25 * rng.standard_normal((len(skins), 5, 3, 3))
     return np.einsum("skij,snkj->snki", gain, skins.db_uT.reshape(*skins.db_uT.shape[:2], 5, 3))
 
 
-def remembered(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """A press leaves 15 % of its change of field to the next, wherever it is."""
+def add_memory(skins: Population, rng: np.random.Generator) -> np.ndarray:
+    """Subtract from each press 15 % of the field change of a random press of the skin."""
     order = [rng.permutation(skins.db_uT.shape[1]) for _ in range(len(skins))]
     return np.stack([db_uT - 0.15 * db_uT[one] for db_uT, one in zip(skins.db_uT, order, strict=True)])
 
 
-def one_by_one(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """Every press has its own error, of 0.3 of |dB| with heavy tails, uncorrelated with its neighbours."""
+def add_independent_errors(skins: Population, rng: np.random.Generator) -> np.ndarray:
+    """Add to each press an independent, heavy-tailed error of 0.3 of |dB|."""
     length_uT = np.linalg.norm(skins.db_uT, axis=2, keepdims=True) / np.sqrt(skins.db_uT.shape[2])
     return skins.db_uT + 0.3 * length_uT * rng.standard_t(3, skins.db_uT.shape)
 
@@ -69,8 +70,8 @@ def one_by_one(skins: Population, rng: np.random.Generator) -> np.ndarray:
 FAMILIES: dict[str, LawError] = {
     "nothing missed": law_error(0.0), "0.3 of |dB|": law_error(0.3), "0.5": law_error(0.5), "0.6": law_error(0.6),
     "0.8": law_error(0.8), "0.5 over 1.2 to 2 mm": law_error(0.5, (1.2, 2.0)),
-    "0.5 over 6 to 12 mm": law_error(0.5, (6.0, 12.0)), "chips mixed": chips_mixed, "remembered": remembered,
-    "one by one": one_by_one,
+    "0.5 over 6 to 12 mm": law_error(0.5, (6.0, 12.0)), "chips mixed": mix_chips, "remembered": add_memory,
+    "one by one": add_independent_errors,
 }  # fmt: skip
 
 

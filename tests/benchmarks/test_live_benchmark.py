@@ -1,8 +1,7 @@
-"""How long a byte takes to an estimate, with a page open; and what a day of frames takes in memory.
+"""Latency from a byte to its estimate while a page is open, and memory for a day of frames.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_live_benchmark.py`.
-The board is another process, on a pseudo-terminal; the
-page is read by another too; of several boards, each is one. Nothing is asserted but that frames came.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_live_benchmark.py`. Each board is a process of its own on a
+pseudo-terminal, and another process reads the page. The tests assert only that frames arrived.
 """
 
 import asyncio
@@ -53,17 +52,17 @@ BOARDS = {
     "eight boards": [SLEEVE] + [(5, 133.0)] * 7,
 }
 BOARDS = size(BOARDS, dict([*BOARDS.items()][:1]))
-every_way = pytest.mark.parametrize("boards", BOARDS.values(), ids=BOARDS.keys())
+for_all_boards = pytest.mark.parametrize("boards", BOARDS.values(), ids=BOARDS.keys())
 
 
-@every_way
-def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, boards):
-    with at_work(tmp_path, boards) as (sessions, server):
+@for_all_boards
+def test_latency_from_last_byte_to_estimate(tmp_path, boards):
+    with running_boards(tmp_path, boards) as (sessions, server):
         addresses = [f"{server}/live?board={i}" for i in range(len(sessions))]
         page = subprocess.Popen([sys.executable, "-c", PAGE, *addresses], env=ENVIRONMENT)
         try:
             time.sleep(size(2.0, 0.1))
-            with measured(sessions, boards):
+            with print_latency(sessions, boards):
                 time.sleep(min(SECONDS, LATENCIES_N / boards[0][1]))
         finally:
             page.kill()
@@ -71,24 +70,24 @@ def test_from_the_last_byte_of_a_frame_to_its_estimate(tmp_path, boards):
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no browser: see tests/live/test_browser.py")
-@every_way
-def test_from_the_last_byte_of_a_frame_to_the_screen(tmp_path, boards):
+@for_all_boards
+def test_latency_from_last_byte_to_screen(tmp_path, boards):
     async def act(tab: Tab) -> None:
         await tab.until(f"boards.length === {len(boards)} && boards.every(({{last}}) => last)")
-        with measured(sessions, boards):
+        with print_latency(sessions, boards):
             await asyncio.sleep(SECONDS)
 
     async def look() -> None:
         async with aiohttp.ClientSession() as client:
             await in_browser(tmp_path, act)(server, client)
 
-    with at_work(tmp_path, boards) as (sessions, server):
+    with running_boards(tmp_path, boards) as (sessions, server):
         asyncio.run(look())
 
 
 @contextmanager
-def at_work(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[list[Session], str]]:
-    """Plug boards in, each a process of its own, and serve their page; give them when all have been zeroed."""
+def running_boards(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[list[Session], str]]:
+    """Start each board in its own process and serve their page; yield when all boards have been zeroed."""
     sessions, players = [], []
     try:
         for i, (chips_n, rate_hz) in enumerate(boards):
@@ -98,7 +97,7 @@ def at_work(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[lis
             model = read_network(write_model(folder, f"model{i}", chips_n=chips_n))
             sessions.append(Session(str(folder / f"board{i}"), [model], "benchmark", alone=len(boards) == 1))
             sessions[-1].start()
-        address = serve_beside(sessions)
+        address = serve_in_thread(sessions)
         while not all(session.traces is not None and session.skin.zeroed for session in sessions):
             time.sleep(0.1)
         yield sessions, address
@@ -111,31 +110,35 @@ def at_work(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[lis
 
 
 @contextmanager
-def measured(sessions: list[Session], boards: list[tuple[int, float]]) -> Iterator[None]:
-    """Print what frames took that came meanwhile, of all boards together."""
+def print_latency(sessions: list[Session], boards: list[tuple[int, float]]) -> Iterator[None]:
+    """Print the latency of the frames that arrive within this block, for all boards together."""
     for session in sessions:
         session.traces.to_estimate_s.clear()
         session.traces.to_screen_s.clear()
-    before_s, wall_s, before_n = time.process_time(), time.monotonic(), frames_of(sessions)
+    before_s, wall_s, before_n = time.process_time(), time.monotonic(), count_frames(sessions)
     yield
-    took_s, wall_s, frames_n = time.process_time() - before_s, time.monotonic() - wall_s, frames_of(sessions) - before_n
+    took_s, wall_s, frames_n = (
+        time.process_time() - before_s,
+        time.monotonic() - wall_s,
+        count_frames(sessions) - before_n,
+    )
     assert frames_n
     print(f"\n{', '.join(f'{chips_n} chips at {rate_hz:g} Hz' for chips_n, rate_hz in boards)}: {frames_n} frames")
     for where in ("to_estimate_s", "to_screen_s"):
         if latency_ms := [1e3 * late_s for session in sessions for late_s in list(getattr(session.traces, where))]:
             p50, p95, p99 = np.percentile(latency_ms, [50, 95, 99])
             print(f"  byte {where[:-2].replace('_', ' ')}: p50 {p50:.2f} ms, p95 {p95:.2f} ms, p99 {p99:.2f} ms")
-    print(f"  processor time, page and reading included: {1e3 * took_s / frames_n:.2f} ms a frame,", end=" ")
+    print(f"  processor time, including the page and the port: {1e3 * took_s / frames_n:.2f} ms per frame,", end=" ")
     print(f"{100 * took_s / wall_s:.0f} % of a core")
     print(f"  load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
-def frames_of(sessions: list[Session]) -> int:
+def count_frames(sessions: list[Session]) -> int:
     return sum(session.skin.account["frames_n"] for session in sessions)
 
 
-def serve_beside(sessions: list[Session]) -> str:
-    """Serve the page on a thread; give its address."""
+def serve_in_thread(sessions: list[Session]) -> str:
+    """Serve the page in a thread; return its address."""
     ready, address = threading.Event(), []
 
     async def run() -> None:
@@ -168,7 +171,7 @@ def test_a_day_of_frames_takes_the_memory_of_ten_minutes():
 
 
 class Accelerated:
-    """A reader without port and clock: a quarter of a second of frames whenever it is asked."""
+    """Reader without a port or a clock: each call returns a quarter of a second of frames."""
 
     plugged_in, problem, missed_bytes_n = True, "", 0
 
@@ -184,7 +187,7 @@ class Accelerated:
 
 
 @pytest.mark.timeout(7200)
-@pytest.mark.skipif(not STATM.exists(), reason="reads the memory of Linux")
+@pytest.mark.skipif(not STATM.exists(), reason="needs /proc of Linux")
 def test_hours_of_bytes_take_the_memory_of_ten_minutes(tmp_path):
     script, hours = make_script(pokes_n=20), float(os.environ.get("RESKIN_HOURS", size("1", "0.02")))
     frames_n = round(400 * QUARTER_S)

@@ -1,8 +1,8 @@
-"""Errors after labels at places chosen by the map's uncertainty, beside fixed and random places.
+"""Errors after labels at places chosen by the map's uncertainty, compared with fixed and random places.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`, a minute. Simulated skins about the
-nominal one, with errors of the law as in training, that the shipped model has not seen. Of each, 65 presses on the grid
-may be labelled; 65 others are read.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`, one minute. The skins are
+simulated about the nominal one, with law errors as in training; the shipped model was not trained on them. For each
+skin, 65 presses on the grid are candidates for labels, and 65 others are test presses.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ SKINS_N, LABELS_N, PRESS_N = size(40, 2), size((0, 1, 3, 5, 10), (0, 1)), 2.0
 Choose = Callable[[Universal, list[int]], int]
 
 
-def test_errors_after_labels_at_fixed_random_and_chosen_places():
+def test_errors_by_choice_of_labelled_places():
     rng, errors = rng_for(0, "next place"), {}
     design = parse(SkinDesign, nominal("skin"), "params.yaml: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
@@ -51,12 +51,12 @@ def test_errors_after_labels_at_fixed_random_and_chosen_places():
         mse_mm2 = (np.array(off_mm) ** 2).mean(axis=(1, 2))
         line = f"{way}, {n} labels: {within:.1f} % within 1 mm, MSE_xy {mse_mm2.mean():.3f} mm2"
         more = mse_mm2 - (np.array(errors["fixed", n]) ** 2).mean(axis=(1, 2))
-        print(f"{line}; less fixed {more.mean():+.3f} +- {more.std(ddof=1) / SKINS_N**0.5:.3f} (standard error)")
+        print(f"{line}; minus fixed {more.mean():+.3f} +- {more.std(ddof=1) / SKINS_N**0.5:.3f} (standard error)")
     assert all(np.isfinite(off_mm).all() for off_mm in errors.values())
 
 
 def ways(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
-    """Fixed places are those that `reskin live` shows, in random order, each by the press nearest to it."""
+    """Return the ways to choose the next press; `fixed` takes those nearest to the places that `reskin live` shows."""
     live_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
     fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(live_mm)]
     anywhere = rng.permutation(len(pool_mm)).tolist()

@@ -1,6 +1,7 @@
-"""What an indentation costs on one core, and how often magpylib's dipoles would fit into that, in the same run.
+"""Time of a simulated indentation on one core, and of magpylib's dipoles in the same run.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_physics_benchmark.py`. Nothing but equality is asserted.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_physics_benchmark.py`. Only the equality of results is
+asserted.
 """
 
 import resource
@@ -41,7 +42,7 @@ def one_pass_m() -> np.ndarray:
 
 def forget_tables() -> None:
     if not FULL:
-        return  # other tests use them at the same time
+        return  # tests that run in parallel use these tables
     for cached in (
         deformation._tabulate,
         deformation._displaced,
@@ -63,17 +64,16 @@ def best_ms(call: Callable[[], Any], repeats_n: int) -> float:
     return 1e3 * min(times_s)
 
 
-def everything_moves(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+def move_everything(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     moments = Rotation.from_rotvec([0.06, 0.08, 0.0]).apply(one.moments_A_m2)
     moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), moments
     rest = one.nodes_m, one.moments_A_m2
-    return tuple(map(np.asfortranarray, rest)), tuple(
-        map(np.asfortranarray, moved)
-    )  # as `deformation.move_dipoles` gives them
+    # In the memory order of `deformation.move_dipoles`
+    return tuple(map(np.asfortranarray, rest)), tuple(map(np.asfortranarray, moved))
 
 
 def core_field(dipoles: tuple[np.ndarray, np.ndarray], board: Board) -> np.ndarray:
-    """Sum magpylib.core's dipoles: one call over every pair of node and chip."""
+    """Sum magpylib.core's dipoles, by one call for all pairs of node and chip."""
     from magpylib.core import dipole_Hfield
 
     positions_m, moments = dipoles
@@ -83,9 +83,9 @@ def core_field(dipoles: tuple[np.ndarray, np.ndarray], board: Board) -> np.ndarr
 
 
 @pytest.mark.timeout(600)
-def test_the_field_of_all_nodes_costs_less_than_magpylibs_dipoles() -> None:
-    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, of the dev dependencies")
-    rest, moved = everything_moves(skin("s0"))
+def test_field_of_all_nodes_equals_magpylib() -> None:
+    magpylib = pytest.importorskip("magpylib", reason="needs magpylib, a dev dependency")
+    rest, moved = move_everything(skin("s0"))
     objects = [
         [magpylib.misc.Dipole(moment=m, position=x) for x, m in zip(*dipoles, strict=True)] for dipoles in (rest, moved)
     ]
@@ -105,12 +105,12 @@ def test_the_field_of_all_nodes_costs_less_than_magpylibs_dipoles() -> None:
     print(f"\nfield before and after, {len(rest[0])} nodes that all move x {len(BOARD.chips_m)} chips")
     for name, (call, _) in calls.items():
         print(f"  {name:16} {times_ms[name]:8.2f} ms {times_ms[name] / times_ms['compiled']:8.1f} x")
-        # The others lose digits to the difference of two sums, and magpylib's mu_0 is of another year.
+        # The others lose digits in the difference of two sums, and magpylib's mu_0 is from another CODATA year.
         np.testing.assert_allclose(call(), truth_T, atol=1e-7 * np.abs(truth_T).max())
 
 
 @pytest.mark.timeout(600)
-def test_an_indentation_of_one_skin_is_timed_with_and_without_its_table() -> None:
+def test_time_of_pokes_with_and_without_table() -> None:
     pokes_m, one = one_pass_m(), skin("s0")
     changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # compiles
     forget_tables()
@@ -125,12 +125,14 @@ def test_an_indentation_of_one_skin_is_timed_with_and_without_its_table() -> Non
     tracemalloc.stop()
     assert np.array_equal(first_T, again_T)
     n = len(pokes_m)
-    print(f"\n{n} pokes of one skin: {poking_ms / n:.3f} ms each, and {with_table_ms - poking_ms:.0f} ms for the table")
-    print(f"  together {with_table_ms / n:.3f} ms each; peak {peak_MB:.1f} MB")
+    print(
+        f"\n{n} pokes of one skin: {poking_ms / n:.3f} ms each, plus {with_table_ms - poking_ms:.0f} ms for the table"
+    )
+    print(f"  together {with_table_ms / n:.3f} ms per poke; peak {peak_MB:.1f} MB")
 
 
 @pytest.mark.timeout(600)
-def test_eighteen_skins_are_timed_from_their_names_on() -> None:
+def test_time_of_eighteen_skins_from_scratch() -> None:
     pokes_m = one_pass_m()
     forget_tables()
     start_s = time.perf_counter()
@@ -140,11 +142,11 @@ def test_eighteen_skins_are_timed_from_their_names_on() -> None:
     total_s = time.perf_counter() - start_s
     peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"\n{SKINS_N} skins x {len(pokes_m)} pokes, magnets and tables included: {total_s:.1f} s,")
-    print(f"  {1e3 * total_s / SKINS_N / len(pokes_m):.3f} ms an indentation; the process peaked at {peak_MB:.0f} MB")
+    print(f"  {1e3 * total_s / SKINS_N / len(pokes_m):.3f} ms per indentation; the process peaked at {peak_MB:.0f} MB")
 
 
 @pytest.mark.timeout(600)
-def test_a_papers_worth_of_pokes_each_at_its_own_place_and_depth_is_timed_on_two_skins() -> None:
+def test_time_of_the_papers_number_of_irregular_pokes() -> None:
     rng = rng_for(0, "benchmark")
     pokes_m = np.tile(one_pass_m(), (PASSES_N, 1))
     pokes_m += rng.normal(0, (0.05e-3, 0.05e-3, 0.01e-3), pokes_m.shape)
@@ -155,4 +157,4 @@ def test_a_papers_worth_of_pokes_each_at_its_own_place_and_depth_is_timed_on_two
     total_s = time.perf_counter() - start_s
     peak_MB = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(f"\n2 skins x {len(pokes_m)} pokes: {total_s:.1f} s; {SKINS_N} would take {9 * total_s:.0f} s on one core")
-    print(f"  {500 * total_s / len(pokes_m):.3f} ms an indentation; the process peaked at {peak_MB:.0f} MB")
+    print(f"  {500 * total_s / len(pokes_m):.3f} ms per indentation; the process peaked at {peak_MB:.0f} MB")

@@ -1,6 +1,7 @@
-"""What the paper's 18 skins x 10,140 indentations cost as raw captures: the stage itself, two processes of one thread.
+"""Time to simulate the paper's 18 skins x 10,140 indentations as raw captures, by the stage in two processes.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_simulate_benchmark.py`. Nothing but counts is asserted.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_simulate_benchmark.py`. Only the number of captures is
+asserted.
 """
 
 import json
@@ -23,7 +24,7 @@ PLACES_N, DEPTHS_MM = 65, size((0.2, 0.4, 0.6, 0.8, 1.0, 1.2), (0.2,))
 
 
 @pytest.mark.timeout(900)
-def test_the_papers_captures_are_timed_from_parameters_to_bytes(tmp_path: Path) -> None:
+def test_time_to_simulate_the_papers_captures(tmp_path: Path) -> None:
     scene = read_yaml(ROOT / SCENES / "quick.yaml")
     grid = scene["simulate"]["protocols"]["grid"]
     grid |= {"passes_n": PASSES_N, "skins_n": SKINS_N, "depths_mm": list(DEPTHS_MM)}
@@ -44,5 +45,5 @@ def test_the_papers_captures_are_timed_from_parameters_to_bytes(tmp_path: Path) 
     indentations_n = len(captures) * PASSES_N * PLACES_N * len(DEPTHS_MM)
     assert len(captures) == SKINS_N
     print(f"\n{len(captures)} captures, {indentations_n} indentations, {bytes_n / 1e6:.0f} MB: {took_s:.1f} s in all,")
-    print(f"  {1e3 * took_s / indentations_n:.3f} ms an indentation; a process peaked at", end=" ")
+    print(f"  {1e3 * took_s / indentations_n:.3f} ms per indentation; peak memory of a process", end=" ")
     print(f"{cost['peak_process_memory_MB']:.0f} MB")

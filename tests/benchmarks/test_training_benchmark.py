@@ -1,8 +1,8 @@
-"""What the fold grid costs: this engine, a plain loop over a DataLoader, and one over index tensors, in one run.
+"""Time to train the fold grid: this engine, a plain DataLoader loop, and a loop over index tensors, in one run.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_training_benchmark.py`. Only that training went well is
-asserted. Ratios are formed within a repeat, whose parts meet about the same load. On a machine that is busy otherwise
-two threads wait for each other, and of the ratios only those of CPU seconds mean something.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_training_benchmark.py`. Only convergence of the training is
+asserted. Ratios are formed within a repeat, whose parts run under about the same load. On a machine that is busy with
+other work two threads wait for each other, and only the ratios of CPU seconds are meaningful.
 """
 
 import os
@@ -36,7 +36,7 @@ from tests.benchmarks import FULL, size
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3
 ROWS_N, CHANNELS_N = size(100_000, 3_600), 15
 STEPS_N, BATCH_N = size(400, 2), 128
-PLAIN_N = 2  # networks of the plain loops, which train one after another: their time is scaled
+PLAIN_N = 2  # networks that the plain loops train, one after another; their time is scaled to the grid
 REPEATS_N = size(3, 1)
 LAYERS = paper_layers(CHANNELS_N)
 
@@ -48,7 +48,7 @@ def recipe(triplet_weight: float, steps_n: int = STEPS_N) -> Recipe:
     )  # fmt: skip
 
 
-def measured() -> TrainingData:
+def make_rows() -> TrainingData:
     rng = rng_for(0, "training benchmark")
     place_mm = 2.0 * rng.integers(0, 9, (ROWS_N, 2))
     target = np.column_stack([place_mm, rng.uniform(0, 3, ROWS_N)])
@@ -68,10 +68,11 @@ def fold_grid(rows: TrainingData, triplet_weight: float) -> list[TrainingJob]:
 
 
 def flop(triplet_weight: float) -> float:
-    """Count the products of one step of one network, a multiplication and an addition each as one operation.
+    """Count the operations of the matrix products in one step of one network; a multiply-add is two operations.
 
-    Forward, gradient of the weights, gradient of the inputs but for the first layer's: 2 b (3 sum(in out) - in1 out1);
-    with triplets two more passes through the first three layers. No bias, ReLU, loss or optimiser.
+    The forward pass, the gradients of the weights and those of the inputs, except for the first layer's inputs, take
+    2 b (3 sum(in out) - in1 out1); triplets add two passes through the first three layers. Bias, ReLU, loss and
+    optimiser are not counted.
     """
 
     def passes(layers: Sequence) -> float:
@@ -92,21 +93,21 @@ def seconds(call: Callable[[], object], clock: Callable[[], float] = time.perf_c
     return clock() - start_s
 
 
-def started(job: TrainingJob, rows: TrainingData) -> int:
+def train_one(job: TrainingJob, rows: TrainingData) -> int:
     train_stack([job], rows)
     return os.getpid()
 
 
-def start(executor: Executor, workers_n: int = 2) -> None:
-    """Start the workers with a step of training each: the first step of a process loads most of PyTorch."""
-    few = TrainingData(*(values[:BATCH_N] for values in (measured().db_uT, measured().target, measured().skin)))
+def start_workers(executor: Executor, workers_n: int = 2) -> None:
+    """Start the workers with one training step each: the first step of a process loads most of PyTorch."""
+    few = TrainingData(*(values[:BATCH_N] for values in (make_rows().db_uT, make_rows().target, make_rows().skin)))
     job = replace(fold_grid(few, 0.0)[0], recipe=recipe(0.0, 1), train=np.arange(64), test=np.arange(64, BATCH_N))
-    running = [executor.submit(started, job, few) for _ in range(workers_n)]
+    running = [executor.submit(train_one, job, few) for _ in range(workers_n)]
     assert len({one.result() for one in running}) == workers_n
 
 
 def run_grid(jobs: list[TrainingJob], rows: TrainingData, executor: Executor, cache: Path) -> tuple[float, float]:
-    """Train the grid; give its seconds, and the seconds of all networks together, each within its process."""
+    """Train the grid; return its wall seconds, and the sum of the seconds that networks took in their processes."""
     start_s = time.perf_counter()
     trained = run_jobs(jobs, rows, executor=executor, cache=cache, log=lambda line: None)
     took_s = time.perf_counter() - start_s
@@ -133,7 +134,7 @@ def plain_loop(batches: Iterable[Sequence[torch.Tensor]]) -> None:
 def plain_grid(
     rows: TrainingData, threads_n: int, batches_of: Callable[[TensorDataset], Iterable]
 ) -> tuple[float, float]:
-    """Train a part of the grid one network at a time, as a user would; give wall and CPU seconds for the whole."""
+    """Train a part of the grid one network at a time; return wall and CPU seconds scaled to the whole grid."""
     torch.set_num_threads(threads_n)
     jobs = fold_grid(rows, 0.0)
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
@@ -147,7 +148,7 @@ def plain_grid(
 
 
 def engine_cpu_s(rows: TrainingData) -> float:
-    """Train one stack in this process; give CPU seconds for the whole grid: a busy machine leaves them alone."""
+    """Train one stack in this process; return CPU seconds scaled to the grid, which load hardly changes."""
     jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, 0.0)]
     start_s = time.process_time()
     train_stack(jobs[: STACK_N["cpu"]], rows)
@@ -165,7 +166,7 @@ def by_index(data: TensorDataset) -> Iterable:
 
 
 @contextmanager
-def clocked(parts: dict[str, list[tuple[object, str]]]):
+def record_cpu_s(parts: dict[str, list[tuple[object, str]]]):
     """Sum the CPU seconds spent in named functions, none of which calls another."""
     spent_s: dict[str, float] = defaultdict(float)
 
@@ -193,28 +194,30 @@ STEP = {
     "backward": [(torch.Tensor, "backward")],
     "AdamW": [(AdamW, "step"), (Stack, "zero_grad")],
     "one-cycle rate": [(train_module, "one_cycle")],
-    "watch for finite weights, keep them": [(Monitor, "check")],
+    "check for finite weights, keep them": [(Monitor, "check")],
 }
 
 
 @pytest.fixture(autouse=True)
-def _by_default(monkeypatch: pytest.MonkeyPatch) -> None:
+def _unset_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     for variable in ("RESKIN_EXECUTOR", "RESKIN_DEVICE"):
         monkeypatch.delenv(variable, raising=False)
 
 
 @pytest.mark.timeout(1800)
-def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> None:
-    rows = measured()
-    plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))  # loads
+def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
+    rows = make_rows()
+    plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))  # imports
     train_stack([replace(fold_grid(rows, 0.0)[0], recipe=recipe(0.0, 1))], rows)
     columns: dict[str, list[float]] = defaultdict(list)
     for i in range(REPEATS_N):
         sgemm = max(sgemm_flop_per_s())
         columns["sgemm, one thread, GFLOP/s"].append(1e-9 * sgemm)
         with make_executor(imports="reskin.models.train") as executor:
-            start_s = seconds(lambda: start(executor))
-            beside = [executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)]  # a quarter of a second each
+            start_s = seconds(lambda: start_workers(executor))
+            beside = [
+                executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)
+            ]  # each takes a quarter of a second
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))
             columns["sgemm, in both processes at once, GFLOP/s"].append(1e-9 * both)
             for what, weight in (("grid", 0.0), ("grid with triplets", 0.1)):
@@ -251,12 +254,12 @@ def test_the_fold_grid_is_timed_beside_plain_loops_and_sgemm(tmp_path: Path) -> 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
 def test_a_step_is_taken_apart(triplet_weight: float) -> None:
-    rows = measured()
+    rows = make_rows()
     jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
-    train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # loads
+    train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # imports
     sgemm, best_s, best = max(sgemm_flop_per_s()), np.inf, {}
     for _ in range(REPEATS_N):
-        with clocked({"all": [(train_module, "train")]}) as whole, clocked(STEP) as spent_s:
+        with record_cpu_s({"all": [(train_module, "train")]}) as whole, record_cpu_s(STEP) as spent_s:
             assert all(one.stopped_step is None for one in train_stack(jobs, rows))
         if whole["all"] < best_s:
             best_s, best = whole["all"], dict(spent_s)

@@ -1,8 +1,8 @@
-"""Error of the universal model against what it takes: lattice pitch, forces, training skins and steps.
+"""Error of the universal model against its cost: lattice pitch, forces, training skins and steps.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints a table, docs/learning.md holds
-one. Skins that no network was trained on, with errors of the law as in training, 65 presses each. Processor time of
-one thread.
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints the table of docs/learning.md. No
+network was trained on the tested skins, which have law errors as in training and 65 presses each. Times are processor
+time of one thread.
 """
 
 import os
@@ -36,19 +36,19 @@ TESTED_N, SEED = size(24, 2), 2021
 
 @dataclass(frozen=True)
 class Row:
-    """A setting with its errors and costs."""
+    """One setting with its errors and costs."""
 
     setting: str
     accuracy_pct: float
     mse_xy_mm2: float
     force_factor: float
-    made_s: float
+    build_s: float
     reading_us: float
 
     def __str__(self) -> str:
         return (
             f"| {self.setting} | {self.accuracy_pct:.1f} | {self.mse_xy_mm2:.2f} | {self.force_factor:.2f} | "
-            f"{self.made_s:.0f} | {self.reading_us:.0f} |"
+            f"{self.build_s:.0f} | {self.reading_us:.0f} |"
         )
 
 
@@ -64,24 +64,24 @@ def test_error_against_time_of_map_and_network(monkeypatch):
             networks[skins_n, steps_n] = trained, time.process_time() - start_s
     used = networks[SKINS_N[len(SKINS_N) // 2], STEPS_N[-1]][0]
     print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; {TESTED_N} skins")
-    print("| setting | within 1 mm, % | MSE_xy, mm² | force off by a factor of | made in, s | a reading, µs |")
+    print("| setting | within 1 mm, % | MSE_xy, mm² | force wrong by a factor of | build time, s | reading time, µs |")
     print("|---|---|---|---|---|---|")
     rows = []
     for pitch_mm in PITCHES_MM:
         for forces_n in FORCES_N if pitch_mm == 0.8 or not FULL else (9,):
-            made, made_s = lattice(monkeypatch, pitch_mm, forces_n, setup)
-            rows.append(evaluated(f"pitch {pitch_mm} mm, {forces_n} forces", made, used, prior, made_s))
+            tables, build_s = make_lattice(monkeypatch, pitch_mm, forces_n, setup)
+            rows.append(evaluate(f"pitch {pitch_mm} mm, {forces_n} forces", tables, used, prior, build_s))
             print(rows[-1])
-    whole, _ = lattice(monkeypatch, 0.8 if FULL else 3.2, 9 if FULL else 3, setup)
+    whole, _ = make_lattice(monkeypatch, 0.8 if FULL else 3.2, 9 if FULL else 3, setup)
     for (skins_n, steps_n), (trained, trained_s) in networks.items():
-        rows.append(evaluated(f"network of {skins_n} skins, {steps_n} steps", whole, trained, prior, trained_s))
+        rows.append(evaluate(f"network of {skins_n} skins, {steps_n} steps", whole, trained, prior, trained_s))
         print(rows[-1])
     assert all(np.isfinite([row.accuracy_pct, row.mse_xy_mm2, row.force_factor]).all() for row in rows)
     if FULL:
         assert rows[-1].accuracy_pct > 50
 
 
-def lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[Tables, float]:
+def make_lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[Tables, float]:
     """Tabulate a lattice of this pitch and number of forces; return it with the seconds it took."""
     monkeypatch.setattr(map, "PITCH_MM", pitch_mm)
     monkeypatch.setattr(map, "STEPS_N", 2 * round(SIDE_MM / pitch_mm / 2))
@@ -90,9 +90,9 @@ def lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[
     return tabulate(NOMINAL, NOMINAL_SPREADS, setup, forces_N), time.process_time() - start_s
 
 
-def evaluated(setting: str, made: Tables, networks: Sequence[Weights], prior: SkinPrior, made_s: float) -> Row:
-    """Score a model on fresh skins, calibrated to 65 presses of each."""
-    model = Universal(made, networks, NO_POWERS)
+def evaluate(setting: str, tables: Tables, networks: Sequence[Weights], prior: SkinPrior, build_s: float) -> Row:
+    """Score a model on new skins, calibrated to 65 presses of each."""
+    model = Universal(tables, networks, NO_POWERS)
     skins = draw_prior_skins(prior, TESTED_N, SEED, AS_TRAINED, LAW_ERRORS[AS_TRAINED])
     off_mm, off_log, took_s, read_n = [], [], 0.0, 0
     for i in range(len(skins)):
@@ -106,5 +106,5 @@ def evaluated(setting: str, made: Tables, networks: Sequence[Weights], prior: Sk
     off = np.concatenate(off_mm)
     return Row(
         setting, 100 * float((np.abs(off) <= 1).all(axis=1).mean()), float((off**2).mean()),
-        float(np.exp(np.sqrt(np.mean(np.concatenate(off_log) ** 2)))), made_s, 1e6 * took_s / read_n,
+        float(np.exp(np.sqrt(np.mean(np.concatenate(off_log) ** 2)))), build_s, 1e6 * took_s / read_n,
     )  # fmt: skip

@@ -1,8 +1,8 @@
-"""What each stage of a scene costs, beside the least that this machine could need for the three heaviest.
+"""Write docs/costs.md: the cost of each stage of a scene, with lower limits for the three most expensive stages.
 
-python -m tests.benchmarks.time_costs [quick paper]: stages from reports/<scene>/provenance.json and dvc.lock, as the
-last run left them; this machine's rates of matrix products (a CPU second, with the instructions that trainings use),
-memory and disk are measured now. Writes docs/costs.md. Keep the machine quiet: stages were timed, and not now.
+Run `python -m tests.benchmarks.time_costs [quick paper]`. Costs of stages are those of their last runs, from
+reports/<scene>/provenance.json and dvc.lock. The limits use rates of this machine that are measured now: matrix
+products per CPU second (with the instructions that training uses), memory and disk. Keep the machine quiet meanwhile.
 """
 
 import argparse
@@ -25,11 +25,15 @@ HEAVIEST_N, BEST_OF_N = 3, 5
 LAYERS = paper_layers(15)
 WEIGHTS_N = sum(layer.in_n * layer.out_n + layer.out_n for layer in LAYERS)
 WIDTHS_N = sum(layer.out_n for layer in LAYERS)
-MOVES_N = 8  # of each weight a step: it, its gradient and both moments read, and the gradient, it and both written
-ACTIVATION_MOVES_N = 4  # written and read forward, and again backward
-# How many passes of a batch through the first layers beside the labelled one: of triplets, of unlabelled lines.
+MOVES_N = 8  # per weight and step: read weight, gradient and both moments; write the gradient, then weight and moments
+ACTIVATION_MOVES_N = 4  # written and read in the forward pass, and again in the backward pass
+# Passes of a batch through the first layers in addition to the labelled one: triplets, unlabelled lines.
 EXTRA_PASSES_N = {"train_multi": 0, "train_single": 0, "train_triplet": 2, "adapt": 5}
-GROUP = {"train_multi": 1, "train_triplet": 1, "adapt": 3}  # sweep_sensors: of each board and number of skins
+GROUP = {
+    "train_multi": 1,
+    "train_triplet": 1,
+    "adapt": 3,
+}  # networks of sweep_sensors for each board and number of skins
 MIXED: dict[str, Mapping[str, int]] = {"sweep_sensors": GROUP, "sweep_pokes": {"adapt": 1}}
 
 
@@ -43,7 +47,7 @@ def products_flop(kind: str, batch_n: int) -> float:
 
 
 def moved_bytes(kind: str, batch_n: int) -> float:
-    """Count what a step of one network moves at least, were nothing kept in a cache."""
+    """Count the bytes that one step of one network moves if no cache keeps any."""
     activations_n = batch_n * (WIDTHS_N + EXTRA_PASSES_N[kind] * sum(one.out_n for one in LAYERS[:FEATURE_LAYERS_N]))
     return 4.0 * (MOVES_N * WEIGHTS_N + ACTIVATION_MOVES_N * activations_n)
 
@@ -59,7 +63,7 @@ def best(call: Callable[[], object], clock: Callable[[], float]) -> float:
 
 
 def measure_rates() -> dict[str, float]:
-    """Measure matrix products and memory a CPU second of one thread, and the disk a second that passes."""
+    """Measure matrix products and memory per CPU second of one thread, and the disk per wall second."""
     torch.set_num_threads(1)
     one, other = torch.rand(2, 1024, 1024)
     many, block = np.ones(2**26, np.float32), os.urandom(2**26)
@@ -80,7 +84,7 @@ def measure_rates() -> dict[str, float]:
 
 
 def stages_of(scene: str) -> list[dict[str, Any]]:
-    """Read what each stage cost, and what it left on disk where dvc.lock tells it."""
+    """Return the cost of each stage, and the size of its outputs if dvc.lock has it."""
     costs = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["runtime"]["stages"]
     lock = read_yaml(ROOT / "dvc.lock")["stages"]
     rows = []
@@ -93,15 +97,15 @@ def stages_of(scene: str) -> list[dict[str, Any]]:
 
 
 def limits_of(scene: str, row: Mapping[str, Any], rates: Mapping[str, float]) -> dict[str, float] | None:
-    """Give the seconds that products, memory and disk would need alone; None for what does not train networks."""
-    words, stage = read_yaml(ROOT / f"pipeline/scenes/{scene}.yaml"), str(row["stage"])
+    """Return the seconds that products, memory and disk alone would need; None for stages that do not train."""
+    settings, stage = read_yaml(ROOT / f"pipeline/scenes/{scene}.yaml"), str(row["stage"])
     shared = read_yaml(ROOT / "params.yaml")
     group = MIXED.get(stage, {stage: 1} if stage in EXTRA_PASSES_N else None)
     if group is None:
         return None
     flop = moved = 0.0
     for kind, n in group.items():
-        section = words[kind]
+        section = settings[kind]
         rule = shared["adaptations"][section["adaptation"]] if kind == "adapt" else shared["recipes"][section["recipe"]]
         steps_n = row["trainings_n"] * n / sum(group.values()) * section["steps_n"]
         flop += steps_n * products_flop(kind, rule["batch_n"])
@@ -112,7 +116,7 @@ def limits_of(scene: str, row: Mapping[str, Any], rates: Mapping[str, float]) ->
     }  # fmt: skip
 
 
-def shown(row: Mapping[str, Any]) -> dict[str, str]:
+def format_row(row: Mapping[str, Any]) -> dict[str, str]:
     return {
         "stage": row["stage"],
         "computed, s": f"{row.get('computed_s', row['seconds']):,.1f}",
@@ -122,8 +126,8 @@ def shown(row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def heaviest(scene: str, rows: list[dict[str, Any]], rates: Mapping[str, float]) -> list[dict[str, str]]:
-    """Hold the three heaviest stages against their limits."""
+def compare_heaviest(scene: str, rows: list[dict[str, Any]], rates: Mapping[str, float]) -> list[dict[str, str]]:
+    """Compare the three most expensive stages with their limits."""
     found = []
     for row in rows[:HEAVIEST_N]:
         limits, took_s = limits_of(scene, row, rates), row.get("computed_s", row["seconds"])
@@ -143,17 +147,17 @@ def main() -> None:
     MEASURED.mkdir(exist_ok=True)
     (MEASURED / "rates.json").write_text(json.dumps({"machine": machine(), **rates}, indent=1) + "\n")
     parts = [
-        f"Rates of {machine()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of products of matrices (float32) and "
-        f"{rates['memory_bytes_per_s'] / 1e9:.1f} GB copied a CPU second of one thread; "
-        f"{rates['disk_bytes_per_s'] / 1e6:.0f} MB written to disk a second."
+        f"Rates of {machine()}: {rates['sgemm_flop_per_s'] / 1e9:.0f} GFLOP of matrix products (float32) and "
+        f"{rates['memory_bytes_per_s'] / 1e9:.1f} GB copied per CPU second of one thread; "
+        f"{rates['disk_bytes_per_s'] / 1e6:.0f} MB written to disk per second."
     ]
     for scene in scenes:
         rows = stages_of(scene)
         code = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["git"]
         parts += [
             f"## Scene `{scene}`, code {code}",
-            table(heaviest(scene, rows, rates)),
-            table(list(map(shown, rows))),
+            table(compare_heaviest(scene, rows, rates)),
+            table(list(map(format_row, rows))),
         ]
     write_block("costs.md", "stages-costs", parts)
 

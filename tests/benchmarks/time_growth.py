@@ -1,10 +1,11 @@
-"""What do more skins, and more recorded captures, cost? CPU seconds and memory of each stage and of DVC, by count.
+"""Measure CPU seconds and memory of each stage and of DVC against the number of skins or of recorded captures.
 
-python tests/benchmarks/time_growth.py skins 18 60 180 600 1800: a scene of so many simulated skins of 65 pokes each,
-from bytes to its page. Eighteen are simulated; those beyond are their bytes again under other labels, as what follows
-costs the same. python tests/benchmarks/time_growth.py captures 10 30 100: so many recorded captures; what `reskin add`
-of one more takes, the first `dvc repro` of all, and one that has nothing to do. Adds to docs/measured/growth.json;
-then show_growth. CPU seconds, as other work on the machine changes them least.
+`python -m tests.benchmarks.time_growth skins 18 60 180 600 1800` processes scenes with these numbers of simulated
+skins, from bytes to the page, with 65 pokes per skin. Only 18 skins are simulated; further skins are copies under other
+labels, which cost the same in all later stages. `python -m tests.benchmarks.time_growth captures 10 30 100` times, for
+these numbers of recorded captures, `reskin add` of one more capture, the first `dvc repro` of all, and a `dvc repro`
+that has nothing to do. Adds to docs/measured/growth.json, from which show_growth writes the page. Costs are CPU seconds
+because other work on the machine changes them least.
 """
 
 import argparse
@@ -31,12 +32,12 @@ from tests.benchmarks.pages import MEASURED
 from tests.stages.checkout import ROOT, copy_checkout, variables
 
 SCENE, BOARDS_N, SIMULATED_N = "grow", 6, 18
-STEPS_N = 100  # of each training: rows change what is read and scored, not what a step costs
-READINGS_N = 40  # of a recorded capture: small, so that what stands around a capture is seen
+STEPS_N = 100  # per training run: more rows change the cost of reading and scoring, not that of a step
+READINGS_N = 40  # per recorded capture: few, so that the overhead per capture dominates
 
 
-def measured(folder: Path, *words: str) -> dict[str, float]:
-    """Run a program of the environment: CPU and wall seconds of it and its children, peak memory of the largest."""
+def time_command(folder: Path, *words: str) -> dict[str, float]:
+    """Run a program of the environment; return CPU and wall seconds with its children, and the largest peak memory."""
     command, start_s = [str(folder / ".venv/bin" / words[0]), *words[1:]], time.monotonic()
     log = folder / "said.txt"
     with log.open("w") as said:
@@ -50,7 +51,7 @@ def measured(folder: Path, *words: str) -> dict[str, float]:
 
 @contextmanager
 def checkout(scene: Mapping[str, Any]) -> Iterator[Path]:
-    """Give a copy of this checkout with one scene."""
+    """Yield a copy of this checkout with one scene."""
     with tempfile.TemporaryDirectory() as temporary:
         root = copy_checkout(Path(temporary))
         (root / SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is YAML
@@ -58,19 +59,19 @@ def checkout(scene: Mapping[str, Any]) -> Iterator[Path]:
 
 
 def skins_scene(skins_n: int) -> dict[str, Any]:
-    """Take of scene quick the boards, and one light press at each place."""
-    words = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
-    rigid = words["simulate"]["boards"]["rigid"] | {"boards_n": BOARDS_N, "skins_per_board_n": skins_n // BOARDS_N}
-    grid = words["simulate"]["protocols"]["grid"] | {"skins_n": skins_n, "passes_n": 1, "depths_mm": [0.8]}
+    """Return a scene with the boards of scene quick and one light press at each place."""
+    quick = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
+    rigid = quick["simulate"]["boards"]["rigid"] | {"boards_n": BOARDS_N, "skins_per_board_n": skins_n // BOARDS_N}
+    grid = quick["simulate"]["protocols"]["grid"] | {"skins_n": skins_n, "passes_n": 1, "depths_mm": [0.8]}
     return {
         "source": "simulated", "seed": 2021, "experiments": ["lobo"], "selection": {"force_min_N": 0.0}, "split": {},
         "simulate": {"boards": {"rigid": rigid}, "protocols": {"grid": grid}},
-        "train_multi": words["train_multi"] | {"steps_n": STEPS_N},
+        "train_multi": quick["train_multi"] | {"steps_n": STEPS_N},
     }  # fmt: skip
 
 
-def label_again(raw: Path, skins_n: int) -> None:
-    """Lay captures beside the simulated ones: their bytes under other names, as many as are asked for."""
+def copy_captures(raw: Path, skins_n: int) -> None:
+    """Add copies of the simulated captures under other names until there are `skins_n` captures."""
     sources = sorted(child for child in raw.iterdir() if child.is_dir())
     for i in range(len(sources), skins_n):
         source, name = sources[i % len(sources)], f"b{i % BOARDS_N}_s{i // BOARDS_N}"
@@ -84,7 +85,7 @@ def label_again(raw: Path, skins_n: int) -> None:
 
 
 def stages_of(root: Path, before: Mapping[str, float]) -> dict[str, Any]:
-    """Read what each stage of the scene took; DVC took the rest of the whole run."""
+    """Return the cost of each stage of the scene; the rest of the whole run is the cost of DVC."""
     files = sorted((root / ".reskin/costs" / SCENE).glob("*.json"))
     costs = {file.stem: io.read_json(file) for file in files if file.stem != "simulate"}  # which ran before
     found = {
@@ -95,23 +96,23 @@ def stages_of(root: Path, before: Mapping[str, float]) -> dict[str, Any]:
 
 
 def grow_skins(skins_n: int, bytes_of: Path) -> dict[str, Any]:
-    """Take so many skins from bytes to a page, stage by stage, as `dvc repro` does."""
+    """Process this number of skins from bytes to a page, stage by stage, as `dvc repro` does."""
     with checkout(skins_scene(skins_n)) as root:
-        measured(root, "reskin", "scenes", "use", SCENE)
+        time_command(root, "reskin", "scenes", "use", SCENE)
         raw = root / "data/raw" / SCENE
         if not bytes_of.exists():
-            simulated = measured(root, "dvc", "repro", "--quiet", f"simulate@{SCENE}")
+            simulated = time_command(root, "dvc", "repro", "--quiet", f"simulate@{SCENE}")
             shutil.copytree(raw, bytes_of)
             io.write_json(bytes_of.with_suffix(".json"), simulated)
         if not raw.exists():
             shutil.copytree(bytes_of, raw)
-        label_again(raw, skins_n)
-        measured(root, "dvc", "repro", "--quiet", "code")
-        committed = measured(root, "dvc", "commit", "--quiet", "--force", f"simulate@{SCENE}")
-        whole = measured(root, "dvc", "repro", "--quiet", f"report@{SCENE}")
+        copy_captures(raw, skins_n)
+        time_command(root, "dvc", "repro", "--quiet", "code")
+        committed = time_command(root, "dvc", "commit", "--quiet", "--force", f"simulate@{SCENE}")
+        whole = time_command(root, "dvc", "repro", "--quiet", f"report@{SCENE}")
         stages = stages_of(root, whole)
         stages["dvc, raw captures"] = committed
-        stages["dvc, nothing to do"] = measured(root, "dvc", "repro", "--quiet", f"report@{SCENE}")
+        stages["dvc, nothing to do"] = time_command(root, "dvc", "repro", "--quiet", f"report@{SCENE}")
         stages["whole"] = whole
         folders = {name: sum(1 for _ in (root / name).rglob("*")) for name in ("data/raw", "data/indentations")}
         rows_n = io.read_json(root / f"data/models/{SCENE}/folds.json")["rows_n"]
@@ -119,7 +120,7 @@ def grow_skins(skins_n: int, bytes_of: Path) -> dict[str, Any]:
 
 
 def recording(rng: np.random.Generator) -> bytes:
-    """Write a recording of layout `table`: no two have one reading in common."""
+    """Return a recording of layout `table`; no two recordings have a reading in common."""
     fields = [f"B{axis}{chip}" for chip in range(5) for axis in "xyz"]
     lines = [",".join(["phase", "x_mm", "y_mm", "Fz_N", *fields])]
     for i in range(READINGS_N):
@@ -129,8 +130,8 @@ def recording(rng: np.random.Generator) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def lay_captures(root: Path, captures_n: int, rng: np.random.Generator) -> None:
-    """Lay captures as `reskin add` would, all at once: folders, one .dvc file each, the registry, the plan."""
+def create_captures(root: Path, captures_n: int, rng: np.random.Generator) -> None:
+    """Create captures as `reskin add` would, all at once: folders, .dvc files, the registry and the plan."""
     from dvc.repo import Repo
 
     entries, targets = {}, []
@@ -148,7 +149,7 @@ def lay_captures(root: Path, captures_n: int, rng: np.random.Generator) -> None:
 
 
 def grow_captures(captures_n: int) -> dict[str, Any]:
-    """Time what is done with so many recorded captures: add one more, ingest and split all, find nothing to do."""
+    """Time commands on this number of recorded captures: add one, ingest and split all, find nothing to do."""
     rng = np.random.default_rng(captures_n)
     training = {"recipe": "paper", "steps_n": 1, "seeds_n": 1, "variants": {}}
     scene = {
@@ -156,21 +157,21 @@ def grow_captures(captures_n: int) -> dict[str, Any]:
         "train_multi": training,
     }  # fmt: skip
     with checkout(scene) as root:
-        lay_captures(root, captures_n, rng)
+        create_captures(root, captures_n, rng)
         (root / "one.csv").write_bytes(recording(rng))
         words = ("--layout", "table", "--board", "b0", "--skin", "b0_s0", "--scene", SCENE, "--name", "last")
-        found = {"add one": measured(root, "reskin", "add", "one.csv", *words)}
-        found["ingest and split all"] = measured(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
-        found["nothing to do"] = measured(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
+        found = {"add one": time_command(root, "reskin", "add", "one.csv", *words)}
+        found["ingest and split all"] = time_command(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
+        found["nothing to do"] = time_command(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
         (root / "two.csv").write_bytes(recording(rng))
-        measured(root, "reskin", "add", "two.csv", *words[:-1], "more")
-        found["ingest one more, split"] = measured(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
+        time_command(root, "reskin", "add", "two.csv", *words[:-1], "more")
+        found["ingest one more, split"] = time_command(root, "dvc", "repro", "--quiet", f"split@{SCENE}")
         lock_bytes_n = (root / "dvc.lock").stat().st_size
         return {"captures_n": captures_n, "lock_bytes_n": lock_bytes_n, "steps": found}
 
 
 def keep(out: Path, part: str, point: Mapping[str, Any], count: str) -> None:
-    """Add a point to what is there, in place of one of the same count."""
+    """Add a point to the measurements; it replaces one of the same count."""
     before: dict[str, Any] = json.loads(out.read_text()) if out.exists() else {}
     others = [row for row in before.get(part, []) if row[count] != point[count]]
     of = {"git": code_version(), "machine": machine()}
@@ -184,15 +185,15 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("part", choices=("skins", "captures"))
     parser.add_argument("counts", type=int, nargs="+")
     parser.add_argument("--out", type=Path, default=MEASURED / "growth.json")
-    asked = parser.parse_args(words)
+    arguments = parser.parse_args(words)
     with tempfile.TemporaryDirectory() as temporary:
-        for count in asked.counts:
-            if asked.part == "skins":
+        for count in arguments.counts:
+            if arguments.part == "skins":
                 point, name = grow_skins(count, Path(temporary) / "raw"), "skins_n"
             else:
                 point, name = grow_captures(count), "captures_n"
             print(json.dumps(point), flush=True)
-            keep(asked.out, asked.part, point, name)
+            keep(arguments.out, arguments.part, point, name)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Time an installation as a newcomer with nothing but Python makes it: an empty environment, the wheel, a page.
+"""Time the installation for a new user who has only Python: an empty environment, the wheel, a page.
 
-python3 tests/benchmarks/time_install.py [--python FILE] [--constraint FILE]. Builds the wheel, makes an empty
+Run `python3 tests/benchmarks/time_install.py [--python FILE] [--constraint FILE]`. Builds the wheel, makes an empty
 environment, installs the wheel without extras, and runs `reskin live --emulate nominal` in an empty folder until its
-page answers, twice: the first time, Numba compiles. Prints seconds and MB as JSON. Needs packages from pip's index or
-cache.
+page loads. It does so twice, because Numba compiles in the first run. Prints seconds and MB as JSON. Needs packages
+from pip's index or cache.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from pathlib import Path
 from time_repro import run, size_MB  # beside this file
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE_S = 600.0  # at most, until the page answers
+PAGE_S = 600.0  # limit until the page loads
 PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check")
 
 
@@ -31,7 +31,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def answers(url: str) -> bool:
+def page_loads(url: str) -> bool:
     try:
         with urllib.request.urlopen(url, timeout=1.0) as page:
             return b"live.js" in page.read()
@@ -40,15 +40,15 @@ def answers(url: str) -> bool:
 
 
 def seconds_to_page(reskin: Path, folder: Path) -> float:
-    """Start `reskin live` on a simulated skin; give the time until its page is served, in seconds."""
+    """Start `reskin live` on a simulated skin; return the seconds until its page loads."""
     port, begun_s = free_port(), time.monotonic()
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     command = [str(reskin), "live", "--emulate", "nominal", "--http-port", str(port)]
     process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
     try:
-        while not answers(f"http://127.0.0.1:{port}/"):
+        while not page_loads(f"http://127.0.0.1:{port}/"):
             if process.poll() is not None or time.monotonic() - begun_s > PAGE_S:
-                sys.exit(f"{' '.join(command)}: a page must answer within {PAGE_S:g} s; got none")
+                sys.exit(f"{' '.join(command)}: the page did not load within {PAGE_S:g} s")
             time.sleep(0.05)
         return round(time.monotonic() - begun_s, 1)
     finally:
@@ -83,9 +83,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--python", default=sys.executable)
     parser.add_argument("--constraint", type=Path)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        print(json.dumps(measure(Path(folder), asked.python, asked.constraint), indent=2))
+        print(json.dumps(measure(Path(folder), arguments.python, arguments.constraint), indent=2))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Are the numbers of the same settings equal under other threads, instructions and Pythons?
+"""Compare the results of a scene under different numbers of threads, processor instructions and Python versions.
 
-python -m tests.benchmarks.time_repeat [--python .../python3.12 ...]: a part of scene quick (one skin a board, all its
-passes and steps; one skin alone, boards held out without and with triplets) runs from nothing in a clean copy of the
-last commit under each setting; its numbers are compared with those of the first run. Adds to
-docs/measured/repeat.json and writes docs/repeat.md.
+Run `python -m tests.benchmarks.time_repeat [--python .../python3.12 ...]`. A part of scene quick (one skin per board,
+all passes and steps; experiments single_random, lobo and triplet) runs from nothing in a clean copy of the last commit
+under each setting, and its numbers are compared with those of the first run. Adds to docs/measured/repeat.json and
+writes docs/repeat.md.
 """
 
 import argparse
@@ -25,11 +25,11 @@ from reskin.config import read_yaml
 from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
 
 SCENE = "repeat"
-SKINS_N = 6  # one a board
+SKINS_N = 6  # one per board
 EXPERIMENTS = ("single_random", "lobo", "triplet")
 TRAINED = ("train_single", "train_multi", "train_triplet")
 AGAIN = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
-# Whatever this processor has, and its libraries choose: nothing that reskin/numerics.py pins holds.
+# Let libraries choose by the processor: undo all that reskin/numerics.py pins.
 UNPINNED = {
     "MKL_CBWR": "AUTO", "ATEN_CPU_CAPABILITY": "avx512", "ONEDNN_MAX_CPU_ISA": "DEFAULT",
     "OPENBLAS_CORETYPE": "SkylakeX", "OPENBLAS_NUM_THREADS": "2",
@@ -46,12 +46,12 @@ SETTINGS: dict[str, dict[str, str]] = {
 FIRST = "two processes"
 
 
-def scene_words() -> dict[str, Any]:
-    """Take of scene quick what these experiments need."""
-    words = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
-    kept = {key: words[key] for key in ("source", "seed", "selection", *TRAINED)}
-    split = {key: words["split"][key] for key in ("random_test_fraction", "random_repeats_n")}
-    simulate = words["simulate"]
+def scene_settings() -> dict[str, Any]:
+    """Return the part of scene quick that these experiments need."""
+    quick = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
+    kept = {key: quick[key] for key in ("source", "seed", "selection", *TRAINED)}
+    split = {key: quick["split"][key] for key in ("random_test_fraction", "random_repeats_n")}
+    simulate = quick["simulate"]
     boards, grid = {"rigid": simulate["boards"]["rigid"]}, simulate["protocols"]["grid"] | {"skins_n": SKINS_N}
     return kept | {
         "experiments": list(EXPERIMENTS), "split": split, "simulate": {"boards": boards, "protocols": {"grid": grid}},
@@ -59,16 +59,16 @@ def scene_words() -> dict[str, Any]:
 
 
 def make_checkout(folder: Path) -> None:
-    """Clone the last commit, with the scene in it."""
+    """Clone the last commit and commit the scene to the clone."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
-    (folder / f"pipeline/scenes/{SCENE}.yaml").write_text(json.dumps(scene_words(), indent=1))  # JSON is YAML
+    (folder / f"pipeline/scenes/{SCENE}.yaml").write_text(json.dumps(scene_settings(), indent=1))  # JSON is YAML
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for words in (["add", "."], [*author, "commit", "--quiet", "--message", SCENE]):
         subprocess.run(["git", *words], cwd=folder, check=True)
 
 
 def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any]:
-    """Run the scene from nothing, and read its numbers."""
+    """Run the scene from nothing and return its numbers."""
     environment = {**os.environ, **setting, "PYTHONPATH": str(folder)}
     subprocess.run([str(python), "-c", AGAIN], cwd=folder, env=environment, check=True, stderr=subprocess.DEVNULL)
     numbers: dict[str, Any] = io.read_json(folder / f".reskin/verified/{SCENE}/numbers.json")
@@ -76,7 +76,7 @@ def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any
 
 
 def differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Count the values that are equal and those that differ, with the largest relative difference and its name."""
+    """Count equal and differing values; return the largest relative difference and its name."""
     done = compare(first, other)
     found = {
         "equal_n": done.equal.total(),
@@ -91,15 +91,21 @@ def differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str,
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "--python", type=Path, nargs="*", default=[], help="of other versions, with the project's packages"
+        "--python", type=Path, nargs="*", default=[], help="interpreters of other versions, with the project's packages"
     )
     parser.add_argument("--out", type=Path, default=MEASURED / "repeat.json")
-    parser.add_argument("--settings", nargs="*", choices=SETTINGS, default=list(SETTINGS), help="beside the first")
-    asked = parser.parse_args()
-    named = {name: setting for name, setting in SETTINGS.items() if name in (FIRST, *asked.settings)}
+    parser.add_argument(
+        "--settings",
+        nargs="*",
+        choices=SETTINGS,
+        default=list(SETTINGS),
+        help="settings to run in addition to the first",
+    )
+    arguments = parser.parse_args()
+    named = {name: setting for name, setting in SETTINGS.items() if name in (FIRST, *arguments.settings)}
     runs = {name: (Path(sys.executable), setting) for name, setting in named.items()}
-    runs |= {version_of(python): (python.absolute(), {}) for python in asked.python}
-    found: dict[str, Any] = json.loads(asked.out.read_text())["runs"] if asked.out.exists() else {}
+    runs |= {python_version(python): (python.absolute(), {}) for python in arguments.python}
+    found: dict[str, Any] = json.loads(arguments.out.read_text())["runs"] if arguments.out.exists() else {}
     with tempfile.TemporaryDirectory() as temporary:
         first: dict[str, Any] = {}
         for name, (python, setting) in runs.items():
@@ -108,7 +114,7 @@ def main() -> None:
             try:
                 numbers = run(folder, python, setting)
             except subprocess.CalledProcessError as error:
-                print(f"{name}: did not end ({error})", flush=True)
+                print(f"{name}: failed ({error})", flush=True)
                 continue
             finally:
                 shutil.rmtree(folder)
@@ -116,12 +122,12 @@ def main() -> None:
             found[name] = {"settings": setting, **differences(first, numbers)}
             print(f"{name}: {json.dumps(found[name])}", flush=True)
             of = {"git": code_version(), "machine": machine(), "experiments": EXPERIMENTS, "runs": found}
-            asked.out.write_text(json.dumps(of, indent=1) + "\n")
-    show(json.loads(asked.out.read_text()))
+            arguments.out.write_text(json.dumps(of, indent=1) + "\n")
+    show(json.loads(arguments.out.read_text()))
 
 
 def show(found: Mapping[str, Any]) -> None:
-    """Write what was measured into docs/repeat.md: a row a setting."""
+    """Write the measurements into docs/repeat.md, one row per setting."""
     rows = [
         {
             "setting": name,
@@ -136,7 +142,7 @@ def show(found: Mapping[str, Any]) -> None:
     write_block("repeat.md", "repeat", [heading, table(rows)])
 
 
-def version_of(python: Path) -> str:
+def python_version(python: Path) -> str:
     words = "import platform; print(platform.python_version())"
     said = subprocess.run([str(python), "-c", words], capture_output=True, text=True, check=True)
     return f"Python {said.stdout.strip()}" if said.stdout.strip() != platform.python_version() else "the same Python"

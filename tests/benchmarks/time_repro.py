@@ -1,8 +1,8 @@
-"""Time `make repro` as a newcomer runs it: a fresh clone in an empty folder, environment first, then all stages.
+"""Time `make repro` for a new user: a clone in an empty folder, first the environment, then all stages.
 
-python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json. A clone of the last commit, without any cache
-but pip's own; the environment is made once, and the stages run so many times from nothing: between two runs all that
-git does not hold goes, but for the environment. Needs nothing but Python and git. Keep the machine quiet.
+Run `python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json`. It clones the last commit and uses no
+cache except pip's own. The environment is made once, and the stages run `--times` times from nothing: between two runs
+all untracked files except the environment are removed. Needs only Python and git. Keep the machine quiet meanwhile.
 """
 
 import argparse
@@ -21,9 +21,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(command: list[str], folder: Path) -> dict[str, float]:
-    """Run a command to its end: wall time and CPU time of it and all that it started, in seconds."""
+    """Run a command; return wall and CPU seconds, including all processes that it started."""
     before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    # DVC waits for every stage, and make for DVC, so that children's children are counted.
+    # DVC waits for every stage and make waits for DVC, so RUSAGE_CHILDREN includes all of them.
     subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -31,12 +31,12 @@ def run(command: list[str], folder: Path) -> dict[str, float]:
 
 
 def size_MB(folder: Path) -> float:
-    """Add up what the files of a folder take on disk."""
+    """Return the disk space of the files in a folder."""
     return round(sum(file.lstat().st_blocks * 512 for file in folder.rglob("*")) / 1e6)
 
 
 def measure(folder: Path, times: int) -> Iterator[dict[str, object]]:
-    """Time the environment with the first run in a new clone, and the stages of every run."""
+    """Time making the environment in a new clone, and the stages in each run."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
     environment = run(["make", ".venv/.installed"], folder)
     environment_MB = size_MB(folder / ".venv")
@@ -54,22 +54,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--times", type=int, default=3)
     parser.add_argument("--out", type=Path, default=ROOT / "reports/time.json")
-    parser.add_argument("--keep", type=Path, help="keep the clone there, with the results of the last run")
-    asked = parser.parse_args()
+    parser.add_argument("--keep", type=Path, help="keep the clone in this folder, with the results of the last run")
+    arguments = parser.parse_args()
     commit = subprocess.run(
         ["git", "rev-parse", "--short=12", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     runs = []
-    folder = asked.keep or Path(tempfile.mkdtemp()) / "clone"
+    folder = arguments.keep or Path(tempfile.mkdtemp()) / "clone"
     try:
-        for i, found in enumerate(measure(folder, asked.times), 1):
+        for i, found in enumerate(measure(folder, arguments.times), 1):
             runs.append(found)
-            print(f"{i}/{asked.times}: {found}", flush=True)
+            print(f"{i}/{arguments.times}: {found}", flush=True)
     finally:
-        if asked.keep is None:
+        if arguments.keep is None:
             shutil.rmtree(folder.parent)
     machine = f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"
-    asked.out.write_text(json.dumps({"git": commit.stdout.strip(), "machine": machine, "runs": runs}, indent=2) + "\n")
+    arguments.out.write_text(
+        json.dumps({"git": commit.stdout.strip(), "machine": machine, "runs": runs}, indent=2) + "\n"
+    )
 
 
 if __name__ == "__main__":
