@@ -102,7 +102,7 @@ def test_iron_disturbance_falls_with_distance():
     assert 0.4 * dipole_uT < chips_uT[-1] < 1.1 * dipole_uT
 
 
-def test_rows_keep_direction_and_scale_with_strength():
+def test_field_of_a_row_keeps_its_direction_and_scales_with_strength():
     cases = list(uniform_fields(REAL, [10.0, 50.0], rows_n=60, rng=rng_for(0, "cases")))
     assert [case.keys["field_uT"] for case in cases] == [0.0, 10.0, 50.0]
     assert not cases[0].added_uT.any()

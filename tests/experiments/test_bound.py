@@ -90,7 +90,7 @@ def test_variance_equals_that_of_sampled_readings():
 
 
 def test_slopes_equal_those_of_a_dipole():
-    def read(mm):  # Bz at a chip 3 mm below a moment along z, which the poke moves down
+    def read(mm):  # Bz at a chip 3 mm below a moment along z that the poke moves down
         x, y, z = mm[:, 0], mm[:, 1], 3.0 - mm[:, 2]
         r2 = x**2 + y**2 + z**2
         return ((3 * z**2 - r2) / r2**2.5)[:, None]
@@ -98,9 +98,9 @@ def test_slopes_equal_those_of_a_dipole():
     pokes_mm = np.array([[1.0, 0.5, 0.4], [-2.0, 3.0, 1.2], [0.0, 0.0, 0.2]])
     x, y, z = pokes_mm[:, 0], pokes_mm[:, 1], 3.0 - pokes_mm[:, 2]
     r2 = x**2 + y**2 + z**2
-    by_rho = (3 * r2 - 15 * z**2) / r2**3.5
-    by_z = (9 * z * r2 - 15 * z**3) / r2**3.5
-    expected = np.stack([x * by_rho, y * by_rho, -by_z], axis=1)[:, None]
+    per_rho = (3 * r2 - 15 * z**2) / r2**3.5
+    per_z = (9 * z * r2 - 15 * z**3) / r2**3.5
+    expected = np.stack([x * per_rho, y * per_rho, -per_z], axis=1)[:, None]
     np.testing.assert_allclose(slopes(read, pokes_mm), expected, rtol=1e-3, atol=1e-6)  # quadratic in the step
 
 

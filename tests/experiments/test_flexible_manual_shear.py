@@ -178,7 +178,7 @@ def test_flexible_numbers_list_variants_and_bias():
     assert set(summary["bias_f_N"]) == {BEFORE, AFTER, CONTROL, GRID} < set(summary)
 
 
-def dragged(seed: int, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
+def make_drag(seed: int, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
     rng = rng_for(seed, "shear")
     true = rng.normal(0, [5, 5, 0.3, 0.3, 1], (n, 5)).astype(np.float32)
     return true, (true + rng.normal(0, [1, 1, 0.1, 0.2, 0.3], (n, 5))).astype(np.float32)
@@ -186,7 +186,7 @@ def dragged(seed: int, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 @given(st.integers(0, 1000))
 def test_errors_equal_scikit_learn(seed):
-    true, predicted = dragged(seed)
+    true, predicted = make_drag(seed)
     ours, rel = score5(true, predicted), 1e-5  # single-precision input
     assert ours["mse_xy_mm2"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]), rel=rel)
     assert ours["mse_fxy_N2"] == pytest.approx(mean_squared_error(true[:, 2:4], predicted[:, 2:4]), rel=rel)
@@ -198,7 +198,7 @@ def test_errors_equal_scikit_learn(seed):
 
 @given(st.integers(0, 1000), st.floats(0.1, 10))
 def test_explained_variance_is_scale_invariant(seed, size):
-    true, predicted = dragged(seed)
+    true, predicted = make_drag(seed)
     scale = np.array([1, 1, size, size, size])
     one, other = score5(true, predicted), score5(true * scale, predicted * scale)
     assert other["mse_fxy_N2"] == pytest.approx(size**2 * one["mse_fxy_N2"], rel=1e-4)
@@ -207,7 +207,7 @@ def test_explained_variance_is_scale_invariant(seed, size):
 
 
 def test_explained_variance_of_truth_and_mean():
-    true, _ = dragged(0)
+    true, _ = make_drag(0)
     assert score5(true, true)["explained_fxy"] == 1
     mean = np.broadcast_to(true.mean(axis=0, dtype=np.float64), true.shape)
     assert score5(true, mean)["explained_xy"] == pytest.approx(0, abs=1e-6)
@@ -215,14 +215,14 @@ def test_explained_variance_of_truth_and_mean():
 
 def test_seeds_of_a_fold_are_averaged_first():
     scores = [("a", {"mse": 1.0}), ("a", {"mse": 3.0}), ("b", {"mse": 6.0})]
-    summary = summarise_shear(scores, scores[:1], target=dragged(0)[0], lines_n=3, passes_n=1, seeds_n=2)
+    summary = summarise_shear(scores, scores[:1], target=make_drag(0)[0], lines_n=3, passes_n=1, seeds_n=2)
     assert summary["mse"] == {"mean": 4.0, "n": 2, "sd": pytest.approx(8**0.5), "sd_seeds": pytest.approx(2**0.5)}
     assert "sd_seeds" not in summary["by_line"]["mse"]
     assert summary["seeds_n"] == 2
 
 
 def test_summary_has_both_splits_and_force_sizes():
-    true, predicted = dragged(1)
+    true, predicted = make_drag(1)
     score = score5(true, predicted)
     summary = summarise_shear(
         [("a", score)], [("b", {**score, "accuracy_pct": 7.0})], target=true, lines_n=3, passes_n=1, seeds_n=1

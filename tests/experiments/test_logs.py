@@ -1,4 +1,4 @@
-"""Tests of synthetic logs: quiet start, contacts, scores and errors; pitch in the earth's field."""
+"""Tests on synthetic logs: quiet start, contacts, scores and errors; a pitching board in the earth's field."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ RATE_HZ = 250.0
 NOISE_uT = 3.0
 
 
-def made_log(quiet_s=2.0, steps_n=4, name="walk"):
+def make_log(quiet_s=2.0, steps_n=4, name="walk"):
     """Return a log of 15 channels: rest, then alternately 0.3 s in contact and 0.2 s off; 200 uT per newton."""
     quiet_n, on_n, off_n = round(quiet_s * RATE_HZ), 75, 50
     force_N = np.zeros(quiet_n + steps_n * (on_n + off_n))
@@ -51,13 +51,13 @@ def truth(force_N):
 
 @pytest.mark.parametrize("quiet_s", [0.8, 2.0, 5.0])
 def test_quiet_start_ends_before_the_first_step(quiet_s):
-    t_s, b_uT, _ = made_log(quiet_s)
+    t_s, b_uT, _ = make_log(quiet_s)
     found_s = quiet_start(t_s, b_uT, where="log") / RATE_HZ
     assert quiet_s - 0.1 <= found_s <= quiet_s
 
 
 def test_log_without_quiet_start_is_an_error():
-    t_s, b_uT, _ = made_log(0.2)
+    t_s, b_uT, _ = make_log(0.2)
     with pytest.raises(CaptureError, match=r"log: the start without contact lasts .* less than 0\.5 s"):
         quiet_start(t_s, b_uT, where="log")
     with pytest.raises(CaptureError, match="the start without contact lasts 0 s"):
@@ -65,7 +65,7 @@ def test_log_without_quiet_start_is_an_error():
 
 
 def test_quiet_log_has_no_contact():
-    t_s, b_uT, _ = made_log(5.0, steps_n=0)
+    t_s, b_uT, _ = make_log(5.0, steps_n=0)
     found = estimate(t_s, b_uT, [predict], where="log")
     assert found.quiet_n >= 0.9 * len(t_s)
     numbers = describe(found)
@@ -74,7 +74,7 @@ def test_quiet_log_has_no_contact():
 
 
 def test_contacts_forces_and_noise_are_recovered():
-    t_s, b_uT, force_N = made_log()
+    t_s, b_uT, force_N = make_log()
     found = estimate(t_s, b_uT, [predict], where="log")
     np.testing.assert_array_equal(found.contact, force_N > 0)
     numbers = describe(found)
@@ -87,12 +87,12 @@ def test_contacts_forces_and_noise_are_recovered():
     assert scores["contacts_true_n"] == 4
     assert scores["missed_readings_n"] == scores["false_readings_n"] == 0
     assert scores["accuracy_pct"] == 100.0
-    # Noise variance of the mean of 15 channels in N^2; the no-load reading adds 1 / 500 of it.
+    # Noise variance of the mean of 15 channels, in N^2; the no-load reading adds 1 / 500 of it.
     assert scores["mse_f_N2"] == pytest.approx((NOISE_uT / 200) ** 2 / 15, rel=0.3)
 
 
 def test_network_errors_do_not_cancel():
-    t_s, b_uT, force_N = made_log()
+    t_s, b_uT, force_N = make_log()
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
     found = estimate(t_s, b_uT, networks, where="log")
     scores = score_contacts(found, truth(force_N))
@@ -103,7 +103,7 @@ def test_network_errors_do_not_cancel():
 
 
 def test_plotted_series_is_the_first_network_with_range():
-    t_s, b_uT, force_N = made_log(steps_n=40)
+    t_s, b_uT, force_N = make_log(steps_n=40)
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
     drawn = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
     assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in drawn[which]["x_mm"] if x_mm is not None)
@@ -125,7 +125,7 @@ def test_truth_is_that_of_the_current_step():
 
 
 def test_plotted_series_is_thinned_and_empty_off_contact():
-    t_s, b_uT, force_N = made_log(steps_n=40)
+    t_s, b_uT, force_N = make_log(steps_n=40)
     drawn = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
     assert len(drawn["t_s"]) <= 1500
     assert drawn["t_s"][0] == pytest.approx(0.004)
@@ -147,7 +147,7 @@ def instrument(noise_uT=0.0):
 
 
 def pitched_log(noise_uT=0.0):
-    t_s, b_uT, force_N = made_log()
+    t_s, b_uT, force_N = make_log()
     quiet_n = estimate(t_s, b_uT, [predict], where="log").quiet_n
     log = Log(t_s, b_uT, truth(force_N), quiet_n)
     return log, score_pitches(log, instrument(noise_uT), [predict], rng_for(0, "aside"))

@@ -81,7 +81,7 @@ def test_no_load_reading_removes_a_steady_field(rows):
 
 
 def test_kept_effects_matter(rows):
-    # Increments 16-23 % of a bonded skin at 1.2 mm; of a sliding one the far field, which is linear, counts
+    # Increments change 16-23 % on a bonded skin at 1.2 mm; on a sliding skin the linear far field dominates
     assert rows["increments"].field_pct > 2
     assert rows["rotation of the magnetisation"].field_pct > 5
     assert rows["slipping base"].field_pct > 50
@@ -104,7 +104,7 @@ def test_bonded_base_is_a_kept_effect(rows, not_inside):
 
 def test_self_field_error_is_proportional_to_powder(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
-    # 10 %: half as strong a field, and the magnetisation is not quite linear in it
+    # 10 %: the field is half as strong, and the magnetisation is not quite linear in it
     assert half["the powder's own field"].field_pct == pytest.approx(
         rows["the powder's own field"].field_pct / 2, rel=0.1
     )

@@ -34,7 +34,7 @@ from reskin.universal.map import Estimate, new_map
 from reskin.universal.model import PriorModel
 from reskin.universal.population import Population
 from reskin.universal.training import draw_weights
-from tests.universal.skins import DESIGN, made_population, made_tables
+from tests.universal.skins import DESIGN, make_population, make_tables
 
 KIND = BoardKind(
     letter="b", boards_n=1, skins_per_board_n=1, skin_mm=(20.0, 20.0), quadrature={"cell_mm": 0.8, "layers_n": 5},
@@ -46,12 +46,12 @@ METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "mse_f_weight_N2", "mse_f_f
 
 @pytest.fixture(scope="module")
 def model() -> PriorModel:
-    return PriorModel(new_map(made_tables()), [draw_weights(15, rng_for(0, "population"))])
+    return PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "population"))])
 
 
 @pytest.fixture(scope="module")
 def skins():
-    return simulated_skins(made_population(3, rng_for(1, "population"), WEIGHT_N), rng_for(2, "population"))
+    return simulated_skins(make_population(3, rng_for(1, "population"), WEIGHT_N), rng_for(2, "population"))
 
 
 def test_prior_is_centred_on_the_simulated_law():
@@ -66,7 +66,7 @@ def test_prior_is_centred_on_the_simulated_law():
 
 def test_interrupted_run_reuses_finished_parts(monkeypatch):
     drawn, shelf = [], {}
-    all_skins = made_population(7, rng_for(0, "skins"))
+    all_skins = make_population(7, rng_for(0, "skins"))
 
     def draw(_: DesignedSkins, name: str, which: slice) -> Population:
         drawn.append(which)
@@ -114,7 +114,7 @@ def test_known_weight_is_the_central_press_of_nearest_force():
     assert weight.force_N != 4.0
 
 
-def weight_of_middle(force_N: list[float]):
+def weight_of_central_presses(force_N: list[float]):
     """Return the known weight chosen from central presses with one reading each."""
     force = np.array(force_N, np.float32)
     names = (np.full(len(force), name) for name in ("c", "b0", "b0_s0"))
@@ -126,10 +126,10 @@ def weight_of_middle(force_N: list[float]):
 
 
 @pytest.mark.parametrize("zero_N", [0.0, -0.01, -5.0, np.nan])
-def test_press_without_positive_force_is_no_known_weight(zero_N):
-    assert weight_of_middle([zero_N, 4.0, 1.0]).db_uT[0] == 4
+def test_press_without_positive_force_is_not_a_known_weight(zero_N):
+    assert weight_of_central_presses([zero_N, 4.0, 1.0]).db_uT[0] == 4
     with pytest.raises(SchemaError, match="skin b0_s0: none of the 2 presses near the middle has a force above 0 N"):
-        weight_of_middle([zero_N, zero_N])
+        weight_of_central_presses([zero_N, zero_N])
 
 
 def test_tables_and_figure_list_every_method():

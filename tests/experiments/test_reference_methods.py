@@ -44,12 +44,12 @@ MAP = np.eye(6) + 0.2 * rng_for(0, "skins differ").standard_normal((6, 6))
 
 
 def old_uT(place_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
-    """Return fields of the known board, linear in log F at each place."""
+    """Return fields of the known board, which are linear in log F at each place."""
     towards = np.cos(place_mm @ rng_for(0, "fields").standard_normal((2, 6)))
     return 100 * towards * (2 + np.log(force_N))[:, None]
 
 
-def recorded() -> Rows:
+def make_rows() -> Rows:
     """Return two boards with the same pokes, two readings each; `MAP` maps fields of b1 to those of b0."""
     place_mm = np.tile(np.repeat(PLACES_MM, 2, axis=0), (2, 1))
     force_N = np.tile(FORCES_N, 10)
@@ -66,12 +66,12 @@ def fold(name: str, train: range, pool: range, test: range) -> Fold:
     return Fold("labels", name, np.array(train), np.array(test), np.array(pool))
 
 
-DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), recorded(), [])
+DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), make_rows(), [])
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 
 def test_pairs_have_the_same_place_and_force():
-    rows = recorded()
+    rows = make_rows()
     rows.target[20:22, 2] = 2.0  # between the two known forces
     rows.target[22:24, 2] = 9.0  # above the largest force
     rows.target[24:26, :2] = 50.0  # not a known place
@@ -121,8 +121,8 @@ def test_foreign_fields_keep_length_but_not_direction():
 
 def test_alarms_exceed_each_boards_limit():
     right = {"b0": np.array([0.1, 0.2, 0.3, 0.4]), "b1": np.array([0.1, 0.1, 0.2, 0.2])}
-    stranger = {"b0": np.array([0.9, 0.9]), "b1": np.array([0.1, 0.9])}
-    found = alarm_statistics(stranger, right, {"b0": 0.35, "b1": 0.15})
+    foreign = {"b0": np.array([0.9, 0.9]), "b1": np.array([0.1, 0.9])}
+    found = alarm_statistics(foreign, right, {"b0": 0.35, "b1": 0.15})
     assert found["alarm_pct"]["mean"] == pytest.approx((100 + 50) / 2)
     assert found["auc"]["mean"] == pytest.approx((1.0 + 0.5 * 0.25 + 0.5) / 2)  # ties count half
     assert found["left_median"]["mean"] == pytest.approx((0.9 + 0.5) / 2)

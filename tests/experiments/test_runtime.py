@@ -131,7 +131,7 @@ def test_boxes_fill_the_volume_of_the_lattice():
 
 
 def test_lifted_box_equals_charged_faces(monkeypatch):
-    # A single box fills the skin, too wide for a dipole; between like poles it is magnetised along z.
+    # A single box fills the skin; it is too wide for a dipole. Between like poles it is magnetised along z.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(
@@ -231,7 +231,7 @@ def test_magpylib_equals_the_kernel(quadratures):
         np.testing.assert_allclose(calls[name](), kernel_T, atol=1e-7 * np.abs(kernel_T).max())
 
 
-def test_flow_equals_that_of_the_paths():
+def test_field_by_flow_equals_field_by_paths():
     one = trial()
     ours_T, theirs_T = (METHODS[name](one, COARSE).call() for name in ("Gauss in z", "kernel alone"))
     # 0.5 %: both interpolate, between different nodes; without the rotation the error of dB exceeds dB
@@ -243,7 +243,7 @@ def test_distant_boxes_are_dipoles():
     one = trial(deep)
     boxes_T = METHODS["magpylib cuboids"](one, Quadrature(2e-3, 2)).call()
     dipoles_T = prepare(one, midpoints(one.skin.thickness_m, Quadrature(2e-3, 2))).call()
-    # 1 %: (cell / distance)^2 is 0.2 %, and the flows are interpolated differently
+    # 1 %: (cell / distance)^2 is 0.2 %, and the flows are interpolated between different nodes
     assert np.linalg.norm(boxes_T - dipoles_T) < 0.01 * np.linalg.norm(dipoles_T)
 
 
@@ -346,7 +346,7 @@ def select(rows, ratio, method) -> list[Precision]:
     return [row for row in rows if row.study == runtime.study_name(ratio) and row.method == method]
 
 
-def test_skins_relaxation_has_its_own_stiffness():
+def test_stiffness_1e7_is_that_of_the_skin():
     np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN_RELAXATION.tau_s, rtol=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Tests of resolved weights against naive loops, the normal distribution and SciPy."""
+"""Tests of resolved weights, compared with naive loops, the normal distribution and SciPy."""
 
 from itertools import pairwise
 
@@ -139,7 +139,7 @@ def test_significant_fall_is_not_monotonic():
     assert not analyse_levels(uT, WEIGHT_N)[0]["monotonic"]["holds"]
 
 
-def test_falls_by_noise_equal_their_expectation():
+def test_number_of_falls_by_noise_equals_its_expectation():
     rng = rng_for(0, "falls")
     rise_uT, noise_uT, fillings_n = 0.5, 2.0, 10
     response_uT = rise_uT * np.arange(2001) + noise_uT * rng.standard_normal((fillings_n, 2001))

@@ -1,4 +1,4 @@
-"""Stiff, extreme and broken cases hold, and planted faults are detected."""
+"""All stability cases pass, stiff, extreme and broken ones included, and planted faults are detected."""
 
 from dataclasses import replace
 from pathlib import Path

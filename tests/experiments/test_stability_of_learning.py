@@ -1,4 +1,4 @@
-"""Extreme trainings hold, and planted faults of the training are detected."""
+"""Extreme cases of training pass, and planted faults in the training code are detected."""
 
 from dataclasses import replace
 

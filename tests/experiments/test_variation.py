@@ -1,3 +1,5 @@
+"""Tests of experiment variation: changes over time and between skins, its table and its figures."""
+
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -130,7 +132,7 @@ def numbers(skins: tuple[str, ...] = ("s0", "s1")) -> dict:
     return {"depth_mm": 1.2, "worn_skin": "s0", "places": places} | when
 
 
-def drawn(last_uT: float = 40.0) -> dict:
+def figure_data(last_uT: float = 40.0) -> dict:
     time = {"contacts_n": [0, 9750], "b_uT": [[0.0] * 15, [last_uT] * 15]}
     place = {"time": time, "skins": {"s0": [1.0] * 15, "s1": [-300.0] * 15}}
     return {"places": [place | {"x_mm": x_mm, "y_mm": 8.0} for x_mm in (8.0, 4.0)]}
@@ -159,7 +161,7 @@ def test_single_skin_has_no_spread():
 
 
 def test_figures_name_channels_places_and_skins():
-    texts = figures(numbers(), drawn(), "simulated")
+    texts = figures(numbers(), figure_data(), "simulated")
     assert sorted(texts) == ["variation_skins.svg", "variation_time.svg"]
     for text in texts.values():
         ET.fromstring(text)
@@ -176,5 +178,7 @@ def test_figures_name_channels_places_and_skins():
 
 
 def test_figures_are_reproducible():
-    first, again, other = (figures(numbers(), lines, "simulated") for lines in (drawn(), drawn(), drawn(99.0)))
+    first, again, other = (
+        figures(numbers(), lines, "simulated") for lines in (figure_data(), figure_data(), figure_data(99.0))
+    )
     assert first == again != other

@@ -73,7 +73,7 @@ def test_no_spread_gives_no_difference():
     assert not any(exact.values())
 
 
-# Each of the following tests plants a fault in the simulator, which its row must detect.
+# Each of the following tests plants a fault in the simulator, which a check must detect.
 
 
 def test_wrong_sign_inside_magnets_is_detected(monkeypatch):

@@ -1,4 +1,4 @@
-"""Tests of the simulated worlds that show what decides table 2."""
+"""Tests of the simulated worlds that show which settings decide table 2."""
 
 from pathlib import Path
 

@@ -1,7 +1,7 @@
 """Small recipes, training data and jobs for tests.
 
-`some_job` is a prepared network whose targets are a smooth function of its inputs. The others are jobs on a scene of
-four skins: two skins are trained on, the last one is new.
+`some_job` prepares a network whose targets are a smooth function of its inputs. The other jobs use a scene of four
+skins: two are training skins and the last one is new.
 """
 
 from dataclasses import replace

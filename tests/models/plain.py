@@ -51,7 +51,7 @@ def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarr
 def plain_train(
     start: Mapping[str, np.ndarray], batches: Iterable[Batch], schedule: Schedule, terms: LossWeights
 ) -> dict[str, np.ndarray]:
-    """The plainest loop that trains one network by autograd, on the batches of a stack of one."""
+    """Train one network by autograd in a plain loop, on the batches of a stack of one."""
     net = plain_net("paper", start)
     features = features_of(net)
     optimizer = torch.optim.AdamW(net.parameters(), lr=schedule.rate_max, weight_decay=schedule.weight_decay)

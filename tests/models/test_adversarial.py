@@ -14,7 +14,7 @@ KNOWN, TARGET = some_rows(200, "known")
 NEW = some_rows(100, "new")[0] + np.float32(1.5)
 
 
-def trained(
+def train_network(
     weight: float, new: np.ndarray = NEW, seed: int = 0, schedule: Schedule = SCHEDULE
 ) -> dict[str, np.ndarray]:
     return dict(train_adversarial(Domains(KNOWN, TARGET, new), schedule, weight, rng_for(seed, "adversarial")))
@@ -45,13 +45,14 @@ def test_features_of_both_skins_converge():
     # Over 12 seeds the ratio is 0.30 with a standard deviation of 0.12, so that the mean of three is four standard
     # errors (0.068) below 0.6. After 150 steps the ratio is 1.05 +- 0.45, which is inconclusive.
     ratios = [
-        feature_distance(trained(1.0, seed=seed)) / feature_distance(trained(0.0, seed=seed)) for seed in range(3)
+        feature_distance(train_network(1.0, seed=seed)) / feature_distance(train_network(0.0, seed=seed))
+        for seed in range(3)
     ]
     assert np.mean(ratios) < 0.6
 
 
 def test_control_ignores_the_new_skin():
     short = SCHEDULE.model_copy(update={"steps_n": 20})
-    control, elsewhere = trained(0.0, schedule=short), trained(0.0, NEW + np.float32(3.0), schedule=short)
+    control, elsewhere = train_network(0.0, schedule=short), train_network(0.0, NEW + np.float32(3.0), schedule=short)
     for name, value in control.items():
         np.testing.assert_array_equal(value, elsewhere[name])

@@ -8,13 +8,13 @@ from reskin.models.alignment import RIDGES, choose_ridge, coral, direct, match_c
 from reskin.seeds import rng_for
 
 
-def drawn(name: str, n: int = 80, c: int = 4) -> np.ndarray:
+def draw_inputs(name: str, n: int = 80, c: int = 4) -> np.ndarray:
     """Inputs of a skin: correlated channels with different scales and means."""
     rng = rng_for(0, "alignment", name)
     return rng.standard_normal((n, c)) @ rng.standard_normal((c, c)) * rng.uniform(1, 30, c) + rng.normal(0, 20, c)
 
 
-OF, TO = drawn("of"), drawn("to", n=70)
+OF, TO = draw_inputs("of"), draw_inputs("to", n=70)
 
 
 def test_matched_channels_have_the_means_and_deviations():
@@ -66,7 +66,7 @@ def test_undetermined_directions_stay():
 
 @pytest.mark.parametrize("noise", [0.01, 30.0])
 def test_ridge_minimises_the_leave_one_out_error(noise):
-    of = drawn("pairs", n=9)
+    of = draw_inputs("pairs", n=9)
     to = of @ np.diag([1.5, 0.5, 1.0, 1.2]) + noise * rng_for(0, "noise").standard_normal(of.shape)
 
     def error(ridge: float) -> float:

@@ -37,14 +37,14 @@ class PicklingExecutor(Executor):
         return done
 
 
-def measured() -> TrainingData:
+def make_rows() -> TrainingData:
     rng = rng_for(0, "baselines")
     db_uT = rng.normal(0, 50, (ROWS_N, CH_N)).astype(np.float32)
     target = (np.tanh(db_uT[:, :3] / 50) + rng.normal(0, 0.1, (ROWS_N, 3))).astype(np.float32)
     return TrainingData(db_uT, target, np.array(["s0"] * ROWS_N))
 
 
-ROWS = measured()
+ROWS = make_rows()
 
 
 def method(name: str = "ridge", inputs: str = "raw") -> Classical:
@@ -73,7 +73,7 @@ def fits(monkeypatch) -> list[dict[str, Any]]:
     return seen
 
 
-def inputs_by_hand(inputs: str, db_uT: np.ndarray) -> np.ndarray:
+def expected_inputs(inputs: str, db_uT: np.ndarray) -> np.ndarray:
     if inputs == "raw":
         return db_uT
     length_uT = np.sqrt((db_uT.astype(float) ** 2).sum(axis=1))[:, None]
@@ -85,9 +85,9 @@ def inputs_by_hand(inputs: str, db_uT: np.ndarray) -> np.ndarray:
 def test_job_equals_direct_call(name, inputs):
     one = method(name, inputs)
     (got,) = results_of(task(one))
-    train, test = (inputs_by_hand(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
+    train, test = (expected_inputs(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
     by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
-    # the last bit of a float32 input of 1 uT to 200 uT may differ; the targets change by at most 1e-5
+    # Inputs of 1 uT to 200 uT may differ in the last bit of a float32; the targets then change by at most 1e-5
     np.testing.assert_allclose(got.predicted, by_hand.predict(test), atol=1e-5)
     assert got.rows_n == 30
     assert got.seconds > 0

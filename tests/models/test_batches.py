@@ -30,7 +30,7 @@ def test_every_step_has_all_batches():
         }
 
 
-def test_missing_data_is_not_drawn():
+def test_absent_data_gives_no_batches():
     assert batches([some_job()])[0].keys() == {"inputs", "targets"}
 
 

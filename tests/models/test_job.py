@@ -28,16 +28,16 @@ from tests.models.example_jobs import (
     without_triplets,
 )
 
-NEW = np.arange(24, ROWS_N)  # rows of the skins that are not trained on
+NEW = np.arange(24, ROWS_N)  # rows of the skins outside the training data
 KINDS = {"pooled": pooled, "adapting": adaptation, "few labels": fine_tuning}
 
 
-def trained(job: TrainingJob, rows: TrainingData) -> TrainingResult:
+def train_job(job: TrainingJob, rows: TrainingData) -> TrainingResult:
     return train_stack([job], rows)[0]
 
 
-def alike(one: TrainingResult, other: TrainingResult) -> bool:
-    """Equal bit for bit: weights, scaler, curve."""
+def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
+    """Return whether weights, scaler and curve are equal bit for bit."""
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     scaler, again = one.scaler.arrays(), other.scaler.arrays()
     return weights and one.curve == other.curve and all((scaler[name] == again[name]).all() for name in scaler)
@@ -50,25 +50,26 @@ def alike(one: TrainingResult, other: TrainingResult) -> bool:
 @pytest.mark.parametrize("at", [POKED, TEST, NEW], ids=["poked", "tested", "all"])
 def test_adaptation_ignores_places_and_forces_of_the_new_skin(at, new):
     once, blind = (
-        trained(adaptation(), example_data()),
-        trained(adaptation(), with_values(example_data(), "target", at, new)),
+        train_job(adaptation(), example_data()),
+        train_job(adaptation(), with_values(example_data(), "target", at, new)),
     )
-    assert alike(once, blind)
+    assert equal_results(once, blind)
     assert (once.predicted == blind.predicted).all()
 
 
 def test_adaptation_ignores_the_skin_of_its_pokes():
-    assert alike(
-        trained(adaptation(), example_data()), trained(adaptation(), with_values(example_data(), "skin", NEW, "b0_s0"))
+    assert equal_results(
+        train_job(adaptation(), example_data()),
+        train_job(adaptation(), with_values(example_data(), "skin", NEW, "b0_s0")),
     )
 
 
 def test_adaptation_uses_fields_and_order_of_the_lines():
-    once, along = trained(adaptation(), example_data()), lines()
+    once, along = train_job(adaptation(), example_data()), lines()
     backwards = replace(along, row=along.row[[0, 2, 4, 1, 3, 5]])
-    assert not alike(once, trained(adaptation(along=backwards), example_data()))
-    assert not alike(once, trained(adaptation(), with_values(example_data(), "db_uT", POKED[0], 0)))
-    assert not alike(once, trained(adaptation(), with_values(example_data(), "target", TRAIN[0], 0)))
+    assert not equal_results(once, train_job(adaptation(along=backwards), example_data()))
+    assert not equal_results(once, train_job(adaptation(), with_values(example_data(), "db_uT", POKED[0], 0)))
+    assert not equal_results(once, train_job(adaptation(), with_values(example_data(), "target", TRAIN[0], 0)))
 
 
 def test_lines_have_no_place_and_no_force():
@@ -79,7 +80,9 @@ def test_pokes_use_the_scaler_of_the_start():
     line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
     along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
     scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
-    prepared, used = prepare(tuned(adaptation(along=along), start=replace(start(), scaler=scaler)), example_data())
+    prepared, used = prepare(
+        with_tuning(adaptation(along=along), start=replace(start(), scaler=scaler)), example_data()
+    )
     assert used is scaler
     db_uT = example_data().db_uT
     for point, row in enumerate(along.row):
@@ -93,18 +96,18 @@ def test_pokes_use_the_scaler_of_the_start():
 @pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
 def test_control_uses_nothing_of_the_new_skin(at):
     control = adaptation(unlabelled_weight=0.0)
-    once = trained(control, example_data())
+    once = train_job(control, example_data())
     for part, new in (("db_uT", 1e4), ("target", np.nan)):
-        assert alike(once, trained(control, with_values(example_data(), part, at, new)))
-    assert not alike(once, trained(adaptation(), example_data()))
+        assert equal_results(once, train_job(control, with_values(example_data(), part, at, new)))
+    assert not equal_results(once, train_job(adaptation(), example_data()))
 
 
 def test_fine_tuning_uses_its_labels_only():
-    once = trained(fine_tuning(), example_data())
+    once = train_job(fine_tuning(), example_data())
     others = np.setdiff1d(NEW, OWN)
-    assert alike(once, trained(fine_tuning(), with_values(example_data(), "target", others, np.nan)))
-    assert not alike(once, trained(fine_tuning(), with_values(example_data(), "target", OWN, 0)))
-    assert not alike(once, trained(fine_tuning(own_weight=0.0), example_data()))
+    assert equal_results(once, train_job(fine_tuning(), with_values(example_data(), "target", others, np.nan)))
+    assert not equal_results(once, train_job(fine_tuning(), with_values(example_data(), "target", OWN, 0)))
+    assert not equal_results(once, train_job(fine_tuning(own_weight=0.0), example_data()))
 
 
 # Held-out data
@@ -114,10 +117,10 @@ def test_fine_tuning_uses_its_labels_only():
 @pytest.mark.parametrize("view", ["raw", "shape"])
 def test_no_test_row_reaches_the_model(scaling, view):
     job = pooled(scaling=scaling, inputs=view)
-    once = trained(job, example_data())
+    once = train_job(job, example_data())
     planted = with_values(with_values(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
-    again = trained(job, planted)
-    assert alike(once, again)
+    again = train_job(job, planted)
+    assert equal_results(once, again)
     assert (once.predicted != again.predicted).any()
 
 
@@ -194,7 +197,7 @@ def key(job: TrainingJob, rows: TrainingData | None = None) -> str:
     return JobKeys(rows or example_data()).key(job)
 
 
-def tuned(job: TrainingJob, **changes: object) -> TrainingJob:
+def with_tuning(job: TrainingJob, **changes: object) -> TrainingJob:
     return replace(job, tuning=replace(job.tuning, **changes))
 
 
@@ -202,7 +205,7 @@ def with_row(part: str, row: int, to: object) -> Callable[[], TrainingData]:
     return lambda: with_values(example_data(), part, np.array([row]), to)
 
 
-DECISIVE_ROWS = {
+INFLUENTIAL_ROWS = {
     "a trained field": ("pooled", with_row("db_uT", TRAIN[3], 1.0)),
     "a trained place": ("pooled", with_row("target", TRAIN[3], 1.0)),
     "the skin of a trained row": ("pooled", with_row("skin", TRAIN[3], "b0_s1")),
@@ -211,7 +214,7 @@ DECISIVE_ROWS = {
     "an own field": ("few labels", with_row("db_uT", OWN[1], 1.0)),
     "an own label": ("few labels", with_row("target", OWN[1], 1.0)),
 }
-IDLE_ROWS = {
+OTHER_ROWS = {
     "a tested place": ("pooled", with_row("target", TEST[3], 1.0)),
     "a field that nobody uses": ("pooled", with_row("db_uT", 30, 1.0)),
     "the name of all skins": ("pooled", lambda: replace(example_data(), skin=np.char.add("x", example_data().skin))),
@@ -221,23 +224,23 @@ IDLE_ROWS = {
 }
 
 
-@pytest.mark.parametrize("what", sorted(DECISIVE_ROWS))
-def test_key_changes_with_what_decides_the_result(what):
-    kind, rows = DECISIVE_ROWS[what]
+@pytest.mark.parametrize("what", sorted(INFLUENTIAL_ROWS))
+def test_key_changes_with_rows_that_influence_the_result(what):
+    kind, rows = INFLUENTIAL_ROWS[what]
     assert key(KINDS[kind](), rows()) != key(KINDS[kind]())
 
 
-@pytest.mark.parametrize("what", sorted(IDLE_ROWS))
-def test_key_ignores_what_decides_nothing(what):
-    kind, rows = IDLE_ROWS[what]
+@pytest.mark.parametrize("what", sorted(OTHER_ROWS))
+def test_key_ignores_rows_without_influence(what):
+    kind, rows = OTHER_ROWS[what]
     assert key(KINDS[kind](), rows()) == key(KINDS[kind]())
 
 
-def finer(job: TrainingJob, **changes: object) -> TrainingJob:
-    return tuned(job, settings=job.tuning.settings.model_copy(update=changes))
+def with_tuning_settings(job: TrainingJob, **changes: object) -> TrainingJob:
+    return with_tuning(job, settings=job.tuning.settings.model_copy(update=changes))
 
 
-def test_no_two_settings_share_a_key():
+def test_different_settings_have_different_keys():
     along = lines()
     jobs = [
         pooled(), adaptation(), fine_tuning(), replace(pooled(), train=TRAIN[1:]), replace(pooled(), test=TEST[1:]),
@@ -247,13 +250,13 @@ def test_no_two_settings_share_a_key():
         )],
         without_triplets(),
         replace(pooled(), seed=8), replace(pooled(), seed_i=1), replace(pooled(), fold="b0"),
-        replace(adaptation(), skin="b1_s0"), tuned(adaptation(), start=start("another")),
-        finer(adaptation(), steps_n=5),
-        finer(adaptation(), unlabelled_weight=0.25), finer(adaptation(), rate_max=1e-4),
+        replace(adaptation(), skin="b1_s0"), with_tuning(adaptation(), start=start("another")),
+        with_tuning_settings(adaptation(), steps_n=5),
+        with_tuning_settings(adaptation(), unlabelled_weight=0.25), with_tuning_settings(adaptation(), rate_max=1e-4),
         adaptation(along=replace(along, order_i=along.order_i[::-1].copy())),
         adaptation(along=replace(along, line_i=np.array([0, 0, 0, 1, 1, 1], np.int32))),
         adaptation(along=replace(along, row=along.row[::-1].copy())),
-        tuned(fine_tuning(), row=OWN[:2]), finer(fine_tuning(), own_weight=0.25),
+        with_tuning(fine_tuning(), row=OWN[:2]), with_tuning_settings(fine_tuning(), own_weight=0.25),
     ]  # fmt: skip
     assert len({key(job) for job in jobs}) == len(jobs)
 
@@ -276,10 +279,10 @@ def test_last_bias_starts_at_the_mean_target(scaling):
     assert prepared.initial_weights["layer6.bias"][2] == 0  # an unknown target
 
 
-NOT_DECIDING = {
-    "code": "tells code from code",
+WITHOUT_INFLUENCE = {
+    "code": "computes the digest of the code",
     "config": "checks settings, whose values are part of the key",
-    "errors": "stops a training, and changes none",
+    "errors": "stops a training run, but changes no result",
     "io": "reads and writes files, whose values are part of the key",
     "numerics": "its signature of the environment is part of the key, as is the device",
     "schema": "makes rows, whose values are part of the key",
@@ -294,7 +297,7 @@ def test_key_covers_the_code_of_training():
     graph = grimp.build_graph("reskin", cache_dir=None)
     modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
     imported = {module for module in modules if not graph.find_children(module)}
-    others = {f"reskin.{name}" for name in NOT_DECIDING}
+    others = {f"reskin.{name}" for name in WITHOUT_INFLUENCE}
     assert imported - others == set(CODE_MODULES)
     assert others <= imported
 

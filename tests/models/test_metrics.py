@@ -56,7 +56,7 @@ def test_unknown_force_is_ignored():
 @given(st.floats(-5, 5), st.floats(-5, 5))
 def test_constant_offset_is_removed_by_registration(dx_mm, dy_mm):
     shifted = TRUE + [dx_mm, dy_mm, 0.0]
-    # exact but for the rounding of means of numbers below 32
+    # exact except for rounding of means of numbers below 32
     assert score(TRUE, register(TRUE, shifted))["mse_xy_mm2"] == pytest.approx(0.0, abs=1e-24)
 
 
@@ -64,7 +64,7 @@ def test_constant_offset_is_removed_by_registration(dx_mm, dy_mm):
 def test_force_error_scales_with_the_square_of_the_unit(scale):
     predicted = TRUE + 0.25
     scaled = score(TRUE * [1, 1, scale], predicted * [1, 1, scale])
-    # two roundings a row
+    # two roundings per row
     assert scaled["mse_f_N2"] == pytest.approx(scale**2 * score(TRUE, predicted)["mse_f_N2"], rel=1e-9)
 
 

@@ -12,7 +12,7 @@ from tests.models.plain import features_of, plain_net, weights_of
 CLOSE = {"rtol": 1e-4, "atol": 1e-6}
 
 
-def drawn(architecture: str = "paper", name: int = 0) -> dict[str, np.ndarray]:
+def draw_parameters(architecture: str = "paper", name: int = 0) -> dict[str, np.ndarray]:
     return draw_weights(LAYERS[architecture](15), rng_for(0, "net", name))
 
 
@@ -21,7 +21,7 @@ def batch(members_n: int, b: int = 16) -> torch.Tensor:
 
 
 def stack(members_n: int, architecture: str = "paper") -> Stack:
-    return Stack(LAYERS[architecture](15), [drawn(architecture, i) for i in range(members_n)])
+    return Stack(LAYERS[architecture](15), [draw_parameters(architecture, i) for i in range(members_n)])
 
 
 def descend(net: nn.Module, inputs: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
@@ -36,7 +36,7 @@ def test_stacked_networks_equal_plain_networks(architecture, members_n):
     net, inputs = stack(members_n, architecture), batch(members_n)
     outputs, _ = descend(net, inputs)
     for i in range(members_n):
-        alone = plain_net(architecture, drawn(architecture, i))
+        alone = plain_net(architecture, draw_parameters(architecture, i))
         output, _ = descend(alone, inputs[i])
         torch.testing.assert_close(outputs[i], output, **CLOSE)
         features = features_of(alone)(inputs[i])
@@ -57,7 +57,7 @@ def _with_gradients_for_weights(net: Stack) -> Stack:
 def test_stacked_networks_are_independent():
     inputs = batch(3)
     outputs, gradients = descend(stack(3), inputs)
-    others = Stack(LAYERS["paper"](15), [drawn(name=0), drawn(name=9), drawn(name=2)])
+    others = Stack(LAYERS["paper"](15), [draw_parameters(name=0), draw_parameters(name=9), draw_parameters(name=2)])
     inputs[1] = 1e3 * inputs[1] + 5
     again, again_gradients = descend(others, inputs)
     for i, same in enumerate([True, False, True]):
@@ -77,7 +77,7 @@ def test_nan_stays_in_its_network():
 def test_network_round_trip_through_a_stack():
     net = stack(3)
     for i in range(3):
-        put, taken = drawn(name=i), net.weights_of(i)
+        put, taken = draw_parameters(name=i), net.weights_of(i)
         assert list(taken) == list(put)
         assert all((taken[name] == put[name]).all() for name in put)
 
@@ -88,12 +88,12 @@ def test_extracted_network_is_a_copy():
     with torch.no_grad():
         for one in net.parameters():
             one += 1
-    assert all((taken[name] == values).all() for name, values in drawn(name=1).items())
+    assert all((taken[name] == values).all() for name, values in draw_parameters(name=1).items())
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_nan_weight_affects_its_network_only(bad):
-    members = [drawn(name=i) for i in range(3)]
+    members = [draw_parameters(name=i) for i in range(3)]
     members[1]["layer4.bias"][7] = bad
     assert Stack(LAYERS["paper"](15), members).is_finite().tolist() == [True, False, True]
 
@@ -116,8 +116,10 @@ def test_released_network_is_nonnegative():
 def test_prediction_does_not_depend_on_the_block(monkeypatch, block_n):
     inputs = batch(1)[0].numpy()
     monkeypatch.setattr(network, "BLOCK_ROWS_N", block_n)
-    predict = Predictor(drawn(), "paper", "cpu")
+    predict = Predictor(draw_parameters(), "paper", "cpu")
     outputs = predict(inputs)
     one_by_one = np.concatenate([predict(row[None]) for row in inputs])
     np.testing.assert_allclose(outputs, one_by_one, **CLOSE)
-    np.testing.assert_allclose(outputs, plain_net("paper", drawn())(torch.from_numpy(inputs)).detach(), **CLOSE)
+    np.testing.assert_allclose(
+        outputs, plain_net("paper", draw_parameters())(torch.from_numpy(inputs)).detach(), **CLOSE
+    )

@@ -23,7 +23,7 @@ STACKED_ATOL = 1e-3  # mm, N: float32 rounding between stacks (test_train.py)
 
 
 class InlineExecutor(Executor):
-    """Run at once in this process and count calls; from the `die_after`-th call on, workers are dead."""
+    """Run each call immediately in this process and count calls; workers are dead from call `die_after` on."""
 
     def __init__(self, die_after: int = 10**9, error: type[Exception] = BrokenProcessPool) -> None:
         self.calls_n = 0
@@ -44,7 +44,7 @@ class InlineExecutor(Executor):
 
 
 def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
-    """Each fold leaves some rows of two skins out."""
+    """Return jobs of folds that each hold out some rows of two skins."""
     everyone = np.arange(24)
     held = [np.array([i, i + 12]) for i in range(folds_n)]
     one = replace(pooled(**changes), experiment="lobo")
@@ -59,13 +59,13 @@ def run(
 
 
 def trainings_n(some: list[TrainingJob], cache: Path) -> int:
-    """The number of stacks that are trained."""
+    """Return the number of stacks that are trained."""
     executor = InlineExecutor()
     run(some, cache, executor)
     return executor.calls_n
 
 
-def alike(one: TrainingResult, other: TrainingResult) -> bool:
+def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     return weights and (one.predicted == other.predicted).all() and one.curve == other.curve
 
@@ -77,7 +77,7 @@ def test_result_reports_whether_it_was_cached(tmp_path):
     assert [one.reused for one in both] == [True, True, False, False]
     assert [one.seconds for one in both[:2]] == pytest.approx(
         [one.seconds for one in first]
-    )  # seconds of the training, not of the cache
+    )  # seconds of the training, not of reading the cache
 
 
 def test_results_are_in_the_order_of_jobs(tmp_path):
@@ -115,15 +115,15 @@ def test_killed_run_keeps_finished_jobs(tmp_path):
         run(some, tmp_path / "killed", InlineExecutor(die_after=1))
     assert trainings_n(some, tmp_path / "killed") == 2  # of three stacks
     done, fresh = run(some, tmp_path / "killed"), run(some, tmp_path / "fresh")
-    assert all(alike(a, b) for a, b in zip(done, fresh, strict=True))
+    assert all(equal_results(a, b) for a, b in zip(done, fresh, strict=True))
 
 
-def test_stack_killed_while_written(tmp_path):
+def test_stack_killed_during_writing_is_retrained(tmp_path):
     # Batches of 1 and many steps amplify differences in the last bits between places in a stack.
     some = jobs(SIZE_N, steps_n=60, batch_n=1)
     done = run(some, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
-    assert all(alike(a, b) for a, b in zip(done, run(some, tmp_path), strict=True))
+    assert all(equal_results(a, b) for a, b in zip(done, run(some, tmp_path), strict=True))
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "bit"])
@@ -135,7 +135,7 @@ def test_damaged_result_is_reported_and_retrained(tmp_path, damage):
     file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
     again = run(jobs(), tmp_path, log=log)
     assert [line.startswith("warning: a cached result is damaged") for line in log[:2]] == [True, False]
-    assert all(alike(a, b) for a, b in zip(first, again, strict=True))
+    assert all(equal_results(a, b) for a, b in zip(first, again, strict=True))
 
 
 def test_memory_error_is_explained(tmp_path, monkeypatch):
@@ -158,7 +158,7 @@ def test_finished_jobs_are_not_trained_again(tmp_path):
     log: list[str] = []
     first = run(jobs(), tmp_path)
     again = run(jobs(), tmp_path, InlineExecutor(die_after=0), log)
-    assert all(alike(a, b) for a, b in zip(first, again, strict=True))
+    assert all(equal_results(a, b) for a, b in zip(first, again, strict=True))
     assert log == ["3 of 3 training runs were finished before"]
 
 
@@ -172,7 +172,7 @@ def test_finished_jobs_are_not_trained_again(tmp_path):
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
-def test_one_more_job_costs_one_stack(tmp_path, more, trained_n):
+def test_additional_job_trains_one_stack(tmp_path, more, trained_n):
     run(jobs(2), tmp_path)
     assert trainings_n([*jobs(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
@@ -189,14 +189,14 @@ def test_equal_trainings_run_once(tmp_path):
     some = [one, replace(one, recipe_name="twin"), one]
     done = run(some, tmp_path)
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
-    assert all(alike(done[0], other) for other in done[1:])
+    assert all(equal_results(done[0], other) for other in done[1:])
 
 
 def test_different_trainings_of_one_name_are_distinct(tmp_path):
     one, other = jobs(1)[0], jobs(1, steps_n=3)[0]
     assert one.name == other.name
     done = run([one, other], tmp_path)
-    assert not alike(*done)
+    assert not equal_results(*done)
     assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
 
 
@@ -217,7 +217,7 @@ def test_cache_opens_without_pickle(tmp_path):
 @pytest.mark.parametrize("job", [pooled(), adaptation(), fine_tuning()], ids=["pooled", "adapting", "few labels"])
 def test_result_round_trip_through_the_cache(tmp_path, job):
     (direct,), (read,) = train_stack([job], example_data()), run([job], tmp_path)
-    assert alike(direct, read)
+    assert equal_results(direct, read)
     assert all((a == read.scaler.arrays()[name]).all() for name, a in direct.scaler.arrays().items())
     assert read.stopped_step is direct.stopped_step is None
 
@@ -233,8 +233,8 @@ def test_diverged_network_keeps_its_last_finite_weights(tmp_path):
 DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # constant output, and no gradient through a ReLU of 0
 
 
-def dies(attempts: set[int]) -> object:
-    """Make some attempts of fold b0 start with dead weights."""
+def prepare_dead(attempts: set[int]) -> object:
+    """Return a `prepare` that gives these attempts of fold b0 dead weights."""
 
     def make(job: TrainingJob, rows: object) -> object:
         prepared, scaler = prepare(job, rows)
@@ -249,7 +249,7 @@ def dies(attempts: set[int]) -> object:
 
 @pytest.mark.parametrize(("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1, 2}, 2, 1)])
 def test_collapsed_training_is_repeated_at_most_twice(tmp_path, monkeypatch, dead, before_n, collapsed):
-    monkeypatch.setattr(train, "prepare", dies(dead))
+    monkeypatch.setattr(train, "prepare", prepare_dead(dead))
     some, log = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
     for _ in range(2):  # the second time from the cache
         first, second = run(some, tmp_path, log=log)
@@ -260,12 +260,12 @@ def test_collapsed_training_is_repeated_at_most_twice(tmp_path, monkeypatch, dea
 
 
 def test_short_training_is_not_checked_for_collapse(tmp_path, monkeypatch):
-    monkeypatch.setattr(train, "prepare", dies({0, 1, 2}))
+    monkeypatch.setattr(train, "prepare", prepare_dead({0, 1, 2}))
     first, _ = run(jobs(2, steps_n=CHECKED_STEPS_N - 1), tmp_path)
     assert (first.explained_min, first.collapsed) == (None, False)
 
 
-def test_constant_or_unknown_target_is_no_collapse(tmp_path):
+def test_constant_or_unknown_target_is_not_a_collapse(tmp_path):
     rows = example_data()
     flat, unknown = rows.target.copy(), rows.target.copy()
     flat[:, 2], unknown[:, 2] = 1.5, np.nan
@@ -282,26 +282,26 @@ def test_worker_process_gives_the_same_result(tmp_path, monkeypatch):
     some = [adaptation(), fine_tuning()]
     with make_executor(imports="reskin.models.train") as executor:
         apart = run(some, tmp_path / "apart", executor)
-    assert all(alike(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
+    assert all(equal_results(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
 
 
-def keyed(some: list[TrainingJob]) -> dict[str, TrainingJob]:
+def by_key(some: list[TrainingJob]) -> dict[str, TrainingJob]:
     return {f"key{i}": job for i, job in enumerate(some)}
 
 
 def test_equal_recipes_share_a_stack():
     twin = [replace(job, recipe_name="twin") for job in jobs(1)]
-    assert [len(stack) for stack in make_stacks(keyed([*jobs(2), *twin]), 3)] == [3]
+    assert [len(stack) for stack in make_stacks(by_key([*jobs(2), *twin]), 3)] == [3]
     released = replace(adaptation(), recipe=pooled(architecture="released").recipe)
     tuned = [adaptation(), released, adaptation(unlabelled_weight=0.0), fine_tuning()]
     others = [jobs(1, steps_n=5)[0], without_triplets(), replace(jobs(1)[0], seed_i=1), *tuned]
-    assert [len(stack) for stack in make_stacks(keyed([*jobs(1), *others]), 3)] == [1] * 8
+    assert [len(stack) for stack in make_stacks(by_key([*jobs(1), *others]), 3)] == [1] * 8
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
 def test_stacks_cover_every_job_once(kinds, size_n):
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
-    some = keyed([pooled(**settings[kind]) for kind in kinds])
+    some = by_key([pooled(**settings[kind]) for kind in kinds])
     found = make_stacks(some, size_n)
     assert sorted(key for one in found for key in one) == sorted(some)
     for one in found:

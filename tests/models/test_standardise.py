@@ -14,7 +14,7 @@ def rows(n: int = 50, ch: int = 6) -> tuple[np.ndarray, np.ndarray]:
 def test_inputs_have_zero_mean_and_unit_deviation():
     db_uT, target = rows()
     scaled = fit_standard(db_uT, target).encode(db_uT).astype(float)
-    # float32 rounding of numbers around 3 sd
+    # float32 rounding of numbers of about 3 sd
     np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(scaled.std(axis=0), 1, atol=1e-5)
 

@@ -17,9 +17,9 @@ from tests.models.plain import plain_net, plain_train
 
 ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = LossWeights(0.0)
-# Sums in another order, on another processor or memory alignment round differently: 6e-8 of a term. AdamW divides a
-# gradient by its own size, so a ReLU that rounding opens for one row moves all weights of its unit by a whole
-# step: one unit of 200 is at most 7 % of the way from the start, a missing loss term is more.
+# Sums in another order, on another processor or with another memory alignment differ by 6e-8 of a term. AdamW divides
+# a gradient by its own size, so if rounding opens a ReLU for one row, all weights of its unit move by a whole step.
+# One unit of 200 is at most 7 % of the distance from the start; a missing loss term changes more than that.
 WAY = 2e-2
 
 
@@ -53,7 +53,7 @@ def test_gradients_are_clipped_per_network():
 
 
 def test_clipping_prevents_dead_networks():
-    """On simulated skins, at four times the rate in use, all ReLUs of a layer die in most networks."""
+    """Without clipping, at four times the usual rate, all ReLUs of a layer die in most networks on simulated skins."""
     jobs = [some_job(i, n=400) for i in range(3)]
     schedule = recipe(steps_n=400, batch_n=64, rate_max=2.4e-2)
     free, cut = (run(jobs_of(jobs), schedule.model_copy(update={"gradient_norm_max": one})) for one in (1e9, 1.0))
@@ -170,7 +170,7 @@ def test_any_number_of_rows_trains_in_any_batch(n, batch_n):
 
 @pytest.mark.parametrize(("times", "rate_max"), [(1e30, 3e-3), (1.0, 1e6), (1e20, 1e6)])
 def test_diverging_training_keeps_its_last_finite_weights(times, rate_max):
-    job = scaled(some_job(), times)
+    job = scale_inputs(some_job(), times)
     (outcome,) = run([job], recipe(steps_n=500, rate_max=rate_max))
     assert outcome.stopped_step is not None
     assert outcome.stopped_step % BLOCK_STEPS_N == 0
@@ -181,7 +181,7 @@ def test_diverging_training_keeps_its_last_finite_weights(times, rate_max):
         assert all((outcome.weights[name] == job.initial_weights[name]).all() for name in job.initial_weights)
 
 
-def scaled(job: PreparedJob, times: float) -> PreparedJob:
+def scale_inputs(job: PreparedJob, times: float) -> PreparedJob:
     return replace(job, labelled=replace(job.labelled, inputs=(job.labelled.inputs * times).astype(np.float32)))
 
 
@@ -232,7 +232,7 @@ def test_neighbours_of_a_diverging_network_are_unaffected():
     schedule = recipe(steps_n=120)
     well = run([some_job(i, terms=True) for i in range(3)], schedule, ALL_TERMS)
     jobs = [some_job(i, terms=True) for i in range(3)]
-    first, ill, last = run([jobs[0], scaled(jobs[1], 1e30), jobs[2]], schedule, ALL_TERMS)
+    first, ill, last = run([jobs[0], scale_inputs(jobs[1], 1e30), jobs[2]], schedule, ALL_TERMS)
     assert same(first, well[0])
     assert same(last, well[2])
     assert ill.stopped_step == BLOCK_STEPS_N

@@ -21,7 +21,7 @@ def distances(place: np.ndarray, anchor: int) -> list[float]:
 
 
 @st.composite
-def placed(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
+def placed_points(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
     """TripletPoints in up to four groups, on few integer places (many ties); each place has at least two visits."""
     axes_n = draw_one(st.sampled_from([1, 2]))
     place, group = [], []
@@ -36,7 +36,7 @@ def placed(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
     return np.array(place, np.float64)[shuffled], np.array(group)[shuffled], seed
 
 
-@given(placed())
+@given(placed_points())
 def test_positive_is_strictly_nearer_in_the_same_group(case):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=64)
@@ -48,8 +48,8 @@ def test_positive_is_strictly_nearer_in_the_same_group(case):
         assert a not in (p, n)
 
 
-@given(placed(), st.floats(-100, 100), st.sampled_from([0.25, 2.0, 8.0]))
-def test_shift_and_scale_do_not_matter(case, shift, times):
+@given(placed_points(), st.floats(-100, 100), st.sampled_from([0.25, 2.0, 8.0]))
+def test_invariance_under_shift_and_scale(case, shift, times):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=32)
     one = draw(triplet_points(place, group), anchor, seed)
@@ -57,7 +57,7 @@ def test_shift_and_scale_do_not_matter(case, shift, times):
     assert all((a == b).all() for a, b in zip(one, other, strict=True))
 
 
-@given(placed())
+@given(placed_points())
 def test_names_of_groups_do_not_matter(case):
     place, group, seed = case
     anchor = np.arange(len(group))
@@ -92,7 +92,7 @@ def test_places_that_differ_along_one_axis():
     assert len(triplet_points(np.array([[0.0, 5.0], [0.0, 6.0], [0.0, 5.0]]), np.zeros(3, int))) == 3
 
 
-def test_point_with_equal_distances_is_no_anchor():
+def test_point_with_equal_distances_is_not_an_anchor():
     three_pokes = triplet_points(np.arange(3.0)[:, None], np.zeros(3, int))
     assert three_pokes.anchors.tolist() == [0, 2]
     near, far = draw(three_pokes, np.array([0, 1, 2]))
@@ -131,8 +131,8 @@ def test_every_ordered_pair_is_equally_likely():
     assert (np.abs(times - n / 6) < 6 * (n * 5 / 36) ** 0.5).all()  # six binomial sd
 
 
-@given(placed())
-def test_every_other_point_takes_part(case):
+@given(placed_points())
+def test_every_other_point_is_drawn(case):
     place, group, seed = case
     mates = np.flatnonzero(group == group[0])
     assume(len(mates) <= 12)

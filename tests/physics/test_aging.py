@@ -1,4 +1,4 @@
-"""Relaxation, hysteresis, wear and temperature, compared with closed forms, 50 digits and published numbers."""
+"""Relaxation, hysteresis, wear and temperature compared with closed forms, 50-digit arithmetic and publications."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ from reskin.physics.aging import (
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-14  # a few dozen operations on doubles
+ROUNDING = 1e-14  # a few dozen operations in double precision
 times_s = st.floats(0, 1e5)
 changes = st.floats(-10, 10)
 
@@ -93,7 +93,7 @@ def test_reading_follows_approach_and_hold():
     jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
     truth = 1 - (SKIN_RELAXATION.share * -np.expm1(-5.0 / SKIN_RELAXATION.tau_s)).sum()
     assert relaxed_share(jump) == pytest.approx(truth, rel=1e-12)
-    # During the approach, each part of the force had less time to relax: mean of the decay over the approach.
+    # Parts of the force that build up during the approach relax for a shorter time: the decay is averaged over it.
     x = 5.0 / SKIN_RELAXATION.tau_s
     assert relaxed_share(slow) == pytest.approx(1 - (SKIN_RELAXATION.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)
 

@@ -8,7 +8,7 @@ from reskin.physics import layer, shear, slide
 from tests.elements import Layer, along_x_strains, plate
 
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3
-DRAG_M, AS_ON_THE_SKIN = 0.9e-3, 0.75  # the deepest of scenes; radius over thickness of a contact
+DRAG_M, AS_ON_THE_SKIN = 0.9e-3, 0.75  # greatest depth of a drag in the scenes; contact radius over thickness
 TAKEN_M = np.array([4e-5, 7e-5])
 HELD = {
     "slipping": {"held": {"axis": [0], "base": [1]}, "drag": {"far": lambda r: 2 / r}},  # beyond it u_r goes as 1 / r
@@ -64,7 +64,7 @@ def test_contact_pressure_puts_the_surface_on_the_tip(base):
 
     top = finite_elements(8).solve(1, load, **HELD[base]).top
     r_m, up_m = (of[top.r_m < contact.radius_m] for of in (top.r_m, top.parts_m[1]))
-    # the pressure's edge falls inside a cell: 0.4 % and 0.7 % of the depth there
+    # the edge of the pressure is inside a cell, where the error is 0.4 % and 0.7 % of the depth
     np.testing.assert_allclose(up_m, TIP_M - np.sqrt(TIP_M**2 - r_m**2) - DEPTH_M, atol=1e-2 * DEPTH_M)
 
 
@@ -80,7 +80,7 @@ def test_deepest_drag_is_covered_by_finite_elements():
     assert 0.7 < contact.radius_m / H_M < AS_ON_THE_SKIN
 
 
-# as on the skin, and a thin layer, whose load is wide relative to a cell: errors of 0.8 % and 0.05 %
+# A contact as on the skin, and one on a thin layer, which is wide relative to a cell: errors of 0.8 % and 0.05 %
 @pytest.mark.parametrize(("radius_h", "tolerance"), [(AS_ON_THE_SKIN, 0.012), (2.5, 1e-3)])
 def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     radius_m, chi = radius_h * H_M, layer.CONTACT_W * (1 - layer.CONTACT_X**2) ** 2.5
@@ -98,7 +98,7 @@ def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     found = [*at.parts_m[:, near], *half_curl(at)[:, near]]
     errors = [np.linalg.norm(f - t) / np.linalg.norm(t) for f, t in zip(found, truth[:, near], strict=True)]
     assert max(errors[:3]) < tolerance
-    assert max(errors[3:]) < 4 * tolerance  # gradients converge one order slower
+    assert max(errors[3:]) < 4 * tolerance  # gradients converge one order more slowly
     assert 1 / solved.under_load_m == pytest.approx(table.stiffness_m, rel=5e-4)
     d, e, s = half_curl(solved.top)
     # beside the contact's edge: 4 % and 0.4 % lower

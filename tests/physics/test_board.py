@@ -1,4 +1,4 @@
-"""Boards compared with the design they are drawn from: chip positions, rotations, draws by name."""
+"""Boards compared with their design: chip positions, rotations and draws by name."""
 
 import numpy as np
 import pytest
@@ -107,7 +107,7 @@ def test_tiled_boards_have_forty_chips():
 
 
 @given(st.integers(1, 4), st.integers(1, 3), st.floats(1, 100))
-def test_boards_lie_evenly_around_the_middle(columns_n, rows_n, pitch_mm):
+def test_boards_are_centred_and_evenly_spaced(columns_n, rows_n, pitch_mm):
     tiles = {"columns_n": columns_n, "rows_n": rows_n, "pitch_mm": pitch_mm}
     centres_mm = np.array(design(tiles=tiles).tiles.centres_mm)
     assert len(centres_mm) == columns_n * rows_n

@@ -12,7 +12,7 @@ from reskin.physics.magnet import change_of_field
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-12  # a few thousand operations in float64, of like sign in the sum of sizes
+ROUNDING = 1e-12  # a few thousand operations in float64, relative to the sum of magnitudes
 seeds = st.integers(0, 10**6)
 
 
@@ -23,13 +23,13 @@ def compiled():
 
 
 def naive(rest, moved, observers_m):
-    """The specification: the difference of each dipole's field, summed."""
+    """Sum the field differences of all dipoles, as specified."""
     after_T = magnet.field_of_each(*moved, observers_m)
     return (after_T - magnet.field_of_each(*rest, observers_m)).sum(axis=1)
 
 
 def scene(seed, nodes_n=200):
-    """Dipoles of a slab off the origin that move by a tenth of a millimetre and turn by a tenth."""
+    """Return dipoles of a slab off the origin that move by 0.1 mm and whose moments change by a tenth."""
     rng = rng_for(seed, "change")
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), size=(nodes_n, 3))
     moments = 1e-5 * rng.normal(size=(nodes_n, 3))
@@ -70,7 +70,7 @@ def test_no_dipoles():
 
 
 @given(seeds)
-def test_there_and_back_is_no_change(seed):
+def test_moving_there_and_back_changes_nothing(seed):
     rest, moved, observers_m = scene(seed)
     back_T = change_of_field(moved, rest, observers_m)
     np.testing.assert_allclose(back_T, -change_of_field(rest, moved, observers_m), atol=1e-20)

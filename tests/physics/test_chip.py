@@ -104,7 +104,7 @@ def test_frame_has_the_last_finished_conversion(rate_hz, phase_s):
     age_s, _ = last_conversions(frame_s, np.array([phase_s]))
     ends_s = phase_s + CONVERSION_S * np.arange(-1, int(frame_s[-1] / CONVERSION_S) + 2)
     truth_s = [t - max(end for end in ends_s if end <= t + 1e-12) for t in frame_s]
-    # a conversion that ends with the frame may count either way
+    # a conversion that ends exactly with the frame may belong to it or not
     off_s = np.abs(age_s[:, 0] - truth_s)
     assert (np.minimum(off_s, CONVERSION_S - off_s) < 1e-9).all()
 

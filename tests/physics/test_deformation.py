@@ -34,8 +34,8 @@ def det_f(at):
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("depth_m", [0.2e-3, 0.6e-3, 1.2e-3])
-def test_surface_lies_on_the_tip(depth_m, base):
-    # Without following the surface it is 27 % of the depth beside it at 1.2 mm.
+def test_surface_follows_the_tip(depth_m, base):
+    # If the material were not followed, the surface would miss the tip by 27 % of the depth at 1.2 mm.
     assert not broken(mechanics.sunken_surface(layer.IndentedLayer(H_M, TIP_M, base), depth_m))
 
 
@@ -62,7 +62,7 @@ def test_one_linear_step_would_lose_volume():
 def test_slipping_base_conserves_flow():
     press = layer.IndentedLayer(H_M, TIP_M, "slipping")
     assert not broken(mechanics.far_field(press, 1.2e-3))
-    # Between a cone's and a cylinder's volume under the dent.
+    # The volume under the dent is between that of a cone and that of a cylinder.
     grown_m2 = (follow(np.full(5, 9e-3), np.linspace(0, 1, 5) * H_M, base="slipping").r_m ** 2 - 9e-3**2).mean()
     assert (
         press.contact(1.2e-3).radius_m ** 2 * 1.2e-3 / 3 < grown_m2 * H_M < press.contact(1.2e-3).radius_m ** 2 * 1.2e-3
@@ -91,7 +91,7 @@ def test_shallow_poke_is_linear(base):
     r_m, z_m = nodes(r_max_m=1e-3)
     at, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
     linear = linear_at(r_m, z_m, depth_m, base)
-    # 5 % of the depth: the material's own displacement, and a contact (0.3 mm) not wider than the shortest wave
+    # 5 % of the depth: the displacement of the material, and a contact (0.3 mm) no wider than the shortest wave
     np.testing.assert_allclose(at.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
     np.testing.assert_allclose(at.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
 

@@ -17,7 +17,7 @@ depths_m = st.floats(1e-5, 1.2e-3)
 bases = st.sampled_from(BASES)
 
 
-@cache  # not at collection, which every test worker repeats
+@cache  # computed on demand, because every test worker repeats the collection
 def table(base="bonded"):
     return deformation.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base)
 
@@ -43,7 +43,7 @@ def places(rng, places_n, half_m=10e-3):
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize(("rung_i", "share"), [(4, 2e-3), (-1, 2e-3), (None, 0.05)])
 def test_table_equals_following_nodes(rung_i, share, base):
-    # 2e-3 of the depth: between tables of R/h and places r. Between its depths 5 %: the contact's edge jumps outwards.
+    # Interpolating in R/h and r costs 2e-3 of the depth. Between tabulated depths it is 5 %: the contact's edge jumps.
     depth_m = 0.55e-3 if rung_i is None else table(base).depth_m[rung_i]
     start_m = places(np.random.default_rng(0), 150) * (1, 0, 1)
     start_m = start_m[start_m[:, 2] < H_M]  # on the surface itself the angle jumps at the contact's edge
@@ -101,7 +101,9 @@ def test_slipping_skin_moves_outward_beyond_the_reach(depth_m):
     moved = move(rest_m, (0, 0, depth_m), "slipping")
     assert moved.i.size == r_m.size
     grown_m2 = moved.after[0][:, 0] ** 2 - r_m**2
-    np.testing.assert_allclose(grown_m2, grown_m2[-1], rtol=0.01)  # the edge of the table joins: exp(-5 pi), and sums
+    np.testing.assert_allclose(
+        grown_m2, grown_m2[-1], rtol=0.01
+    )  # at the table's edge the two solutions differ by exp(-5 pi), and by rounding of sums
     past = slice(len(HEIGHTS), None)
     np.testing.assert_array_equal(moved.after[0][past, 1:], rest_m[past, 1:])
     np.testing.assert_array_equal(moved.after[1][past], moved.before[1][past])

@@ -10,7 +10,7 @@ from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
 from reskin.physics.shear import drag_force
 
-ROUNDING = 1e-12  # some hundred steps on doubles
+ROUNDING = 1e-12  # some hundred steps in double precision
 K = 1000.0  # N/m, the skin's order of magnitude
 paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st.floats(-1e-2, 1e-2)))
 frictions = st.floats(0, 2)
@@ -35,7 +35,7 @@ def test_straight_drag_is_spring_or_friction(end_m, normal_N, mu, stiffness, ste
 
 
 @given(paths_m)
-def test_no_friction_no_force(path_m):
+def test_force_is_zero_without_friction(path_m):
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.0)
     assert not found.force_N.any()
     assert not found.elastic_m.any()
@@ -57,7 +57,7 @@ def test_force_stays_within_coulombs_disc(path_m, mu, data):
     stiffness = data.draw(arrays(float, t, elements=st.floats(0, 5e3)))
     found = drag_force(path_m, normal_N, stiffness_N_per_m=stiffness, friction=mu)
     size_N = np.hypot(*found.force_N.T)
-    assert (size_N <= mu * normal_N * (1 + ROUNDING) + 1e-300).all()  # below that, doubles lose digits
+    assert (size_N <= mu * normal_N * (1 + ROUNDING) + 1e-300).all()  # subnormal numbers lose digits
     np.testing.assert_allclose(size_N[found.sliding], (mu * normal_N)[found.sliding], rtol=ROUNDING, atol=1e-300)
     np.testing.assert_allclose(found.force_N, stiffness[:, None] * found.elastic_m, rtol=ROUNDING, atol=1e-300)
 
@@ -75,7 +75,7 @@ def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
 
 def test_loop_dissipates_friction_times_length():
     reach_m, mu, steps_n = 3e-3, 0.8, 300
-    stuck_m = mu * 1.0 / K  # 0.8 mm: with steps of 10 um, every change from sticking to sliding is a place of the path
+    stuck_m = mu * 1.0 / K  # 0.8 mm: with steps of 10 um, each change between sticking and sliding is at a stop
     along_m = np.concatenate(
         [np.linspace(a, b, n + 1)[:-1] * reach_m for a, b, n in ((0, 1, steps_n), *[(1, -1, 600), (-1, 1, 600)] * 2)]
     )
@@ -83,7 +83,7 @@ def test_loop_dissipates_friction_times_length():
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
-    # In a loop the spring reverses twice, by twice its length each time; the rest of 4 reaches slides.
+    # In a loop the spring reverses twice, by twice its length each time; the tip slides over the rest of the 4 reaches.
     assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)  # sums of 1200 straight pieces
     slid_m = np.hypot(*slipped_m(path_m, found)[-1200:].T).sum()
     assert slid_m == pytest.approx(4 * reach_m - 4 * stuck_m, rel=1e-9)
@@ -114,7 +114,7 @@ def test_force_turns_within_a_few_spring_lengths():
     path_m = np.vstack([straight(4e-3, 400, 0.0), straight(8e-3, 800, np.pi / 2)[1:] + [4e-3, 0]])
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.8)
     sideways_N, past_m = found.force_N[401:, 0], path_m[401:, 1]
-    # The spring trails behind (a tractrix): at angle f from the new line, tan(f / 2) = exp(-way / length)
+    # The spring trails behind (a tractrix): its angle f from the new line is tan(f / 2) = exp(-way / length)
     angle_rad = 2 * np.arctan(np.exp(-past_m / 0.8e-3))
     np.testing.assert_allclose(sideways_N, 0.8 * np.sin(angle_rad), atol=0.8 * 10e-6 / 0.8e-3)  # one step's turn
 

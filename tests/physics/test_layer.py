@@ -1,4 +1,4 @@
-"""The bonded layer: laws of `verification` for any layer, limits, 50-digit arithmetic; invalid input."""
+"""The bonded layer compared with limits, 50-digit arithmetic and the laws of `verification`; invalid input."""
 
 from dataclasses import asdict
 
@@ -72,7 +72,8 @@ def test_base_is_fixed_and_surface_free_of_shear():
 @settings(max_examples=30)  # a new layer takes 50 ms
 @given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
 def test_force_equals_dimitriadis_for_small_tips(thickness_m, tip_radius_m, relative_depth):
-    # From chi^2 on the series is low: 8 % at chi = sqrt(R d) / h = 0.5, 16 % at 1, as rings of pressure confirm.
+    # The series is too low from its term in chi^2 on: by 8 % at chi = sqrt(R d) / h = 0.5 and by 16 % at 1, as pressure
+    # rings confirm.
     depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
     assert mechanics.dimitriadis(np.array([depth_m]), IndentedLayer(thickness_m, tip_radius_m, "bonded")).holds
 
@@ -90,8 +91,8 @@ def test_pressure_rings_give_the_same_force(base):
     press = IndentedLayer(2e-3, 3e-3, base)
     assert mechanics.rings(1e-3, press).holds
     _, pressure = mechanics.ring_pressures(1e-3, press)
-    assert (pressure > 0).all()  # the contact radius is not too large: no tension
-    assert pressure[-1] < 0.25 * pressure[0]  # nor too small: no edge
+    assert (pressure > 0).all()  # no tension: the contact radius is not too large
+    assert pressure[-1] < 0.25 * pressure[0]  # no peak at the edge: it is not too small
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
@@ -120,7 +121,7 @@ def test_force_grows_with_depth_and_thinness(thickness_m, tip_radius_m):
     assert (thin[1:] > thick[1:]).all()
 
 
-def test_no_contact_or_no_stiffness_is_no_force():
+def test_force_is_zero_without_contact_or_stiffness():
     assert not force([-1e-3, -1e-12, 0.0]).any()
     assert not force(DEPTHS_M, modulus_Pa=0.0).any()
 

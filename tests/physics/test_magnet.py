@@ -63,14 +63,14 @@ def test_cubes_cover_a_side_symmetrically(side_mm, n):
 
 @given(places_m, polarities)
 def test_mirror_symmetry(point_m, polarity):
-    # Charges that keep their sign in the mirror x -> -x flip Bx alone; a checkerboard's are swapped as well.
+    # If charges keep their sign under x -> -x, only Bx changes sign; the charges of a checkerboard are swapped as well.
     sign = -1 if polarity == "checkerboard" else 1
     here_T, there_T = (magnet.array_field((point_m * (side, 1, 1))[None], THICKNESS_M, polarity)[0] for side in (1, -1))
     np.testing.assert_allclose(there_T, sign * here_T * (-1, 1, 1), atol=1e-12)
 
 
 def test_array_strength_of_the_specification():
-    # 0.38-0.65 T in the slab; the seam crossings are weaker and the faces stronger.
+    # 0.38-0.65 T in the slab; weaker at seam crossings and stronger at the faces.
     size_T = np.linalg.norm(magnet.array_field(NODES_M, THICKNESS_M, "checkerboard"), axis=1)
     assert 0.38 < np.median(size_T) < 0.65
 

@@ -54,7 +54,7 @@ def test_skins_of_any_size_are_filled(x_m, y_m, rule):
         along_m = np.unique(rest.nodes_m[:, axis])
         for a_m, b_m in pairwise(marks_m):
             inside_m = along_m[(a_m < along_m) & (along_m < b_m)]
-            cells_n = round((b_m - a_m) / (2 * (inside_m[0] - a_m)))  # the first middle lies half a cell in
+            cells_n = round((b_m - a_m) / (2 * (inside_m[0] - a_m)))  # the first node is half a cell from the edge
             assert cells_n == len(inside_m)
             assert (b_m - a_m) / cells_n <= rule.cell_m * (1 + 1e-6)
 

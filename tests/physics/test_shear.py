@@ -1,4 +1,4 @@
-"""Shear under a dragged tip, compared with 50 digits, a boundary value problem, Mindlin, Johnson, thin layers; laws."""
+"""Shear under a dragged tip compared with 50-digit arithmetic, a boundary value problem and published solutions."""
 
 import mpmath
 import numpy as np
@@ -60,7 +60,7 @@ def some_places_m(places_n=40, top=0.95):
     return np.stack([r_m * np.cos(f), r_m * np.sin(f), H_M * rng.uniform(0.05, top, places_n)], axis=1)
 
 
-def moved(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear_displacement):
+def displace(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear_displacement):
     of = shear.tabulate_depth(0.6e-3, **SKIN) if of is None else of
     force_N, centre_m = np.asarray(force_N, dtype=float), np.asarray(centre_m, dtype=float)
     return by(of, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
@@ -91,7 +91,7 @@ def test_response_equals_50_digits(kh, share):
 
 @pytest.mark.parametrize("kh", [0.05, 0.5, 1.5, 4.0, 12.0])
 def test_response_solves_the_boundary_value_problem(kh):
-    """Equilibrium and Hooke's law at k = G = 1: in the wave's plane two u and two stresses, across one each."""
+    """Equilibrium and Hooke's law at k = G = 1: two displacements and stresses in the wave's plane, one across it."""
 
     def slopes(_z, at):
         along, up, shearing, normal, across, across_stress = at
@@ -125,7 +125,7 @@ def test_boundary_conditions_of_short_waves():
 
 
 def test_bettis_reciprocity_with_pressure():
-    """Betti: the work of each load on the other's displacement is equal; `layer` solves the other load."""
+    """Betti: each load does equal work on the displacement of the other; `layer` solves the pressure."""
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(shear.wave_response(kh[None], kh).w, aside, atol=1e-14)
@@ -172,7 +172,7 @@ def test_every_level_carries_the_force(traction):
         z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
         along = shear.evaluate_map(traction, r_m, z, thickness_m=H_M)[..., 0]
         slope = (-3 * along[:, 0] + 4 * along[:, 1] - along[:, 2]) / (2 * step_m)
-        # u_x,z; u_z,x adds up to nothing. 12 h away shear has died down to exp(-0.74 * 12), times the area there
+        # u_x,z; the sum of u_z,x is zero. At a distance of 12 h shear has decayed to exp(-0.74 * 12), times the area.
         assert np.trapezoid(2 * np.pi * r_m * slope, r_m) == pytest.approx(1, abs=1e-3)
 
 
@@ -185,14 +185,14 @@ def test_volume_is_kept_and_rotation_is_half_the_curl():
         [grad[:, 2, 1] - grad[:, 1, 2], grad[:, 0, 2] - grad[:, 2, 0], grad[:, 1, 0] - grad[:, 0, 1]], axis=1
     )
     of = shear.tabulate(traction, H_M)
-    found = moved([YOUNG_PA / 3, 0], places_m, of, centre_m=(0, 0)).half_curl
+    found = displace([YOUNG_PA / 3, 0], places_m, of, centre_m=(0, 0)).half_curl
     np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # and of the table
 
 
 @pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])
 def test_table_equals_direct_integration(force):
     traction, places_m = sliding(), some_places_m(top=1.0)
-    found = moved(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
+    found = displace(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
     turn = np.array([[force[0], -force[1], 0], [force[1], force[0], 0], [0, 0, 1]])
     truth_m = displacement_m(traction, places_m @ turn) @ turn.T
     np.testing.assert_allclose(found.displacement_m, truth_m, atol=1e-3 * np.abs(truth_m).max())  # steps of 25 um
@@ -261,8 +261,8 @@ def test_sliding_is_19_to_20_percent_softer_than_sticking():
 @given(forces_N, forces_N, st.floats(-3, 3))
 def test_displacement_is_linear(one_N, other_N, times):
     nodes_m = some_places_m(30)
-    both = moved(one_N + times * other_N, nodes_m)
-    first, second = moved(one_N, nodes_m), moved(other_N, nodes_m)
+    both = displace(one_N + times * other_N, nodes_m)
+    first, second = displace(one_N, nodes_m), displace(other_N, nodes_m)
     for name in ("displacement_m", "half_curl"):
         parts = getattr(first, name) + times * getattr(second, name)
         np.testing.assert_allclose(getattr(both, name), parts, atol=ROUNDING)
@@ -273,25 +273,25 @@ def test_rotation_of_force_and_nodes(force_N, angle_rad):
     nodes_m, (c, s) = some_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     still, turned = (
-        moved(force_N, nodes_m, centre_m=(0, 0)),
-        moved(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
+        displace(force_N, nodes_m, centre_m=(0, 0)),
+        displace(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
     )
-    # a node at the edge of a table cell may fall into the next, with the same value
+    # a node at the edge of a table cell may be in the next cell, which has the same value
     np.testing.assert_allclose(turned.displacement_m, still.displacement_m @ turn.T, atol=1e-10)
     np.testing.assert_allclose(turned.half_curl, still.half_curl @ turn.T, atol=1e-9)
 
 
 def test_mirror_symmetry_along_the_force():
     nodes_m, mirror = some_places_m(), np.array([1, -1, 1])
-    here, there = moved([0.5, 0], nodes_m, centre_m=(0, 0)), moved([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
+    here, there = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
     np.testing.assert_allclose(there.displacement_m, here.displacement_m * mirror, atol=1e-18)
     np.testing.assert_allclose(there.half_curl, -here.half_curl * mirror, atol=1e-15)  # an axial vector
-    back = moved([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
+    back = displace([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
 
 
 def test_skin_follows_the_tip_and_leans_forward():
-    middle = moved([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
+    middle = displace([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
     assert (middle.displacement_m[:, 0] > 0).all()
     assert not middle.displacement_m[:, 1:].any()
     assert (middle.half_curl[:, 1] > 0).all()  # from z towards x
@@ -299,10 +299,10 @@ def test_skin_follows_the_tip_and_leans_forward():
 
 
 def test_base_and_far_nodes_do_not_move():
-    base = moved([0.5, 0.3], some_places_m() * [1, 1, 0])
+    base = displace([0.5, 0.3], some_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
-    assert base.half_curl.any()  # the material on the base shears, and so turns
-    away = moved([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
+    assert base.half_curl.any()  # the material on the base shears and therefore rotates
+    away = displace([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
     assert not away.displacement_m.any()
     assert not away.half_curl.any()
 
@@ -318,8 +318,8 @@ def test_displacement_beyond_the_reach_is_below_half_a_percent():
 def test_scaling_of_size_and_stiffness(size, hardness):
     nodes_m = some_places_m(30)
     large = shear.tabulate_depth(size * 0.6e-3, thickness_m=size * H_M, tip_radius_m=size * TIP_M, base="bonded")
-    here = moved([0.5, 0.2], nodes_m, centre_m=(0, 0))
-    there = moved(
+    here = displace([0.5, 0.2], nodes_m, centre_m=(0, 0))
+    there = displace(
         [0.5 * hardness * size**2, 0.2 * hardness * size**2],
         size * nodes_m,
         large,
@@ -330,7 +330,7 @@ def test_scaling_of_size_and_stiffness(size, hardness):
     np.testing.assert_allclose(there.half_curl, here.half_curl, atol=1e-9)
 
 
-# the square of less than 1e-150 loses digits
+# squares of numbers below 1e-150 lose digits
 @given(st.floats(-20, 20).filter(lambda amount: amount == 0 or abs(amount) > 1e-150), st.floats(-np.pi, np.pi))
 def test_rotation_equals_polar_decomposition_in_simple_shear(amount, towards_rad):
     ahead = np.array([np.cos(towards_rad), np.sin(towards_rad), 0.0])
@@ -353,13 +353,13 @@ def test_traction_moves_by_force_over_stiffness():
     assert mean_per_m == pytest.approx(1 / of.stiffness_m, rel=1e-3)  # no waves below 0.3 mm
 
 
-def follow_dipoles(force_N, nodes_m, of, steps_n):
+def shear_in_many_steps(force_N, nodes_m, of, steps_n):
     """Apply the force in many small steps, updating nodes and traction; the centre rests at 0."""
     at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / of.stiffness_m
     for step_i in range(steps_n):
         centre_m = ahead_m * (step_i + 0.5) / steps_n
-        half_m = at_m + moved(np.array(force_N) / steps_n, at_m, of, centre_m).displacement_m / 2
-        at_m = at_m + moved(np.array(force_N) / steps_n, half_m, of, centre_m).displacement_m
+        half_m = at_m + displace(np.array(force_N) / steps_n, at_m, of, centre_m).displacement_m / 2
+        at_m = at_m + displace(np.array(force_N) / steps_n, half_m, of, centre_m).displacement_m
     return at_m - nodes_m
 
 
@@ -367,9 +367,9 @@ def test_midpoint_steps_equal_many_small_steps():
     nodes_m, over = [0.5, 0.5, 1] * some_places_m(200), []
     for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):  # mu = 0.8, 0.4, 0.8; 1, 1, 2 steps
         of = shear.tabulate_depth(depth_m, **SKIN)
-        truth_m = follow_dipoles([force_N, 0], nodes_m, of, 48)
+        truth_m = shear_in_many_steps([force_N, 0], nodes_m, of, 48)
         found_m, one_shot_m = (
-            moved([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m
+            displace([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m
             for by in (shear.shear_in_steps, shear.shear_displacement)
         )
         over.append(np.abs(found_m - truth_m).max() / np.abs(truth_m).max())
@@ -381,19 +381,21 @@ def test_midpoint_steps_equal_many_small_steps():
 
 def test_small_force_needs_no_midpoint():
     nodes_m = some_places_m()
-    once, half_way = (moved([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps))
+    once, half_way = (
+        displace([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps)
+    )
     size_m = np.abs(once.displacement_m).max()
-    # half of 0.1 um beside a field that changes over 1 mm
+    # half of 0.1 um, in a field that varies over 1 mm
     np.testing.assert_allclose(half_way.displacement_m, once.displacement_m, atol=2e-4 * size_m)
 
 
 def test_carried_nodes_rotate_with_the_force():
     nodes_m, turn = some_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
-    here = moved([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
-    there = moved([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
+    here = displace([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
+    there = displace([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
     np.testing.assert_allclose(there.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
     np.testing.assert_allclose(there.half_curl, here.half_curl @ turn.T, atol=1e-12)
-    assert not moved([0.5, 0.3], nodes_m * [1, 1, 0], by=shear.shear_in_steps).displacement_m.any()
+    assert not displace([0.5, 0.3], nodes_m * [1, 1, 0], by=shear.shear_in_steps).displacement_m.any()
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
@@ -401,13 +403,13 @@ def test_steepest_place_of_the_table(traction):
     of, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
     r_m, f = (part.ravel() for part in np.meshgrid(of.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)
-    largest = np.linalg.norm(moved(force_N, places_m, of, (0, 0)).half_curl, axis=1).max()
-    assert of.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: beside one of the table's
+    largest = np.linalg.norm(displace(force_N, places_m, of, (0, 0)).half_curl, axis=1).max()
+    assert of.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: next to a place of the table
 
 
 def test_nodes_above_the_surface_move_with_it():
     rim_m = np.array([[2e-3, 1e-3, 1.1 * H_M], [2e-3, 1e-3, H_M]])
-    rim, surface = moved([0.5, 0.2], rim_m).displacement_m
+    rim, surface = displace([0.5, 0.2], rim_m).displacement_m
     np.testing.assert_array_equal(rim, surface)
 
 
@@ -421,7 +423,7 @@ def test_midpoint_steps_keep_volume(depth_m, force_N, loss):
     losses = []
     for by in (shear.shear_displacement, shear.shear_in_steps):
         ends = [
-            [moved([force_N, 0], places_m + sign * e, of, (0, 0), by=by).displacement_m for e in step_m * np.eye(3)]
+            [displace([force_N, 0], places_m + sign * e, of, (0, 0), by=by).displacement_m for e in step_m * np.eye(3)]
             for sign in (1, -1)
         ]
         grad = np.moveaxis(np.array(ends[0]) - np.array(ends[1]), 0, -1) / (2 * step_m)
@@ -440,14 +442,14 @@ def test_midpoint_steps_keep_volume(depth_m, force_N, loss):
         ("thickness", lambda: shear.tabulate_depth(1e-3, thickness_m=0.0, tip_radius_m=3e-3, base="bonded")),
         ("contact radius", lambda: shear.tabulate(hertzian(6.1e-3), H_M)),
         ("contact radius", lambda: shear.tabulate(hertzian(), np.inf)),
-        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=0.0)),
-        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=np.nan)),
-        ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, 2.41e-3]]))),
-        ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, -1e-6]]))),
-        ("height of nodes", lambda: moved([1, 0], np.array([[0.0, 0.0, np.nan]]))),
-        ("half of the curl", lambda: moved([3, 0], some_places_m(), by=shear.shear_in_steps)),
-        ("half of the curl", lambda: moved([0, np.nan], some_places_m(), by=shear.shear_in_steps)),
-        ("modulus", lambda: moved([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.shear_in_steps)),
+        ("modulus", lambda: displace([1, 0], np.zeros((1, 3)), modulus_Pa=0.0)),
+        ("modulus", lambda: displace([1, 0], np.zeros((1, 3)), modulus_Pa=np.nan)),
+        ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, 2.41e-3]]))),
+        ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, -1e-6]]))),
+        ("height of nodes", lambda: displace([1, 0], np.array([[0.0, 0.0, np.nan]]))),
+        ("half of the curl", lambda: displace([3, 0], some_places_m(), by=shear.shear_in_steps)),
+        ("half of the curl", lambda: displace([0, np.nan], some_places_m(), by=shear.shear_in_steps)),
+        ("modulus", lambda: displace([1, 0], np.zeros((1, 3)), modulus_Pa=0.0, by=shear.shear_in_steps)),
     ],
 )
 def test_invalid_drags_are_refused(what, of):

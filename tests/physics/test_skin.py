@@ -20,8 +20,8 @@ EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
 PEAK_T = 1e-3  # size of the fields; tolerances are rounding relative to it
-COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)  # for laws that hold for any rule, and for draws
-DEPTH_M = 0.6e-3  # one depth needs one table, and these laws hold at any depth
+COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)  # COARSE for laws that hold for any rule, SPARSE for draws
+DEPTH_M = 0.6e-3  # these laws hold at any depth, and a single depth needs only one table
 places_m = st.floats(-8e-3, 8e-3)
 # No deadline: the first example computes the tables for all others.
 patient = settings(max_examples=20, deadline=None)
@@ -50,7 +50,7 @@ def change(poke_m, on=None, board=BOARD):
     return changes_of_field(board, on or skin(), np.array([poke_m]))[1][0]
 
 
-def moved_by(one, poke_m):
+def move_dipoles(one, poke_m):
     true_m = np.array(poke_m) + (0, 0, one.depth_zero_m)
     rest = deformation.group_by_height(one.nodes_m, one.moments_A_m2, one.thickness_m)
     return deformation.move_dipoles(table_of(one, rest, true_m[2]), rest, true_m)
@@ -61,8 +61,8 @@ def table_of(one, rest, depth_m):
 
 
 def change_by_loop(one, board, poke_m):
-    """The specification: for each node that moves, the difference of its field."""
-    moved, total_T = moved_by(one, poke_m), np.zeros_like(board.chips_m)
+    """Sum the field difference of each moving node, as specified."""
+    moved, total_T = move_dipoles(one, poke_m), np.zeros_like(board.chips_m)
     for i, place, after in zip(moved.i, *moved.after, strict=True):
         for chip_i, chip in enumerate(board.chips_m):
             total_T[chip_i] += one_dipole(place, after, chip)
@@ -84,9 +84,9 @@ def test_poke_equals_loop_over_rotated_dipoles(base):
 
 
 def test_material_leans_towards_the_dent():
-    # Beside the tip the surface falls towards the axis: an arrow that points up leans inwards, over the dent.
+    # Beside the tip the surface slopes down towards the axis, so an arrow that points up leans inwards over the dent.
     one = skin()
-    moved = moved_by(one, (0.0, 0.0, DEPTH_M))
+    moved = move_dipoles(one, (0.0, 0.0, DEPTH_M))
     start_m, _ = moved.before
     r_m = np.linalg.norm(start_m[:, :2], axis=1)
     flank = (r_m > 0.5e-3) & (r_m < 1.5e-3) & (start_m[:, 2] > 1.5e-3)
@@ -117,7 +117,7 @@ def test_rotation_of_moments_matters():
     # 156-242 % over indentations of the grid: moments are rotated, R.M, not only moved
     one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
-        moved = moved_by(one, (*place, DEPTH_M))
+        moved = move_dipoles(one, (*place, DEPTH_M))
         unturned_T = change_of_field(moved.before, (moved.after[0], moved.before[1]), BOARD.chips_m)
         truth_T = change((*place, DEPTH_M), one)
         wrong.append(np.linalg.norm(unturned_T - truth_T))
@@ -134,7 +134,7 @@ def test_field_at_rest_equals_loop_over_dipoles():
 
 def test_change_equals_difference_of_sums():
     one, poke_m = skin(UNEVEN), (1.1e-3, -2.3e-3, 1e-3)
-    moved = moved_by(one, poke_m)
+    moved = move_dipoles(one, poke_m)
     places_m, moments = one.nodes_m.copy(), one.moments_A_m2.copy()
     places_m[moved.i], moments[moved.i] = moved.after
     after_T = magnet.field(places_m, moments, BOARD.chips_m)
@@ -187,15 +187,15 @@ def test_offsets_of_skin_and_poke():
 
 
 def test_wider_skin_changes_nothing_far_from_its_edges():
-    # 8 cubes and 12, both even, so that the same poles stand over the chips; 25 mm and more from the nearer edge.
+    # 8 and 12 cubes are both even, so the same poles are over the chips, which are at least 25 mm from the edges.
     wide, wider = (
         draw_skin(design(), EXACT, seed=0, name="s0", rule=COARSE, sides_m=(side_m, side_m))
         for side_m in (50.8e-3, 76.2e-3)
     )
     poke_m = (1.3e-3, -2.1e-3, DEPTH_M)
     once_T, again_T = change(poke_m, wide), change(poke_m, wider)
-    # Only the magnets past the edge act there; they alternate, so that their fields nearly cancel. On the authors'
-    # 20 mm, whose outer chips lie 3 mm from an edge, the same poke differs from one on an infinite skin.
+    # Only the magnets beyond the edge differ there; they alternate, so their fields nearly cancel. On the authors'
+    # skin of 20 mm, whose outer chips are 3 mm from an edge, the same poke differs from one on an infinite skin.
     assert np.linalg.norm(once_T - again_T) < 1e-4 * np.linalg.norm(again_T)
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
@@ -225,8 +225,8 @@ def test_many_pokes_equal_single_pokes():
     ],
 )
 def test_tables_equal_following_nodes(thickness_mm, at, error, base):
-    # 1.82 mm lies halfway between two tables. At the tables' depths: what interpolating in R/h and r costs. Between
-    # them 0.6 %: following ends there with half a step, and half steps change dB by as much themselves (flow.STEP).
+    # 1.82 mm is halfway between two tables. At the tables' depths this is the error of interpolation in R/h and r.
+    # Between these depths it is 0.6 %: following ends with half a step, which changes dB as much (flow.STEP).
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
     ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):
@@ -256,7 +256,7 @@ def test_draws_have_the_given_spreads():
 
 
 def test_filler_and_amplitude_scale_the_moments():
-    # One layer has its nodes at half height, where the field vanishes at seam crossings but not at these middles.
+    # The nodes of a single layer are at half height, where the field vanishes at seam crossings but not at nodes.
     exact = np.linalg.norm(skin(rule=SPARSE).moments_A_m2, axis=1)
     for spread, within in ((no_spread(skin_amplitude=0.1), False), (no_spread(skin_filler=0.1), True)):
         drawn = [np.linalg.norm(skin(spread, f"s{i}", SPARSE).moments_A_m2, axis=1) for i in range(60)]
@@ -314,7 +314,7 @@ def test_unverified_depths_are_counted():
 HELD = {"give_um": (48.0, 7.0), "away_um_mm": 6.0, "lets_go_mm2": 40.0, "springs_N_mm": 7.0, "friction": 0.8}
 
 
-def held(spread=UNEVEN, **changes):
+def held_skin(spread=UNEVEN, **changes):
     return skin(spread, base="slipping", hold=HELD | changes)
 
 
@@ -336,17 +336,17 @@ def test_held_skin_slides_rigidly():
     assert 0.2 < share < 0.9
     nearest = np.argmin(np.linalg.norm(free_m[0][:, :2] - poke_m[0, :2], axis=1))
     np.testing.assert_allclose(apart_m[nearest, :2], share * taken_m, atol=2e-6)
-    still = held(give_um=(0.0, 0.0), away_um_mm=0.0)
+    still = held_skin(give_um=(0.0, 0.0), away_um_mm=0.0)
     np.testing.assert_array_equal(change(poke_m[0], still), change(poke_m[0], free))
 
 
 def test_force_on_a_held_skin():
-    one, free = held(EXACT), skin(base="slipping")
+    one, free = held_skin(EXACT), skin(base="slipping")
     depth_m = np.array([0.4e-3, 1.0e-3])
     stiffer = (1 - depth_m / one.thickness_m) ** -1.5
     np.testing.assert_allclose(forces(one, depth_m), stiffer * forces(free, depth_m), rtol=1e-9)
     soft, hard = (skin(UNEVEN, base="slipping", hold=HELD, modulus_kPa=kPa) for kPa in (0.0, 1e6))
-    assert not broken(stability.modulus(BOARD, held(), soft, hard))
+    assert not broken(stability.modulus(BOARD, held_skin(), soft, hard))
 
 
 def test_bonded_skin_is_not_held():

@@ -36,7 +36,8 @@ def drag_matrix(pieces_n, sides_m):
 @pytest.mark.parametrize("sides_m", [SQUARE, (20e-3, 50e-3)])
 def test_motion_minimises_the_drag(sides_m):
     place_m, taken_m = np.array([6e-3, -3e-3]), np.array([4e-5, 7e-5])
-    # Least drag with the place taken so far: Lagrange's equations. 80 pieces along a side miss rho^2 by 1/80^2.
+    # Least drag for a given displacement of the place, by Lagrange's equations. With 80 pieces per side, rho^2 is off
+    # by 1/80^2.
     held = np.array([[1, 0, -place_m[1]], [0, 1, place_m[0]]])
     equations = np.block([[drag_matrix(80, sides_m), held.T], [held, np.zeros((2, 2))]])
     *expected, spin_rad = np.linalg.solve(equations, np.append(np.zeros(3), taken_m))[:3]
@@ -77,7 +78,7 @@ def test_displacement_follows_force_and_distance():
 
 @given(place, st.floats(1e3, 1e5))
 def test_force_and_motion_agree(place_m, springs_N_per_m):
-    # Springs spread evenly: the force moves by f / springs, and spins by its moment over springs rho^2 (a loop's sum).
+    # Evenly spread springs: the force moves the skin by f / springs and rotates it by its moment over springs rho^2.
     force_N, (x, y) = np.array([0.7, -0.4]), place_m
     taken_m = slide.compliance_m_per_N(np.array([place_m]), SQUARE, springs_N_per_m)[0] @ force_N
     move_m, spin_rad = one(place_m, taken_m)
@@ -96,7 +97,7 @@ def test_friction_bounds_the_slide(place_m, taken_m, force_N):
     assert sideways_N <= min(0.8 * force_N, hold.springs_N_per_m * np.hypot(*whole.move_m[0])) * (1 + 1e-12)
     moves, (x, y), (whole_x, whole_y) = whole.move_m.any(), found.move_m[0], whole.move_m[0]
     assert x * whole_y == pytest.approx(y * whole_x, rel=1e-12, abs=1e-24)
-    if moves:  # motion and spin are held back alike: by 1 - exp(-mu F / k u)
+    if moves:  # motion and spin are limited by the same factor, 1 - exp(-mu F / k u)
         with np.errstate(over="ignore"):
             share = 1 - np.exp(-0.8 * force_N / (7e3 * np.hypot(whole_x, whole_y)))
         np.testing.assert_allclose(found.move_m, share * whole.move_m, rtol=1e-9, atol=1e-20)

@@ -1,4 +1,4 @@
-"""Synthetic training cards, and the numbers of a run of every experiment."""
+"""Synthetic cards of trained networks, and synthetic numbers of every experiment."""
 
 import xml.etree.ElementTree as ET
 from typing import Any
@@ -12,7 +12,7 @@ from tests.scenes import RECIPE
 
 
 def texts_of(svg: str) -> str:
-    """Return all text of a figure."""
+    """Return all texts in a figure."""
     return " ".join(
         "".join(element.itertext()) for element in ET.fromstring(svg).iter() if element.tag.endswith("text")
     )
@@ -118,7 +118,7 @@ SKINS = [("b0", "s0"), ("b0", "s1"), ("b1", "s2"), ("b1", "s3")]
 
 
 def card(experiment: str, fold: str, scores: dict, recipe: str = "paper", seed_i: int = 0, **changes: Any) -> dict:
-    """Return the card of a training; adaptations used 390 pokes."""
+    """Return the card of a trained network; adaptations used 390 pokes."""
     values = {
         "question": experiment, "recipe_name": recipe, "recipe": dict(RECIPE), "fold": fold, "seed_i": seed_i,
         "scores": scores, "train_skins": ["s8", "s9"], "train_rows_n": 100,

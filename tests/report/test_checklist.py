@@ -46,7 +46,7 @@ def row(**fields: Any) -> Row:
     return Row(**{"id": "a", "where": "section 9", "what": "b", "paper": "SINGLE_SENSOR.accuracy_pct"} | fields)
 
 
-def judged(
+def judge_value(
     value: Any, printed: Any = None, *, pooled: bool = True, simulated: bool = True, **changes: Any
 ) -> Judgement:
     return judge(row(**{"ours": "a.accuracy_pct"} | changes), printed, value, pooled=pooled, simulated=simulated)
@@ -93,9 +93,9 @@ def test_missing_experiment_is_not_run():
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
 def test_number_is_met_within_paper_sd_or_ten_percent(mean, sd, ours, path):
-    judgement = judged(stat(ours), (mean, sd), ours=f"a.{path}")
+    judgement = judge_value(stat(ours), (mean, sd), ours=f"a.{path}")
     assert (judgement.criterion, judgement.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
-    alone = judged(stat(ours), mean, ours=f"a.{path}")
+    alone = judge_value(stat(ours), mean, ours=f"a.{path}")
     assert (alone.criterion, alone.met) == (
         "within 10 % of the paper's", "yes" if abs(ours - mean) <= 0.1 * mean else "no",
     )  # fmt: skip
@@ -111,14 +111,14 @@ def test_number_is_met_within_paper_sd_or_ten_percent(mean, sd, ours, path):
     ],
 )  # fmt: skip
 def test_limits_are_met_by_the_mean(rule, ours, paper, criterion, met):
-    judgement = judged(ours, paper, rule=rule)
+    judgement = judge_value(ours, paper, rule=rule)
     assert (judgement.verdict, judgement.criterion, judgement.met) == (FEW_BOARDS, criterion, met)
 
 
 def test_finding_has_the_verdict_of_its_experiment():
-    judgement = judged({"verdict": "undecided", "of_trainings": SUPPORTED}, rule="finding")
+    judgement = judge_value({"verdict": "undecided", "of_trainings": SUPPORTED}, rule="finding")
     assert (judgement.verdict, judgement.met) == ("undecided", "yes")
-    assert judged(False).met == "no"
+    assert judge_value(False).met == "no"
 
 
 @pytest.mark.parametrize(
@@ -131,21 +131,21 @@ def test_finding_has_the_verdict_of_its_experiment():
     ],
 )  # fmt: skip
 def test_claims_are_judged_by_interval_over_boards(rule, low, high, verdict):
-    assert judged(over_boards(low, high), rule=rule).verdict == verdict
-    assert judged({"mean": (low + high) / 2, "n": 1}, rule=rule).verdict == FEW_BOARDS
+    assert judge_value(over_boards(low, high), rule=rule).verdict == verdict
+    assert judge_value({"mean": (low + high) / 2, "n": 1}, rule=rule).verdict == FEW_BOARDS
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
 def test_lower_and_upper_limits_are_judged_alike(low, width, limit):
     ours = over_boards(low, low + width)
-    least, most = (judged(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
+    least, most = (judge_value(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
     assert (least, most) in {(SUPPORTED, CONTRADICTED), (CONTRADICTED, SUPPORTED), (UNDECIDED, UNDECIDED)}
     assert (least == SUPPORTED) == (low > limit)
 
 
 def test_decrease_of_an_error_is_a_gain():
-    assert judged(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == SUPPORTED
-    assert judged(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == CONTRADICTED
+    assert judge_value(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == SUPPORTED
+    assert judge_value(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == CONTRADICTED
 
 
 @pytest.mark.parametrize(
@@ -158,30 +158,30 @@ def test_decrease_of_an_error_is_a_gain():
     ],
 )
 def test_sizeable_gain_is_half_of_the_papers(low, high, verdict, equivalent):
-    judgement = judged(over_boards(low, high), 5.97, rule="sizeable")
+    judgement = judge_value(over_boards(low, high), 5.97, rule="sizeable")
     assert (judgement.verdict, judgement.criterion) == (verdict, "gain above 2.98, half of the paper's")
     assert (EQUIVALENT in judgement.notes) == equivalent == (max(-low, high) < 5.97 / 2)
 
 
-def test_repeats_of_one_skin_are_one_board():
-    assert judged(stat(96.3, 0.1, 5), 90.0, rule="at_least").verdict == FEW_BOARDS
+def test_repeats_on_one_skin_have_too_few_boards():
+    assert judge_value(stat(96.3, 0.1, 5), 90.0, rule="at_least").verdict == FEW_BOARDS
 
 
-def test_each_rule_fails_where_one_count_fails():
+def test_each_rule_fails_if_one_count_fails():
     sweep = [
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
-    judgement = judged(sweep, rule="each")
+    judgement = judge_value(sweep, rule="each")
     assert (judgement.verdict, judgement.met) == (UNDECIDED, "yes")
     assert judgement.notes == ("1 skins: supported, 6 skins: undecided, 15 skins: supported",)
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
-    assert judged(sweep, rule="each").verdict == CONTRADICTED
+    assert judge_value(sweep, rule="each").verdict == CONTRADICTED
 
 
-def test_simulated_calibration_target_is_no_evidence():
+def test_simulated_calibration_target_is_not_evidence():
     target = {"ours": "table2.single.accuracy_pct", "rule": "target"}
-    assert judged(stat(25.0), (25.0, 10.0), **target).notes == (TARGET,)
-    assert judged(stat(25.0), (25.0, 10.0), simulated=False, **target).notes == ()
+    assert judge_value(stat(25.0), (25.0, 10.0), **target).notes == (TARGET,)
+    assert judge_value(stat(25.0), (25.0, 10.0), simulated=False, **target).notes == ()
     assert {one.id for one in ROWS if one.rule == "target"} == {
         f"table-2-single-{metric}" for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
     }
@@ -205,8 +205,8 @@ def test_sweep_too_short_for_a_claim_is_not_reached():
 
 def test_single_training_skin_is_not_compared_with_pooled():
     item = {"ours": "table2.multi.accuracy_pct"}
-    assert judged(stat(90.0), (85.0, 1.0), pooled=False, **item).notes == (ONE_SKIN,)
-    assert judged(stat(90.0), (85.0, 1.0), **item).met == "no"
+    assert judge_value(stat(90.0), (85.0, 1.0), pooled=False, **item).notes == (ONE_SKIN,)
+    assert judge_value(stat(90.0), (85.0, 1.0), **item).met == "no"
 
 
 def test_reason_is_shown_only_where_ours_differs():

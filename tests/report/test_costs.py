@@ -47,7 +47,7 @@ STIFF = [
 ]
 
 
-def timed(rows: list[Precision]) -> list[dict]:
+def with_times(rows: list[Precision]) -> list[dict]:
     """Return the rows of a study with run times, except for failures and references."""
     done = [row for row in rows if row.error is not None and row.method != REFERENCE]
     times = {row.key: {"median_s": 1e-4 * (i + 1), "repeats_n": 5} for i, row in enumerate(done)}
@@ -55,11 +55,11 @@ def timed(rows: list[Precision]) -> list[dict]:
 
 
 def draw_quadratures(rows=SUMS, **limits) -> str:
-    return quadratures(timed(rows), asdict(choose(rows, used=DEFAULT_QUADRATURE, **limits)), "simulated")
+    return quadratures(with_times(rows), asdict(choose(rows, used=DEFAULT_QUADRATURE, **limits)), "simulated")
 
 
 def draw_integrators(rows=STIFF) -> str:
-    return integrators(timed(rows))
+    return integrators(with_times(rows))
 
 
 def test_quadrature_figure_labels():
@@ -78,7 +78,7 @@ def test_quadrature_figure_labels():
     assert "reference's own error, at most" in text
 
 
-def test_only_the_rule_in_use_is_marked_without_a_good_enough_one():
+def test_rule_in_use_is_marked_if_no_rule_meets_the_limit():
     text = texts_of(draw_quadratures(error_max=1e-6))
     assert "cheapest" not in text
     assert "in use: 0.5 mm x 6" in text
@@ -88,35 +88,35 @@ def test_integrator_figure_labels():
     text = texts_of(draw_integrators())
     for label in ("stiffness 1e+03", "stiffness 1e+08", "exact update", "Radau", "rms error / rms force"):
         assert label in text
-    for line in failures(timed(STIFF)):
+    for line in failures(with_times(STIFF)):
         for label in line.split():
             assert label in text
 
 
 def test_failures_are_grouped_by_method_and_kind():
-    diverged, stopped = failures(timed(STIFF))
+    diverged, stopped = failures(with_times(STIFF))
     assert diverged == (
         "Failed: explicit Euler, diverged: relaxation, stiffness 1e+03 (1e-02 s, 1e-03 s);"
         " relaxation, stiffness 1e+08 (1e-02 s, 1e-03 s)"
     )
     assert stopped.startswith("Failed: explicit Euler, stopped after 20000 right-hand sides: ")
-    assert failures(timed(SUMS)) == []
+    assert failures(with_times(SUMS)) == []
 
 
 def test_failed_and_untimed_rows_are_not_drawn():
     # Each point is one <use> of a marker.
     done = [row for row in STIFF if row.failure is None]
-    assert drawn(draw_integrators()) == drawn(draw_integrators(done))
-    last = {key: value for key, value in timed(SUMS)[-1].items() if key != "median_s"}
+    assert count_marks(draw_integrators()) == count_marks(draw_integrators(done))
+    last = {key: value for key, value in with_times(SUMS)[-1].items() if key != "median_s"}
     choice = asdict(choose(SUMS, used=DEFAULT_QUADRATURE))
-    untimed, without = (quadratures([*timed(SUMS)[:-1], *more], choice, "simulated") for more in ([last], []))
-    assert drawn(untimed) == drawn(without)
+    untimed, without = (quadratures([*with_times(SUMS)[:-1], *more], choice, "simulated") for more in ([last], []))
+    assert count_marks(untimed) == count_marks(without)
 
 
 def test_pages_match_the_studies_of_the_scene():
     stages = {"stages": {"simulate": cost()}}
     assert set(cost_pages(stages, "simulated")) == {"stages.md"}
-    assert set(cost_pages(stages | {"integrators": timed(STIFF)}, "simulated")) == {
+    assert set(cost_pages(stages | {"integrators": with_times(STIFF)}, "simulated")) == {
         "integrators.svg", "integrators.md", "stages.md",
     }  # fmt: skip
 
@@ -133,7 +133,7 @@ def test_figure_bytes_depend_only_on_rows():
     assert draw_quadratures() == draw_quadratures()
     stiff = draw_integrators()
     assert draw_integrators() == stiff
-    slower = [row | ({"median_s": row["median_s"] ** 2} if "median_s" in row else {}) for row in timed(STIFF)]
+    slower = [row | ({"median_s": row["median_s"] ** 2} if "median_s" in row else {}) for row in with_times(STIFF)]
     assert integrators(slower) != stiff
 
 
@@ -214,7 +214,7 @@ def test_raw_and_other_inputs_differ_in_fill():
     assert shape["markerfacecolor"] == "white"
 
 
-def test_looks_of_49_methods_are_distinct():
+def test_styles_of_49_methods_are_distinct():
     assert len({(look_of(i)["color"], look_of(i)["marker"]) for i in range(49)}) == 49
 
 
@@ -277,14 +277,14 @@ def test_each_point_adds_one_mark(costs):
     few, all_ = cost_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
     ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
     # Each point has a mark in the panel and one in the legend. Each tick is a mark too.
-    assert drawn(all_) - ticks["all"] - (drawn(few) - ticks["few"]) == 2
+    assert count_marks(all_) - ticks["all"] - (count_marks(few) - ticks["few"]) == 2
 
 
 def test_cost_pages_are_reproducible(costs):
     assert cost_pages({"learning": LEARNING, "adaptation": ADAPTATION}, "simulated") == costs
 
 
-def drawn(svg: str) -> int:
+def count_marks(svg: str) -> int:
     """Return the number of marks: each is a <use> of a path."""
     return len(re.findall("<use ", svg))
 

@@ -1,4 +1,4 @@
-"""Tests of the tables of trainings on many skins, and of the blocks of README and docs that show them."""
+"""Tests of the tables on training with many skins, and of the blocks of README and docs that show them."""
 
 from itertools import pairwise
 

@@ -170,7 +170,7 @@ def test_learning_times_are_medians():
         "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
-    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; the last was not timed
+    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; the last method was not timed
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 
 

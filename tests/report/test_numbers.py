@@ -1,4 +1,4 @@
-"""Tests of numbers.json, which equal runs share, of provenance.json, and of the headline scores that DVC shows."""
+"""Tests of numbers.json, which is equal for equal runs, of provenance.json, and of the scores that DVC shows."""
 
 import copy
 import json
@@ -76,7 +76,7 @@ def test_table_2_and_control_are_shown_by_their_means():
 def test_drift_is_shown_at_its_end():
     windows = [{"contacts_n": n, "accuracy_pct": 100.0 - n, "mse_xy_mm2": 1.0} for n in (10, 20)]
     numbers = {"provenance": {"source": "recorded"}, "drift": {"each": windows, "findings": [{"finding": "x"}]}}
-    assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}  # there is no force
+    assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}  # without forces
 
 
 def test_recorded_scenes_show_registered_scores_and_best_methods():

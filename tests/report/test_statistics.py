@@ -60,7 +60,7 @@ TRUE = RNG.uniform(0, 16, (30, 3))
 SKIN = np.repeat(["s0", "s1", "s2"], 10)
 
 
-def shifted(fold: str, off_mm: float) -> dict:
+def card_with_offset(fold: str, off_mm: float) -> dict:
     return card("lobo", fold, score_groups(TRUE, TRUE + off_mm, np.repeat(fold, 30), SKIN))
 
 
@@ -83,7 +83,7 @@ def board_scores(values: list[float]) -> pd.DataFrame:
 
 def test_seeds_of_a_fold_are_averaged_first():
     # squared errors: fold b0 has 0 and 4 (two seeds), fold b1 has 16
-    cards = [shifted("b0", 0), shifted("b0", 2) | {"seed_i": 1}, shifted("b1", 4)]
+    cards = [card_with_offset("b0", 0), card_with_offset("b0", 2) | {"seed_i": 1}, card_with_offset("b1", 4)]
     summary = over_folds(tidy(cards))["mse_xy_mm2"]
     assert summary["n"] == 2
     assert summary["mean"] == pytest.approx((2 + 16) / 2)
@@ -127,7 +127,7 @@ def test_unequal_skins_pool_to_the_score_of_all_rows():
 def test_tidy_table_survives_csv():
     points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
                           "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
-    table = tidy([shifted("b0", 1), *adapted_cards()], points)
+    table = tidy([card_with_offset("b0", 1), *adapted_cards()], points)
     assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
     assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # as labelled, registered, and each skin
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
@@ -266,7 +266,9 @@ def test_single_board_has_no_verdict():
 
 
 def test_repeats_on_one_skin_are_not_boards():
-    assert verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS  # n with no interval over boards
+    assert (
+        verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
+    )  # n counts repeats: no interval over boards
 
 
 def test_combined_verdicts():

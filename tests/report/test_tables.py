@@ -1,4 +1,4 @@
-"""Tests of the report's tables: our numbers beside the paper's, with their source."""
+"""Tests of the report's tables: our numbers, the paper's numbers and their source."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A small scene to simulate, and variations of it."""
+"""A small simulated scene and variations of it."""
 
 from reskin.config import parse
 from reskin.simulation.settings import SimulationSettings

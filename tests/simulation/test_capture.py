@@ -38,7 +38,7 @@ def capture():
     return capture_of()
 
 
-def quiet(**changes):
+def noiseless_scene(**changes):
     return synthesis("chip", noise_xy_uT=0.0, noise_z_uT=0.0, **changes)
 
 
@@ -50,12 +50,12 @@ def same(one, other):
     )
 
 
-def shaped(capture, frames_n=FRAMES_N):
+def frames_by_indentation(capture, frames_n=FRAMES_N):
     """Frames as [indentation, frame, chip, axis]."""
     return capture.b_uT.astype(np.float64).reshape(-1, frames_n, 5, 3)
 
 
-def touched(capture, name):
+def labels_in_contact(capture, name):
     return getattr(capture.probe, name)[capture.probe.contact]
 
 
@@ -68,8 +68,8 @@ def test_frames_and_dwells_of_each_indentation(capture):
 
 
 def test_noiseless_capture_equals_the_field():
-    of = quiet()
-    b_uT = shaped(capture_of(of))
+    of = noiseless_scene()
+    b_uT = frames_by_indentation(capture_of(of))
     board = draw_board(of.boards["rigid"].design, of.spreads, seed=1, name="b0")
     rule = of.boards["rigid"].quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=rule)
@@ -81,28 +81,29 @@ def test_noiseless_capture_equals_the_field():
 
 
 def test_robot_spread_changes_fields_but_not_labels():
-    exact, loose = capture_of(quiet()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
+    exact, loose = capture_of(noiseless_scene()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
     assert np.array_equal(exact.probe.x_mm, loose.probe.x_mm)
-    moved_uT = (shaped(exact) - shaped(loose))[:, READ].std()
+    moved_uT = (frames_by_indentation(exact) - frames_by_indentation(loose))[:, READ].std()
     assert moved_uT > 2 * 5.0  # twice the noise of one reading
 
 
 def test_labels_are_commanded_and_forces_measured(capture):
     log = capture.probe
     np.testing.assert_array_equal(
-        np.column_stack([touched(capture, "x_mm"), touched(capture, "y_mm")]), np.tile(points_mm(), (4, 1))
+        np.column_stack([labels_in_contact(capture, "x_mm"), labels_in_contact(capture, "y_mm")]),
+        np.tile(points_mm(), (4, 1)),
     )
     assert not log.depth_mm[~log.contact].any()
     of = synthesis()
     skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0")
-    noise_N = touched(capture, "Fz_N") - forces(skin, np.repeat([0.6e-3, 1.2e-3] * 2, 65))
+    noise_N = labels_in_contact(capture, "Fz_N") - forces(skin, np.repeat([0.6e-3, 1.2e-3] * 2, 65))
     assert noise_N.std() == pytest.approx(0.006, rel=0.2)  # four times the sampling error of 260 draws
     assert np.abs(np.concatenate([noise_N, log.Fz_N[~log.contact], log.Fx_N, log.Fy_N])).max() < 6 * 0.006
 
 
 def test_passes_of_a_perfect_robot_differ_by_noise(capture):
     still = [1, 2, 3, 4, 8, 9, 10]  # while the tip moves, chips that convert earlier see less
-    b_uT = shaped(capture)[:, still]
+    b_uT = frames_by_indentation(capture)[:, still]
     differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)
     np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)  # 7000 draws: 0.8 %
 
@@ -136,15 +137,15 @@ def sleeve(**changes):
 def test_scattered_pokes_are_at_their_labels():
     of = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
     one = capture_of(of, "sleeve", board="v0", skin="v0_s0")
-    place_mm = np.column_stack([touched(one, "x_mm"), touched(one, "y_mm")]).astype(float)
+    place_mm = np.column_stack([labels_in_contact(one, "x_mm"), labels_in_contact(one, "y_mm")]).astype(float)
     board = draw_board(of.boards["sleeve"].design, of.spreads, seed=1, name="v0")
     rule = of.boards["sleeve"].quadrature.in_si()
     skin = draw_skin(of.skin, of.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
-    pokes_m = np.column_stack([place_mm - (25.4, 50.8), touched(one, "depth_mm")]) * 1e-3
+    pokes_m = np.column_stack([place_mm - (25.4, 50.8), labels_in_contact(one, "depth_mm")]) * 1e-3
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
     b_uT = one.b_uT.astype(np.float64).reshape(-1, FRAMES_N, 40, 3)
-    # one LSB of z: two roundings; rounding of float32 labels (4 nm) is negligible
+    # one LSB of z (two roundings); the rounding of float32 labels (4 nm) is negligible
     assert np.abs(b_uT[:, READ] - b_uT[:, 1:2] - truth_uT[:, None]).max() < 0.75
 
 
@@ -161,41 +162,47 @@ def test_frames_of_forty_chips_survive_the_wire():
 def test_hand_pokes_have_fields_but_no_labels():
     one = capture_of(with_protocol("hand", HAND), "hand")
     for name in ("x_mm", "y_mm", "depth_mm", "Fx_N", "Fy_N", "Fz_N"):
-        assert np.isnan(touched(one, name)).all()
-    np.testing.assert_array_equal(touched(one, "pass_i"), np.repeat([0, 1, 2], 4))
+        assert np.isnan(labels_in_contact(one, name)).all()
+    np.testing.assert_array_equal(labels_in_contact(one, "pass_i"), np.repeat([0, 1, 2], 4))
     assert one.name == "b0_s0-hand"
-    change_uT = np.linalg.norm((shaped(one)[:, READ] - shaped(one)[:, 1:2]).mean(axis=1).reshape(12, 15), axis=1)
+    change_uT = np.linalg.norm(
+        (frames_by_indentation(one)[:, READ] - frames_by_indentation(one)[:, 1:2]).mean(axis=1).reshape(12, 15), axis=1
+    )
     assert change_uT.min() > 30  # noise alone: difference of two readings in 15 channels, averaged over 3: 13
 
 
-def aged(**changes):
+def aged_capture(**changes):
     grid = GRID | {"terms": list(changes)}
     return with_protocol("grid", grid, terms=changes)
 
 
 def test_aging_softens_and_drifts(capture):
-    old = capture_of(aged(ageing=AGEING))
-    ratio = touched(old, "Fz_N")[-65:] / touched(capture, "Fz_N")[-65:]
-    # by hand: 1 - 0.1 (1 - exp(-227/300)) - 0.01 log10(1.227) = 0.946 at contact 227, half way through the last 65
+    old = capture_of(aged_capture(ageing=AGEING))
+    ratio = labels_in_contact(old, "Fz_N")[-65:] / labels_in_contact(capture, "Fz_N")[-65:]
+    # 1 - 0.1 (1 - exp(-227/300)) - 0.01 log10(1.227) = 0.946 at contact 227, half way through the last 65
     assert np.median(ratio) == pytest.approx(0.946, abs=0.005)
-    drift_uT = (shaped(old)[:, 1:5].mean(axis=1) - shaped(capture)[:, 1:5].mean(axis=1))[-1]
+    drift_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
+        -1
+    ]
     assert np.abs(drift_uT).max() > 5
-    early_uT = (shaped(old)[:, 1:5].mean(axis=1) - shaped(capture)[:, 1:5].mean(axis=1))[0]
+    early_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
+        0
+    ]
     assert np.abs(early_uT).max() < 12  # noise only: difference of two means with 5 / sqrt(2), three sd
 
 
 def test_relaxation_lowers_the_force_only(capture):
-    slack = capture_of(aged(relaxation=RELAXATION))
-    ratio = np.median(touched(slack, "Fz_N")[65:130] / touched(capture, "Fz_N")[65:130])
+    slack = capture_of(aged_capture(relaxation=RELAXATION))
+    ratio = np.median(labels_in_contact(slack, "Fz_N")[65:130] / labels_in_contact(capture, "Fz_N")[65:130])
     # after 1 s the two fastest terms, 0.05 each, are gone, and at most a tenth of the third
     assert 0.88 < ratio < 0.91
     assert np.array_equal(slack.b_uT, capture.b_uT)
 
 
 def test_temperature_is_read_and_weakens_the_field(capture):
-    warm = capture_of(aged(temperature=TEMPERATURE))
+    warm = capture_of(aged_capture(temperature=TEMPERATURE))
     assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
-    before_uT, after_uT = (shaped(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
+    before_uT, after_uT = (frames_by_indentation(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
     change_uT = np.abs(after_uT).sum() - np.abs(before_uT).sum()
     offset = 5 * 3 * 200 * 0.8  # the chips' offset is constant: mean |normal| of 15 channels
     assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
@@ -223,11 +230,13 @@ def test_order_of_captures():
 
 def test_skins_of_a_board_share_chips_only(capture):
     other = capture_of(skin="b0_s1")
-    assert not np.allclose(shaped(capture)[0, 1], shaped(other)[0, 1], atol=20)  # six times the noise
+    assert not np.allclose(
+        frames_by_indentation(capture)[0, 1], frames_by_indentation(other)[0, 1], atol=20
+    )  # six times the noise
 
 
 def test_skin_without_magnetisation_has_no_signal():
-    b_uT = shaped(capture_of(synthesis("skin", saturation_T=0.0)))
+    b_uT = frames_by_indentation(capture_of(synthesis("skin", saturation_T=0.0)))
     np.testing.assert_allclose(b_uT.std(axis=(0, 1)), np.tile([3.3, 3.3, 5.0], (5, 1)), rtol=0.1)
 
 

@@ -38,7 +38,7 @@ def capture_of(name, protocol, **changes):
     return simulate_capture(with_protocol(name, protocol, **changes), name, board="b0", skin="b0_s0", seed=1)
 
 
-def drawn(presses_n, name="presses"):
+def draw_presses(presses_n, name="presses"):
     section = PRESS | {"presses_n": presses_n, "duration_s": (0.05, 1.0), "terms": ()}
     return Press(**section).plan(rng_for(0, name), SKIN_MM)
 
@@ -93,7 +93,7 @@ def test_half_sine_is_symmetric():
 
 
 def test_durations_are_log_uniform():
-    stops = drawn(2000)
+    stops = draw_presses(2000)
     frames_n = (stops.depth_mm > 0).sum(axis=1)
     position = np.log(frames_n / 20) / np.log(20)
     np.testing.assert_allclose(
@@ -134,7 +134,7 @@ def test_chips_read_a_rising_press_late():
     still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
     late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
     assert (late_uT > 1.0).all()  # three LSB of z
-    # the same press, read up to 1.84 of 2.5 ms late: each reading is between two of the slow press
+    # the same press read up to 1.84 ms late, with 2.5 ms between frames: each reading is between two of the slow press
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
     assert (moving_uT[1:] >= low_uT - 1).all()  # uT: one LSB of x and y, and of z
     assert (moving_uT[1:] <= high_uT + 1).all()
@@ -167,7 +167,7 @@ def test_force_controlled_presses_refuse_relaxation_and_wear():
         with_protocol("glass", GLASS | {"step_N": 0.3})
 
 
-def test_walk_is_an_sd_card_log_and_no_capture(tmp_path):
+def test_walk_is_an_sd_card_log_not_a_capture(tmp_path):
     capture = capture_of("log", WALK)
     header = write_capture(tmp_path / capture.name, *to_files(capture, with_protocol("log", WALK)))
     assert sorted(header.files) == ["log.csv", "probe.csv"]

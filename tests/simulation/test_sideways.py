@@ -1,4 +1,4 @@
-"""Tangential forces: Coulomb and spring by hand; no friction, mirror images."""
+"""Tangential forces compared with Coulomb's law and a spring; drags without friction and mirrored drags."""
 
 from dataclasses import replace
 
@@ -24,20 +24,20 @@ STRAIGHT = np.zeros((1, 2))
 
 
 def line(*x_mm, y_mm=1.0):
-    """One dragged line: tips (x, y, depth)."""
+    """Return the tip positions (x, y, depth) of one dragged line."""
     return np.array([[[1e-3 * x, 1e-3 * y_mm, DEPTH_M] for x in x_mm]])
 
 
-def pushed(tip_m, coefficient=0.8, tilt=STRAIGHT):
+def drag(tip_m, coefficient=0.8, tilt=STRAIGHT):
     return drag_tip(BOARD, SKIN, tip_m, tilt=tilt, how=Friction(coefficient=coefficient))
 
 
-def pressed(tip_m):
+def press_T(tip_m):
     return changes_of_field(BOARD, SKIN, tip_m.reshape(-1, 3))[1].reshape(*tip_m.shape[:2], 5, 3)
 
 
 def test_short_drag_sticks_and_long_drag_slides():
-    found = pushed(line(0.0, 0.1, 4.0)).force_N[0]
+    found = drag(line(0.0, 0.1, 4.0)).force_N[0]
     sizes = {"thickness_m": SKIN.thickness_m, "tip_radius_m": SKIN.tip_radius_m, "base": SKIN.base}
     stiffness = SKIN.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
     limit_N = 0.8 * forces(SKIN, np.array([DEPTH_M]))[0]
@@ -47,15 +47,15 @@ def test_short_drag_sticks_and_long_drag_slides():
 
 def test_without_friction_the_drag_is_a_press():
     tip_m = line(-2.0, 0.0, 3.0)
-    found = pushed(tip_m, coefficient=0.0)
+    found = drag(tip_m, coefficient=0.0)
     assert not found.force_N.any()
-    np.testing.assert_array_equal(found.change_T, pressed(tip_m))
+    np.testing.assert_array_equal(found.change_T, press_T(tip_m))
 
 
 def test_push_direction_changes_the_field():
-    there, back = pushed(line(-2.0, 1.0)), pushed(line(4.0, 1.0))
+    there, back = drag(line(-2.0, 1.0)), drag(line(4.0, 1.0))
     np.testing.assert_allclose(there.force_N[0, 1], -back.force_N[0, 1])
-    alone_T = pressed(line(1.0))[0, 0]
+    alone_T = press_T(line(1.0))[0, 0]
     size_T = np.linalg.norm(alone_T)
     for one, other in ((there, alone_T), (back, alone_T)):
         assert np.linalg.norm(one.change_T[0, 1] - other) > 0.1 * size_T
@@ -64,42 +64,42 @@ def test_push_direction_changes_the_field():
 
 def test_mirror_symmetry_of_a_drag():
     # Chips 1 and 3 swap; B is axial, and so is the checkerboard: its Jx flips instead (as for a poke).
-    one = pushed(line(-1.0, 2.0))
-    mirrored = pushed(line(1.0, -2.0)).change_T[0][:, [0, 3, 2, 1, 4]]
+    one = drag(line(-1.0, 2.0))
+    mirrored = drag(line(1.0, -2.0)).change_T[0][:, [0, 3, 2, 1, 4]]
     np.testing.assert_allclose(mirrored, one.change_T[0] * (1, -1, -1), atol=1e-9 * np.abs(one.change_T).max())
 
 
 def test_lean_of_the_tip_is_limited_by_friction():
     normal_N = forces(SKIN, np.array([DEPTH_M]))[0]
     for lean, share in ((0.1, 0.1), (2.0, 0.8)):
-        found = pushed(line(1.0), tilt=np.array([[0.0, lean]])).force_N[0, 0]
+        found = drag(line(1.0), tilt=np.array([[0.0, lean]])).force_N[0, 0]
         np.testing.assert_allclose(found, [0.0, share * normal_N], rtol=1e-12)
 
 
 def test_tip_above_the_skin_has_no_effect():
     tip_m = line(0.0, 2.0) * (1, 1, -1)
-    found = pushed(tip_m)
+    found = drag(tip_m)
     assert not found.force_N.any()
     assert not found.change_T.any()
 
 
 def test_lines_are_independent():
     lines_m = np.concatenate([line(0.0, 3.0), line(-3.0, -2.9)])
-    both, second = pushed(lines_m, tilt=np.zeros((2, 2))), pushed(lines_m[1:])
+    both, second = drag(lines_m, tilt=np.zeros((2, 2))), drag(lines_m[1:])
     np.testing.assert_allclose(both.force_N[1], second.force_N[0])
 
 
 @pytest.mark.parametrize("coefficient", [0.3, 0.8])
 def test_force_is_limited_by_coulomb(coefficient):
     tip_m = line(-5.0, -4.9, -4.5, 0.0, 0.05, -3.0)
-    found = np.hypot(*pushed(tip_m, coefficient).force_N[0].T)
+    found = np.hypot(*drag(tip_m, coefficient).force_N[0].T)
     assert (found <= coefficient * forces(SKIN, tip_m[0, :, 2]) * (1 + 1e-12)).all()
 
 
 def test_drag_equals_press_and_many_small_shears():
     # Reference: material pressed at its rest position behind the tip, then sheared in fiftieths of the force.
     tip_m, modulus_Pa = line(-2.0, 1.0), SKIN.modulus_Pa
-    found = pushed(tip_m, coefficient=0.4)
+    found = drag(tip_m, coefficient=0.4)
     sizes = {"thickness_m": SKIN.thickness_m, "tip_radius_m": SKIN.tip_radius_m, "base": SKIN.base}
     of = shear.tabulate_depth(DEPTH_M, **sizes)
     force_N = found.force_N[0, 1]

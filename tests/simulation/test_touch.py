@@ -26,20 +26,20 @@ RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boar
 TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
-STOPS_N = 48  # stops of a path; also with twice as many
+STOPS_N = 48  # stops of a path, compared with a path of twice as many
 HALVED = 0.75  # ratio of the largest steps of dB: 0.5 if dB is smooth, 1 if it jumps
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
 ways = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # drags much shorter than sticking
 some = settings(max_examples=8, deadline=None)
 
 
-def drawn(name: str) -> tuple[Board, Skin]:
+def draw_board_and_skin(name: str) -> tuple[Board, Skin]:
     board = draw_board(RIGID, SPREADS, seed=1, name=name)
     return board, draw_skin(DESIGN, SPREADS, seed=1, name=f"{name}_s0", rule=COARSE)
 
 
-def pressed_by(skin: Skin, force_N) -> np.ndarray:
-    """Commanded depths of forces on a skin; without force, a tip 20 um above it."""
+def depths_of_forces_m(skin: Skin, force_N) -> np.ndarray:
+    """Return the commanded depths for forces on a skin; for zero force the tip is 20 um above the skin."""
     of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
     depth_m = slide.depth_at(np.asarray(force_N, float), **of) - skin.depth_zero_m
     return np.where(np.asarray(force_N) > 0, depth_m, -20e-6 - skin.depth_zero_m)
@@ -52,9 +52,9 @@ def sizes_uT(change_T) -> np.ndarray:
 @some
 @given(places, st.integers(0, 10**6))
 def test_millinewton_is_below_the_noise(place_m, name_i):
-    board, skin = drawn(f"b{name_i}")
+    board, skin = draw_board_and_skin(f"b{name_i}")
     force_N = np.array([0.0, 1e-6, 1e-5, 1e-4, LIGHT_N])
-    poke_m = np.column_stack([np.tile(place_m, (5, 1)), pressed_by(skin, force_N)])
+    poke_m = np.column_stack([np.tile(place_m, (5, 1)), depths_of_forces_m(skin, force_N)])
     np.testing.assert_allclose(forces(skin, poke_m[:, 2]), force_N, rtol=1e-2)
     found_uT = sizes_uT(changes_of_field(board, skin, poke_m)[1])
     assert found_uT[0] == 0
@@ -64,11 +64,11 @@ def test_millinewton_is_below_the_noise(place_m, name_i):
 
 
 def path(skin: Skin, ends_m, forces_N, stops_n: int) -> np.ndarray:
-    """Approach, press, drag under a growing force, release: stops in equal steps of place and of force."""
+    """Return a path of approach, press, drag under growing force and release, in equal steps of place and force."""
     share = np.linspace(0, 3, stops_n + 1)
     place_m = np.stack([np.interp(share, (1, 2), ends) for ends in np.transpose(ends_m)], axis=1)
     force_N = np.interp(share, (0, 1, 2, 3), (0.0, *forces_N, 0.0))
-    return np.column_stack([place_m, pressed_by(skin, force_N)])[None]
+    return np.column_stack([place_m, depths_of_forces_m(skin, force_N)])[None]
 
 
 def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> float:
@@ -82,7 +82,7 @@ def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> floa
     places, st.floats(0, 2 * np.pi), st.floats(0.02, 2.5), st.floats(0, 1.2), st.floats(-0.3, 0.3), st.integers(0, 99)
 )
 def test_press_and_drag_share_one_friction(start_m, angle_rad, force_N, friction, lean, name_i):
-    board, skin = drawn(f"b{name_i}")
+    board, skin = draw_board_and_skin(f"b{name_i}")
     assert skin.hold is not None
     way_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
     end_m = np.subtract(start_m, way_m)  # at least a millimetre inside the skin's edge
@@ -96,7 +96,7 @@ def test_press_and_drag_share_one_friction(start_m, angle_rad, force_N, friction
 
 
 def test_frictionless_tip_moves_no_skin():
-    board, skin = drawn("b0")
+    board, skin = draw_board_and_skin("b0")
     tip_m = path(skin, ((0.0, 0.0), (1e-3, 0.0)), (0.5, 0.5), STOPS_N // 4)
     slippery = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.0))
     assert not slippery.force_N.any()
@@ -106,7 +106,7 @@ def test_frictionless_tip_moves_no_skin():
 
 @pytest.mark.parametrize("depth_m", [3e-5, 2e-4, 6e-4])
 def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
-    board, skin = drawn("b0")
+    board, skin = draw_board_and_skin("b0")
     deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # across two depths of the shear tables
     place_m = np.column_stack([np.r_[0.0, np.full(41, 4e-5)], np.zeros(42)])
     tip_m = np.column_stack([place_m, np.r_[deeper_m[0], deeper_m]])[None]
@@ -118,7 +118,7 @@ def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
 @settings(max_examples=4, deadline=None)
 @given(places, ways, st.tuples(st.floats(0.05, 1.5), st.floats(0.05, 1.5)), st.integers(0, 10**6))
 def test_half_steps_halve_the_largest_field_step(start_m, way_m, forces_N, name_i):
-    board, skin = drawn(f"b{name_i}")
+    board, skin = draw_board_and_skin(f"b{name_i}")
     end_m = tuple(np.add(start_m, way_m))
     coarse, fine = (
         largest_step_uT(board, skin, path(skin, (start_m, end_m), forces_N, n), 0.4) for n in (STOPS_N, 2 * STOPS_N)
@@ -127,7 +127,7 @@ def test_half_steps_halve_the_largest_field_step(start_m, way_m, forces_N, name_
 
 
 def test_planted_jump_at_first_contact_is_detected(monkeypatch):
-    board, skin = drawn("b0")
+    board, skin = draw_board_and_skin("b0")
     monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
     place_m = (6e-3, 2e-3)
     coarse, fine = (
@@ -138,8 +138,8 @@ def test_planted_jump_at_first_contact_is_detected(monkeypatch):
 
 @pytest.mark.parametrize("terms", [(), ("memory",)])
 def test_lift_off_leaves_only_the_memory(terms):
-    board, skin = drawn("b0")
-    depth_m = pressed_by(skin, np.array([0.5, 2.0, 0.5, 0.0]))
+    board, skin = draw_board_and_skin("b0")
+    depth_m = depths_of_forces_m(skin, np.array([0.5, 2.0, 0.5, 0.0]))
     tip_m = np.column_stack([np.full(4, 5e-3), np.full(4, -3e-3), depth_m])[None].repeat(3, axis=0)
     rng = np.random.default_rng(0)
     found = simulate_response(board, skin, tip_m, tilt=np.zeros((3, 2)), terms=TERMS.only(terms), rng=rng)
@@ -153,11 +153,11 @@ def test_lift_off_leaves_only_the_memory(terms):
 
 
 def test_friction_matters_for_light_touches_only():
-    board, skin = drawn("b0")
+    board, skin = draw_board_and_skin("b0")
     assert skin.hold is not None
     firm = replace(skin, hold=replace(skin.hold, friction=1e12))
     place_m = np.array([7e-3, 4e-3])
-    at = np.column_stack([np.tile(place_m, (2, 1)), pressed_by(skin, np.array([1e-3, 6.0]))])
+    at = np.column_stack([np.tile(place_m, (2, 1)), depths_of_forces_m(skin, np.array([1e-3, 6.0]))])
     light_uT, hard_uT = (sizes_uT(changes_of_field(board, one, at)[1]) for one in (skin, firm))
     assert light_uT[0] < 0.02 * hard_uT[0]
     assert light_uT[1] == pytest.approx(hard_uT[1], rel=1e-3)

@@ -1,4 +1,4 @@
-"""Physics terms that a protocol does not use are not computed (by profiling one simulation)."""
+"""Physics terms that a protocol does not use are not computed (found by profiling a simulation)."""
 
 import sys
 from pathlib import Path
@@ -23,7 +23,7 @@ FEW = GRID | {"passes_n": 1, "depths_mm": (0.6,), "skins_n": 1}
 
 
 def functions_run(scene):
-    """Names of the library functions that were called."""
+    """Return the names of the library functions that were called."""
     called = set()
 
     def note(frame, event, _):

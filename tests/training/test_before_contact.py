@@ -21,7 +21,7 @@ CHANCE_MAX_PCT = 15.0  # 1 of 64 places by chance, a little more for means of ne
 
 
 def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
-    """Score a scan of a 14 mm grid in four passes; the next field keeps a share `memory` of each poke."""
+    """Score a scan of a 14 mm grid in four passes; the share `memory` of each poke remains in the next field."""
     rng = rng_for(0, "scan")
     order = [np.arange(PLACES_N) if snake else rng.permutation(PLACES_N) for _ in range(PASSES_N)]
     at = np.concatenate(order)
@@ -55,7 +55,7 @@ def test_snake_scan_without_memory_reveals_places_by_number(tmp_path):
 
 
 def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
-    """Score a tip that hovers above each place of a grid before it touches; a magnetic tip is read."""
+    """Score a tip that hovers above each place before it touches; only a magnetic tip changes the readings."""
     at = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)  # above each place, then in contact
     touches = np.tile([False, True], PASSES_N * PLACES_N)
     place_mm = np.column_stack([2 * (at // 8), 2 * (at % 8)]).astype(np.float32)

@@ -29,7 +29,7 @@ def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **chan
     return synthetic.card(experiment, fold, scores, name) | data | outcome | changes
 
 
-def adapted(name: str, mse_xy_mm2: float, base: str, *, unlabelled_weight: float = 0.1, **changes: Any) -> Card:
+def adapted_card(name: str, mse_xy_mm2: float, base: str, *, unlabelled_weight: float = 0.1, **changes: Any) -> Card:
     schedule = {"batch_n": 64, "rate_max": 1e-3, "weight_decay": 0.0, "steps_n": 400}
     settings = {"base": base, "unlabelled_weight": unlabelled_weight} | schedule
     recipe = RECIPE | {"triplet_weight": WEIGHTS[base]}
@@ -45,8 +45,8 @@ CARDS = [
     card("lobo", "fastest", 0.4, recipe=RECIPE | {"rate_max": 9e-3}),
     card("triplet", "light", 0.35, recipe=RECIPE | {"triplet_weight": 0.1}),
     card("triplet", "heavy", 0.6, recipe=RECIPE | {"triplet_weight": 1.0}),
-    adapted("from-light", 0.34, "light"),
-    adapted("from-heavy", 0.25, "heavy"),
+    adapted_card("from-light", 0.34, "light"),
+    adapted_card("from-heavy", 0.25, "heavy"),
 ]
 
 
@@ -98,7 +98,7 @@ def test_mean_over_boards_decides():
 def test_adapted_skins_are_pooled_by_board():
     # Two skins of board b0 (0.2, 0.4) and one of b1 (0.9): (0.3 + 0.9) / 2, not the mean of three.
     skins = [
-        adapted("from-light", error, "light", fold=fold, test_skins=[skin])
+        adapted_card("from-light", error, "light", fold=fold, test_skins=[skin])
         for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))
     ]
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
@@ -115,16 +115,16 @@ SHAPED = {"inputs": "shape"}
     [
         card("lobo", "shaped", 0.001, recipe=RECIPE | SHAPED),
         card("triplet", "shaped", 0.001, recipe=RECIPE | SHAPED),
-        adapted("shaped", 0.001, "light") | {"recipe": RECIPE | SHAPED},
+        adapted_card("shaped", 0.001, "light") | {"recipe": RECIPE | SHAPED},
         card("single_random", "single", 0.001),
     ],
     ids=["shape", "triplet shape", "adapted shape", "another experiment"],
 )
-def test_other_inputs_and_experiments_are_no_candidates(better):
+def test_other_inputs_and_experiments_are_not_candidates(better):
     assert choose([better, *CARDS]) == choose(CARDS)
 
 
-def test_steps_and_base_are_no_settings():
+def test_steps_and_base_are_not_settings():
     for one in choose(CARDS).values():
         assert "steps_n" not in one["settings"]
         assert "base" not in one["settings"]
@@ -139,7 +139,7 @@ def test_steps_and_base_are_no_settings():
         ([], "train_multi"),
         ([one for one in CARDS if one["question"] != "lobo"], "train_multi"),
         ([one for one in CARDS if one["question"] != "adapt"], "adapt"),
-        ([*CARDS[:5], adapted("control", 0.1, "light", unlabelled_weight=0.0)], "adapt"),
+        ([*CARDS[:5], adapted_card("control", 0.1, "light", unlabelled_weight=0.0)], "adapt"),
     ],
     ids=["nothing", "nothing pooled", "nothing adapted", "a control alone"],
 )
@@ -157,7 +157,7 @@ def test_record_lists_boards_skins_and_settings():
     assert record["chosen"] == {stage: one["settings"] for stage, one in choose(CARDS).items()}
 
 
-def longer(one: Card, steps_n: int, **scores: float) -> Card:
+def with_steps(one: Card, steps_n: int, **scores: float) -> Card:
     """Return a card with the same settings, another number of steps and another error."""
     return card(one["question"], f"{one['recipe_name']}-{steps_n}", scores["mse_xy_mm2"],
                 recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
@@ -167,15 +167,15 @@ def test_candidates_need_equal_steps():
     slow, fast = (card("lobo", name, mse, recipe=RECIPE | {"rate_max": rate, "steps_n": 100})
                   for name, mse, rate in (("slow", 0.5, 1e-3), ("fast", 0.4, 6e-3)))  # fmt: skip
     others = [one for one in CARDS if one["question"] != "lobo"]
-    unfair = [slow, fast, longer(slow, 900, mse_xy_mm2=0.1)]
+    unfair = [slow, fast, with_steps(slow, 900, mse_xy_mm2=0.1)]
     with pytest.raises(ParamsError, match="steps of train_multi's fast differ between candidates"):
         choose([*unfair, *others])
-    chosen = choose([*unfair, longer(fast, 900, mse_xy_mm2=0.15), *others])["train_multi"]
+    chosen = choose([*unfair, with_steps(fast, 900, mse_xy_mm2=0.15), *others])["train_multi"]
     assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3  # 0.275 against 0.3
 
 
 def test_control_is_listed_but_not_chosen():
-    control = adapted("from-heavy-control", 0.2, "heavy", unlabelled_weight=0.0)
+    control = adapted_card("from-heavy-control", 0.2, "heavy", unlabelled_weight=0.0)
     chosen = choose([*CARDS, control])["adapt"]
     assert chosen["recipe_name"] == "from-heavy"
     assert (chosen["error"], chosen["control"]) == (pytest.approx(0.25), pytest.approx(0.2))
@@ -193,6 +193,6 @@ def test_settings_of_a_collapsed_training_are_not_chosen(failure):
         choose(collapsed_cards)
 
 
-def test_collapsed_network_is_no_base_of_adaptation():
+def test_collapsed_network_is_not_a_base_for_adaptation():
     cards = [one | {"collapsed_before_n": 1} if one["recipe_name"] == "heavy" else one for one in CARDS]
     assert names(choose(cards)) == {"train_multi": "fast", "adapt": "from-light", "train_triplet": "light"}

@@ -1,4 +1,4 @@
-"""Tests of trainings with a few labels of a new board: folds, labels, scalers, adaptation and fine-tuning."""
+"""Tests of training with a few labels of a new board: folds, labels, scalers, adaptation and fine-tuning."""
 
 from collections import Counter
 from dataclasses import replace
@@ -70,7 +70,7 @@ def training_data(rows: Rows) -> TrainingData:
     return TrainingData(rows.db_uT, rows.target, rows.skin)
 
 
-def untrained(job: TrainingJob) -> TrainingResult:
+def initial_result(job: TrainingJob) -> TrainingResult:
     """Return a result with the initial weights and the fitted scaler of a job."""
     prepared, scaler = prepare(job, training_data(ROWS))
     return TrainingResult(
@@ -87,10 +87,10 @@ def untrained(job: TrainingJob) -> TrainingResult:
 
 
 def networks_of(at: few.Study) -> list[few.Done]:
-    """Return all networks of the study, in the steps of the stage."""
+    """Return all networks of the study, step by step as in the stage."""
     done: list[few.Done] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
-        done = [*done, *((entry, job, untrained(job)) for entry, job in step(at, done))]
+        done = [*done, *((entry, job, initial_result(job)) for entry, job in step(at, done))]
     return done
 
 
@@ -187,7 +187,7 @@ def test_labels_depend_on_the_seed_but_not_on_order():
     assert all(one != changed for one, changed in zip(first, other, strict=True))
 
 
-def unknown(what: np.ndarray, rows: Rows = ROWS) -> Rows:
+def with_unknown_targets(what: np.ndarray, rows: Rows = ROWS) -> Rows:
     """Return the rows with unknown places and forces for some of them."""
     target = rows.target.copy()
     target[what] = np.nan
@@ -223,12 +223,12 @@ def test_only_listed_networks_are_adapted():
 
 
 def networks_of_no_labels(at: few.Study) -> list[few.Done]:
-    return [(entry, job, untrained(job)) for entry, job in few.network_jobs(at, [])]
+    return [(entry, job, initial_result(job)) for entry, job in few.network_jobs(at, [])]
 
 
 def test_adaptation_uses_no_label_of_the_new_board():
     for job in ADAPTED:
-        unlabelled_data = training_data(unknown(ROWS.board == job.fold[:2]))
+        unlabelled_data = training_data(with_unknown_targets(ROWS.board == job.fold[:2]))
         prepared, other = prepare(job, training_data(ROWS))[0], prepare(job, unlabelled_data)[0]
         assert prepared.few_labels is other.few_labels is None
         assert (prepared.labelled.inputs == other.labelled.inputs).all()

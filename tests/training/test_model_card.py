@@ -72,5 +72,5 @@ def test_card_of_a_tuned_network_has_its_tuning(job, kind, used):
     tuning = card(job)["tuning"]
     assert (tuning["from"], tuning["kind"], tuning["skins"]) == ("start", kind, ["b1_s1"])
     assert tuning["settings"] == job.tuning.settings.model_dump()
-    assert tuning["pokes_n"] == len({row // 2 for row in used})  # two readings an indentation
+    assert tuning["pokes_n"] == len({row // 2 for row in used})  # two readings per indentation
     assert not set(used) & set(TEST)

@@ -20,7 +20,7 @@ SCALING = {"paper": "standard", "released": "released"}
 TARGET_RANGE = np.array([[4.0, 4.0, 0.3], [12.0, 12.0, 1.5]])  # least and greatest x, y (mm), F (N)
 
 
-def trained(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:
+def train_network(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:
     """Return a network after a few hundred training steps, and held-out rows."""
     rng = rng_for(0, "onnx", architecture, inputs)
     target = rng.uniform(*TARGET_RANGE, (600, 3)).astype(np.float32)  # x_mm, y_mm, F_N
@@ -43,7 +43,7 @@ def trained(architecture: str, inputs: str) -> tuple[Network, np.ndarray]:
 def test_onnx_model_equals_torch_within_1e_5(tmp_path, architecture, inputs):
     pytest.importorskip("onnx", reason="extra `onnx` is not installed")
     runtime = pytest.importorskip("onnxruntime", reason="extra `onnx` is not installed")
-    network, db_uT = trained(architecture, inputs)
+    network, db_uT = train_network(architecture, inputs)
     reskin.Model(network).export_onnx(tmp_path / "model.onnx")
     session = runtime.InferenceSession(tmp_path / "model.onnx", providers=["CPUExecutionProvider"])
     far_uT = (1000 * rng_for(1, "onnx").standard_normal((100, 15))).astype(np.float32)  # far outside the training rows

@@ -35,7 +35,7 @@ from reskin.universal.map import NOMINAL, NOMINAL_SPREADS, new_map
 from reskin.universal.model import PriorModel
 from reskin.universal.network import predict
 from reskin.universal.training import SkinPrior, TrainingSettings, draw_weights
-from tests.universal.skins import SETUP, made_population, made_tables
+from tests.universal.skins import SETUP, make_population, make_tables
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 FRAME = Frame(np.tile(QUARTER, (5, 1, 1)), (8.0, 7.0), mirrored=True)
@@ -66,7 +66,7 @@ def test_recorded_readings_are_grouped_by_press():
 
 def test_saved_networks_predict_the_same(tmp_path):
     networks = [draw_weights(15, rng_for(0, "written", i)) for i in range(2)]
-    model = PriorModel(new_map(made_tables()), networks)
+    model = PriorModel(new_map(make_tables()), networks)
     nominal, held_out = (
         Variant(SkinPrior(name, NOMINAL, NOMINAL_SPREADS, SETUP), model) for name in ("nominal", "without b1")
     )
@@ -83,13 +83,13 @@ def test_saved_networks_predict_the_same(tmp_path):
 
 @pytest.fixture(autouse=True)
 def made(monkeypatch):
-    draw = lambda centre, spreads, setup, n, rng: made_population(n, rng)  # noqa: E731
+    draw = lambda centre, spreads, setup, n, rng: make_population(n, rng)  # noqa: E731
     monkeypatch.setattr(universal, "draw_population", draw)
 
 
 @pytest.fixture(scope="module")
 def nominal() -> Variant:
-    model = PriorModel(new_map(made_tables()), [draw_weights(15, rng_for(0, "sureness"))])
+    model = PriorModel(new_map(make_tables()), [draw_weights(15, rng_for(0, "sureness"))])
     return Variant(SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP), model)
 
 
@@ -101,7 +101,7 @@ def scaled_channels(skins, rng):
     return skins.db_uT * np.exp(0.5 * rng.standard_normal((len(skins), 1, 15)))
 
 
-def calibrated(nominal: Variant, error) -> tuple[PoolCalibration, LabelledPresses]:
+def calibrate_to_errors(nominal: Variant, error) -> tuple[PoolCalibration, LabelledPresses]:
     return calibrate_to_simulated(nominal.model, draw_prior_skins(nominal.prior, 1, 0, "asked", error), 0, 0)
 
 
@@ -111,7 +111,7 @@ def test_best_powers_cover_90_percent():
 
 
 def test_larger_misfit_widens_intervals_only(nominal):
-    (fitting, _), (misfitting, tested) = (calibrated(nominal, error) for error in (unchanged, scaled_channels))
+    (fitting, _), (misfitting, tested) = (calibrate_to_errors(nominal, error) for error in (unchanged, scaled_channels))
     assert misfitting.misfit > 2 * fitting.misfit
     powers = misfitting.nominal_powers(Powers(0.2, 0.1))
     assert powers.map == pytest.approx(min(1.0, 0.2 / misfitting.misfit))
@@ -126,7 +126,7 @@ def test_larger_misfit_widens_intervals_only(nominal):
 @pytest.fixture
 def fits_and_misled(nominal) -> tuple[PoolCalibration, PoolCalibration]:
     """Return a skin that fits, and the same with labels that have independent errors of 3 mm."""
-    fits, _ = calibrated(nominal, unchanged)
+    fits, _ = calibrate_to_errors(nominal, unchanged)
     off_mm = 3 * rng_for(1, "labels").standard_normal(fits.pool.place_mm.shape)
     return fits, replace(fits, pool=replace(fits.pool, place_mm=fits.pool.place_mm + off_mm))
 

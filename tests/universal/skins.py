@@ -1,4 +1,4 @@
-"""A synthetic skin whose fields have a closed form, so that tests need no simulation; the real skin's design."""
+"""A synthetic skin with fields in closed form, so that tests need no simulation, and the design of the real skin."""
 
 from pathlib import Path
 
@@ -22,20 +22,20 @@ REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300
 
 
 def fields_uT(place_mm: np.ndarray, force_N: np.ndarray, upright: float = 1.0) -> np.ndarray:
-    """A bump under each chip that leans away from it: 15 channels; `upright` scales the z axes."""
+    """Return 15 channels of a bump around each chip whose field leans away from it; `upright` scales the z axes."""
     apart = (place_mm[:, None] - CHIPS_MM) / WIDE_MM
     size = 400 * force_N[:, None] ** 0.7 * np.exp(-(apart**2).sum(axis=2) / 2)
     return np.stack([size * apart[..., 0], size * apart[..., 1], size * upright], axis=2).reshape(len(place_mm), -1)
 
 
 def poked_uT(place_mm: np.ndarray, force_N: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Fields of a skin whose parameters are `number` prior deviations off the centre."""
+    """Return fields of a skin whose parameters are `number` prior standard deviations from the centre."""
     label_x_mm, label_y_mm, gap_mm = number * SPREADS
     return fields_uT(place_mm + [label_x_mm, label_y_mm], force_N, 1 + gap_mm)
 
 
-def made_tables() -> Tables:
-    """Tables of the synthetic skin; slopes by small differences."""
+def make_tables() -> Tables:
+    """Return tables of the synthetic skin, with slopes by small differences."""
     axis_mm = lattice_mm()
     place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.repeat(place_mm, len(FORCES_N), axis=0), np.tile(FORCES_N, len(place_mm))
@@ -48,7 +48,7 @@ def made_tables() -> Tables:
     )  # fmt: skip
 
 
-def made_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
+def make_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
     """Draw synthetic skins with different parameters; if a weight is given, its press comes last."""
     place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
     force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, PRESSES_N)))

@@ -5,14 +5,14 @@ import pytest
 
 from reskin.universal.map import NOISE_uT, SkinMap, condition_on_labels, expected_gain, kernel, new_map
 from reskin.universal.model import load_universal
-from tests.universal.skins import fields_uT, made_tables
+from tests.universal.skins import fields_uT, make_tables
 
 PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])  # lattice points
 
 
 @pytest.fixture(scope="module")
 def skin() -> SkinMap:
-    return new_map(made_tables())
+    return new_map(make_tables())
 
 
 def test_gain_equals_removed_variance(skin):

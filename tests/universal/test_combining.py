@@ -7,14 +7,14 @@ from reskin.seeds import rng_for
 from reskin.universal.map import SkinMap, new_map
 from reskin.universal.model import LABEL_SD_MM, OFFSET_SD_MM, Evaluation, network_offsets_mm
 from reskin.universal.network import NetworkEstimate
-from tests.universal.skins import fields_uT, made_tables
+from tests.universal.skins import fields_uT, make_tables
 
 RNG = rng_for(0, "experts")
 
 
 @pytest.fixture(scope="module")
 def skin() -> SkinMap:
-    return new_map(made_tables())
+    return new_map(make_tables())
 
 
 def evaluation(skin: SkinMap, db_uT: np.ndarray, place_mm: np.ndarray, sd_mm: float = 1.0) -> Evaluation:

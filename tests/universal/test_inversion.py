@@ -32,7 +32,7 @@ def test_search_recovers_places_and_forces():
     found = search(chart(TRUE, CHEAP), fields_uT())
     np.testing.assert_allclose(
         found.place_mm, PLACE_MM, atol=0.2
-    )  # a quarter of the pitch: one step, with slopes of the lattice
+    )  # a quarter of the pitch, after a single step with the slopes of the lattice
     np.testing.assert_allclose(np.log(found.force_N), np.log(FORCE_N), atol=0.2)
     assert found.left.max() < 0.1
 

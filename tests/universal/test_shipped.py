@@ -1,4 +1,4 @@
-"""The model that comes with the library: accuracy on simulated pokes, misfit, labels, files and refused input."""
+"""The model that comes with the library: accuracy on simulated pokes, misfit, labels, files and invalid input."""
 
 import shutil
 from pathlib import Path
@@ -200,8 +200,8 @@ def test_saved_skin_keeps_incremental_pokes(skin, tmp_path):
     assert (np.abs(after.place_mm - before.place_mm) < 0.5 * before.sd_mm).all()
 
 
-def many(labels_n):
-    """Labels in the skin's middle."""
+def repeated_labels(labels_n):
+    """Return this number of equal labels in the middle of the skin."""
     return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
 
 
@@ -222,7 +222,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
         ({"even_uT": one_uT[:, :12]}, "arrays must be"),
         ({"labelled_mm": np.full((1, 2), 40.0), "labelled_N": np.ones(1), "labelled_uT": one_uT}, "places must be on"),
         ({"labelled_mm": np.full((1, 2), 8.0)}, "each press needs x and y"),
-        ({"labelled_uT": np.ones((2001, CHANNELS_N))} | many(2001), "2001 are too many, at most 2000"),
+        ({"labelled_uT": np.ones((2001, CHANNELS_N))} | repeated_labels(2001), "2001 are too many, at most 2000"),
         ({"pokes_uT": np.ones((9000, CHANNELS_N))}, "1,08.* bytes are too many for a saved skin .at most 1,048,576"),
     ]:
         io.write_tensors(file, sound | changed, header)

@@ -18,14 +18,14 @@ from reskin.universal.map import (
     new_map,
 )
 from reskin.universal.population import grid
-from tests.universal.skins import REST_SLOPE_uT, made_tables, poked_uT
+from tests.universal.skins import REST_SLOPE_uT, make_tables, poked_uT
 
 NUMBER = np.array([0.0, 0.0, 1.5])
 
 
 @pytest.fixture(scope="module")
 def skin() -> map.SkinMap:
-    return new_map(made_tables())
+    return new_map(make_tables())
 
 
 def presses(number=NUMBER, seed=0):
@@ -91,7 +91,7 @@ def test_order_of_labels_does_not_matter(skin):
 def test_unlabelled_presses_improve_the_parameters(skin, gap):
     _, _, db_uT = presses(np.array([0.0, 0.0, gap]))
     found = condition_on_presses(skin, db_uT + rng_for(3, "noise").normal(0, 3, db_uT.shape))
-    # Not closer: each press's place and force absorb part of the parameter's effect.
+    # The estimate is not closer because the place and force of each press absorb part of the parameter's effect.
     assert abs(found.mean[2] - gap) < 0.8 * abs(gap)
     assert found.cov[2, 2] < skin.cov[2, 2]
 

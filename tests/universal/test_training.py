@@ -17,10 +17,10 @@ from reskin.universal.training import (
     residual_uT,
     train,
 )
-from tests.universal.skins import SETUP, fields_uT, made_population
+from tests.universal.skins import SETUP, fields_uT, make_population
 
 PRIOR = SkinPrior("made up", NOMINAL, NOMINAL_SPREADS, SETUP)
-SKINS = made_population(20, rng_for(0, "taught"))
+SKINS = make_population(20, rng_for(0, "taught"))
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def weights():
 
 def test_short_training_beats_the_mean_on_unseen_skins(weights):
     tested = slice(PLACES_N, None)
-    fresh, off_mm2, off_log2 = made_population(5, rng_for(1, "fresh")), [], []
+    fresh, off_mm2, off_log2 = make_population(5, rng_for(1, "fresh")), [], []
     for db_uT, rest_uT, place_mm, force_N in zip(
         fresh.db_uT, fresh.rest_uT, fresh.place_mm, fresh.force_N, strict=True
     ):

@@ -55,7 +55,7 @@ CHOICE = {
 
 
 def capture(skin: str) -> Readings:
-    """Return a grid poked twice, with a field above the noise that is a function of place for each skin."""
+    """Return two passes over a grid; the field exceeds the noise and is a function of place for each skin."""
     rng = rng_for(0, "skin", "b0_s0" if skin == COPY else skin)
     place_i = np.tile(np.arange(PLACES_N), PASSES_N)
     x, y = place_i // 4, place_i % 4
@@ -113,10 +113,10 @@ def load_scene_data(folder: Path) -> SceneData:
 
 
 def write(folder: Path, arm: str, data: SceneData, jobs: list[TrainingJob]) -> None:
-    write_models(folder / "models" / arm, data, jobs, [untrained(job, data) for job in jobs], arm)
+    write_models(folder / "models" / arm, data, jobs, [initial_result(job, data) for job in jobs], arm)
 
 
-def untrained(job: TrainingJob, data: SceneData) -> TrainingResult:
+def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
     prepared, scaler = prepare(job, TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin))
     predicted = np.zeros((len(job.test), 3), np.float32)
     weights = prepared.initial_weights
@@ -124,7 +124,7 @@ def untrained(job: TrainingJob, data: SceneData) -> TrainingResult:
 
 
 @pytest.fixture(autouse=True)
-def _at_home(tmp_path, monkeypatch):
+def _working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # costs are written to the working folder
     monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
@@ -300,7 +300,7 @@ def test_setting_that_was_not_chosen_is_reported(scene, chosen, arm, found):
         (lambda tuning, at: tuning | {"indentations": at["tested"]}, "pokes must be of the pool, and none tested"),
         (lambda tuning, at: tuning | {"indentations": at["trained"]}, "pokes must be of the pool, and none tested"),
     ],
-    ids=["a network that saw the board", "pokes that are tested", "pokes of a training skin"],
+    ids=["a network trained on the board", "test pokes", "pokes of a training skin"],
 )
 def test_adaptation_from_a_wrong_network_or_pokes_is_a_leak(scene, change, sentence):
     file = next((scene / "models/adapt").glob("*.json"))

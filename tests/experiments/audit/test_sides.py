@@ -29,7 +29,7 @@ UNSEEN = ("lobo", "sensors", "transfer")
 
 
 def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
-    """Return presses of two skins per board: a shared response, and a third as much of each skin."""
+    """Return presses of two skins per board, with a shared response and an individual one a third as large."""
     rng = rng_for(0, "audit")
     common, dbs_uT = rng.normal(0, 25, (9, 15)), []
     for _ in range(2 * boards_n):
@@ -178,15 +178,15 @@ def test_copy_is_detected_in_a_sample(monkeypatch):
     assert run_audit(held_out(LABELS), LABELS, DB_uT)[-1].holds
 
 
-def test_equal_directions_of_other_strengths_are_no_copy():
+def test_equal_directions_of_other_strengths_are_not_a_copy():
     planted, own = DB_uT.copy(), LABELS.skin == "b0_s1"
     factor = rng_for(4, "factor").uniform(1, 4, (own.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
     planted[own] = factor * DB_uT[LABELS.skin == "b2_s1"]
     assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_response_rotated_by_ten_degrees_is_no_copy():
-    # Re-seating a skin rotates it by more. Each row is off its ray by 0.17 |dB|, at least 39 uT.
+def test_response_rotated_by_ten_degrees_is_not_a_copy():
+    # Re-seating a skin rotates it by more. The distance of each row from its ray is 0.17 |dB|, at least 39 uT.
     planted, source = DB_uT.copy(), DB_uT[LABELS.skin == "b2_s1"]
     one, other = source[:, :14:2], source[:, 1:14:2]
     cos, sin = np.cos(np.radians(10)), np.sin(np.radians(10))
@@ -308,7 +308,7 @@ def test_last_bit_of_a_scaler_may_differ():
     assert scaler_check(rounded, fold, DB_uT, "standard").holds
 
 
-def test_scaler_nearer_to_both_sides_fails():
+def test_scaler_closer_to_that_of_both_sides_fails():
     fold = held_out(LABELS)
 
     def fit(db_uT, target):

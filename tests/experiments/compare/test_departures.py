@@ -1,4 +1,4 @@
-"""Tests of departures of a capture from its scene."""
+"""Tests of the departures of a capture from its scene."""
 
 from dataclasses import replace
 

@@ -32,7 +32,7 @@ from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[3]
 SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"], "lab.yaml: compare")
-# The nominal skin has the same tip, as the flow of each tip takes seconds.
+# The nominal skin has the same tip because computing the flow of a tip takes seconds.
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
@@ -158,7 +158,7 @@ def test_pokes_beyond_the_deepest_are_counted_and_clamped():
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
     still = replace(TRUE, away_um_mm=0.0)  # the slide would grow with force
     held_uT = law.simulate_uT(still, SETUP, np.zeros((4, 2)), force_N)
-    soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)  # reaches that depth at half the force
+    soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)  # reaches the same depth at half the force
     assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
     np.testing.assert_allclose(held_uT[2], held_uT[3])
 

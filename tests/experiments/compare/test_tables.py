@@ -42,7 +42,7 @@ DRAWN = {
 }  # fmt: skip
 
 
-def test_simulations_are_judged_by_bounds():
+def test_simulations_are_compared_with_bounds():
     table = tables(NUMBERS, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]

@@ -39,7 +39,7 @@ def test_single_contact_equals_the_simulator():
     poke_m = np.array([[2e-3, -3e-3, DEPTH_M]])
     ((_, before, after),) = moved_dipoles(SKIN, poke_m - [0, 0, SKIN.depth_zero_m])
     theirs_T = change_of_field(before, after, BOARD.chips_m)
-    # Linear interpolation between five heights: an error of 1 %, or 0.3 % with the nine in use.
+    # Linear interpolation between five heights has an error of 1 %; with the nine in use it is 0.3 %.
     assert rms(pressed_T(poke_m[0]) - theirs_T) < 0.02 * rms(theirs_T)
 
 
@@ -51,7 +51,7 @@ def test_error_of_the_sum_falls_with_distance_and_rises_with_depth():
     for separation_mm in (
         4,
         12,
-    ):  # the error is a product of two displacements: half as deep is half the share
+    ):  # the error is a product of two displacements, so half the depth gives half the relative error
         assert rows[0.6, separation_mm] < 0.7 * rows[1.2, separation_mm]
     for depth_mm in (0.6, 1.2):
         assert 0 < rows[depth_mm, 12] < rows[depth_mm, 4]

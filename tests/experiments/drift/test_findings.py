@@ -25,7 +25,7 @@ def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True)
 PAPER = {"initial": errors(1.0, 0.5), "regular": errors(0.2, 0.01), "each": errors(0.3, 0.01)}
 
 
-def judged(
+def findings_by_name(
     networks: dict, late: dict | None = LATE, boards: tuple[str, ...] = ("b0", "b1", "b2", "b3")
 ) -> dict[str, dict]:
     windows_n = next(iter(networks.values()))["mse_xy_mm2"].shape[1]
@@ -34,26 +34,26 @@ def judged(
 
 
 def verdicts(networks: dict, late: dict | None = LATE) -> dict[str, str]:
-    return {name: one["verdict"] for name, one in judged(networks, late).items()}
+    return {name: one["verdict"] for name, one in findings_by_name(networks, late).items()}
 
 
 def test_errors_as_in_the_paper_support_all_findings():
     assert verdicts(PAPER) == dict.fromkeys((HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE, OVERESTIMATES), SUPPORTED)
-    assert all(one["holds"] for one in judged(PAPER).values())
+    assert all(one["holds"] for one in findings_by_name(PAPER).values())
 
 
 @pytest.mark.parametrize(
     ("finding", "changed", "late"),
     [
-        (HIGHER_AND_FASTER, {"initial": errors(1.0, -0.1)}, LATE),  # higher, not faster
-        (HIGHER_AND_FASTER, {"initial": errors(0.0, 0.05)}, LATE),  # faster, not higher
+        (HIGHER_AND_FASTER, {"initial": errors(1.0, -0.1)}, LATE),  # higher errors that do not grow faster
+        (HIGHER_AND_FASTER, {"initial": errors(0.0, 0.05)}, LATE),  # errors that grow faster but are not higher
         (OFFSET, {"initial": errors(0.1, 0.0)}, LATE),
         (EACH_IS_WORSE, {"each": errors(0.1, 0.01)}, LATE),
         (OVERESTIMATES, {}, LATE | {"bias_N": -0.02, "network_bias_N": [-0.02, -0.021, -0.02, -0.019]}),
     ],
 )
 def test_opposite_finding_is_contradicted(finding, changed, late):
-    one = judged(PAPER | changed, late)[finding]
+    one = findings_by_name(PAPER | changed, late)[finding]
     assert (one["holds"], one["verdict"]) == (False, CONTRADICTED)
 
 
@@ -63,28 +63,28 @@ def test_disagreement_of_boards_is_undecided(finding):
     near = errors(0.2, 0.01)
     apart = {name: of + np.array(signs)[:, None] * 0.1 * np.arange(1, 5) * of for name, of in near.items()}
     changed = {"each": apart} if finding == EACH_IS_WORSE else {"initial": apart}
-    one = judged(PAPER | {"regular": near} | changed)[finding]
+    one = findings_by_name(PAPER | {"regular": near} | changed)[finding]
     assert (one["holds"], one["verdict"]) == (False, UNDECIDED)
 
 
 def test_single_network_has_no_verdict():
     alone = {policy: {name: of[:1] for name, of in own.items()} for policy, own in PAPER.items()}
-    findings = judged(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
+    findings = findings_by_name(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
     assert {one["verdict"] for one in findings.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in findings.values()} == {UNDECIDED}
 
 
-def test_trainings_on_one_board_are_judged_only_as_trainings():
-    one_board = judged(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
+def test_networks_of_one_board_have_no_verdict_over_boards():
+    one_board = findings_by_name(PAPER, LATE | {"network_board": ["b0"] * 4}, ("b0",) * 4)
     assert {one["verdict"] for one in one_board.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in one_board.values()} == {SUPPORTED}
 
 
-def test_repeated_trainings_do_not_narrow_the_interval():
+def test_repeated_networks_do_not_narrow_the_interval():
     twice = {policy: {name: np.repeat(of, 2, axis=0) for name, of in own.items()} for policy, own in PAPER.items()}
     late = LATE | {"network_bias_N": list(np.repeat(LATE["network_bias_N"], 2))}
     boards = ("b0", "b0", "b1", "b1", "b2", "b2", "b3", "b3")
-    again, once = judged(twice, late | {"network_board": list(boards)}, boards), judged(PAPER)
+    again, once = findings_by_name(twice, late | {"network_board": list(boards)}, boards), findings_by_name(PAPER)
     assert [one["verdict"] for one in again.values()] == [one["verdict"] for one in once.values()]
     assert again[OFFSET]["measured"] == once[OFFSET]["measured"]
 
@@ -96,7 +96,7 @@ def test_one_contradicting_metric_contradicts():
     assert verdicts(PAPER | {"initial": unclear})[OFFSET] == UNDECIDED
 
 
-def test_readings_policies_are_judged_over_all_windows():
+def test_policies_are_judged_over_all_windows():
     last_good = {name: of.copy() for name, of in errors(1.0, 0.5).items()}
     for of in last_good.values():
         of[:, -1] = 0
@@ -111,7 +111,7 @@ def test_paired_differences_cancel_shared_errors():
     own, other = (of["mse_xy_mm2"].mean(axis=1) for of in (each, regular))
     low, high = ttest_rel(own, other).confidence_interval(0.95)
     difference = f"difference {(own - other).mean():+.2g} [{low:+.2g}, {high:+.2g}] mm²"
-    assert difference in judged(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE]["measured"]
+    assert difference in findings_by_name(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE]["measured"]
 
 
 @pytest.mark.parametrize(
@@ -121,24 +121,24 @@ def test_paired_differences_cancel_shared_errors():
         (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),  # two standard errors over indentations
         (-0.02, 0.0101, [-0.02, -0.02, -0.02, -0.02], UNDECIDED),
         (-0.02, 0.0099, [-0.02, -0.02, -0.02, -0.02], CONTRADICTED),
-        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),  # trainings differ more
+        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),  # networks differ more
     ],
 )
 def test_bias_must_exceed_both_variations(bias_N, se_N, networks_N, verdict):
     late = LATE | {"bias_N": bias_N, "bias_se_N": se_N, "network_bias_N": networks_N}
-    assert judged(PAPER, late)[OVERESTIMATES]["of_trainings"] == verdict
+    assert findings_by_name(PAPER, late)[OVERESTIMATES]["of_trainings"] == verdict
 
 
 def test_without_forces_only_places_are_judged():
     two = {"initial": errors(1.0, 0.5, force=False), "each": errors(0.3, 0.01, force=False)}
     assert verdicts(two, None) == {HIGHER_AND_FASTER: SUPPORTED, OFFSET: SUPPORTED}
-    assert not any("MSE_F" in one["measured"] for one in judged(two, None).values())
+    assert not any("MSE_F" in one["measured"] for one in findings_by_name(two, None).values())
 
 
 def test_untestable_findings_are_omitted():
-    assert judged({"initial": errors(1, 1)}, None) == {}
+    assert findings_by_name({"initial": errors(1, 1)}, None) == {}
     one_window = {policy: {name: of[:, :1] for name, of in own.items()} for policy, own in PAPER.items()}
-    assert set(judged(one_window, None)) == {OFFSET, EACH_IS_WORSE}
+    assert set(findings_by_name(one_window, None)) == {OFFSET, EACH_IS_WORSE}
 
 
 @given(st.lists(st.floats(0, 10), min_size=2, max_size=9))
@@ -149,7 +149,7 @@ def test_growth_equals_numpys_slope(values):
 
 
 def test_measured_text_has_policies_difference_and_interval():
-    first, offset, third, late = (one["measured"] for one in judged(PAPER).values())
+    first, offset, third, late = (one["measured"] for one in findings_by_name(PAPER).values())
     assert first.startswith("MSE_xy, mean over windows: initial 1.75, regular 0.215, difference +1.5 [")
     assert "MSE_xy, growth in 10,000 contacts: initial 1, regular 0.02, difference +0.98 [" in first
     assert offset == "; ".join(first.split("; ")[:2])

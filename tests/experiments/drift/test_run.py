@@ -52,7 +52,7 @@ def write(folder: Path, *captures: Readings) -> Path:
 
 @pytest.fixture
 def scene(tmp_path, monkeypatch) -> dict[str, Any]:
-    """Options that both stages take: scene ci with longer trainings, which are kept in the folder of the test."""
+    """Return options of both stages: scene ci with longer training, cached in the folder of the test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     settings = YAML(typ="safe").load((ROOT / "pipeline/scenes/ci.yaml").read_text())
@@ -141,7 +141,7 @@ def test_variation_recovers_drift_and_gain(scene, tmp_path):
     assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
     assert results["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)  # float32 degrees
     for place in results["numbers"]["places"]:
-        assert place["time"]["visits_n"] == 2  # of three, in the first 200 contacts
+        assert place["time"]["visits_n"] == 2  # two of three are in the first 200 contacts
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
         assert place["time"]["db_change_uT"] < 1e-3  # float32 fields of 1000 uT
         assert place["skins"]["skins"] == ["s0", "s1"]  # the first of each board
