@@ -25,9 +25,8 @@ def test_time_of_estimates_and_calibration():
     at = rng.integers(len(tables.axis_mm), size=(2, POKES_N))
     force_i = rng.integers(len(tables.force_N), size=POKES_N)
     db_uT, force_N = tables.mean_uT[*at, force_i], tables.force_N[force_i]
-    b_uT = (
-        db_uT + tables.rest_uT + rng.normal(0, 4, (POKES_N, CHANNELS_N))
-    )  # any orientation of the chips takes the same time
+    # Not converted to the chips' axes, which does not matter for the time
+    b_uT = db_uT + tables.rest_uT + rng.normal(0, 4, (POKES_N, CHANNELS_N))
     rest_uT = b_uT[:1] - db_uT[:1]
     print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     skin.zero(rest_uT).estimate(b_uT[:1])
