@@ -22,7 +22,7 @@ from pipeline.executors import make_executor, prepare_workers
 from reskin.errors import ParamsError
 from reskin.models.runner import run_jobs
 from tests.models.example_jobs import example_data
-from tests.models.test_runner import alike, jobs
+from tests.models.test_runner import equal_results, jobs
 
 ROOT = Path(__file__).resolve().parents[1]
 # As deploy/dask.sh starts workers.
@@ -84,7 +84,7 @@ def test_sweep_on_two_workers_equals_a_local_one(address, tmp_path, monkeypatch)
             ran = [future.result() for future in [executor.submit(describe_call, i) for i in range(6)]]
     for a, b in zip(*results, strict=True):
         assert (a.key, a.predicted.tobytes()) == (b.key, b.predicted.tobytes())
-        assert alike(a, b)
+        assert equal_results(a, b)
     assert [i for _, _, i in ran] == list(range(6))
     assert len({process for process, _, _ in ran} - {os.getpid()}) == 2
     assert {folder for _, folder, _ in ran} == {os.getcwd()}  # paths in stages are relative
