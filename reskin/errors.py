@@ -56,7 +56,14 @@ class MachineError(ReskinError):
     """The machine failed: no disk space, no memory, no permission, or a dead worker process. Finished work is kept."""
 
 
-EXTRAS = {"torch": "train", "onnx": "onnx", "onnxruntime": "onnx"}  # by package; all others come with `pipeline`
+EXTRAS = {  # by package; all others come with `pipeline`
+    "torch": "train",
+    "onnx": "onnx",
+    "onnxruntime": "onnx",
+    "dask": "dask",
+    "distributed": "dask",
+    "psycopg2": "team",
+}
 DISK_REMEDIES = {  # by errno
     getattr(errno, name): remedy
     for names, remedy in (
