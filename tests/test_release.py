@@ -71,6 +71,7 @@ def test_wheel_holds_the_library_only(wheel):
     files = [file.relative_to(ROOT) for file in (ROOT / "reskin").rglob("*.*")]
     assert names == {str(file) for file in files if not any(part.startswith((".", "__pyc")) for part in file.parts)}
     assert {
+        "reskin/py.typed",
         "reskin/simulation/nominal.yaml",
         "reskin/live/page/live.js",
         "reskin/universal/universal.safetensors",
@@ -97,6 +98,12 @@ def test_missing_package_names_its_extra():
         require("nowhere", "model.safetensors")
     with pytest.raises(ParamsError, match=r"package torch is not installed.*'\.\[train\]'"), explaining("reskin"):
         raise ModuleNotFoundError("", name="torch.nn")
+    for package, extra in (("distributed.client", "dask"), ("dask", "dask"), ("psycopg2", "team"), ("onnx", "onnx")):
+        name = package.partition(".")[0]
+        message = rf"package {name} is not installed.*'\.\[{extra}\]'"
+        assert extra in PROJECT["optional-dependencies"]
+        with pytest.raises(ParamsError, match=message), explaining("train_multi"):
+            raise ModuleNotFoundError("", name=package)
     with pytest.raises(ModuleNotFoundError), explaining("reskin"):
         raise ModuleNotFoundError("", name="pipeline.gone")
 
