@@ -48,7 +48,7 @@ sys.meta_path.insert(0, Missing())
 for name in {core}:
     importlib.import_module(name)
 from reskin.universal.model import load_universal
-print(load_universal().predict([[0.0] * 15]).shape)
+print(load_universal().zero([0.0] * 15).predict([[0.0] * 15]).shape)
 """
 
 

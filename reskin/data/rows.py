@@ -10,6 +10,7 @@ from jaxtyping import Float32, Int32, Int64
 from reskin import io
 from reskin.config import Strict
 from reskin.data.baseline import subtract
+from reskin.display import one_line
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
@@ -41,6 +42,8 @@ class Rows:
     pass_i: Int32[np.ndarray, " f"]
     indentation: Int64[np.ndarray, " f"]
     dropped: dict[str, int]
+
+    __repr__ = one_line
 
     def __len__(self) -> int:
         return len(self.db_uT)

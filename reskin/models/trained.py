@@ -13,6 +13,7 @@ from pydantic import Field
 from reskin import io
 from reskin.config import Strict, parse
 from reskin.data.rows import TARGETS
+from reskin.display import one_line
 from reskin.errors import ParamsError, SchemaError, missing_package, require
 from reskin.models.inputs import VIEW, DB_FLOOR_uT, Scaler
 from reskin.models.recipe import HEADLINE
@@ -57,6 +58,8 @@ class Network:
 
     card: Mapping[str, Any]
     tensors: Mapping[str, np.ndarray]
+
+    __repr__ = one_line
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
         """Predict row by row."""

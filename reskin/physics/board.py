@@ -13,6 +13,7 @@ from scipy.constants import micro, milli
 from scipy.spatial.transform import Rotation
 
 from reskin.config import Strict
+from reskin.display import one_line
 from reskin.seeds import rng_for
 
 CHIPS_MAX_N = 64
@@ -96,6 +97,8 @@ class Board:
     turn: Float[np.ndarray, "k 3 3"]  # columns: the chip's axes in the board's frame
     sensitivity: Float[np.ndarray, "k 3 3"]
     offset_T: Float[np.ndarray, "k 3"]
+
+    __repr__ = one_line
 
 
 def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -> Board:

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 from scipy.constants import kilo, milli
 
 from reskin.config import Strict
+from reskin.display import one_line
 from reskin.errors import ParamsError
 from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics.board import Board, Spreads
@@ -58,6 +59,8 @@ class Skin:
     depth_zero_m: float  # added to a commanded depth
     base: layer.Base
     hold: slide.Hold | None = None
+
+    __repr__ = one_line
 
 
 def draw_skin(

@@ -11,11 +11,12 @@ from jaxtyping import Bool, Float, Int64
 
 from reskin import io
 from reskin.errors import SchemaError
-from reskin.universal.map import Estimate
+from reskin.universal.map import Estimate, NOISE_uT
 from reskin.universal.network import FULL_SET_N
 
 CHANNELS_N = 15  # five chips with three axes each
 FIELD_MAX_uT = 1e6  # 20 times the range of a chip, so no press exceeds it; its square fits single precision
+BEYOND = 2.0  # a label whose force is outside the model's range by more than this factor has another unit
 LABELS_MAX_N = 2000  # memory grows with the square of the number, time even faster
 
 
@@ -64,6 +65,26 @@ def check_labels(
     _need("labels", "forces", "above 0 N", forces_N, forces_N > 0)
     _need("labels", "forces", "finite", forces_N, np.isfinite(forces_N))
     return places_mm, forces_N
+
+
+def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
+    """Raise SchemaError on forces of labels that are half the model's smallest force or less, or twice its largest."""
+    least_N, most_N = float(range_N.min()), float(range_N.max())
+    inside = (force_N > least_N / BEYOND) & (force_N < BEYOND * most_N)
+    if not inside.all():
+        got = f"{force_N[~inside][0]:.6g} N"
+        rule = f"about {least_N:.3g} to {most_N:.3g} N, the model's range"
+        raise SchemaError("labels", "forces", rule, got, "Are they in newtons? Convert them, or leave the press out.")
+
+
+def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]:
+    """Return changes of field by presses; raise SchemaError if all are within the noise, as fields in mT are."""
+    strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), -1, 3), axis=2).max(initial=0.0))
+    if len(db_uT) and strongest_uT < NOISE_uT:
+        rule = f"{NOISE_uT:g} uT or more at some chip"
+        remedy = "Are the fields in uT? Convert mT or G, or press the skin."
+        raise SchemaError("presses", "changes of field", rule, f"{strongest_uT:.3g} uT at most", remedy)
+    return db_uT
 
 
 def _need(where: str, what: str, rule: str, got: np.ndarray, holds: Bool[np.ndarray, "..."]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 from scipy.linalg import solve_triangular
 
+from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.universal.kernels import Lattice, LinearMeans, in_blocks, means, whiten
 from reskin.universal.law import Law, Setup, at_rest_uT, inside, simulate_uT, with_parameters
@@ -48,6 +49,8 @@ class Tables:
     slope_uT: Float[np.ndarray, "a a q ch t"]
     rest_uT: Float[np.ndarray, " ch"]
     rest_slope_uT: Float[np.ndarray, "ch t"]
+
+    __repr__ = one_line
 
 
 def lattice_mm() -> Float[np.ndarray, " a"]:
@@ -173,6 +176,8 @@ class Hypotheses:
     residual: Float32[np.ndarray, "h ch"]
     error_cov: Float[np.ndarray, "ch ch"]
 
+    __repr__ = one_line
+
     @property
     def at(self) -> tuple[Float[np.ndarray, "h 2"], Float[np.ndarray, " h"]]:
         """Place and logarithm of the force of each hypothesis."""
@@ -281,6 +286,8 @@ class SkinMap:
     mean: Float[np.ndarray, " t"]
     cov: Float[np.ndarray, "t t"]
     labelled: Labelled | None = None
+
+    __repr__ = one_line
 
     @property
     def error_cov(self) -> Float[np.ndarray, "ch ch"]:

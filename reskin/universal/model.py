@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from reskin import io
 from reskin.data.grid import CENTRE_MM, SKIN_MM
+from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.universal import network
 from reskin.universal.calibration import (
@@ -26,6 +27,8 @@ from reskin.universal.calibration import (
     LabelledPresses,
     LikelihoodPowers,
     check_labels,
+    check_presses,
+    check_range,
     check_readings,
     check_shape,
     folds_of_labels,
@@ -79,6 +82,8 @@ class Evaluation:
     likelihoods: Likelihoods
     network: NetworkEstimate
 
+    __repr__ = one_line
+
     def by_map(self, power: float) -> Estimate:
         """Estimate by the map alone, as means over its hypotheses."""
         return self.evaluator.mean(self.likelihoods, power)
@@ -111,6 +116,8 @@ class CalibratedModel:
     skin: SkinMap
     networks: Sequence[Layers]
     offsets_mm: Sequence[Float[np.ndarray, "2"]]
+
+    __repr__ = one_line
 
     def with_offsets_in_biases(self) -> "CalibratedModel":
         """Return the same model with the offsets added to the networks' last biases: faster, in single precision."""
@@ -150,6 +157,8 @@ class PressCalibration:
     networks: Sequence[Weights]
     data: CalibrationData
 
+    __repr__ = one_line
+
     @cached_property
     def layers(self) -> list[Layers]:
         """The conditioned networks."""
@@ -173,6 +182,8 @@ class PriorModel:
 
     skin: SkinMap
     networks: Sequence[Weights]
+
+    __repr__ = one_line
 
     def calibrate(self, data: CalibrationData) -> PressCalibration:
         """Calibrate to a skin; labels of the data are not used (see `PressCalibration.with_labels`)."""
@@ -208,8 +219,9 @@ def network_offsets_mm(
 class Universal:
     """The model for the paper's board that comes with the project; it can be calibrated during use.
 
-    Call `zero` with readings without contact, `see` with presses at unknown places, and `label` with presses at known
-    places, in any order and any number of times; call `predict` at any time. Fields are in uT along the chips' axes.
+    Call `zero` with readings without contact first, then `see` with presses at unknown places and `label` with presses
+    at known ones, in any order and as often as wanted; `predict` at any time after `zero`. These three change the model
+    in place and return it. Fields are in uT along the chips' axes.
 
     Parameters
     ----------
@@ -233,6 +245,14 @@ class Universal:
         self._power: float | None  # None: not computed yet
         self._restart(self._prior_map, CalibrationData(self.tables.rest_uT))
 
+    def __repr__(self) -> str:
+        noload = "no no-load reading" if self._noload_uT is None else "no-load reading taken"
+        presses_n, labels_n = len(self._data.presses_uT), len(self._data.labels)
+        return (
+            f"Universal(five chips of the paper's board, trained on simulated skins, {noload}, "
+            f"{presses_n} presses at unknown places, {labels_n} labelled)"
+        )
+
     @property
     def card(self) -> dict[str, Any]:
         """The model's JSON card: how it was made, and what it must not be used for."""
@@ -245,8 +265,15 @@ class Universal:
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
-        """The no-load field that is subtracted from readings, along the chips' axes; zeros before `zero`."""
-        return np.zeros(CHANNELS_N) if self._noload_uT is None else self._noload_uT
+        """The no-load field that is subtracted, along the chips' axes; raise SchemaError before `zero`."""
+        if self._noload_uT is None:
+            raise SchemaError("universal model: no no-load reading: call zero(...) with readings without contact first.")
+        return self._noload_uT
+
+    @property
+    def zeroed(self) -> bool:
+        """Whether there is a no-load field."""
+        return self._noload_uT is not None
 
     @property
     def presses_n(self) -> int:
@@ -276,7 +303,8 @@ class Universal:
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and condition the map on it.
 
-        Earlier presses are discarded, unless `keep` is set: use this for the same skin after drift.
+        Earlier presses are discarded, unless `keep` is set: use this for the same skin after drift. The model is changed in
+        place and returned.
 
         Raises
         ------
@@ -296,7 +324,7 @@ class Universal:
         The first set is used in several rounds, later sets in one. Set `even` if these and all earlier presses are
         evenly spread over the skin (a grid, each place once), so that their mean place is the skin's centre.
         """
-        db_uT, data = self._change(check_readings(b_uT)), self._data
+        db_uT, data = check_presses(self._change(check_readings(b_uT))), self._data
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
         if even:
             return self._restart(self._noload_map, replace(data, presses_uT=presses_uT, even_uT=presses_uT))
@@ -319,14 +347,16 @@ class Universal:
 
         Raises
         ------
-        SchemaError : a place is off the skin, a force is 0 N or less, or there are too many labels; the model is
-            unchanged
+        SchemaError : no no-load reading, no change of field above the noise, a place off the skin, a force of 0 N or
+            less, or outside the model's range by a factor of 2, too many labels; the model is unchanged
         """
         readings_uT = check_readings(b_uT)
         places_mm, forces_N = check_labels(
             np.asarray(place_mm, float), np.asarray(force_N, float), len(readings_uT), CENTRE_MM + REACH_MM
         )
-        labels, before = LabelledPresses(places_mm - CENTRE_MM, forces_N, self._change(readings_uT)), self._data.labels
+        check_range(forces_N, self.tables.force_N)
+        db_uT, before = check_presses(self._change(readings_uT)), self._data.labels
+        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT)
         if keep:
             labels = LabelledPresses(
                 np.concatenate([before.place_mm, labels.place_mm]), np.concatenate([before.force_N, labels.force_N]),
@@ -339,7 +369,14 @@ class Universal:
         return self._set(press_map, data)
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
-        """Return the place, in mm, where a labelled press of about this force would be most informative."""
+        """Return the place, in mm, where a labelled press of about this force would be most informative.
+
+        Raises
+        ------
+        SchemaError : a force that is not finite or not above 0 N
+        """
+        if not (np.isfinite(force_N) and force_N > 0):
+            raise SchemaError("next_place", "the force", "finite and above 0 N", force_N, "Try: 2.0")
         place_mm = self.skin.hypotheses.place_mm[::CHOICE_EVERY_N]
         gain = expected_gain(self.skin, place_mm, np.full(len(place_mm), force_N))
         return place_mm[gain.argmax()] + CENTRE_MM
@@ -387,7 +424,7 @@ class Universal:
         return self._calibration.data
 
     def _change(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f ch"]:
-        """Return field changes along the board's axes."""
+        """Return field changes along the board's axes; raise SchemaError before `zero`."""
         return to_board(check_shape(b_uT) - self.noload_uT)
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from reskin.errors import SchemaError
 from reskin.universal.map import NOISE_uT, SkinMap, condition_on_labels, expected_gain, kernel, new_map
 from reskin.universal.model import load_universal
 from tests.universal.skins import fields_uT, make_tables
@@ -40,9 +41,15 @@ def test_labelled_place_gains_less_than_a_far_one(skin):
 
 
 def test_model_chooses_the_next_place():
-    model = load_universal()
+    model = load_universal().zero(np.zeros(15))
     first_mm = model.next_place()
     press_uT = 300 * np.sin(np.arange(15.0))[None]
     next_mm = model.label(first_mm[None], np.array([2.0]), press_uT).next_place()
     assert ((first_mm > 0) & (first_mm < 16)).all()
     assert np.linalg.norm(next_mm - first_mm) > 2
+
+
+@pytest.mark.parametrize("force_N", [0.0, -1.0, np.nan, np.inf])
+def test_next_place_needs_a_force_above_zero(force_N):
+    with pytest.raises(SchemaError, match="next_place: the force must be finite and above 0 N"):
+        load_universal().next_place(force_N)

@@ -9,6 +9,7 @@ import pytest
 import reskin
 from reskin import io
 from reskin.config import parse, read_yaml
+from reskin.data.rows import Rows
 from reskin.errors import SchemaError
 from reskin.physics import slide
 from reskin.physics.board import BoardDesign, Spreads, draw_board
@@ -17,10 +18,10 @@ from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation import defaults
-from reskin.universal.calibration import CHANNELS_N
+from reskin.universal.calibration import CHANNELS_N, CalibrationData, no_labels
 from reskin.universal.law import to_chips
 from reskin.universal.map import NOMINAL
-from reskin.universal.model import FILE, Universal, load_universal
+from reskin.universal.model import FILE, PriorModel, Universal, load_universal
 
 ROOT = Path(__file__).resolve().parents[2]
 PARAMS = read_yaml(defaults.NOMINAL)
@@ -80,6 +81,64 @@ def test_other_boards_are_refused(skin):
     with pytest.raises(SchemaError, match="do not have the 15 channels of five chips"):
         skin.predict(np.zeros((2, 12)))
     assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
+
+
+def test_use_before_zero_is_refused(skin):
+    read_uT = pokes(skin)
+    uses = [skin.predict, skin.estimate, skin.see, skin, lambda b_uT: skin.label(PLACES_MM, np.ones(4), b_uT)]
+    for use in uses:
+        with pytest.raises(SchemaError, match=r"no no-load reading: call zero\(\.\.\.\) .* first"):
+            use(read_uT)
+    assert not skin.zeroed
+    skin.zero(to_chips(skin.tables.rest_uT[None]))
+    for use in uses:
+        use(read_uT + skin.noload_uT)
+    assert skin.presses_n == 8
+
+
+def test_fields_in_mT_are_refused(skin):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    skin.zero(1e-3 * rest_uT)
+    read_mT = 1e-3 * (pokes(skin, -1) + rest_uT)
+    for calibrate in (skin.see, lambda b_uT: skin.label(PLACES_MM, np.ones(4), b_uT)):
+        rule = r"must be 4.5 uT or more at some chip; got 0.504 uT at most\. Are the fields in uT"
+        with pytest.raises(SchemaError, match=rule):
+            calibrate(read_mT)
+    assert skin.presses_n == 0
+    lightest_uT = pokes(skin, 0)[:1]
+    assert skin.see(lightest_uT + skin.noload_uT).presses_n == 1  # one light touch is enough
+
+
+@pytest.mark.parametrize(
+    ("force_N", "valid"), [(0.025, False), (0.03, True), (18.9, True), (19.0, False), (1600.0, False)]
+)
+def test_forces_of_labels_far_outside_the_range_are_refused(skin, force_N, valid):
+    rest_uT = to_chips(skin.tables.rest_uT[None])
+    skin.zero(rest_uT)
+    if valid:
+        skin.label(PLACES_MM[:1], force_N, pokes(skin)[:1] + rest_uT)
+    else:
+        with pytest.raises(SchemaError, match=r"forces must be about 0.05 to 9.5 N, .* Are they in newtons\?"):
+            skin.label(PLACES_MM[:1], force_N, pokes(skin)[:1] + rest_uT)
+    assert skin.presses_n == int(valid)
+
+
+def test_texts_of_models_are_one_line(skin):
+    skin.zero(to_chips(skin.tables.rest_uT[None]))
+    skin.label(PLACES_MM, np.ones(4), pokes(skin) + skin.noload_uT).see(pokes(skin)[:2] + skin.noload_uT)
+    assert repr(skin) == (
+        "Universal(five chips of the paper's board, trained on simulated skins, no-load reading taken, "
+        "2 presses at unknown places, 4 labelled)"
+    )
+    prior = PriorModel(skin.skin, skin.networks)
+    pressed = prior.calibrate(CalibrationData(skin.tables.rest_uT))
+    calibrated = pressed.with_labels(no_labels())
+    board, drawn = reskin.draw_board(), reskin.draw_skin()
+    rows = Rows.of_labels(["b0"] * 400, ["s0"] * 400)
+    for one in (prior, pressed, calibrated, skin.skin, skin.tables, skin.skin.hypotheses, board, drawn, rows):
+        assert "\n" not in repr(one)
+        assert len(repr(one)) < 400
+    assert "chips_m=[5, 3]" in repr(board)
 
 
 def test_single_and_joint_adaptation_agree(skin):
@@ -242,7 +301,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
 
 
 def test_no_rows():
-    model = load_universal()
+    model = load_universal().zero(np.zeros(15))
     assert model.predict(np.empty((0, 15))).shape == (0, 3)
     assert len(model.estimate(np.empty((0, 15))).place_mm) == 0
     with pytest.raises(SchemaError, match="no readings without contact"):
