@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from reskin.data.grid import CENTRE_MM
-from reskin.errors import ReskinError
+from reskin.errors import ReskinError, SchemaError
 from reskin.live.health import LIVE_POLICY
 from reskin.live.tracker import WAITING, Estimates, Layout, LiveSkin, Models, UniversalEstimator, check_ports
 from reskin.recordings.fault_policy import FaultPolicy
@@ -190,7 +190,7 @@ class Session:
         self._recording: tuple[Path, Header] | None = None
         self._recorded = ""
         self._lock, self._button_lock, self._stop = threading.Lock(), threading.Lock(), threading.Event()
-        self._thread = threading.Thread(target=self.run, name="estimates", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="estimates", daemon=True)
 
     def __str__(self) -> str:
         return f"{self.source} on {self.skin.port}"
@@ -205,7 +205,7 @@ class Session:
         self._end_recording()
         self.skin.reader.stop()
 
-    def run(self) -> None:
+    def _run(self) -> None:
         """Estimate until `stop` is called; an error ends this and becomes an alarm on the page."""
         try:
             while not self._stop.is_set():
@@ -229,11 +229,16 @@ class Session:
         if presses is not None and isinstance(estimator, UniversalEstimator):
             presses.add(estimates)
             if presses.complete:
-                if isinstance(presses, GuidedPresses):
-                    self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
-                else:
-                    self._adapted = estimator.adapt(presses.db_uT)
-                self._presses = None
+                try:
+                    if isinstance(presses, GuidedPresses):
+                        self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
+                    else:
+                        self._adapted = estimator.adapt(presses.db_uT)
+                except SchemaError as error:  # of these presses
+                    self._adapted = str(error)
+                with self._button_lock:  # a button may have replaced the presses meanwhile
+                    if self._presses is presses:
+                        self._presses = None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
         """Return the next binary message for a page that has the bins before `after_bin`, and its newest bin."""

@@ -36,7 +36,7 @@ from reskin.models.trained import Network
 from reskin.physics.board import BoardDesign
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
-from reskin.universal.calibration import CHANNELS_N
+from reskin.universal.calibration import CHANNELS_N, check_presses
 from reskin.universal.map import Estimate
 from reskin.universal.model import Universal
 
@@ -101,7 +101,8 @@ class UniversalEstimator:
 
     def __init__(self, model: Universal) -> None:
         self._given = model
-        self._noload_uT = model.noload_uT
+        # Until the first no-load reading of the board, zeros.
+        self._noload_uT = model.noload_uT if model.zeroed else np.zeros(CHANNELS_N)
         self._presses_uT = np.zeros((0, CHANNELS_N))  # field changes for presses at unknown places
         self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))
         self._calibrate()
@@ -112,7 +113,14 @@ class UniversalEstimator:
         self._calibrate()
 
     def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
-        """Calibrate to presses at unknown places; return a text with standard deviation and misfit before and after."""
+        """Calibrate to presses at unknown places; return a text with standard deviation and misfit before and after.
+
+        Raises
+        ------
+        SchemaError
+            If no press changes the field; nothing is changed then.
+        """
+        check_presses(db_uT)
         before, self._presses_uT = self._estimate(db_uT), db_uT.astype(np.float64)
         self._calibrate()
         after = self._estimate(db_uT)
@@ -129,7 +137,13 @@ class UniversalEstimator:
         """Calibrate to presses at known places; return a text with the error at held-out presses before and after.
 
         The force was not measured; the model's own estimate is used as its label.
+
+        Raises
+        ------
+        SchemaError
+            If no press changes the field; nothing is changed then.
         """
+        check_presses(db_uT[~held_out])
 
         def error_mm() -> float:
             found_mm = self._estimate(db_uT[held_out]).place_mm

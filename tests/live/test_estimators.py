@@ -1,19 +1,20 @@
 """Tests of the estimators of a live board, their calibration on the page, and unknown skins."""
 
 import re
+import time
 
 import numpy as np
 import pytest
 
 import reskin
-from reskin.errors import ParamsError
+from reskin.errors import ParamsError, SchemaError
 from reskin.live.emulator import Script, encode_pieces
-from reskin.live.session import PRESSES_N, GuidedPresses, Presses
+from reskin.live.session import PRESSES_N, GuidedPresses, Presses, Session
 from reskin.live.tracker import UNKNOWN_SKIN, Estimates, UniversalEstimator
 from reskin.predicting import read_models
 from reskin.seeds import rng_for
 from reskin.universal.model import load_universal
-from tests.live.boards import make_script, play_to_skin
+from tests.live.boards import ScriptReader, make_script, play_to_skin
 
 QUIET_N, POKED_N = 600, 100
 
@@ -68,6 +69,48 @@ def test_presses_are_collected_and_adapted_to(random_pokes):
     before = estimator(pokes.db_uT.astype(np.float32))
     estimator.set_noload(random_pokes[0])  # the adaptation is kept
     np.testing.assert_allclose(estimator(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
+
+
+class PressedWhileAdapting(UniversalEstimator):
+    """An estimator whose user presses the button Adapt while it adapts."""
+
+    session: Session
+    times_n: int
+
+    def adapt(self, db_uT):
+        for _ in range(self.times_n):
+            self.session.press("adapt")
+        return super().adapt(db_uT)
+
+
+@pytest.mark.parametrize(("times_n", "instruction"), [(0, ""), (1, ""), (2, f"press 1 of {PRESSES_N}, anywhere")])
+def test_presses_asked_for_during_adaptation_are_kept(random_pokes, times_n, instruction):
+    session = Session("played", load_universal(), "a board")
+    session.skin.reader = reader = ScriptReader(make_poke_script(random_pokes))
+    session.skin.estimator = estimator = PressedWhileAdapting(load_universal())
+    estimator.session, estimator.times_n = session, times_n
+    session.press("adapt")
+    session.start()
+    while not (reader.at_end and session.state()["adapted"]):
+        time.sleep(0.01)
+    session.stop()
+    state = session.state()
+    assert state["adapted"].startswith(f"adapted to {PRESSES_N} presses")
+    assert state["adapting"] == instruction
+    assert state["alarms"] == []
+
+
+def test_presses_within_the_noise_are_refused_and_change_nothing(random_pokes):
+    noload_uT, b_uT, _, _ = random_pokes
+    db_uT = b_uT - noload_uT.mean(axis=0)
+    estimator = UniversalEstimator(load_universal())
+    estimator.set_noload(noload_uT)
+    before = estimator(db_uT.astype(np.float32)).target
+    for calibrate in (estimator.adapt, lambda weak_uT: estimator.label(b_uT[:, :2], weak_uT, np.arange(len(b_uT)) < 3)):
+        with pytest.raises(SchemaError, match="changes of field must be 4.5 uT or more at some chip"):
+            calibrate(1e-3 * db_uT)
+    estimator.set_noload(noload_uT)
+    np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, before)
 
 
 def test_new_presses_replace_wrong_ones(random_pokes):

@@ -3,6 +3,7 @@
 import asyncio
 import math
 import os
+import time
 from collections import Counter
 from contextlib import ExitStack
 
@@ -113,7 +114,11 @@ def test_model_error_is_an_alarm_on_the_page():
     live = Session("played", [], "a board")
     live.skin = skin_at("played")
     live.skin.estimator = FailingModel()
-    live.run()
+    live.start()
+    end_s = time.monotonic() + 60.0
+    while not live.state()["alarms"] and time.monotonic() < end_s:
+        time.sleep(0.01)
+    live.stop()
     assert "estimates ended: RuntimeError('out of memory')" in live.state()["alarms"]
 
 
