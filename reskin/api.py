@@ -7,6 +7,7 @@ Bx, By, Bz of chip 0, then of chip 1, and so on. Each function imports what it n
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from reskin.recordings.labels import Label
     from reskin.universal.model import Universal
 
-AnyModel = Union[Path, str, Sequence[Path | str], "Model", "Universal"]
+AnyModel = Union[Path, str, "Model", "Universal", Sequence[Union[Path, str, "Model", "Universal"]]]
 Changes = Mapping[str, Any]  # values by name, for the settings that differ from the nominal ones
 NOMINAL_BOARD = "rigid"
 
@@ -169,7 +170,7 @@ def simulate_pokes(
     skin : Skin
         A skin from `draw_skin`.
     pokes : array [n 3]
-        x_mm, y_mm and depth_mm of each indentation; the centre of the skin is at (8, 8) mm.
+        x_mm, y_mm and depth_mm of each indentation (n may be 0); the centre of the skin is at (8, 8) mm.
     board : Board, optional
         The board under the skin, from `draw_board`; the nominal board if not given.
     seed : int
@@ -208,10 +209,13 @@ def simulate_pokes(
         )
     tip_m = (places_mm - (CENTRE_MM, CENTRE_MM, 0.0)) * milli
     board = board or draw_board(seed=seed)
+    design = parse(ChipDesign, nominal("chip", chip), "chip")
+    if not len(places_mm):
+        no_uT = np.zeros((0, 3 * len(board.chips_m)), np.float32)
+        return Pokes(no_uT, no_uT.copy(), np.zeros(0))
     rngs = {part: rng_for(seed, "poking", skin.name, part) for part in ("drift", "noload", "contact")}
     no_tilt = np.zeros((len(tip_m), 2))
     response = simulate_response(board, skin, tip_m[:, None], tilt=no_tilt, terms=Terms(), rng=rngs["drift"])
-    design = parse(ChipDesign, nominal("chip", chip), "chip")
     noload_uT, _ = read_field(response.rest_T, board, design=design, rng=rngs["noload"])
     b_uT, _ = read_field(response.rest_T + response.change_T[:, 0], board, design=design, rng=rngs["contact"])
     return Pokes(noload_uT, b_uT, response.force_N[:, 0, 2])
@@ -377,7 +381,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     port : str or list of str
         A serial port or `socket://host:port`; a list for several boards at once.
     model : optional
-        One or more trained networks (files, or one `Model`), or a universal model (the file of a calibration, or the
+        One or more trained networks (files or `Model`s), or one universal model (the file of a calibration, or the
         object, which is not changed). The uncalibrated universal model if not given.
     baud : int
         Baud rate; USB ports ignore it.
@@ -402,20 +406,34 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     ...         print(contact.t_s, contact.x_mm, contact.y_mm, contact.F_N, contact.alarms)
     """
     from reskin.live.tracker import LiveSkin, LiveSkins, check_ports
-    from reskin.predicting import read_models
-    from reskin.universal.model import Universal
 
-    models: Sequence[Network] | Universal
-    if isinstance(model, Universal):
-        models = model
-    elif isinstance(model, Model):
-        models = [model._network]
-    else:
-        models = read_models([Path(file) for file in ([model] if isinstance(model, str | Path) else model)])
+    models = _load_all(model)
     if isinstance(port, str):
         return LiveSkin(port, models, baud=baud)
     check_ports(port, models, "reskin.open")
     return LiveSkins([LiveSkin(each, models, baud=baud) for each in port])
+
+
+def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
+    """Return trained networks, in the given order, or one universal model."""
+    from reskin.predicting import read_models
+    from reskin.universal.model import Universal
+
+    given = list(model) if isinstance(model, Iterable) and not isinstance(model, str) else [model]
+    for one in given:
+        if not isinstance(one, str | Path | Model | Universal):
+            remedy = "Give a path, or what load_model or load_universal returned."
+            raise ParamsError("reskin.open", "a model", "a file or a loaded model", type(one).__name__, remedy)
+    if len(given) == 1 and isinstance(given[0], Universal):
+        return given[0]
+    files = [Path(one) for one in given if isinstance(one, str | Path)]
+    read = read_models(files) if files or not given else []
+    if isinstance(read, Universal) and len(given) <= 1:
+        return read
+    if isinstance(read, Universal) or any(isinstance(one, Universal) for one in given):
+        raise ParamsError("reskin.open: a universal model cannot be combined with other models. Give it alone.")
+    of_files = iter(read)
+    return [one._network if isinstance(one, Model) else next(of_files) for one in given]
 
 
 def lifted() -> Label:
@@ -425,15 +443,26 @@ def lifted() -> Label:
     return Label(False)
 
 
-def touch(x_mm: float, y_mm: float, **known: Any) -> Label:
+def touch(
+    x_mm: float,
+    y_mm: float,
+    *,
+    depth_mm: float = math.nan,
+    Fx_N: float = math.nan,
+    Fy_N: float = math.nan,
+    Fz_N: float = math.nan,
+    pass_i: int = 0,
+) -> Label:
     """Make the label of a stationary touch, for `record`.
 
     Parameters
     ----------
     x_mm, y_mm : float
         The place of the touch.
-    **known
-        Other known values: depth_mm, Fx_N, Fy_N and Fz_N (forces on the skin, Fz positive in compression), pass_i.
+    depth_mm, Fx_N, Fy_N, Fz_N : float, optional
+        Depth, and forces on the skin (Fz positive in compression); NaN where unknown.
+    pass_i : int
+        Number of the pass over all places.
 
     Examples
     --------
@@ -442,7 +471,7 @@ def touch(x_mm: float, y_mm: float, **known: Any) -> Label:
     """
     from reskin.recordings.labels import Label
 
-    return Label(True, x_mm, y_mm, **known)
+    return Label(True, x_mm, y_mm, depth_mm, Fx_N, Fy_N, Fz_N, pass_i)
 
 
 def record(
@@ -452,7 +481,9 @@ def record(
     out: Path | str | None = None,
     seconds: float = float("inf"),
     dwell_s: float = 0.5,
-    **names: str,
+    board: str | None = None,
+    skin: str | None = None,
+    scan: str | None = None,
 ) -> Path:
     """Record a board while a program moves a robot and reports its position.
 
@@ -471,8 +502,8 @@ def record(
         Maximum duration.
     dwell_s : float
         How long each label is valid; the next label is requested after this time.
-    **names
-        Names for the header: `board`, `skin`, and `scan` (the order of places).
+    board, skin, scan : str, optional
+        For the header: names of the board and the skin, and the order of places (random, snake or a description).
 
     Returns
     -------
@@ -500,9 +531,11 @@ def record(
     from reskin.live.record import record_board
     from reskin.recordings.label_sources import from_program
 
-    board = find_board(None if port is None else [port])
+    given = {"board": board, "skin": skin, "scan": scan}
+    names = {key: name for key, name in given.items() if name is not None}
+    found = find_board(None if port is None else [port])
     folder = Path(out) if out is not None else None
-    done = record_board(board, from_program(labels, dwell_s), folder=folder, seconds=seconds, names=names)
+    done = record_board(found, from_program(labels, dwell_s), folder=folder, seconds=seconds, names=names)
     print(done.summary, file=sys.stderr)
     if done.error is not None:
         raise done.error

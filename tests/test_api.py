@@ -82,6 +82,40 @@ def test_designs_take_plain_values_and_wrong_ones_raise():
         reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
 
 
+def test_no_pokes_are_empty_arrays():
+    noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), np.zeros((0, 3)))
+    some = reskin.simulate_pokes(reskin.draw_skin(), [[8, 8, 1]])
+    assert (noload_uT.shape, b_uT.shape, force_N.shape) == ((0, 15), (0, 15), (0,))
+    assert (noload_uT.dtype, b_uT.dtype, force_N.dtype) == tuple(array.dtype for array in some)
+
+
+def test_touch_takes_named_values():
+    touch = reskin.touch(1, 2, depth_mm=0.5, Fx_N=0.1, Fz_N=3, pass_i=4)
+    assert touch == (True, 1, 2, 0.5, 0.1, touch.Fy_N, 3, 4)
+    assert np.isnan(touch.Fy_N)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'Fz'"):
+        reskin.touch(1, 2, Fz=3)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'bord'"):
+        reskin.record(iter(()), port="/dev/none", bord="b1")  # before it listens
+
+
+def test_open_takes_loaded_models(model):  # noqa: F811
+    network, universal = reskin.load_model(model), reskin.load_universal()
+    for models, name in (
+        ([network], "1 network"), ([network, str(model), network], "3 networks"), ((model, model), "2 networks"),
+        (iter([model, network]), "2 networks"), ([universal], "universal model"),
+        (universal, "universal model"), ([], "universal model"),
+        (network, "1 network"), (model, "1 network"),
+    ):  # fmt: skip
+        assert reskin.open("/dev/none", model=models).estimator.name == name
+    with pytest.raises(ReskinError, match="a universal model cannot be combined with other models"):
+        reskin.open("/dev/none", model=[network, universal])
+    with pytest.raises(ReskinError, match="a model must be a file or a loaded model; got int"):
+        reskin.open("/dev/none", model=[1])
+    with pytest.raises(ReskinError, match="a model must be a file or a loaded model; got NoneType"):
+        reskin.open("/dev/none", model=None)
+
+
 def test_loaded_model_predicts_as_its_network(model):  # noqa: F811
     b_uT = rng_for(0, "api").normal(500, 100, (4, 15)).astype(np.float32)
 

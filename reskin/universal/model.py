@@ -22,7 +22,6 @@ from reskin.display import one_line
 from reskin.errors import SchemaError
 from reskin.universal import network
 from reskin.universal.calibration import (
-    CHANNELS_N,
     CalibrationData,
     LabelledPresses,
     LikelihoodPowers,
@@ -267,7 +266,7 @@ class Universal:
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
         """The no-load field that is subtracted, along the chips' axes; raise SchemaError before `zero`."""
         if self._noload_uT is None:
-            raise SchemaError("universal model: no no-load reading: call zero(...) with readings without contact first.")
+            raise SchemaError("the model has no no-load reading: call zero(...) with readings without contact first.")
         return self._noload_uT
 
     @property

@@ -1,9 +1,9 @@
 """Read layout `eflash7`: an eFlesh pad pressed over a six-axis sensor, one CSV file per recording.
 
-One or two places of a 3 x 3 grid of unknown pitch are touched, so `x_mm` and `y_mm` are NaN. The account counts the rows
-of each place by its number n, as `place_<n>_rows_n`: n is 1 + column + 3 row, with columns and rows counted from 0. The
-recorder subtracted a baseline that it does not give, so `b_uT` lacks a constant in each channel. The no-load field is
-the mean over the untouched rows at the start of a recording, and forces are relative to their mean force.
+One or two places of a 3 x 3 grid of unknown pitch are touched, so `x_mm` and `y_mm` are NaN. The account counts the
+rows of each place by its number n, as `place_<n>_rows_n`: n is 1 + column + 3 row, with columns and rows counted from
+0. The recorder subtracted a baseline that it does not give, so `b_uT` lacks a constant in each channel. The no-load
+field is the mean over the untouched rows at the start of a recording, and forces are relative to their mean force.
 """
 
 import re
