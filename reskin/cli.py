@@ -236,9 +236,12 @@ def predict(
 ) -> None:
     """Turn a log into contacts, places and forces. The log must begin with a second without contact."""
     from reskin.predicting import predict as write
+    from reskin.predicting import warnings
 
     counts = write(log, model, out, rate_hz=rate_hz)
     typer.echo(f"predicted {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
+    for sentence in warnings(counts):
+        typer.echo(sentence)
 
 
 if __name__ == "__main__":

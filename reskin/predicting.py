@@ -3,12 +3,13 @@
 Whether the model was trained on the board of the log is not checked: the user has to know.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import Float32
 
 from reskin import io
 from reskin.board.stream import decode_all
@@ -21,8 +22,9 @@ from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
 from reskin.recordings.ingest import read_header, timer
 from reskin.recordings.readers import sd_card
 from reskin.universal.calibration import CHANNELS_N, is_calibration
-from reskin.universal.model import Universal, load_universal
+from reskin.universal.model import MISFIT_MAX, Universal, load_universal
 
+FORCE_LIMIT = 1.05  # a force within this factor of an end of the model's range is at the limit
 PARQUET_MAGIC = b"PAR1"
 
 
@@ -38,7 +40,8 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
 
     Returns
     -------
-    Counts of frames, contacts and dropped frames
+    Counts of frames, contacts and dropped frames; for the universal model also the counts of readings in
+    contact whose misfit is above `MISFIT_MAX`, and whose force is at a limit of the model's range
     """
     models = read_models([] if model is None else [model])
     inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
@@ -52,12 +55,52 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
         )
     estimators: Sequence[Estimator]
     if isinstance(models, Universal):
-        estimators = [models.zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))], keep=True)]
+        models.zero(b_uT[: quiet_start(t_s, b_uT, where=str(log))], keep=True)
+        estimators = [universal := _UniversalOfLog(models)]
     else:
-        estimators = models
+        estimators, universal = models, None
     found = estimate(t_s, b_uT, estimators, where=str(log))
     io.write_text(out, render(found))
-    return describe(found) | account
+    return describe(found) | ({} if universal is None else universal.count_suspects(found)) | account
+
+
+class _UniversalOfLog:
+    """The universal model as an estimator of a log; it keeps the misfits of its readings."""
+
+    def __init__(self, model: Universal) -> None:
+        self._model = model
+        self._misfit = np.empty(0)
+
+    def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
+        found = self._model.estimate(db_uT + self._model.noload_uT)
+        self._misfit = found.misfit
+        return np.column_stack([found.place_mm, found.force_N]).astype(np.float32)
+
+    def count_suspects(self, found: LogEstimates) -> dict[str, int]:
+        """Count readings in contact with a large misfit, and those at a limit of the model's force range."""
+        force_N = found.targets[0, found.contact, 2]
+        least_N, most_N = self._model.tables.force_N[[0, -1]]
+        at_limit = (force_N <= FORCE_LIMIT * least_N) | (force_N >= most_N / FORCE_LIMIT)
+        return {
+            "unknown_skin_readings_n": int((self._misfit[found.contact] > MISFIT_MAX).sum()),
+            "force_at_limit_readings_n": int(at_limit.sum()),
+        }
+
+
+def warnings(counts: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for each count of `predict` that makes its estimates doubtful."""
+    found, all_n = [], counts["contact_readings_n"]
+    if unknown_n := counts.get("unknown_skin_readings_n"):
+        found.append(
+            f"unknown skin: the misfit is above {MISFIT_MAX:g} in {unknown_n} of {all_n} readings in contact. Are the "
+            "chips in another order, or is this another kind of skin?"
+        )
+    if limit_n := counts.get("force_at_limit_readings_n"):
+        found.append(
+            f"{limit_n} of {all_n} readings in contact are at a limit of the model's force range; the true force may "
+            "be outside it."
+        )
+    return found
 
 
 def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:

@@ -6,16 +6,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from reskin import io, load_model
+from reskin import cli, draw_skin, io, load_model, load_universal, simulate_pokes
 from reskin.board.wire import Frames, encode, record_type
 from reskin.errors import CaptureError, ReskinError
 from reskin.models.network import draw_weights, paper_layers
-from reskin.predicting import predict
+from reskin.predicting import predict, warnings
 from reskin.recordings import clocks
 from reskin.recordings.clocks import Arrivals
 from reskin.recordings.decode import decode_dump
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
-from reskin.recordings.readers.sd_card import render
+from reskin.recordings.readers.sd_card import read_log, render
 from reskin.seeds import rng_for
 from tests.recordings.headers import make_header
 
@@ -89,7 +89,7 @@ def test_unsuitable_tables_and_labelled_recordings_raise(tmp_path, model):
     with pytest.raises(CaptureError, match="not the columns of reskin decode: x"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
     write_capture(tmp_path / "c0", make_header(capture="c0"), {})
-    with pytest.raises(CaptureError, match="layout .* cannot be predicted from"):
+    with pytest.raises(CaptureError, match="layout .* cannot be predicted"):
         predict(tmp_path / "c0", model, tmp_path / "out.csv")
 
 
@@ -212,3 +212,41 @@ def test_without_a_model_the_universal_model_is_used(tmp_path):
     touched = [row for row in rows if row[-1] == "1"]
     assert len(touched) == TOUCHED_N
     assert all(-1 < float(value) < 17 for row in touched for value in row[1:3])
+
+
+def write_presses(folder, chips_on_n=0, factor=1.0):
+    """Write the log of presses on a simulated skin; chips may be read in another order, and changes scaled."""
+    places = np.column_stack([rng_for(0, "places").uniform(3, 13, (12, 2)), np.full(12, 1.0)])
+    noload_uT, b_uT, _ = simulate_pokes(draw_skin(seed=3), places, seed=3)
+    rest_uT = noload_uT.mean(axis=0)
+    clean_uT = np.concatenate(
+        [np.tile(rest_uT, (QUIET_N, 1)), np.repeat(rest_uT + factor * (b_uT - rest_uT), 10, axis=0)]
+    )
+    clean_uT = np.roll(clean_uT, 3 * chips_on_n, axis=1) + 3 * rng_for(0, "log").standard_normal(clean_uT.shape)
+    t_s = (1 + np.arange(len(clean_uT))) / RATE_HZ
+    (folder / "log.csv").write_text(render(t_s, clean_uT.astype(np.float32), np.full((len(t_s), 5), 25, np.float32)))
+    return folder / "log.csv"
+
+
+def test_summary_counts_misfits_and_forces_at_the_limit(tmp_path, model, capsys):
+    log, out = write_presses(tmp_path), tmp_path / "out.csv"
+    counts = predict(log, None, out)
+    assert (counts["unknown_skin_readings_n"], counts["force_at_limit_readings_n"]) == (0, 0)
+    assert warnings(counts) == []
+    estimates = np.genfromtxt(out, delimiter=",", names=True)
+    universal = load_universal()
+    b_uT = read_log(log)[1]
+    expected = universal.zero(b_uT[:QUIET_N]).predict(b_uT[QUIET_N:])
+    np.testing.assert_allclose(estimates["F_N"][QUIET_N:], expected[:, 2], atol=0.05)
+    assert out.read_text().splitlines()[0] == "t_s,x_mm,y_mm,F_N,contact"
+
+    swapped = predict(write_presses(tmp_path, chips_on_n=1), None, out)
+    assert swapped["unknown_skin_readings_n"] > 0.5 * swapped["contact_readings_n"]
+    assert "Are the chips in another order" in warnings(swapped)[0]
+
+    strong = write_presses(tmp_path, factor=4.0)
+    cli.predict(strong, out, None)
+    output = capsys.readouterr().out
+    assert "120 of 120 readings in contact are at a limit of the model's force range" in output
+    assert "force_at_limit_readings_n 120" in output
+    assert "unknown_skin_readings_n" not in predict(log, model, out)  # of the universal model only

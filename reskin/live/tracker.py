@@ -38,7 +38,7 @@ from reskin.recordings.fault_policy import FaultPolicy
 from reskin.simulation.defaults import nominal
 from reskin.universal.calibration import CHANNELS_N, check_presses
 from reskin.universal.map import Estimate
-from reskin.universal.model import Universal
+from reskin.universal.model import MISFIT_MAX, Universal
 
 NOLOAD_S = 1.0  # time without contact over which the no-load reading is averaged
 NOLOAD_FRAMES_MAX_N = 10_000
@@ -51,7 +51,6 @@ SPACING_MM = 5.0  # spacing of chips on the page if their places are unknown
 # Largest input of a network, in standard deviations over training. Assumed; 6 is reached in scene quick, and 7 on the
 # boards of scene lab with its own models.
 UNKNOWN_SDS = 10.0
-MISFIT_MAX = 4.0  # assumed, chi^2 per channel; about 1 for skins like those that the universal model was made from
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"

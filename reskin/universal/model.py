@@ -62,6 +62,7 @@ MAP_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of a network's estimates
 FADES_PER_LABEL = 0.15  # how fast the centring of the networks' places fades, as labels determine the centre better
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the constant error of the networks' places; sd of single errors about it
+MISFIT_MAX = 4.0  # assumed, chi^2 per channel; about 1 for skins like those that the model was trained on
 BLOCK_N = 200  # readings evaluated at once, to bound memory
 
 FILE = Path(__file__).with_name("universal.safetensors")  # the card has the same name, .json
