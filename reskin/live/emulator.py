@@ -266,6 +266,7 @@ class Terminal(EmulatedPort):
         if link is not None and link.exists() and not link.is_symlink():
             raise ParamsError(f"--port: {link} is an existing file, not a link. Choose another name.")
         self._link = link
+        self._open_ends: tuple[int, ...] = ()
         super().__init__()
 
     def plug_in(self) -> None:
@@ -273,7 +274,12 @@ class Terminal(EmulatedPort):
         import termios
         import tty  # these modules do not exist on Windows
 
-        self._far, self._near = os.openpty()
+        if self._link is not None and self._link.is_symlink() and self._link.exists():
+            raise ParamsError(
+                f"--port: {self._link} leads to {os.readlink(self._link)}, which is in use, perhaps by another "
+                "`reskin emulate`. Stop that one, remove the link, or choose another name."
+            )
+        self._open_ends = self._far, self._near = os.openpty()
         tty.setraw(self._near)
         # Packet mode reports when a reader opens the terminal, because opening flushes it.
         fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
@@ -286,10 +292,11 @@ class Terminal(EmulatedPort):
             self.name = str(self._link)
 
     def unplug(self) -> None:
-        if self._link is not None:
-            self._link.unlink(missing_ok=True)
-        os.close(self._near)
-        os.close(self._far)
+        if self._link is not None and self._open_ends:
+            self._link.unlink(missing_ok=True)  # while unplugged, the link may be another emulator's
+        for end in self._open_ends:
+            os.close(end)
+        self._open_ends = ()
 
     def send(self, data: bytes, stop: threading.Event) -> int:
         sent_n = 0

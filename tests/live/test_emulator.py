@@ -132,6 +132,34 @@ def test_link_keeps_its_name_over_unplugging(tmp_path):
     end.unplug()
 
 
+def test_link_in_use_is_refused_and_kept(tmp_path):
+    link = tmp_path / "board"
+    first = make_port(str(link))
+    leads_to = link.readlink()
+    with pytest.raises(ParamsError, match=r"--port: .*board leads to /dev/.*, which is in use"):
+        make_port(str(link))
+    assert link.readlink() == leads_to
+    first.unplug()
+    assert not link.is_symlink()
+    link.symlink_to(leads_to.with_name("999999"))  # of an emulator that was killed
+    second = make_port(str(link))
+    assert link.exists()
+    second.unplug()
+
+
+def test_link_taken_while_unplugged_is_kept(tmp_path):
+    link = tmp_path / "board"
+    first = make_port(str(link))
+    first.unplug()
+    second = make_port(str(link))
+    with pytest.raises(ParamsError, match="which is in use"):
+        first.plug_in()
+    first.unplug()  # as the command does at its end
+    assert link.exists()
+    second.unplug()
+    assert not link.is_symlink()
+
+
 def test_invalid_ports_raise(tmp_path):
     (tmp_path / "file").touch()
     for port in ("usb", "tcp:x", str(tmp_path / "file")):
