@@ -28,7 +28,8 @@ COUNTS_KEY = b"reskin.account"
 DIGEST = "digest"  # in the metadata of a safetensors file
 HEADER_AT = 8  # bytes of a safetensors file before its header: the header's length
 REMEDY = (
-    "It was cut or changed. In a checkout: delete it, then `reskin check-cache` and `dvc repro`; else copy it again."
+    "It was cut or changed. If `dvc repro` wrote it: delete it, then `reskin check-cache` and `dvc repro`. If not: copy "
+    "it again."
 )
 OF_MACHINE = {
     errno.EACCES,
@@ -42,7 +43,7 @@ OF_MACHINE = {
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary sibling of `path` to write (a file or a folder), and rename it when the block succeeds."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         remove(temporary)
@@ -80,6 +81,16 @@ def restoring(*files: Path) -> Iterator[None]:
                 with replacing(file) as temporary:
                     temporary.write_bytes(content)
         raise
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and those around it, if missing; raise `SchemaError` if that is impossible."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileNotFoundError, FileExistsError, NotADirectoryError) as error:  # /proc, a missing drive, a file
+        raise SchemaError(
+            f"{folder}: cannot create this folder: {error.strerror}. Choose another folder for the output."
+        ) from None
 
 
 def remove(path: Path) -> None:
@@ -273,7 +284,7 @@ def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
         current = set(file.parent.glob(f"kept-{_cache_state(package)}-*"))
         for old in set(file.parent.glob("kept-*.npy")) - current:
             remove(old)
-    except OSError:
+    except (OSError, SchemaError):
         return  # on a read-only or full disk, the array is computed again
 
 

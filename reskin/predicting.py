@@ -15,7 +15,7 @@ from reskin import io
 from reskin.board.stream import decode_all
 from reskin.errors import CaptureError, ParamsError, SchemaError
 from reskin.logs import Estimator, LogEstimates, describe, estimate, quiet_start
-from reskin.models.trained import Network, read_network
+from reskin.models.trained import SUFFIX, Network, read_network
 from reskin.recordings import tables
 from reskin.recordings.decode import read_frames
 from reskin.recordings.header import LOG_FILE, RATE_MAX_HZ, STREAM_FILE
@@ -138,12 +138,21 @@ def _read_capture(folder: Path) -> sd_card.Log:
 
 def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
     """Read trained networks, or one calibration of the universal model; without files, the uncalibrated model."""
-    calibrations = [file for file in files if file.is_file() and is_calibration(file)]
+    calibrations = [file for file in files if file.is_file() and _is_calibration(file)]
     if not calibrations:
         return [read_network(file) for file in files] or load_universal()
     if len(files) > 1:
         raise ParamsError(f"{calibrations[0]}: a calibration cannot be combined with other models. Give it alone.")
     return load_universal(calibrations[0])
+
+
+def _is_calibration(file: Path) -> bool:
+    try:
+        return is_calibration(file)
+    except SchemaError:
+        if file.suffix == SUFFIX:
+            raise
+        return False  # another kind of file, which `read_network` refuses
 
 
 def render(found: LogEstimates) -> str:

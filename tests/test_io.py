@@ -53,6 +53,13 @@ def test_capture_without_readings_is_an_error(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_folder_that_cannot_be_created_is_an_error(tmp_path):
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file/below", Path("/proc/nowhere")):
+        with pytest.raises(SchemaError, match=f"^{folder}: cannot create this folder"):
+            io.write_text(folder / "out.csv", "new")
+
+
 def test_failed_write_keeps_the_old_file(tmp_path):
     io.write_text(tmp_path / "a.txt", "old")
     with pytest.raises(RuntimeError), io.replacing(tmp_path / "a.txt") as temporary:

@@ -17,6 +17,7 @@ from reskin.recordings.decode import decode_dump
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE, Clock, write_capture
 from reskin.recordings.readers.sd_card import read_log, render
 from reskin.seeds import rng_for
+from reskin.universal.model import FILE
 from tests.recordings.headers import make_header
 
 RATE_HZ, QUIET_N, TOUCHED_N = 250.0, 400, 100
@@ -118,7 +119,7 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
     four.mkdir()
     cases = [
         (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model 15"),
-        (log, tmp_path / "other.safetensors", out, r"model file not found. Models in its folder: model\.safetensors"),
+        (log, tmp_path / "other.safetensors", out, r"model file not found. Models in this folder: model\.safetensors"),
         (log, model, log, "is the log, the model or its card"),
         (log, model, model, "is the log, the model or its card"),
         (log, model, model.with_suffix(".json"), "is the log, the model or its card"),
@@ -196,6 +197,20 @@ def test_a_model_without_its_card_raises(tmp_path, model):
 def test_a_missing_model_names_the_scene_that_trains_it(tmp_path, path, remedy):
     with pytest.raises(ReskinError, match=f"model file not found.*{remedy}"):
         load_model(tmp_path / path)
+
+
+def test_files_that_are_no_model_raise_and_none_is_to_be_deleted(tmp_path, model):
+    (tmp_path / "net.pt").write_bytes(b"PK" + bytes(100))
+    cases = {
+        tmp_path / "net.pt": "not a trained model",
+        model.with_suffix(".json"): f"not a trained model.* Give {model}",
+        tmp_path: r"this is a folder.* model\.safetensors",
+        FILE: "this is the universal model. Use it without --model",
+    }
+    for file, message in cases.items():
+        with pytest.raises(ReskinError, match=f"{file}: {message}") as refused:
+            predict(write_log(tmp_path), file, tmp_path / "out.csv")
+        assert "delete" not in str(refused.value)
 
 
 def test_a_log_that_starts_in_contact_raises(tmp_path, model):

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from reskin.board.wire import encode
-from reskin.errors import CaptureError
+from reskin.errors import CaptureError, SchemaError
 from reskin.recordings.header import HEADER_FILE, parse
 from reskin.recordings.label_sources import LabelSource
 from reskin.recordings.preparing import CaptureNames, native
@@ -135,6 +135,11 @@ def test_stuck_label_thread_writes_no_header(tmp_path):
     context.mark(7.0, 8.0)
     assert headers[0].clock.marks == ((5.0, 6.0),)
     assert parse((part / HEADER_FILE).read_text(), "header").clock.marks == ((5.0, 6.0),)
+
+
+def test_folder_that_cannot_be_created_is_an_error():
+    with pytest.raises(SchemaError, match="^/proc/nowhere: cannot create"):
+        begin_capture(Path("/proc/nowhere/run1"), NO_INFO, wire="binary", chips_n=5, by="a test")
 
 
 def test_existing_folder_is_not_overwritten(tmp_path):

@@ -52,6 +52,7 @@ TICK_S = 0.1  # longest delay until a stop is noticed
 LATE_MAX_S = 0.1  # after being blocked for longer, the player does not catch up
 SENT_TOGETHER_N = 256  # maximum number of overdue frames that are sent at once
 HOST = "127.0.0.1"
+TCP_PORT_MAX = 65535
 
 Source = Literal["simulated", "recorded"]
 
@@ -356,6 +357,8 @@ def make_port(kind: str) -> EmulatedPort:
     if kind == "pty":
         return Terminal()
     if name == "tcp" and (number.isdecimal() or kind == "tcp"):
+        if int(number or 0) > TCP_PORT_MAX:
+            raise ParamsError(f"--port: {number} is not a TCP port (1 to {TCP_PORT_MAX}). Try: --port tcp")
         return TcpServer(int(number or 0))
     if Path(kind).parent.is_dir() and "/" in kind:
         return Terminal(Path(kind))

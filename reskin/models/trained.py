@@ -20,6 +20,8 @@ from reskin.models.recipe import HEADLINE
 from reskin.numerics import device
 
 FORMAT = "reskin-model/3"  # of a model's card
+UNIVERSAL = "reskin-universal"  # begins the format of the universal model's card
+SUFFIX = ".safetensors"
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -86,8 +88,14 @@ def read_network(model: Path) -> Network:
         If the card is invalid or does not fit the weights, or the network has collapsed.
     """
     card_file = model.with_suffix(".json")
+    if model.is_dir():
+        raise ParamsError(f"{model}: this is a folder, not a model file. {_find_models(model / 'any')}")
     if not model.is_file():
         raise ParamsError(f"{model}: model file not found. {_find_models(model)}")
+    if model.suffix != SUFFIX:
+        weights = model.with_suffix(SUFFIX)
+        remedy = f"Give {weights}." if weights.is_file() else "If it was one, copy it again."
+        raise ParamsError(f"{model}: not a trained model ({SUFFIX}) or a saved calibration. {remedy}")
     if not card_file.is_file():
         raise ParamsError(
             f"{card_file}: card of the model not found. Copy it with its .safetensors file. If {model.name} is a "
@@ -95,6 +103,8 @@ def read_network(model: Path) -> Network:
         )
     content = io.read_json(card_file)
     form = content.get("format") if isinstance(content, dict) else None
+    if str(form).startswith(UNIVERSAL):
+        raise ParamsError(f"{model}: this is the universal model. Use it without --model, or by reskin.load_universal().")
     if form != FORMAT:
         raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
     card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
@@ -118,8 +128,8 @@ def read_network(model: Path) -> Network:
 
 def _find_models(missing: Path) -> str:
     """Return how to get a missing model file; stages write model files to data/models/SCENE/STAGE."""
-    if found := sorted(file.name for file in missing.parent.glob("*.safetensors")):
-        return f"Models in its folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
+    if found := sorted(file.name for file in missing.parent.glob(f"*{SUFFIX}")):
+        return f"Models in this folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
     if missing.parts[-5:-3] != ("data", "models"):
         return "Give the path of a trained .safetensors file."
     scene = missing.parts[-3]

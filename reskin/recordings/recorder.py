@@ -106,7 +106,8 @@ def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, 
         clock=Clock(kind="arrivals", rate_hz=None, marks=()), protocol="as the probe log says",
         note=f"recorded by {by}; arrival times are unix seconds of the host",
     )  # fmt: skip
-    part.mkdir(parents=True)
+    io.make_folder(part.parent)
+    part.mkdir()
     io.write_text(part / HEADER_FILE, render(header))
     return part, header
 

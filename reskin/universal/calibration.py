@@ -17,17 +17,20 @@ from reskin.universal.network import FULL_SET_N
 CHANNELS_N = 15  # five chips with three axes each
 FIELD_MAX_uT = 1e6  # 20 times the range of a chip, so no press exceeds it; its square fits single precision
 BEYOND = 2.0  # a label whose force is outside the model's range by more than this factor has another unit
+CHANNELS_RULE = f"This model needs {CHANNELS_N} numbers per reading: Bx, By, Bz of each of five chips."
 LABELS_MAX_N = 2000  # memory grows with the square of the number, time even faster
 
 
 def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
     """Return one or several readings as rows; raise SchemaError if they have another number of channels."""
-    rows_uT = np.atleast_2d(np.asarray(b_uT, float))
+    try:
+        rows_uT = np.atleast_2d(np.asarray(b_uT, float))
+    except (TypeError, ValueError):  # words, or rows of different lengths
+        got = " ".join(repr(b_uT).split())[:60]
+        raise SchemaError(f"b_uT: {got} is not an array of numbers. {CHANNELS_RULE}") from None
     if rows_uT.ndim != 2 or rows_uT.shape[1] != CHANNELS_N:
-        shape = np.shape(b_uT)
-        raise SchemaError(
-            f"fields of shape {shape} do not have the {CHANNELS_N} channels of five chips. Use a model for such boards."
-        )
+        got = f"{rows_uT.size} numbers" if np.ndim(b_uT) < 2 else f"shape {rows_uT.shape}"
+        raise SchemaError(f"b_uT has {got}. {CHANNELS_RULE}")
     return rows_uT
 
 

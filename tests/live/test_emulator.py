@@ -162,7 +162,7 @@ def test_link_taken_while_unplugged_is_kept(tmp_path):
 
 def test_invalid_ports_raise(tmp_path):
     (tmp_path / "file").touch()
-    for port in ("usb", "tcp:x", str(tmp_path / "file")):
+    for port in ("usb", "tcp:x", "tcp:99999", str(tmp_path / "file")):
         with pytest.raises(ParamsError, match="--port: "):
             make_port(port)
     for url in ("loop://", "alt:///dev/null?class=VTIMESerial", "socket://nowhere"):

@@ -1,5 +1,6 @@
 """The model that comes with the library: accuracy on simulated pokes, misfit, labels, files and invalid input."""
 
+import inspect
 import shutil
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from reskin.physics.magnet import Quadrature
 from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation import defaults
-from reskin.universal.calibration import CHANNELS_N, CalibrationData, no_labels
+from reskin.universal.calibration import CHANNELS_N, CalibrationData, check_shape, no_labels
 from reskin.universal.law import to_chips
 from reskin.universal.map import NOMINAL
 from reskin.universal.model import FILE, PriorModel, Universal, load_universal
@@ -78,8 +79,12 @@ def test_card_describes_the_model(skin):
 
 
 def test_other_boards_are_refused(skin):
-    with pytest.raises(SchemaError, match="do not have the 15 channels of five chips"):
-        skin.predict(np.zeros((2, 12)))
+    for b_uT, got in ((np.zeros((2, 12)), r"shape \(2, 12\)"), (np.zeros(14), "14 numbers")):
+        with pytest.raises(SchemaError, match=f"b_uT has {got}.* 15 numbers per reading"):
+            skin.predict(b_uT)
+    for b_uT in (["a"] * 15, [[1.0], [1.0, 2.0]]):  # tests check types, users' programs do not
+        with pytest.raises(SchemaError, match="b_uT: .* is not an array of numbers"):
+            inspect.unwrap(check_shape)(b_uT)
     assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
 
 
