@@ -28,8 +28,8 @@ COUNTS_KEY = b"reskin.account"
 DIGEST = "digest"  # in the metadata of a safetensors file
 HEADER_AT = 8  # bytes of a safetensors file before its header: the header's length
 REMEDY = (
-    "It was cut or changed. If `dvc repro` wrote it: delete it, then `reskin check-cache` and `dvc repro`. If not: copy "
-    "it again."
+    "It was cut or changed. If `dvc repro` wrote it: delete it, then `reskin check-cache` and `dvc repro`. "
+    "If not: copy it again."
 )
 OF_MACHINE = {
     errno.EACCES,

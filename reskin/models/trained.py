@@ -104,7 +104,9 @@ def read_network(model: Path) -> Network:
     content = io.read_json(card_file)
     form = content.get("format") if isinstance(content, dict) else None
     if str(form).startswith(UNIVERSAL):
-        raise ParamsError(f"{model}: this is the universal model. Use it without --model, or by reskin.load_universal().")
+        raise ParamsError(
+            f"{model}: this is the universal model. Use it without --model, or by reskin.load_universal()."
+        )
     if form != FORMAT:
         raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
     card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]

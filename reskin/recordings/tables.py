@@ -20,6 +20,9 @@ from reskin.recordings.header import Header
 from reskin.schema import UNITS, Readings
 
 FIRST_ROW = 2  # row 1 of the file is the header
+# Arrow's messages about a cell that is not a number, and about a row with too few or too many cells
+CONVERSION = re.compile(r"column #(\d+): Row #(\d+): CSV conversion error to (\w+): invalid value '(.*)'")
+COLUMNS_N = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
 def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
@@ -37,11 +40,27 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
         )
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         got = ascii(" ".join(str(error).split()))[1:-1][:200]  # the error may quote a long row of binary data
+        if found := CONVERSION.search(got):
+            name, rule = _column_names(source)[int(found[1])], "a whole number" if "int" in found[3] else "a number"
+            raise CaptureError(
+                f"{where} row {found[2]}", name, rule, f"'{found[4][:20]}'", "Correct or remove that row."
+            ) from None
+        if found := COLUMNS_N.search(got):
+            what = f"{found[3]} columns, but row 1 has {found[2]}"
+            raise CaptureError(f"{where} row {found[1]}: {what}. Was the file cut or edited?") from None
         raise CaptureError(f"{where}: not a CSV with columns {_list(types)}: {got}. Correct that row.") from None
     except FileNotFoundError:
         raise CaptureError(f"{where}: file not found. Copy the whole capture folder.") from None
     _check_names(table.column_names, types, where)
     return table.select(list(types)).combine_chunks()
+
+
+def _column_names(source: str | Path) -> list[str]:
+    """Return the names in row 1 of a CSV text or file."""
+    if isinstance(source, str):
+        return source.split("\n", 1)[0].strip().split(",")
+    with source.open(encoding="utf-8-sig", errors="replace") as file:
+        return file.readline().strip().split(",")
 
 
 def render_csv(table: pa.Table) -> str:
@@ -152,7 +171,7 @@ def _read_text(path: Path, where: str) -> str:
 def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first_line_n: int) -> CaptureError:
     for row_i, row in enumerate(cells):
         for name, cell in zip(names, row, strict=True):
-            if not _is_number(cell):
+            if not is_number(cell):
                 place = f"{name} in line {first_line_n + row_i}"
                 rule = f"a finite number below {MAGNITUDE_MAX:g}"
                 return CaptureError(
@@ -161,7 +180,7 @@ def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first
     raise AssertionError("numbers refused, though every cell is one")
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
     try:
         return abs(float(cell)) < MAGNITUDE_MAX
     except ValueError:

@@ -65,10 +65,10 @@ def test_round_trip_is_exact(lengths: list[float], begin_s: float, label: float)
     ("old", "new", "message"),
     [
         ("Fz_N\n", "Fz_lbf\n", "row 1.*missing Fz_N, unknown Fz_lbf"),
-        (",Fz_N\n", "\n", "Row #2: Expected 10 columns, got 11"),
+        (",Fz_N\n", "\n", "row 2: 11 columns, but row 1 has 10"),
         ("Fy_N,Fz_N\n", "Fz_N,Fz_N\n", "row 1.*missing Fy_N"),
-        ("0.6", "deep", "Row #3.*deep"),
-        ("0,0,contact", "0.5,0,contact", "Row #3.*0.5"),
+        ("0.6", "deep", "row 3: depth_mm must be a number; got 'deep'"),
+        ("0,0,contact", "0.5,0,contact", "row 3: indentation must be a whole number; got '0.5'"),
         ("1,0,contact", "1,0,touch", "row 5: phase must be noload or contact; got touch"),
         ("1,0,contact", "1,0,", "row 5: phase must be known; got an empty field"),
         ("1,0,contact", ",0,contact", "row 5: indentation must be known"),

@@ -20,6 +20,7 @@ TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
 HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
+SHOWN_CHIPS_MAX = 5  # boards with more have too long a line 1 for an error
 KEPT_SHARE_MIN = 0.5  # assumed: with fewer good frames, contacts would be missed
 Log = tuple[
     Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
@@ -111,15 +112,31 @@ def _chips_n(path: Path, where: str) -> int:
     names = first.removeprefix(BOM_UTF8).decode("ascii", errors="replace").strip().split(",")
     chips_n = (len(names) - 1) // len(CHIP_COLUMNS)
     if chips_n < 1 or names != column_names(chips_n):
-        rule, got = f"{','.join(column_names(1))}, then T1 and so on", repr(",".join(names)[:60])
-        raise CaptureError(
-            where, "row 1, the column names,", rule, got, "If it is a board's log, write that line on top."
-        )
+        raise CaptureError(f"{where}: {_header_fault(names)}")
     if last != b"\n":
         raise CaptureError(
             f"{where}: the last line is cut: no line feed ends it. Remove it, if the board was switched off there."
         )
     return chips_n
+
+
+def _header_fault(names: list[str]) -> str:
+    """Say what is wrong with the names in line 1, and what to do."""
+    wanted = column_names(len(names) // len(CHIP_COLUMNS) + 1)
+    rule = f"{','.join(column_names(1))}, then T1 and so on"
+    if tables.is_number(names[0]):
+        chips_n = max((len(names) - 1) // len(CHIP_COLUMNS), 1)
+        whole = f": {','.join(column_names(chips_n))}" if chips_n <= SHOWN_CHIPS_MAX else ""
+        return f"line 1 has numbers, not the column names {rule}. If this is a board's log, add this line on top{whole}"
+    if ";" in names[0]:
+        return "semicolons in line 1. Export it with commas between columns and points in numbers."
+    if {"phase", "x_mm", "y_mm"} & set(names):
+        return f"line 1 has columns of labels or estimates; a log has {rule}. To add labelled data: reskin add."
+    wrong_i = next((i for i, (name, right) in enumerate(zip(names, wanted, strict=False)) if name != right), len(names))
+    if wrong_i == len(names):
+        return f"line 1: column {wrong_i + 1} must be {wanted[wrong_i]}; the line ends at {names[-1]}. Complete it."
+    got = ascii(names[wrong_i][:20])[1:-1]
+    return f"line 1: column {wrong_i + 1} is {got!r}; it must be {wanted[wrong_i]} (columns: {rule}). Correct line 1."
 
 
 def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
