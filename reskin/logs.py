@@ -77,6 +77,11 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
         quiet_n = window_n * (int(wandered.argmax()) if wandered.any() else windows_n)
     else:
         quiet_n = 0
+    if (logged_s := len(b_uT) * step_s(t_s)) < QUIET_MIN_S:
+        raise CaptureError(
+            f"{where}: the log has {len(b_uT)} readings ({logged_s:.2g} s); {QUIET_MIN_S:g} s or more without contact "
+            "are needed at its start. Record a longer log."
+        )
     if quiet_n * step_s(t_s) < QUIET_MIN_S:
         raise CaptureError(
             f"{where}: the start without contact lasts {quiet_n * step_s(t_s):.2g} s, less than {QUIET_MIN_S:g} s. "

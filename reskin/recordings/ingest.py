@@ -264,7 +264,8 @@ def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
 def read_header(folder: Path) -> Header:
     file = folder / HEADER_FILE
     if not file.is_file():
-        raise CaptureError(f"{file}: file not found, so this is not a capture folder. Is it another --layout?")
+        fault = "this is a file" if folder.is_file() else f"there is no {HEADER_FILE} in it"
+        raise CaptureError(f"{folder}: not a capture folder: {fault}. Give a folder that `reskin record` wrote.")
     return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
 
 

@@ -163,8 +163,12 @@ def _read_text(path: Path, where: str) -> str:
     except OSError as error:
         raise CaptureError(f"{where}: cannot read the file: {error.strerror}. Copy the recording again.") from None
     if not text.endswith("\n"):
-        found = f"the last line ends in {text[-12:]!r}, not in a line feed" if text else "the file is empty"
-        raise CaptureError(f"{where}: {found}. Copy the recording again; if it is whole, end it with an empty line.")
+        if not text:
+            raise CaptureError(f"{where}: the file is empty. Copy the recording again.")
+        raise CaptureError(
+            f"{where}: the last line has no line break; it ends in {text[-12:]!r}. If it was cut, copy the recording "
+            "again; if it is whole, end it with a line break."
+        )
     return text
 
 

@@ -21,6 +21,7 @@ FORCE_MAX_N = 100.0
 FORCE_MIN_N = 0.05  # every recording has a stronger touch; a touch of 0.4 N in kg is weaker
 SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
 EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
+FAR_SHARE_MAX = 0.1  # of places far from the others: with more, all places are in another unit
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 
 
@@ -67,13 +68,21 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
         raise CaptureError(where, "force", rule, got, "Convert kg or kN to N, or press the skin.")
 
 
-def check_places(place_mm: Float[np.ndarray, "f axes"], where: str) -> None:
+def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_line_n: int = 1) -> None:
     """Raise if different places are closer together or farther apart than on a skin; NaN (unknown) is allowed."""
-    known_mm = place_mm[np.isfinite(place_mm).all(axis=1)]
+    known = np.isfinite(place_mm).all(axis=1)
+    known_mm = place_mm[known]
     extent_mm = float(np.ptp(known_mm, axis=0).max()) if len(known_mm) else 0.0
     if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
         rule = f"one, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
-        raise CaptureError(where, "places", rule, f"{extent_mm:.4g}", "Convert m or um to mm.")
+        got, remedy = f"{extent_mm:.4g}", "Convert m or um to mm."
+        far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
+        if 0 < far.sum() <= FAR_SHARE_MAX * len(far):
+            i = int(far.argmax())
+            line_n, place = first_line_n + int(np.flatnonzero(known)[i]), ", ".join(f"{of:g}" for of in known_mm[i])
+            got += f": line {line_n} ({place} mm) is far from the others"
+            remedy = "Correct that place, or convert its unit to mm."
+        raise CaptureError(where, "places", rule, got, remedy)
 
 
 def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
@@ -91,7 +100,8 @@ def check_log(log: ProbeLog, where: str) -> None:
     for axis_N in force_N.T:
         check_forces(axis_N, where, first_line_n=FIRST_ROW)
     check_touch(force_N[contact], where)
-    check_places(np.stack([log.x_mm, log.y_mm], axis=1)[contact], where)
+    place_mm = np.where(contact[:, None], np.stack([log.x_mm, log.y_mm], axis=1), np.nan)
+    check_places(place_mm, where, first_line_n=FIRST_ROW)
     check_depths(log.depth_mm[contact], where)
     known_N = log.Fz_N[contact & np.isfinite(log.Fz_N)]
     if len(known_N) and np.median(known_N) < 0:

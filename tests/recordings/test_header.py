@@ -100,7 +100,7 @@ def test_changed_file_is_refused(tmp_path):
 
 
 def test_folder_without_header_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match="not a capture folder"):
+    with pytest.raises(CaptureError, match="not a capture folder: there is no header.json"):
         read_header(tmp_path)
 
 

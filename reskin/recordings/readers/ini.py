@@ -118,7 +118,7 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
     truths = to_numbers(read_cells(folder / TRUTHS, where, separator=None), where, names=["x_mm", "y_mm", "F_N"])
     check_forces(truths[:, 2], where, first_line_n=1)
     check_touch(truths[:, 2], where)
-    check_places(truths[truths[:, 2] >= CONTACT_MIN_N, :2], where)
+    check_places(np.where(truths[:, 2:] >= CONTACT_MIN_N, truths[:, :2], np.nan), where)
     return truths
 
 

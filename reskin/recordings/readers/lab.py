@@ -151,7 +151,7 @@ def _check_table(table: _Table, where: str) -> None:
     if pressed_N > 0:
         remedy = "Is compression negative Fz in this file? Turn its sign."
         raise CaptureError(where, "the usual Fz in contact", "negative", f"{pressed_N:.4g} N", remedy)
-    check_places(table.place_mm, where)
+    check_places(table.place_mm, where, first_line_n=FIRST_LINE_N)
     begins = np.flatnonzero(np.diff(table.press, prepend=-1))
     moved = np.flatnonzero((table.place_mm != table.place_mm[begins][table.press]).any(axis=1))
     if len(moved):

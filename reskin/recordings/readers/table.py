@@ -170,7 +170,8 @@ def _check(
 ) -> None:
     _refuse_subtracted(b_uT, contact, where)
     check_fields(b_uT, where, first_line_n=FIRST_LINE_N)
-    check_places(np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1)[contact], where)
+    place_mm = np.where(contact[:, None], np.stack([numbers["x_mm"], numbers["y_mm"]], axis=1), np.nan)
+    check_places(place_mm, where, first_line_n=FIRST_LINE_N)
     if "depth_mm" in numbers:
         check_depths(numbers["depth_mm"][contact], where)
     for axis in ("Fx_N", "Fy_N", "Fz_N"):

@@ -11,7 +11,7 @@ from reskin import seeds
 from reskin.errors import CaptureError
 from reskin.recordings import ReaderLayout
 from reskin.recordings.readers import READERS
-from reskin.recordings.tables import make_readings
+from reskin.recordings.tables import make_readings, read_cells
 from reskin.recordings.units import check_depths, check_fields, check_forces, check_places, check_touch
 from reskin.schema import to_table
 from tests.recordings.headers import make_header
@@ -98,6 +98,14 @@ def test_places_pass_in_millimetres_only(extent_mm: float, start_mm: float) -> N
                 check_places(factor * place_mm, "here")
 
 
+def test_place_far_from_the_others_is_named_with_its_line() -> None:
+    place_mm = np.array([[np.nan, np.nan], *([float(i), 2.0] for i in range(19)), [999.0, 2.0]])
+    with pytest.raises(CaptureError, match=r"line 22 \(999, 2 mm\) is far from the others"):
+        check_places(place_mm, "here", first_line_n=2)
+    with pytest.raises(CaptureError, match="Convert m or um to mm"):
+        check_places(1e3 * place_mm[:20], "here")
+
+
 def test_one_place_passes_with_rounding() -> None:
     check_places(np.array([[315.0, -100.0], [315.00003, -99.99999]]), "here")
     check_places(np.full((3, 2), np.nan), "here")
@@ -113,6 +121,15 @@ def test_depths_pass_in_millimetres_only(deepest_mm: float, accepted: bool) -> N
     else:
         with pytest.raises(CaptureError, match="^here: depth must be 0.05 to 100 mm where it is greatest"):
             check_depths(depth_mm, "here")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("", "the file is empty"), ("1,2\n1,2.8", "last line has no line break")]
+)
+def test_cut_text_is_refused(tmp_path, text: str, message: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(CaptureError, match=message):
+        read_cells(tmp_path / "a.csv", "a.csv", separator=",")
 
 
 def test_each_layout_has_a_reader() -> None:
