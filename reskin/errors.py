@@ -1,9 +1,10 @@
 """Errors that a user can cause or fix, and explanations of errors from the machine and of missing packages."""
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
+from difflib import get_close_matches
 from importlib.util import find_spec
 
 
@@ -105,6 +106,16 @@ Run it again: finished work is kept.
             raise
         file, remedy = error.filename or "the disk", DISK_REMEDIES[error.errno]
         raise MachineError(f"{where}: {file}: {error.strerror}. {remedy} {RETRY}") from None
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return a question with the most similar known name, after a space; empty if none is similar.
+
+    >>> did_you_mean("stuk", ["zeros", "stuck"])
+    ' Did you mean stuck?'
+    """
+    similar = get_close_matches(str(name), known, n=1)
+    return f" Did you mean {similar[0]}?" if similar else ""
 
 
 def require(package: str, where: object) -> None:

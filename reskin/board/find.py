@@ -81,7 +81,9 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     boards = [each for each in found if each.problem is None]
     if not boards:
         got = "; ".join(map(str, found)) or "no serial port at all"
-        raise CaptureError(f"no board found: {got}. Plug one in, or give --port.")
+        raise CaptureError(
+            f"no board found ({got}). Plug one in, or give --port. To try without one: reskin live --emulate nominal"
+        )
     return boards
 
 

@@ -3,6 +3,9 @@
 The port is a serial port or `socket://host:port`.
 """
 
+import errno
+import os
+import re
 import select
 
 import serial
@@ -24,15 +27,34 @@ def open_port(port: str, baud: int) -> Device:
     Boards and force gauges are opened here. Bytes that were waiting in the port are discarded. A socket becomes
     non-blocking; use `read_waiting` to read from either kind.
     """
+    check_name(port)
     try:
-        if "://" in port and not port.startswith(SOCKET):  # pyserial has more schemes, some of which load code
-            raise ValueError(f"the only supported URL is {SOCKET}host:port")
         device = serial.serial_for_url(port, baud, timeout=READ_TIMEOUT_s, exclusive=None if "://" in port else True)
     except (OSError, ValueError) as error:
-        raise CaptureError(f"{port}: cannot open the port: {error}. {found_ports()}") from None
+        reason = {
+            errno.ENOENT: f"no such port. {found_ports()}",
+            errno.EAGAIN: "another program uses it (reskin live, a serial monitor?). Close that program.",
+        }.get(error.errno if isinstance(error, OSError) else None, f"{error}. {found_ports()}")
+        raise CaptureError(f"{port}: cannot open the port: {reason}") from None
     if not isinstance(device, serial.Serial):
         device.timeout = 0
     return device
+
+
+def check_name(port: str) -> None:
+    """Raise `CaptureError` for a name that no port can have, such as that of a file."""
+    reason = ""
+    if port.startswith(SOCKET):
+        if not re.fullmatch(r".+:\d{1,5}([/?].*)?", port.removeprefix(SOCKET)):
+            reason = f"its port number is missing. Write {SOCKET}HOST:PORT."
+    elif "://" in port:  # pyserial has more schemes, some of which load code
+        reason = f"the only supported URL is {SOCKET}HOST:PORT."
+    elif os.path.isdir(port):  # never raises, as `Path.is_dir` may for COM3
+        reason = f"it is a folder. {found_ports()}"
+    elif os.path.isfile(port):
+        reason = "it is a file. Read files with reskin decode or reskin predict."
+    if reason:
+        raise CaptureError(f"{port}: cannot open the port: {reason}")
 
 
 def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:

@@ -5,6 +5,7 @@ of a board and a button: no path, name or number from a client reaches a file.
 """
 
 import asyncio
+import errno
 import hmac
 import json
 import re
@@ -12,6 +13,7 @@ import secrets
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from socket import gaierror
 
 from aiohttp import WSMsgType, web
 from aiohttp.typedefs import Handler
@@ -131,12 +133,16 @@ def serve(sessions: Sequence[Session], *, host: str, http_port: int, say: Callab
         session.start()
     try:
         address = f"http://{'localhost' if host in LOCAL else host}:{http_port}/{f'?token={token}' if token else ''}"
-        say(f"{', '.join(map(str, sessions))}: open {address}; Ctrl-C ends it")
-        web.run_app(Server(sessions, token).application(), host=host, port=http_port, print=None, handle_signals=True)
+        sentence = f"{', '.join(map(str, sessions))}: open {address}; Ctrl-C ends it"
+        app = Server(sessions, token).application()
+        # `print` is called once the server listens.
+        web.run_app(app, host=host, port=http_port, print=lambda _: say(sentence), handle_signals=True)
     except OSError as error:
-        raise ParamsError(
-            f"--http-port: cannot listen on {http_port}: {error.strerror}. Choose another port."
-        ) from None
+        if isinstance(error, gaierror) or error.errno in (None, errno.EADDRNOTAVAIL):
+            remedy = "Try 127.0.0.1 (this machine only) or 0.0.0.0 (other machines too)."
+            raise ParamsError(f"--host: {host} is not an address of this machine. {remedy}") from None
+        reason = "another program uses it" if error.errno == errno.EADDRINUSE else error.strerror
+        raise ParamsError(f"--http-port: cannot listen on {http_port}: {reason}. Choose another port.") from None
     finally:
         for session in sessions:
             session.stop()

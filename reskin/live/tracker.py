@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from reskin.board import find
 from reskin.board.faults import GARBAGE_FRAMES_N
 from reskin.board.find import Chunk
+from reskin.board.port import check_name
 from reskin.board.reader import PLUGGED_IN, Reader
 from reskin.board.stream import FrameStream
 from reskin.board.wire import Frames, concatenate
@@ -178,6 +179,8 @@ class UniversalEstimator:
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
     """Raise ParamsError for ports named twice, too many ports, or one skin's calibration used for several boards."""
     find.check_named_once(ports, where)
+    for port in ports:  # one that is unplugged is waited for
+        check_name(port)
     if len(ports) > 1 and isinstance(models, Universal) and models.presses_n:
         raise ParamsError(
             f"{where}: a model that is calibrated to one skin ({models.presses_n} presses) cannot estimate for "

@@ -22,7 +22,7 @@ from reskin.board.faults import (
     unusual_lsb,
 )
 from reskin.config import Strict
-from reskin.errors import CaptureError, ParamsError
+from reskin.errors import CaptureError, ParamsError, did_you_mean
 
 USUAL_LSB = "that of the other chips, and not that of a reset chip"
 
@@ -69,9 +69,13 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
         kind = FaultPolicy.model_fields[name].annotation if name in FaultPolicy.model_fields else None
         allowed = get_args(kind)
         if action not in allowed:
+            if allowed:
+                raise ParamsError(where, name, " or ".join(allowed), repr(action)[:40], f"Try: {name}={allowed[0]}")
+            guess = did_you_mean(name, FaultPolicy.model_fields)
             names = ", ".join(FaultPolicy.model_fields)
-            rule = f"{name}={'|'.join(allowed)}" if allowed else f"NAME=drop|flag|refuse with one of {names}"
-            raise ParamsError(where, "the action for a fault", rule, repr(text)[:40], f"Try: {where} too_hot=drop")
+            raise ParamsError(
+                f"{where}: {repr(text)[:40]} is not NAME=drop|flag|refuse with a known fault.{guess} Faults: {names}"
+            )
         changes[name] = action
     return policy.model_copy(update=changes)
 

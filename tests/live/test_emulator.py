@@ -165,9 +165,11 @@ def test_invalid_ports_raise(tmp_path):
     for port in ("usb", "tcp:x", "tcp:99999", str(tmp_path / "file")):
         with pytest.raises(ParamsError, match="--port: "):
             make_port(port)
-    for url in ("loop://", "alt:///dev/null?class=VTIMESerial", "socket://nowhere"):
+    for url in ("loop://", "alt:///dev/null?class=VTIMESerial", "socket://nowhere:1"):
         with pytest.raises(CaptureError, match="cannot open the port"):
             open_port(url, 115200)
+    with pytest.raises(CaptureError, match="port number is missing"):
+        open_port("socket://127.0.0.1", 115200)
 
 
 class TestFaults:

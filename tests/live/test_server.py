@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+import re
+import socket as socketlib
 import struct
 import time
 from collections.abc import Awaitable, Callable
@@ -12,6 +14,8 @@ import numpy as np
 import pytest
 from aiohttp import web
 
+from reskin.errors import CaptureError, ParamsError
+from reskin.live import server
 from reskin.live.server import PAGES_MAX_N, REQUEST_BYTES_MAX_N, Server
 from reskin.live.session import BINS_N, HEAD, NUMBERS_N, open_sessions
 from reskin.live.tracker import Models
@@ -105,6 +109,38 @@ def test_page_gets_estimates_and_buttons_zero_and_record(tmp_path, monkeypatch):
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
         serve(name, models, act)
+
+
+def test_address_that_cannot_be_used_is_an_error_and_not_printed():
+    printed: list[str] = []
+    with socketlib.create_server(("127.0.0.1", 0)) as busy:
+        number = busy.getsockname()[1]
+        for host, message in {
+            "127.0.0.1": f"--http-port: cannot listen on {number}: another program uses it",
+            "192.0.2.1": "--host: 192.0.2.1 is not an address of this machine",  # reserved for documentation
+            "no such host": "--host: no such host is not an address of this machine",
+        }.items():
+            with pytest.raises(ParamsError, match=message):
+                server.serve([], host=host, http_port=number, say=printed.append)
+    assert printed == []
+
+
+def test_page_is_announced_once_it_is_served(monkeypatch):
+    printed: list[str] = []
+
+    def run_app(app, *, host, port, print, handle_signals) -> None:
+        assert printed == []
+        print("======== Running on ... ========")
+
+    monkeypatch.setattr(web, "run_app", run_app)
+    server.serve([], host="0.0.0.0", http_port=8765, say=printed.append)
+    assert re.search(r"open http://0.0.0.0:8765/\?token=.+; Ctrl-C", printed[0])
+
+
+def test_file_is_no_board(tmp_path):
+    (tmp_path / "log.csv").touch()
+    with pytest.raises(CaptureError, match="log.csv: cannot open the port: it is a file"):
+        open_sessions([str(tmp_path / "log.csv")], [], "a board")
 
 
 def test_page_waits_for_a_missing_board(tmp_path):

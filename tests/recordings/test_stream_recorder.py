@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 
 from reskin.board import stream
+from reskin.board.port import open_port
 from reskin.board.wire import encode
 from reskin.errors import CaptureError
 from reskin.recordings import clocks, stream_recorder
@@ -320,8 +321,14 @@ class TestErrors:
     def test_file_is_not_a_port(self, tmp_path):
         file = tmp_path / "no_port"
         file.touch()
-        with pytest.raises(CaptureError, match="no_port: cannot open the port"):
-            stream_recorder.record(str(file), tmp_path, settings=SETTINGS, stop=threading.Event())
+        for name, reason in {file: "it is a file.* reskin predict", tmp_path: "it is a folder"}.items():
+            with pytest.raises(CaptureError, match=f"{name}: cannot open the port: {reason}"):
+                stream_recorder.record(str(name), tmp_path, settings=SETTINGS, stop=threading.Event())
+
+    def test_port_of_another_program(self, board, tmp_path):
+        other = "another program uses it"
+        with open_port(board.name, 115200), pytest.raises(CaptureError, match=f"cannot open the port: {other}"):
+            stream_recorder.record(board.name, tmp_path, settings=SETTINGS, stop=threading.Event())
 
     def test_silent_port(self, board, clock, tmp_path):
         with pytest.raises(CaptureError, match=f"{board.name}: no bytes arrived in 0.7 s. Is the"):
