@@ -13,7 +13,7 @@ from pipeline.manage.registry import Registry, read_registry
 from pipeline.manage.running import DVC_FILES, require_idle
 from pipeline.scenes import ANALYSES, EXPERIMENTS, MAIN_PROTOCOL, TABLE_2, Plan, Scene, read_plan, read_scene, stages
 from reskin import io
-from reskin.errors import ParamsError
+from reskin.errors import ParamsError, did_you_mean
 from reskin.recordings.header import NAME
 
 HEADER = """\
@@ -85,12 +85,12 @@ def scene_names(root: Path) -> list[str]:
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
 
 
-def scene_file(root: Path, name: str) -> Path:
+def scene_file(root: Path, name: str, *, remedy: str = "To make one: docs/add-a-scene.md.") -> Path:
     """Return the file of a scene; raise `ParamsError` if there is none."""
     known = scene_names(root)
     if name not in known:
-        remedy = f"Check the name, or create {SCENES}/{name}.yaml, for example with reskin add --like SCENE."
-        raise ParamsError(f"no scene {name}. The scenes are: {', '.join(known)}. {remedy}")
+        guess = did_you_mean(name, known)
+        raise ParamsError(f"no scene {name}.{guess} The scenes are: {', '.join(known)}. {remedy}")
     return root / SCENES / f"{name}.yaml"
 
 

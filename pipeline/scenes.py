@@ -13,7 +13,7 @@ from pipeline.stages import module_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.data.rows import Selection
 from reskin.data.splits import Split
-from reskin.errors import ParamsError
+from reskin.errors import ParamsError, did_you_mean
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Name, Recipe, Schedule
 from reskin.recordings.fault_policy import FaultPolicy
 
@@ -190,10 +190,10 @@ def check_scene(settings: Settings) -> Scene:
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
     """Check a scene's experiments and that it has the sections they need, but not the content of the sections."""
     for name, value in content.items():
-        if name not in {*Scene.model_fields, *SECTIONS}:
-            found = repr(value)[:80]
+        if name not in (known := {*Scene.model_fields, *SECTIONS}):
+            found, guess = repr(value)[:80], did_you_mean(name, sorted(known))
             raise ParamsError(
-                f"{where}: {name} is not a known parameter (its value: {found}). Correct or remove it there."
+                f"{where}: {name} is not a known parameter (its value: {found}). Correct or remove it there.{guess}"
             )
         if name in SECTIONS and not isinstance(value, dict):
             raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Correct it there.")

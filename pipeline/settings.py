@@ -13,7 +13,7 @@ from pydantic import Field
 
 from pipeline import PARAMS, PLAN, SCENES
 from reskin.config import Strict, parse, read_yaml
-from reskin.errors import ParamsError
+from reskin.errors import ParamsError, did_you_mean
 from reskin.models.recipe import HEADLINE, AdaptationWithBase, AugmentedRecipe, Name, Recipe
 from reskin.simulation.defaults import NOMINAL, SHARED
 
@@ -49,7 +49,7 @@ class Training(SectionWithRows):
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
-        return expand_variants(section, settings.row("recipes", take(section, "recipe", where)), where)
+        return expand_variants(section, settings.row("recipes", section, "recipe", where), where)
 
 
 class SectionWithTraining(SectionWithRows):
@@ -73,7 +73,7 @@ class Adaptations(SectionWithRows):
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
-        adaptation = settings.row("adaptations", take(section, "adaptation", where))
+        adaptation = settings.row("adaptations", section, "adaptation", where)
         section = expand_variants(section, adaptation | {"base": take(section, "base", where)}, where)
         known = sorted(settings.section(Training, "train_triplet").recipes)
         for name, recipe in section["recipes"].items():
@@ -124,12 +124,16 @@ class Settings:
             self.parsed[model, name] = parse(model, self.shared[name], name)
         return cast(Section, self.parsed[model, name])
 
-    def row(self, section: str, name: Any) -> dict[str, Any]:
-        """Return a named row of a shared section, such as a recipe; raise `ParamsError` if there is none."""
-        rows = self.shared[section]
+    def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
+        """Remove a key from a section and return the row of a shared section that it names, such as a recipe.
+
+        Raises `ParamsError`, which names `where` and the key, if the key or the row is missing.
+        """
+        name, rows = take(section, key, where), self.shared[shared]
         if not isinstance(name, str) or name not in rows:
+            rule = f"one of {', '.join(sorted(rows))} (section {shared} of {PARAMS})"
             raise ParamsError(
-                self.where, f"a row of {section}", f"one of {sorted(rows)}", repr(name), "Correct it there."
+                f"{where}.{key} must be {rule}; got {name!r}. Correct it there.{did_you_mean(name, rows)}"
             )
         return dict(rows[name])
 

@@ -4,6 +4,7 @@ A model of settings is frozen, allows no unknown keys and has few defaults; it i
 """
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from reskin.errors import ParamsError
+from reskin.errors import ParamsError, did_you_mean
 
 
 class Strict(BaseModel):
@@ -58,7 +59,9 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         if first["type"] == "value_error":  # parameters contradict each other: the rule names them and their values
             place = f"{where}: {name}" if first["loc"] else where
             raise ParamsError(f"{place}: {rule}. Correct it there.") from None
-        raise ParamsError(where, name, rule, got, "Correct it there.") from None
+        choices = re.findall("'([^']*)'", rule) if first["type"] == "literal_error" else []
+        guess = did_you_mean(first.get("input"), choices)
+        raise ParamsError(where, name, rule, got, f"Correct it there.{guess}") from None
 
 
 def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:

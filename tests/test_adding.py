@@ -233,7 +233,7 @@ def test_invalid_name_is_an_error(root, lab_file, tmp_path, name):
 def test_unknown_scene_is_an_error(root, lab_file):
     prepared = preparing.foreign(lab_file, "lab", labels(), {})
     assert_refused(
-        root, lambda: add.add(root, "smal", prepared, allow_copy=False), "no scene smal. The scenes are: .*small"
+        root, lambda: add.add(root, "smal", prepared, allow_copy=False), "no scene smal. Did you mean small?.* --like"
     )
 
 
@@ -242,7 +242,7 @@ def test_recording_cannot_join_a_simulated_scene(root, lab_file):
     assert_refused(
         root,
         lambda: add.add(root, "ci", prepared, allow_copy=False),
-        "source must be simulated, as scene ci is; got recorded",
+        "scene ci is simulated, but .* is recorded.* --scene NEW --like ini",
     )
 
 
@@ -353,6 +353,9 @@ def test_command_line_reports_a_scene_added_to_the_plan(root, lab_file, monkeypa
     monkeypatch.chdir(root)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     assert "added scene small to pipeline/plan.yaml" in run(root, "reskin", *arguments).stdout
+    taken = output_of([*arguments, "--layout", "table"])
+    assert "the name b_s_readings is taken in this scene" in taken
+    assert "It can be read with" not in taken
     again = output_of([*arguments, "--name", "again", "--board", "b2", "--skin", "s2", "--allow-copy"])
     assert "added small/again" in again
     assert "switched" not in again

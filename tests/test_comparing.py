@@ -5,7 +5,7 @@ import subprocess
 import pytest
 from typer.testing import CliRunner
 
-from pipeline import plan
+from pipeline import SCENES, plan
 from pipeline.cli import app
 from reskin import io
 
@@ -28,6 +28,8 @@ def checkout(tmp_path, monkeypatch):
     """Return a checkout with a committed accuracy of 80 %."""
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
+    for name in ("quick", "lab"):
+        io.write_text(tmp_path / SCENES / f"{name}.yaml", "")
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for arguments in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"], ["tag", "first"]):
         subprocess.run(["git", *arguments], cwd=tmp_path, check=True)
@@ -109,6 +111,7 @@ def test_folder_or_file_can_replace_the_revision(checkout, where):
     [
         (["quick", "--against", "nowhere"], "git revision nowhere has no reports/quick/numbers.json"),
         (["quick", "--against", "reports"], None), (["lab"], "reports/lab/numbers.json: file not found"),
+        (["zzz"], "no scene zzz. The scenes are: lab, quick"),
         (["quick", "--against", ".git"], ".git: no quick/numbers.json there"),
     ],
 )  # fmt: skip

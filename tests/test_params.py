@@ -26,16 +26,17 @@ def test_params_and_plan_are_valid():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sead": 3}, "scene.yaml: sead is not a known parameter .its value: 3"),
+        ({"sead": 3}, "scene.yaml: sead is not a known parameter .its value: 3.*Did you mean seed"),
         ({"seed": "3"}, "scene.yaml: seed must be a valid integer; got '3'"),
         ({"seed": -1}, "seed must be greater than or equal to 0; got -1"),
-        ({"experiments": ["lobbo"]}, r"experiments.0 must be .*'lobo'.*; got 'lobbo'"),
+        ({"experiments": ["lobbo"]}, r"experiments.0 must be .*'lobo'.*; got 'lobbo'.*Did you mean lobo"),
+        ({"train_multi": TRAINING | {"recipe": "papr"}}, "train_multi.recipe must be .*Did you mean paper"),
         ({"experiments": []}, "experiments must"),
         ({"source": "simulated"}, "a scene has a section simulate if and only if its source is simulated"),
         ({"train_single": TRAINING}, "no experiment uses train_single of the scene"),
         ({"experiments": ["lobo", "transfer"], "train_single": TRAINING}, "split lacks transfer_skins_n"),
         ({"split": {"transfer_skins_n": 3}}, "no experiment uses transfer_skins_n of split"),
-        ({"train_multi": TRAINING | {"recipe": "other"}}, "a row of recipes must be one of .*; got 'other'"),
+        ({"train_multi": TRAINING | {"recipe": "other"}}, r"train_multi\.recipe must be one of .*; got 'other'"),
         (
             {"train_multi": TRAINING | {"steps_n": 0}},
             "train_multi: recipes.paper.steps_n must be greater than or equal to 1; got 0",
@@ -51,7 +52,7 @@ def test_params_and_plan_are_valid():
         ),
         ({"train_multi": TRAINING | {"variants": {"fast": 3}}}, "train_multi.variants: the variants must be a mapping"),
         ({"train_multi": TRAINING | {"recipes": {"a": {}}}}, "train_multi: unknown key recipes"),
-        ({"train_multi": TRAINING | {"recipe": ["paper"]}}, "a row of recipes must be one of"),
+        ({"train_multi": TRAINING | {"recipe": ["paper"]}}, r"train_multi\.recipe must be one of"),
     ],
 )
 def test_invalid_scene_names_the_parameter(changes, message):
@@ -198,7 +199,7 @@ def test_split_settings_match_experiments(experiment):
     [
         ({"audit": {"settings": "guessed"}}, "audit: settings must be 'chosen' or 'for speed'; got 'guessed'"),
         ({"adapt": ADAPTATIONS | {"pokes_n": 0}}, "adapt: pokes_n must be greater than or equal"),
-        ({"adapt": ADAPTATIONS | {"adaptation": "other"}}, "a row of adaptations must be one of .*; got 'other'"),
+        ({"adapt": ADAPTATIONS | {"adaptation": "other"}}, r"adapt\.adaptation must be one of .*; got 'other'"),
         ({"sweep_pokes": {"pokes_n": [], "boards_n": 1}}, "sweep_pokes: pokes_n must"),
         ({"sweep_pokes": {"pokes_n": [8], "boards_n": 0}}, "sweep_pokes: boards_n must be greater than or equal to 1"),
     ],

@@ -148,6 +148,8 @@ def test_outdated_plan_is_an_error(tmp_path):
 def test_unknown_scene_is_an_error(tmp_path):
     with pytest.raises(ParamsError, match="no scene three. The scenes are: one, two"):
         plan.use(checkout(tmp_path), ["three"])
+    with pytest.raises(ParamsError, match="no scene tow. Did you mean two"):
+        plan.scene_file(tmp_path, "tow")
 
 
 def simulated_checkout(tmp_path, **changes):

@@ -6,6 +6,7 @@ import subprocess
 import pytest
 from typer.testing import CliRunner
 
+from pipeline import SCENES
 from pipeline.cli import app
 from pipeline.manage import verify
 from reskin import io
@@ -24,6 +25,8 @@ def checkout(tmp_path, monkeypatch):
     """Return a checkout with a committed accuracy of 80 %."""
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
+    for name in ("quick", "lab"):
+        io.write_text(tmp_path / SCENES / f"{name}.yaml", "")
     io.write_text(tmp_path / "data/captures.yaml", "captures: {}\n")
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for arguments in (["init", "-q"], ["add", "."], [*author, "commit", "-qm", "x"]):
@@ -75,6 +78,7 @@ def test_rerun_starts_from_the_commit_and_is_kept(checkout, monkeypatch):
     ("arguments", "message"),
     [
         (["lab"], "has no reports/lab/numbers.json"),
+        (["zzz"], "no scene zzz. The scenes are: lab, quick"),
         (["quick", "--against", "data"], "data: no quick/numbers.json there"),
     ],
 )

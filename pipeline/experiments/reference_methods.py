@@ -75,9 +75,9 @@ class ReferenceMethods(SectionWithRows):
 
     @classmethod
     def expand(cls, section: Row, settings: Settings, where: str) -> Row:
-        recipe = settings.row("recipes", take(section, "recipe", where))
+        recipe = settings.row("recipes", section, "recipe", where)
         recipe |= {"inputs": take(section, "inputs", where), "steps_n": take(section, "steps_n", where)}
-        methods = settings.row("methods", take(section, "methods", where))
+        methods = settings.row("methods", section, "methods", where)
         return section | {"recipe": recipe, "methods": methods}
 
 

@@ -15,7 +15,7 @@ from pipeline.manage.running import require_idle
 from pipeline.scenes import Scene, read_plan, read_scene, read_shared
 from pipeline.stage import say
 from reskin import config, io
-from reskin.errors import CaptureError, ReskinError
+from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.header import STREAM_FILE, Header, write_capture
 from reskin.recordings.ingest import check_losses, open_capture
@@ -32,11 +32,12 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
     """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; undo all on failure."""
     require_idle(root)
     header, files = prepared
-    settings = read_scene(root, plan.scene_file(root, scene).stem)
+    settings = read_scene(root, plan.scene_file(root, scene, remedy="To create it, give --like ini too.").stem)
     if settings.source != header.source:
-        remedy = "Simulated and recorded captures belong to different scenes."
-        rule = f"{settings.source}, as scene {scene} is"
-        raise CaptureError(f"capture {header.capture}", "source", rule, header.source, remedy)
+        remedy = "Choose a scene of the same source"
+        if header.source == "recorded":
+            remedy += ", or create one: --scene NEW --like ini"
+        raise ParamsError(f"scene {scene} is {settings.source}, but {header.capture} is {header.source}. {remedy}.")
     shared, before = read_shared(root / PARAMS), read_registry(root)
     target = root / RAW / scene / header.capture
     _check_free(target, header.capture in before.captures.get(scene, {}))
@@ -68,11 +69,11 @@ def remove(root: Path, scene: str, capture: str) -> None:
 
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
-        remedy = "If it is the same recording, nothing is to be done. Otherwise choose another --name."
-        raise CaptureError(f"the name {target.name} is taken in this scene. {remedy}")
+        remedy = "Is it the same recording? Then nothing is left to do. If not, choose another --name."
+        raise ParamsError(f"the name {target.name} is taken in this scene. {remedy}")
     if target.exists():
         remedy = "It is in no scene: `reskin add` was killed there. Delete the folder, or choose another --name."
-        raise CaptureError(f"{target}: the folder exists already. {remedy}")
+        raise ParamsError(f"{target}: the folder exists already. {remedy}")
 
 
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
@@ -165,6 +166,7 @@ def _track(folder: Path, root: Path) -> None:
 
     try:
         with Repo(str(root)) as repo:
+            repo.scm_context.quiet = True  # else DVC says how to stage files with git
             repo.add([str(folder)])
     except (DvcException, OSError) as error:
         reason = " ".join(str(error).split())[-300:]

@@ -15,6 +15,7 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline import plan
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
@@ -183,6 +184,7 @@ def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
     try:
         folder = root / "reports" / scene
         if not (folder / "numbers.json").exists():
+            plan.scene_file(root, scene)
             remedy = f"Try: reskin scenes use {scene}, then dvc repro."
             raise SchemaError(f"{folder / 'numbers.json'}: file not found. {remedy}")
         committed = read_folder(Path(against), scene) if Path(against).exists() else read_revision(root, scene, against)
@@ -210,7 +212,7 @@ def read_revision(root: Path, scene: str, revision: str) -> Report:
     listed = _git(root, "ls-tree", "-r", "--name-only", revision, f"{folder}/") if which("git") else ""
     names = [name for name in listed.splitlines() if name.endswith((".json", ".csv"))]
     if f"reports/{scene}/numbers.json" not in names:
-        remedy = "Try: reskin compare SCENE --against REVISION-OR-FOLDER."
+        remedy = f"Commit reports/{scene} first. `reskin compare --against` takes another revision, or a folder."
         raise SchemaError(f"git revision {revision} has no reports/{scene}/numbers.json. {remedy}")
     commit = _git(root, "log", "-1", "--format=%h", revision, "--", folder).strip()
     texts = {name.removeprefix(f"reports/{scene}/"): _git(root, "show", f"{revision}:./{name}") for name in names}

@@ -6,7 +6,7 @@ from ruamel.yaml import YAML
 
 from reskin import io
 from reskin.config import Strict, parse, read_yaml
-from reskin.errors import CaptureError
+from reskin.errors import CaptureError, did_you_mean
 from reskin.recordings.header import Header
 
 REGISTRY = "data/captures.yaml"
@@ -70,7 +70,10 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
     """Return the registry without a capture, and without its scene if no capture of it is left."""
-    captures = registry.captures.get(scene, {})
+    if scene not in registry.captures:
+        guess, known = did_you_mean(scene, registry.captures), ", ".join(sorted(registry.captures)) or "none"
+        raise CaptureError(f"no scene {scene} has recorded captures.{guess} Scenes that have some: {known}.")
+    captures = registry.captures[scene]
     if capture not in captures:
         known = ", ".join(sorted(captures)) or "none"
         raise CaptureError(f"scene {scene} has no capture {capture}. Its captures: {known}.")

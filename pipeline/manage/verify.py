@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from pipeline import plan
 from pipeline.manage.add import RAW
 from pipeline.manage.compare import Echo, print_comparison, read_folder, read_revision
 from pipeline.manage.registry import REGISTRY
@@ -22,6 +23,8 @@ QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_T
 
 def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
     """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
+    for name in names:
+        plan.scene_file(root, name)
     committed = {name: read_revision(root, name, "HEAD") for name in names}  # first: the rerun takes hours
     if against is None:
         rerun(root, names)

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.executors import make_executor
-from pipeline.settings import Adaptations, Row, SectionWithRows, Settings, Training, take
+from pipeline.settings import Adaptations, Row, SectionWithRows, Settings, Training
 from pipeline.stage import say
 from pipeline.training import BEFORE_CONTACT_FILE
 from pipeline.training.before_contact import BY_TIME, score_before_contact
@@ -86,7 +86,7 @@ class ClassicalMethods(SectionWithRows):
 
     @classmethod
     def expand(cls, section: Row, settings: Settings, where: str) -> Row:
-        return section | {"methods": settings.row("methods", take(section, "methods", where))}
+        return section | {"methods": settings.row("methods", section, "methods", where)}
 
 
 def train_classical(

@@ -41,13 +41,13 @@ class FewLabels(SectionWithRows):
 
     @classmethod
     def expand(cls, section: Row, settings: Settings, where: str) -> Row:
-        base = settings.row("recipes", take(section, "recipe", where)) | {"steps_n": take(section, "steps_n", where)}
+        base = settings.row("recipes", section, "recipe", where) | {"steps_n": take(section, "steps_n", where)}
         adapting, labelling = dict(take(section, "adapting", where)), dict(take(section, "labelling", where))
         return section | {
             "recipes": {name: base | changes for name, changes in take(section, "recipes", where).items()},
-            "adapting": settings.row("adaptations", take(adapting, "adaptation", where)) | adapting,
-            "labelling": settings.row("labellings", take(labelling, "labelling", where)) | labelling,
-            "methods": settings.row("methods", take(section, "methods", where)),
+            "adapting": settings.row("adaptations", adapting, "adaptation", f"{where}.adapting") | adapting,
+            "labelling": settings.row("labellings", labelling, "labelling", f"{where}.labelling") | labelling,
+            "methods": settings.row("methods", section, "methods", where),
         }
 
     @model_validator(mode="after")

@@ -14,7 +14,7 @@ from typing import Any, get_args
 from reskin import io
 from reskin.board import stream
 from reskin.board.wire import TEXT_WIRES, Wire
-from reskin.errors import CaptureError, ReskinError
+from reskin.errors import CaptureError, ParamsError, ReskinError
 from reskin.recordings import ReaderLayout
 from reskin.recordings import header as headers
 from reskin.recordings.fault_policy import REFUSE_NONE
@@ -66,9 +66,14 @@ def parse_marks(texts: list[str]) -> Marks:
 
 @contextmanager
 def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
-    """Add to an error about a recording the layouts that it can be read in, unless `layout` is one of them."""
+    """Add to an error about a recording the layouts that it can be read in, unless `layout` is one of them.
+
+    A `ParamsError` is about names or options, and is passed on as it is.
+    """
     try:
         yield
+    except ParamsError:
+        raise
     except ReskinError as error:
         fitting = layouts_of(recording)
         if not fitting or layout in fitting:
@@ -141,7 +146,7 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
         marks_before = () if headers.PROBE_FILE in files else marks_before  # they belong to the log that is replaced
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
-        raise CaptureError(f"{recording}: the capture has no probe log. Add --probe PROBE.csv.")
+        raise CaptureError(f"{recording}: the capture has no labels. Add --probe PROBE.csv, or record with --labels.")
     for name, file in files.items():
         _need(file)
         if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
