@@ -5,6 +5,7 @@
 """
 
 import sys
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,7 +13,8 @@ import typer
 from typer import Argument, Option
 
 from pipeline import PLAN
-from reskin.cli import Wire
+from reskin.cli import MAINTENANCE, PIPELINE, RECORDINGS, Wire
+from reskin.errors import ParamsError
 from reskin.recordings import ReaderLayout
 
 if TYPE_CHECKING:
@@ -22,15 +24,16 @@ ROOT = Path()  # of the checkout
 
 app = typer.Typer()
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
-app.add_typer(scenes, name="scenes")
+app.add_typer(scenes, name="scenes", rich_help_panel=PIPELINE)
 
 Layout = Literal["capture", "serial-binary", "serial-text", ReaderLayout]
+LAYOUT = "Its format: table for a CSV of your own, capture for a folder of `record`; the others: data/README.md."
 Board = Annotated[str, Option(help="Name of the circuit board.")]
 Marks = Annotated[
     list[str] | None,
     Option(
-        help="Layouts capture, serial-*: STREAM_S,PROBE_S, the times of one event in the recording and in the "
-        "robot's log; may be repeated."
+        help="Layouts capture, serial-*: STREAM_S,PROBE_S, the time of one event in s on the stream's clock and on the "
+        "robot's; may be repeated."
     ),
 ]
 
@@ -42,18 +45,24 @@ def checked_plan() -> "Plan":
     return plan.check(ROOT)
 
 
-@app.command()
+@app.command(rich_help_panel=RECORDINGS)
 def add(
     recording: Annotated[Path, Argument(help="A file or a folder, depending on the layout.")],
-    layout: Annotated[Layout, Option(help="Format of the recording (see data/README.md).")],
+    layout: Annotated[Layout, Option(help=LAYOUT)],
     board: Board,
-    skin: Annotated[str, Option(help="Name of the skin; a skin belongs to one board.")],
+    skin: Annotated[str, Option(help="Name of the skin; a skin that moved to another board needs a new name.")],
     scene: Annotated[str, Option(help="Scene to add the recording to.")],
-    like: Annotated[str | None, Option(help="Create SCENE as a copy of this scene first.")] = None,
+    like: Annotated[
+        str | None, Option(help="If SCENE is new: copy the settings of this recorded scene (ini, lab, ...).")
+    ] = None,
     name: Annotated[str | None, Option(help="Name of the capture. Default: made from board and skin.")] = None,
     probe: Annotated[Path | None, Option(help="Layouts capture, serial-*: log of the robot (CSV).")] = None,
-    chips_n: Annotated[int, Option("--chips", help="Layouts serial-*: chips in a frame.", min=1, max=64)] = 5,
-    rate_hz: Annotated[float, Option("--rate-hz", help="Layouts serial-*: frames per second.")] = 400.0,
+    chips_n: Annotated[
+        int | None, Option("--chips", help="Layouts serial-*: chips in a frame. Default: 5.", min=1, max=64)
+    ] = None,
+    rate_hz: Annotated[
+        float | None, Option("--rate-hz", help="Layouts serial-*: frames per second. Default: 400.")
+    ] = None,
     wire: Annotated[
         Wire | None,
         Option(help="Layouts serial-*: wire format. Default: binary for serial-binary, text-xyzt for serial-text."),
@@ -61,12 +70,14 @@ def add(
     mark: Marks = None,
     rows_late: Annotated[
         int | None,
-        Option(help="Layout ini: number of rows by which fields lag behind labels. Default: detected.", min=0, max=5),
+        Option(help="Layout ini: by how many rows the fields come after the labels. Default: detected.", min=0, max=5),
     ] = None,
-    force_axis: Annotated[Literal["x", "y", "z"], Option(help="Layout eflesh: direction of the force gauge.")] = "z",
+    force_axis: Annotated[
+        Literal["x", "y", "z"] | None, Option(help="Layout eflesh: direction of the force gauge. Default: z.")
+    ] = None,
     allow_copy: Annotated[
         bool,
-        Option("--allow-copy", help="Add it even if the scene has the same readings under another board or skin."),
+        Option("--allow-copy", help="Accept readings that the scene already has under another board or skin."),
     ] = False,
 ) -> None:
     """Add a recording to a scene. The next `dvc repro` uses it."""
@@ -75,6 +86,15 @@ def add(
     from pipeline.scenes import read_plan
     from reskin.recordings import preparing
 
+    serial, native = {"serial-binary", "serial-text"}, {"capture", "serial-binary", "serial-text"}
+    _check_options(
+        layout,
+        {
+            "--probe": (probe, native), "--mark": (mark, native), "--chips": (chips_n, serial),
+            "--rate-hz": (rate_hz, serial), "--wire": (wire, serial), "--rows-late": (rows_late, {"ini"}),
+            "--force-axis": (force_axis, {"eflesh"}),
+        },
+    )  # fmt: skip
     names, marks = preparing.CaptureNames(board, skin, name), preparing.parse_marks(mark or [])
     running = read_plan(ROOT / PLAN).scenes
     with plan.scene_copy(ROOT, scene, like), preparing.suggesting_layout(recording, layout):
@@ -82,24 +102,33 @@ def add(
             prepared = preparing.native(recording, names, probe, marks)
         elif layout == "serial-binary" or layout == "serial-text":
             usual: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
-            prepared = preparing.dump(recording, names, preparing.Dump(wire or usual, chips_n, rate_hz, probe, marks))
+            what = preparing.Dump(wire or usual, chips_n or 5, 400.0 if rate_hz is None else rate_hz, probe, marks)
+            prepared = preparing.dump(recording, names, what)
         else:
-            options = {"force_axis": str(force_axis)} if layout == "eflesh" else {}
+            options = {"force_axis": str(force_axis or "z")} if layout == "eflesh" else {}
             options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
             prepared = preparing.foreign(recording, layout, names, options)
         header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
-    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); now: dvc repro (or: report@{scene})")
+    typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); next: dvc repro report@{scene}")
     if scene not in running:
         typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(running) or 'none'})")
 
 
-@app.command()
+def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) -> None:
+    """Raise for an option that is given although only other layouts use it; `options` has values and layouts."""
+    for option, (value, layouts) in options.items():
+        if value not in (None, []) and layout not in layouts:
+            used = " and ".join(sorted(layouts))
+            raise ParamsError(f"{option} is only for --layout {used}, not {layout}. Omit {option}.")
+
+
+@app.command(rich_help_panel=RECORDINGS)
 def fetch(
     source: Annotated[str | None, Argument(help="lab, ini, eflesh or eflash7. Default: list these sources.")] = None,
     origin: Annotated[
-        str | None, Option("--from", help="Git mirror, or folder of the files, to read instead of the source's home.")
+        str | None, Option("--from", help="Take the files from this git mirror or folder instead of the origin.")
     ] = None,
-    yes: Annotated[bool, Option("--yes", help="Do not ask before fetching data that have no licence.")] = False,
+    yes: Annotated[bool, Option("--yes", help="Agree, without being asked, to use data that has no licence.")] = False,
 ) -> None:
     """Fetch public recordings, verify them, and add them to their scene."""
     from pipeline.manage import fetch as fetching
@@ -110,19 +139,19 @@ def fetch(
     fetching.fetch(ROOT, source, origin, agree=agree, say=typer.echo)
 
 
-@app.command()
+@app.command(rich_help_panel=RECORDINGS)
 def remove(
-    scene: Annotated[str, Argument(help="Scene that the capture belongs to.")],
-    capture: Annotated[str, Argument(help="Name of the capture.")],
+    scene: Annotated[str, Argument(help="Scene of the capture.")],
+    capture: Annotated[str, Argument(help="Name of the capture, as in data/captures.yaml.")],
 ) -> None:
     """Remove a recorded capture from a scene."""
     from pipeline.manage import add as adding
 
     adding.remove(ROOT, scene, capture)
-    typer.echo(f"removed {scene}/{capture}; now: dvc repro")
+    typer.echo(f"removed {scene}/{capture}; next: dvc repro")
 
 
-@app.command()
+@app.command(rich_help_panel=MAINTENANCE)
 def merge() -> None:
     """Resolve conflicts in captures, plan, dvc.lock and reports after a git merge of two people's recordings."""
     from pipeline.manage import merge as merging
@@ -130,9 +159,9 @@ def merge() -> None:
     typer.echo(merging.merge(ROOT))
 
 
-@app.command()
+@app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write to MLflow the training runs and reports that are missing there, of the scenes that `dvc repro` runs."""
+    """Write to MLflow the training runs and reports that it lacks, after it was deleted or could not be reached."""
     from pipeline.scenes import read_scene
     from pipeline.stages.report import read_curves
     from pipeline.tracking import publish as write
@@ -149,25 +178,25 @@ def publish() -> None:
         typer.echo(f"{name}: MLflow runs {counts}")
 
 
-@app.command()
+@app.command(rich_help_panel=PIPELINE)
 def compare(
     scene: Annotated[str | None, Argument(help="Name of a scene. Default: all that `dvc repro` runs.")] = None,
-    against: Annotated[str, Option(help="Git revision, or folder, of the reports to compare with.")] = "HEAD",
+    against: Annotated[str, Option(help="Compare with the reports of this git revision or folder.")] = "HEAD",
 ) -> None:
-    """Compare fresh reports with the committed ones; exit status 1 if any value differs."""
+    """Compare the reports in reports/ with the committed ones; exit status 1 if any value differs."""
     from pipeline.manage.compare import compare_scene
 
     names = [scene] if scene else checked_plan().scenes
     sys.exit(max((compare_scene(ROOT, name, against, typer.echo) for name in names), default=0))
 
 
-@app.command()
+@app.command(rich_help_panel=PIPELINE)
 def verify_reports(
     names: Annotated[
         list[str] | None, Argument(metavar="[SCENE]...", help="Default: all scenes that `dvc repro` runs.")
     ] = None,
     against: Annotated[
-        Path | None, Option(help="Folder with the reports of an earlier rerun, to compare without running again.")
+        Path | None, Option(help="Do not run: compare the reports of an earlier rerun in this folder with the commit.")
     ] = None,
 ) -> None:
     """Rerun scenes in a fresh clone of the last commit; exit status 1 if any value of their reports differs."""
@@ -176,7 +205,7 @@ def verify_reports(
     sys.exit(verify(ROOT, names or list(checked_plan().scenes), against, typer.echo))
 
 
-@app.command()
+@app.command(rich_help_panel=MAINTENANCE)
 def check_cache() -> None:
     """Verify the files in DVC's cache and move damaged ones aside; `dvc repro` then makes them again."""
     from pipeline.manage import cache
@@ -184,7 +213,7 @@ def check_cache() -> None:
     sys.exit(cache.check(ROOT, typer.echo))
 
 
-@app.command()
+@app.command(rich_help_panel=MAINTENANCE)
 def readme(
     check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if they are out of date.")] = False,
 ) -> None:
@@ -209,7 +238,7 @@ def list_scenes() -> None:
 
 
 @scenes.command()
-def use(names: Annotated[list[str], Argument(help="Names of all scenes to run.")]) -> None:
+def use(names: Annotated[list[str], Argument(help="Scenes to run; they replace the current ones.")]) -> None:
     """Set the scenes that `dvc repro` runs."""
     from pipeline import plan
     from pipeline.manage import tidy as tidying
@@ -222,7 +251,7 @@ def use(names: Annotated[list[str], Argument(help="Names of all scenes to run.")
 
 @scenes.command()
 def tidy() -> None:
-    """Remove the output files of experiments that the scenes no longer run."""
+    """Delete the results of experiments that no scene runs any more."""
     from pipeline.manage import tidy as tidying
 
     stale = tidying.tidy(ROOT, checked_plan())
@@ -234,5 +263,9 @@ def tidy() -> None:
 
 @scenes.command()
 def check() -> None:
-    """Check the scenes in the plan and params.yaml, and that the plan is up to date."""
-    checked_plan()
+    """Check the scenes that run, params.yaml, and that pipeline/plan.yaml, the list of what runs, is up to date."""
+    typer.echo(f"{PLAN} is up to date; scenes: {', '.join(checked_plan().scenes) or 'none'}")
+
+
+# Help shows the groups of commands in the order of their first commands.
+app.registered_commands.sort(key=lambda one: one.rich_help_panel == MAINTENANCE)

@@ -23,6 +23,13 @@ CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`, listed here for help and er
     "add", "check-cache", "compare", "fetch", "merge", "publish", "readme", "remove", "scenes", "verify-reports",
 )  # fmt: skip
 
+BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (
+    "Board",
+    "Recordings",
+    "Pipeline",
+    "Maintenance",
+)  # groups of commands in help
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
@@ -34,10 +41,20 @@ app = typer.Typer(
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
 SOURCE = "A capture's folder, nominal (a simulated skin), or the YAML file of a simulated scene."
-ON_FAULT = "NAME=drop|flag|refuse: what to do with readings that have a fault, such as stuck=flag. May be repeated."
+ON_FAULT = (
+    "NAME=flag keeps the estimates of readings with that fault, such as stuck=flag; NAME=drop hides them. May be "
+    "repeated. Names: params.yaml, section faults."
+)
 LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM, to be prompted for places; or a CSV that a robot's program appends to."
+SCAN = (
+    "Order in which places are pressed. With prompts (--labels grid, line): random (default) or snake; otherwise any "
+    "note, which is kept in the header."
+)
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
-FAULT = "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. An unknown name lists all names."
+FAULT = (
+    "NAME[@START_S[+SECONDS]], such as stuck@3+1; may be repeated. Names: failed-read, zeros, chip-reset, stuck, "
+    "saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
+)
 MODEL = "A trained model (.safetensors with its JSON card) or a saved calibration. Default: the universal model."
 LOG = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, or a file of `decode`."
 
@@ -64,7 +81,7 @@ def add_checkout_commands() -> None:
     if (here / "dvc.yaml").is_file() and (here / "pipeline/cli.py").is_file():
         sys.path.insert(0, str(here))
         app.add_typer(importlib.import_module("pipeline.cli").app)
-        app.info.epilog = None
+        app.info.epilog = "Stages of dvc.yaml: python -m pipeline STAGE --scene NAME ..."
     elif sys.argv[1:2] and sys.argv[1] in CHECKOUT_COMMANDS:
         raise ParamsError(
             f"reskin {sys.argv[1]} works in a checkout of the project, a folder with dvc.yaml and pipeline/; {here} is "
@@ -87,7 +104,7 @@ def common_options(
     """Declare the options that come before a command."""
 
 
-@app.command("ports")
+@app.command("ports", rich_help_panel=BOARD)
 def find_ports(
     names: Annotated[list[str] | None, Argument(help="Ports to listen to. Default: all ports of this machine.")] = None,
     hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in.")] = False,
@@ -99,12 +116,12 @@ def find_ports(
         typer.echo(found)
 
 
-@app.command()
+@app.command(rich_help_panel=RECORDINGS)
 def template(
     out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
     chips_n: Chips = 5,
 ) -> None:
-    """Write the header line of a recording in layout `table`; data/README.md says which columns are optional."""
+    """Write an empty CSV for a recording of your own (layout `table`). Add one row per reading; see data/README.md."""
     from reskin import io
     from reskin.recordings.readers.table import NEEDED, columns_of
 
@@ -114,7 +131,7 @@ def template(
     typer.echo(f"wrote {out}; required: {', '.join(NEEDED)} and fields in uT. Then: reskin add --layout table")
 
 
-@app.command()
+@app.command(rich_help_panel=BOARD)
 def record(
     port: Annotated[
         str | None, Option(help="/dev/ttyACM0, COM3 or socket://host:port. Default: the only connected board.")
@@ -122,14 +139,18 @@ def record(
     board: Annotated[str | None, Option(help="Name of the circuit board; can be given later, to `reskin add`.")] = None,
     skin: Annotated[str | None, Option(help="Name of the skin; can be given later, to `reskin add`.")] = None,
     out: Annotated[Path | None, Option(help="New folder for the capture. Default: captures/DATE-TIME.")] = None,
-    wire: Annotated[Wire | None, Option(help="Wire format of --port. Default: binary.")] = None,
-    chips_n: Annotated[int | None, Option("--chips", help="Number of chips. Default: 5.", min=1, max=64)] = None,
+    wire: Annotated[Wire | None, Option(help="With --port: wire format. Default: binary.")] = None,
+    chips_n: Annotated[
+        int | None, Option("--chips", help="With --port: number of chips. Default: 5.", min=1, max=64)
+    ] = None,
     baud: Annotated[int, Option(help="Baud rate; USB ports ignore it.", min=1)] = 115200,
     seconds: Annotated[float, Option(help="Duration. Default: until Ctrl-C.", min=0.0)] = math.inf,
-    scan: Annotated[str | None, Option(help="Order of the places: random, snake, or a description.")] = None,
+    scan: Annotated[str | None, Option(help=SCAN)] = None,
     labels: Annotated[str | None, Option(help=LABELS)] = None,
     gauge: Annotated[str | None, Option(help=GAUGE)] = None,
-    dwell_s: Annotated[float, Option("--dwell", help="Seconds for which a prompted label is valid.", min=0.1)] = 1.0,
+    dwell_s: Annotated[
+        float, Option("--dwell", help="Seconds after Enter for which the label is valid.", min=0.1)
+    ] = 1.0,
 ) -> None:
     """Record what a board sends, with labels if requested; `reskin add` can add labels from a robot's log later."""
     from reskin.board.find import DetectedBoard, find_board
@@ -137,6 +158,10 @@ def record(
 
     source = label_source(labels, gauge, scan, dwell_s=dwell_s, say=typer.echo)
     if port is None:
+        if wire is not None or chips_n is not None:
+            raise ParamsError(
+                "--wire and --chips describe the board on --port. Add --port, or omit them to detect both."
+            )
         found = find_board()
         typer.echo(str(found))
     else:
@@ -149,7 +174,7 @@ def record(
         raise typer.Exit(2)
 
 
-@app.command()
+@app.command(rich_help_panel=BOARD)
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
     port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
@@ -176,13 +201,15 @@ def emulate(
         emulated.unplug()
 
 
-@app.command()
+@app.command(rich_help_panel=BOARD)
 def live(
     port: Annotated[list[str] | None, Option(help="Port of a board; may be repeated. Default: all boards.")] = None,
     model: Annotated[list[Path] | None, Option(help=f"{MODEL} Several models are averaged.")] = None,
     replay: Annotated[str | None, Option(help="Instead of a board: the folder of a capture.")] = None,
     emulate: Annotated[str | None, Option(help="Instead of a board: nominal, or a simulated scene's YAML.")] = None,
-    host: Annotated[str, Option(help="Address to listen on; other machines need a token to connect.")] = "127.0.0.1",
+    host: Annotated[
+        str, Option(help="Address to listen on. 0.0.0.0 serves other machines; the printed address then has a token.")
+    ] = "127.0.0.1",
     http_port: Annotated[int, Option(help="Port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
 ) -> None:
@@ -211,7 +238,7 @@ def live(
         serve(sessions, host=host, http_port=http_port, say=typer.echo)
 
 
-@app.command()
+@app.command(rich_help_panel=RECORDINGS)
 def decode(
     stream: Annotated[Path, Argument(help="A file with the bytes that a port sent.")],
     out: Annotated[Path, Option(help="The Parquet file to write.")],
@@ -227,14 +254,16 @@ def decode(
     typer.echo(f"decoded {out}: " + ", ".join(f"{key} {count}" for key, count in account.items()))
 
 
-@app.command()
+@app.command(rich_help_panel=RECORDINGS)
 def predict(
     log: Annotated[Path, Argument(help=LOG)],
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
     model: Annotated[Path | None, Option(help=MODEL)] = None,
-    rate_hz: Annotated[float, Option("--rate-hz", help="Frame rate of a decoded file without a clock.")] = 400.0,
+    rate_hz: Annotated[
+        float, Option("--rate-hz", help="Frames per second of a `decode` file without a clock.")
+    ] = 400.0,
 ) -> None:
-    """Turn a log into contacts, places and forces. The log must begin with a second without contact."""
+    """Turn a log into contacts, places and forces. The log must begin with 0.5 s or more without contact."""
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 

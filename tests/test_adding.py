@@ -349,10 +349,27 @@ def output_of(arguments: list[str]) -> str:
     return str(done.exception) if isinstance(done.exception, ReskinError) else done.stdout
 
 
+@pytest.mark.parametrize(
+    ("layout", "option", "used"), [("table", "--chips=4", "serial-binary"), ("lab", "--rows-late=0", "ini")]
+)
+def test_options_of_another_layout_are_refused(root, lab_file, monkeypatch, layout, option, used):
+    monkeypatch.chdir(root)
+    arguments = ["add", str(lab_file), "--layout", layout, "--board", "b", "--skin", "s", "--scene", "small", option]
+    assert_refused(root, lambda: app_raising(arguments), f"{option.partition('=')[0]} is only for --layout .*{used}")
+
+
+def app_raising(arguments: list[str]) -> None:
+    raise CliRunner().invoke(app, arguments).exception
+
+
 def test_command_line_reports_a_scene_added_to_the_plan(root, lab_file, monkeypatch):
     monkeypatch.chdir(root)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
-    assert "added scene small to pipeline/plan.yaml" in run(root, "reskin", *arguments).stdout
+    done = run(root, "reskin", *arguments)
+    assert "next: dvc repro report@small" in done.stdout
+    assert "added scene small to pipeline/plan.yaml" in done.stdout
+    assert "dvc config" not in done.stdout + done.stderr
+    assert "is up to date; scenes: small" in output_of(["scenes", "check"])
     taken = output_of([*arguments, "--layout", "table"])
     assert "the name b_s_readings is taken in this scene" in taken
     assert "It can be read with" not in taken

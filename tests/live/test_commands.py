@@ -7,7 +7,8 @@ import pytest
 
 from reskin import cli as commands
 from reskin.board import find
-from reskin.live.emulator import inject, parse_fault
+from reskin.errors import ParamsError
+from reskin.live.emulator import FAULTS, inject, parse_fault
 from reskin.recordings.header import HEADER_FILE, STREAM_FILE, parse
 from tests.live.boards import make_script, plugged_in
 
@@ -42,6 +43,16 @@ def test_record_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
     with plugged_in(inject(make_script(), parse_fault("failed-read@0+99")), loop=True) as name:
         commands.record(port=name, seconds=1.5, out=tmp_path / "run1", **NO_OPTIONS)
     assert "; chip 1: failed I2C reads (" in capsys.readouterr().out
+
+
+def test_wire_and_chips_need_a_port(tmp_path):
+    for options in ({"wire": "binary"}, {"chips_n": 4}):
+        with pytest.raises(ParamsError, match="--wire and --chips .* --port"):
+            commands.record(None, seconds=0.5, out=tmp_path / "run1", **(UNTOLD | options))
+
+
+def test_help_lists_all_faults():
+    assert all(f" {name}" in commands.FAULT for name in FAULTS)
 
 
 def test_live_without_options_shows_all_boards(monkeypatch):
