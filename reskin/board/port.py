@@ -31,10 +31,12 @@ def open_port(port: str, baud: int) -> Device:
     try:
         device = serial.serial_for_url(port, baud, timeout=READ_TIMEOUT_s, exclusive=None if "://" in port else True)
     except (OSError, ValueError) as error:
-        reason = {
-            errno.ENOENT: f"no such port. {found_ports()}",
-            errno.EAGAIN: "another program uses it (reskin live, a serial monitor?). Close that program.",
-        }.get(error.errno if isinstance(error, OSError) else None, f"{error}. {found_ports()}")
+        number = error.errno if isinstance(error, OSError) else None
+        reason = f"{error}. {found_ports()}"
+        if number == errno.ENOENT:
+            reason = f"no such port. {found_ports()}"
+        elif number == errno.EAGAIN:
+            reason = "another program uses it (reskin live, a serial monitor?). Close that program."
         raise CaptureError(f"{port}: cannot open the port: {reason}") from None
     if not isinstance(device, serial.Serial):
         device.timeout = 0

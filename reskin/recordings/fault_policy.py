@@ -71,7 +71,7 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
         if action not in allowed:
             if allowed:
                 raise ParamsError(where, name, " or ".join(allowed), repr(action)[:40], f"Try: {name}={allowed[0]}")
-            guess = did_you_mean(name, FaultPolicy.model_fields)
+            guess = did_you_mean(name, FaultPolicy.model_fields).replace("?", f"={action}?")
             names = ", ".join(FaultPolicy.model_fields)
             raise ParamsError(
                 f"{where}: {repr(text)[:40]} is not NAME=drop|flag|refuse with a known fault.{guess} Faults: {names}"

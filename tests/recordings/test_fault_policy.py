@@ -128,7 +128,7 @@ def test_policy_applies_to_table_rows():
 def test_invalid_overrides_are_refused():
     wrong = {
         "melted=drop": "Faults: .*stuck",
-        "stuk=flag": "Did you mean stuck",
+        "stuk=flag": "Did you mean stuck=flag",
         "torn=flag": "torn must be drop or refuse; got 'flag'",
         "stuck": "stuck must be drop or flag or refuse; got ''. Try: stuck=drop",
     }

@@ -125,8 +125,8 @@ def _header_fault(names: list[str]) -> str:
     wanted = column_names(len(names) // len(CHIP_COLUMNS) + 1)
     rule = f"{','.join(column_names(1))}, then T1 and so on"
     if tables.is_number(names[0]):
-        chips_n = max((len(names) - 1) // len(CHIP_COLUMNS), 1)
-        whole = f": {','.join(column_names(chips_n))}" if chips_n <= SHOWN_CHIPS_MAX else ""
+        chips_n, left_n = divmod(len(names) - 1, len(CHIP_COLUMNS))
+        whole = f": {','.join(column_names(chips_n))}" if not left_n and 0 < chips_n <= SHOWN_CHIPS_MAX else ""
         return f"line 1 has numbers, not the column names {rule}. If this is a board's log, add this line on top{whole}"
     if ";" in names[0]:
         return "semicolons in line 1. Export it with commas between columns and points in numbers."
