@@ -303,8 +303,8 @@ class Universal:
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and condition the map on it.
 
-        Earlier presses are discarded, unless `keep` is set: use this for the same skin after drift. The model is changed
-        in place and returned.
+        Earlier presses are discarded, unless `keep` is set: use this for the same skin after drift. The model is
+        changed in place and returned.
 
         Raises
         ------
