@@ -84,7 +84,7 @@ def restoring(*files: Path) -> Iterator[None]:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and those around it, if missing; raise `SchemaError` if that is impossible."""
+    """Create a folder and its parents if they are missing; raise `SchemaError` if that is impossible."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileNotFoundError, FileExistsError, NotADirectoryError) as error:  # /proc, a missing drive, a file

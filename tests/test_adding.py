@@ -177,6 +177,15 @@ def test_invalid_mark_is_an_error(text):
         preparing.parse_marks([text])
 
 
+def test_capture_without_labels_is_an_error(tmp_path):
+    folder = tmp_path / "run1"
+    clock = Clock(kind="rate", rate_hz=400.0, marks=())
+    header = make_header(capture="run1", layout="native", wire="binary", chips_n=2, clock=clock)
+    write_capture(folder, header, {"stream.bin": encode(FRAMES, "binary")})
+    with pytest.raises(CaptureError, match="no labels. Add --probe .* or record with --labels"):
+        preparing.native(folder, labels(), None, ())
+
+
 def test_marks_are_added_to_the_clock(tmp_path):
     header, _ = preparing.native(native_folder(tmp_path / "run1"), labels(), None, preparing.parse_marks(["1.5,2e1"]))
     assert header.clock.marks == ((0.0, 0.0), (1.5, 20.0))

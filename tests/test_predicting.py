@@ -199,7 +199,7 @@ def test_a_missing_model_names_the_scene_that_trains_it(tmp_path, path, remedy):
         load_model(tmp_path / path)
 
 
-def test_files_that_are_no_model_raise_and_none_is_to_be_deleted(tmp_path, model):
+def test_wrong_model_file_is_an_error_without_advice_to_delete_it(tmp_path, model):
     (tmp_path / "net.pt").write_bytes(b"PK" + bytes(100))
     cases = {
         tmp_path / "net.pt": "not a trained model",

@@ -137,7 +137,7 @@ def test_page_is_announced_once_it_is_served(monkeypatch):
     assert re.search(r"open http://0.0.0.0:8765/\?token=.+; Ctrl-C", printed[0])
 
 
-def test_file_is_no_board(tmp_path):
+def test_file_as_port_is_an_error(tmp_path):
     (tmp_path / "log.csv").touch()
     with pytest.raises(CaptureError, match="log.csv: cannot open the port: it is a file"):
         open_sessions([str(tmp_path / "log.csv")], [], "a board")
