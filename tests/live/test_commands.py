@@ -48,7 +48,7 @@ def test_record_names_the_faulty_chip(tmp_path, monkeypatch, capsys):
 def test_wire_and_chips_need_a_port(tmp_path):
     for options in ({"wire": "binary"}, {"chips_n": 4}):
         with pytest.raises(ParamsError, match="--wire and --chips .* --port"):
-            commands.record(None, seconds=0.5, out=tmp_path / "run1", **(UNTOLD | options))
+            commands.record(None, seconds=0.5, out=tmp_path / "run1", **(NO_OPTIONS | options))
 
 
 def test_help_lists_all_faults():
