@@ -282,6 +282,7 @@ def test_last_bias_starts_at_the_mean_target(scaling):
 WITHOUT_INFLUENCE = {
     "code": "computes the digest of the code",
     "config": "checks settings, whose values are part of the key",
+    "display": "shows objects as text",
     "errors": "stops a training run, but changes no result",
     "io": "reads and writes files, whose values are part of the key",
     "numerics": "its signature of the environment is part of the key, as is the device",
