@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
-from pipeline.report.formatting import COLUMNS, OF_PAPER, show, show_difference, tabulate
+from pipeline.report.formatting import COLUMNS, PAPER_METRICS, show, show_difference, tabulate
 from pipeline.report.paper import FLEXIBLE, FLEXIBLE_BIAS, FLEXIBLE_GAP_LESS_PCT
 from pipeline.settings import Adaptations, Settings
 from pipeline.simulation import simulation_settings
@@ -191,7 +191,7 @@ def _line(title: str, numbers: Mapping[str, Any], name: str, source: str) -> dic
     paper = FLEXIBLE if name == "after" else {}
     for metric, column in COLUMNS.items():
         line[f"{column} (ours)"] = show(numbers[name].get(metric))
-        if metric in OF_PAPER:
+        if metric in PAPER_METRICS:
             line[f"{column} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
     line |= {"bias of F, N": show_difference(numbers["bias_f_N"][name])}
     line |= {"bias of F, %": show_difference(numbers["bias_f_pct"][name])}

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.experiments.results import read_captures, read_losses, write_results
-from pipeline.report.formatting import COLUMNS, OF_PAPER, Stat, gain, show, show_difference, tabulate
+from pipeline.report.formatting import COLUMNS, PAPER_METRICS, Stat, gain, show, show_difference, tabulate
 from pipeline.report.paper import GAINS, MANUAL, MANUAL_POKES_N
 from pipeline.settings import Adaptations, Settings
 from pipeline.statistics import VERDICTS, verdict
@@ -169,6 +169,6 @@ def _line(
     line = {"networks": title, "source": source}
     for metric, column in COLUMNS.items():
         line[f"{column} (ours)"] = cells[metric]
-        if metric in OF_PAPER:
+        if metric in PAPER_METRICS:
             line[f"{column} (paper)"] = f"{paper[metric]:g}" if metric in paper else "–"
     return line | {"n": str(ours["accuracy_pct"]["n"])}

@@ -22,7 +22,7 @@ from pipeline.experiments.detection import roc_area
 from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import write_results
 from pipeline.provenance import SECONDS
-from pipeline.report.formatting import COLUMNS, OF_FORCE, n_of, scores, show, show_difference, tabulate
+from pipeline.report.formatting import COLUMNS, FORCE_METRICS, n_of, scores, show, show_difference, tabulate
 from pipeline.settings import Row, SectionWithRows, Settings, take
 from pipeline.stage import say
 from pipeline.statistics import AS_LABELLED, REGISTERED, by_skin, over_boards, paired, statistic, tally, tidy
@@ -582,7 +582,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _line(row: Mapping[str, Any], source: str) -> dict[str, str]:
-    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in OF_FORCE}
+    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in FORCE_METRICS}
     line = {"method": row["method"], "unlabelled pokes": row["pokes"], "labels": str(row["labels_n"]), "source": source}
     line |= scores(row["as_labelled"]) | scores(row["registered"], places)
     over = row.get("over", {})

@@ -1,1 +1,1 @@
-"""Tables, figures and pages, made from the scores and numbers of a scene; nothing here uses models."""
+"""Tables, figures and pages of a scene, made from its scores and numbers; no module here uses models."""

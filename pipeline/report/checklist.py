@@ -1,7 +1,7 @@
-"""The checklist: each figure, table and numbered result of the paper beside ours, with a verdict on each claim.
+"""The checklist, which compares each result of the paper with ours and gives a verdict on each claim.
 
-Its rows are data: `checklist.yaml`, and `checklist` of each experiment's YAML file. The paper's numbers are constants
-of `pipeline.report.paper`.
+Its rows are read from `checklist.yaml` and from the entry `checklist` of each experiment's YAML file. The paper's
+numbers are constants of `pipeline.report.paper`.
 """
 
 import re
@@ -22,44 +22,45 @@ from reskin.errors import SchemaError
 
 FILE = Path(__file__).with_name("checklist.yaml")
 METRICS = {
-    "accuracy_pct": "accuracy", "mse_xy_mm2": "MSE of the place", "mse_f_N2": "MSE of the force",
+    "accuracy_pct": "accuracy", "mse_xy_mm2": "MSE of the position", "mse_f_N2": "MSE of the force",
     "mse_fxy_N2": "MSE of the shear force", "mse_fz_N2": "MSE of the normal force",
 }  # fmt: skip
 UNITS = {"pct": "%", "mm2": "mm²", "N2": "N²", "mm": "mm", "N": "N", "hz": "Hz"}
 CLAIM = "claim: "
 NEAR = 0.10  # assumed: relative tolerance where the paper gives no sd
-SIZEABLE = 0.5  # assumed: a sizeable difference is at least this part of the paper's own; below it, it is negligible
-SIGNIFICANT = 0.05  # convention: of p-values adjusted for the family of claims
-PLATEAU_POINTS = 1.0  # assumed: "seems to plateau"
+SIZEABLE = 0.5  # assumed: a difference is sizeable if it is at least this fraction of the paper's, else negligible
+SIGNIFICANT = 0.05  # convention: largest significant p-value, after adjustment for the family of claims
+PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a smaller difference than this
 NONE = "–"
 NOT_RUN = "not run in this scene"
 NOT_REACHED = "not reached in this scene"
-SHORT_OF = "not reached: "  # prefix of the note if ours did not go as far as the paper
-ONE_SKIN = "ours has one training skin: not comparable"
+SHORT_OF = "not reached: "  # prefix of a note: our experiment was smaller than the paper's
+ONE_SKIN = "our networks were trained on one skin each: not comparable"
 SETTING = "a setting of this scene, not a result"
-TARGET = "a calibration target of the simulated spreads: agreement is no evidence"
-EQUIVALENT = "equivalent to none within half of the paper's"
-NOT_POOLED = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")  # need several skins
-DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules about differences, which are shown with their sign
+TARGET = "an earlier simulated skin was calibrated to this number: agreement is not evidence"
+EQUIVALENT = "equivalent to no difference: the whole interval is nearer to 0 than half of the paper's difference"
+# Paths of results that are comparable with the paper only if networks were trained on several skins.
+NEEDS_POOLING = ("table2.multi.", "table2.triplet.", "table2.adapted.", "paired.", "contrasts.")
+DIFFERENCES = ("gain", "sizeable", "slight", "plateau")  # rules for differences, which are shown with a sign
 FAMILY = (
-    "The claims of section 5 about accuracy are one family, listed before any run (checklist.yaml, family): their "
-    "p-values (t over boards) are adjusted by Holm's method, and a claim is supported or contradicted only if its "
-    f"adjusted p is {SIGNIFICANT:g} or less. All other verdicts are unadjusted and exploratory. Sizeable: at least "
-    f"{100 * SIZEABLE:g} % of the paper's own difference; equivalent to none: the whole interval is nearer to 0 than "
-    "that."
+    "The claims of section 5 about accuracy form one family, which was listed before any run (`family` in "
+    "checklist.yaml). Their p-values (Student's t over boards) are adjusted by Holm's method. A claim of the family is "
+    f"supported or contradicted only if its adjusted p-value is {SIGNIFICANT:g} or less. All other verdicts are "
+    f"unadjusted and exploratory. A gain is sizeable if it is at least {100 * SIZEABLE:g} % of the paper's difference. "
+    "A difference is equivalent to no difference if its whole interval is nearer to 0 than that."
 )
 MEANING = (
-    f"Verdicts are on claims. {VERDICTS} {FAMILY} Other numbers have no verdict. Met: whether our mean meets the "
-    f"criterion. Slightly: less than {FEW_POINTS:g} points of accuracy up or down; a plateau: less than "
-    f"{PLATEAU_POINTS:g}. Reasons in notes are assumed: no run tested them. Where there is no number to compare, see "
-    "the file named last."
+    f"Only claims have a verdict. {VERDICTS} {FAMILY} Met: whether our mean meets the criterion. Slightly: the "
+    f"accuracy changes by less than {FEW_POINTS:g} percentage points. Plateau: it changes by less than "
+    f"{PLATEAU_POINTS:g}. The reasons in the notes are assumptions, which no run has tested. See file: there is no "
+    "single number to compare, and the result is in the tables or figures named in the column `shown in`."
 )
 CLAIMS_MEANING = f"{VERDICTS} {FAMILY}"
-NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # in a reason
+NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # in the text of a reason
 
 
 class Reach(Strict):
-    """How far the paper went (a constant of `pipeline.report.paper`), and how far ours did (a path in numbers.json)."""
+    """Size of the paper's experiment (a constant of `pipeline.report.paper`) and of ours (a path in numbers.json)."""
 
     paper: str
     ours: str
@@ -67,43 +68,51 @@ class Reach(Strict):
 
 
 class Row(Strict):
-    """One result: where it is in the paper, what the paper gives, and the path of our result in numbers.json.
+    """One result of the paper: its section, its number or words, and the path of our result in numbers.json.
 
-    Rules: `near`, our number is close to the paper's; `at_most`, `at_least`, `positive`, limits; `gain`, a paired
-    difference is an improvement; `sizeable`, it is an improvement of at least half of the paper's; `each`, all
-    differences of a list are improvements; `slight`, `plateau`, the difference is small; `finding`, the experiment
-    judges it; `view`, a figure to look at; `input`, a setting of simulated scenes; `setting`, a setting of all scenes;
-    `target`, in simulated scenes a calibration target.
+    The rule says how our result is judged:
+
+    - `near`: our number is close to the paper's.
+    - `at_most`, `at_least`, `positive`: our number is within a limit.
+    - `gain`: a paired difference is an improvement.
+    - `sizeable`: a paired difference is an improvement of at least half of the paper's difference.
+    - `each`: every paired difference in a list is an improvement.
+    - `slight`, `plateau`: a paired difference is small.
+    - `finding`: the experiment itself gives the verdict.
+    - `input`: like `near` in recorded scenes; not judged in simulated scenes, where the number is a setting.
+    - `target`: like `near`; in simulated scenes, a note says that the number was a calibration target.
+    - `setting`: not judged, because the number is a setting in every scene.
+    - `view`: not judged, because the result is a figure or table to look at.
     """
 
     id: str
     where: str
     what: str
-    paper: str | None = None  # a constant of `pipeline.report.paper`, its parts separated by dots
-    says: str | None = None  # the paper's words, where it gives no number
+    paper: str | None = None  # the dotted name of a constant of `pipeline.report.paper`
+    says: str | None = None  # the paper's words, if it gives no number
     ours: str | None = None
-    experiment: str | None = None  # the experiment behind `ours`, if it may lack this number in a small scene
+    experiment: str | None = None  # the experiment that computes `ours`, if it omits this number in small scenes
     rule: Literal[
         "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
         "setting", "target", "view",
     ] = "near"  # fmt: skip
-    family: bool = False  # one of the claims that are tested together: p-values are adjusted by Holm's method
+    family: bool = False  # whether the claim belongs to the family whose p-values are adjusted by Holm's method
     reach: Reach | None = None
-    only: Literal["recorded", "simulated"] | None = None  # the row is shown for scenes of this source alone
+    only: Literal["recorded", "simulated"] | None = None  # the only source whose scenes show the row
     stage: str | None = None
     shown: tuple[str, ...] = ()
-    why: str = ""  # a possible reason, shown where ours does not meet the criterion; {name} is replaced by that number
+    why: str = ""  # a possible reason, shown if our result misses the criterion; {name} becomes the number at that path
     why_simulated: str = ""  # the same, for simulated scenes only
 
     @property
     def metric(self) -> str:
-        """The last part of the path of ours."""
+        """The last part of the path `ours`."""
         return (self.ours or "").rsplit(".", 1)[-1]
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict on a claim, the criterion, whether our mean meets it, the adjusted p-value, and a note."""
+    """The verdict on a claim, its criterion, whether our mean meets it, the adjusted p-value, and notes."""
 
     verdict: str = NONE
     criterion: str = NONE
@@ -119,7 +128,7 @@ def read_rows() -> list[Row]:
 
 
 def _by_metric(entry: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    """Make a row for each metric that an entry of the file lists; an entry without metrics is one row."""
+    """Yield one row per metric of an entry; an entry that lists no metrics yields one row."""
     row = dict(entry)
     metrics = row.pop("metrics", None)
     if metrics is None:
@@ -130,13 +139,13 @@ def _by_metric(entry: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> pd.DataFrame:
-    """Tabulate every result of the paper beside ours, with the criterion by which ours is judged."""
+    """Tabulate every result of the paper beside ours, with the criterion by which our result is judged."""
     source = numbers["provenance"]["source"]
     rows = [row for row in (read_rows() if rows is None else rows) if row.only in (None, source)]
-    p_adjusted = family_p(numbers, rows)
+    p_adjusted = adjusted_p_values(numbers, rows)
     lines = []
     for row in rows:
-        printed, ours = _both(numbers, row)
+        printed, ours = _paper_and_ours(numbers, row)
         judgement = judge(row, printed, ours, pooled=is_pooled(numbers), simulated=source == "simulated")
         if ours is None and row.experiment in numbers:
             judgement = Judgement(notes=(NOT_REACHED,))
@@ -166,7 +175,7 @@ def checklist(numbers: Mapping[str, Any], rows: Sequence[Row] | None = None) -> 
 
 
 def claims_table(table: pd.DataFrame) -> pd.DataFrame:
-    """Select the paper's claims that are judged from a checklist."""
+    """Select the judged claims of a checklist."""
     judged = table["result"].str.startswith(CLAIM) & (table["verdict"] != NONE)
     claims = table[judged].drop(columns=["stage", "shown in"])
     claims = claims.assign(result=claims["result"].str.removeprefix(CLAIM)).rename(columns={"result": "claim"})
@@ -174,27 +183,30 @@ def claims_table(table: pd.DataFrame) -> pd.DataFrame:
     return claims
 
 
-def family_p(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float]:
-    """Adjust the p-values of the claims that are tested together by Holm's method; by row."""
-    found = {row.id: p_of(row, *_both(numbers, row)) for row in rows if row.family}
-    return statistics.holm({name: p for name, p in found.items() if p is not None})
+def adjusted_p_values(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float]:
+    """Compute the p-values of the family of claims, adjusted by Holm's method, by row id."""
+    p_values = {row.id: claim_p_value(row, *_paper_and_ours(numbers, row)) for row in rows if row.family}
+    return statistics.holm({name: p for name, p in p_values.items() if p is not None})
 
 
-def p_of(row: Row, printed: Any, ours: Any) -> float | None:
+def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
     """Compute the p-value of a claim about differences over boards; None if too few boards were compared.
 
-    A claim about every number of training skins holds only if it holds for each, so its p-value is the largest one. If
-    some number significantly contradicts it, the p-value is the smallest of those, with Bonferroni's correction.
+    A claim about every number of training skins has one p-value per number. It holds only if all parts hold, so its
+    p-value is the largest of them. If some parts significantly contradict the claim, its p-value is the smallest
+    p-value of these parts, with Bonferroni's correction for the number of all parts.
     """
     if isinstance(ours, Sequence):
-        points = [one["accuracy_pct"] for one in ours]
-        each = [p for p in (p_of(row, None, one) for one in points) if p is not None]
-        if not each or len(each) < len(points):
+        parts = [contrast["accuracy_pct"] for contrast in ours]
+        p_values = [p for p in (claim_p_value(row, None, part) for part in parts) if p is not None]
+        if not p_values or len(p_values) < len(parts):
             return None
-        against = [
-            p for p, one in zip(each, points, strict=True) if gain(one, row.metric)["mean"] < 0 and p <= SIGNIFICANT
+        contradicting = [
+            p
+            for p, part in zip(p_values, parts, strict=True)
+            if gain(part, row.metric)["mean"] < 0 and p <= SIGNIFICANT
         ]
-        return min(1.0, len(each) * min(against)) if against else max(each)
+        return min(1.0, len(p_values) * min(contradicting)) if contradicting else max(p_values)
     if not isinstance(ours, Mapping) or "se" not in ours:
         return None
     limit = sizeable(mean_of(printed)) if row.rule == "sizeable" else 0.0
@@ -202,7 +214,7 @@ def p_of(row: Row, printed: Any, ours: Any) -> float | None:
 
 
 def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
-    """Make a claim of the family undecided unless it is significant among all of them."""
+    """Add the adjusted p-value to the judgement of a claim; without significance, the claim becomes undecided."""
     verdict = judgement.verdict
     if verdict in (SUPPORTED, CONTRADICTED) and p_adjusted > SIGNIFICANT:
         verdict = UNDECIDED
@@ -212,13 +224,13 @@ def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
 def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -> Judgement:
     """Judge our result by the rule of the row; claims about means over boards get a verdict from their interval.
 
-    `pooled`: some network was trained on several skins. `simulated`: the scene's readings were simulated.
+    `pooled`: whether some network was trained on several skins. `simulated`: whether the readings are simulated.
     """
     if row.ours is None:
         return Judgement()
     if ours is None:
         return Judgement(notes=(NOT_RUN,))
-    if not pooled and row.ours.startswith(NOT_POOLED):
+    if not pooled and row.ours.startswith(NEEDS_POOLING):
         return Judgement(notes=(ONE_SKIN,))
     if isinstance(ours, bool):
         return Judgement(FEW_BOARDS, "holds on the board that was measured", _yes(ours))
@@ -227,37 +239,39 @@ def judge(row: Row, printed: Any, ours: Any, *, pooled: bool, simulated: bool) -
     if row.rule == "view":
         return Judgement()
     if row.rule == "finding":
-        of_trainings = {SUPPORTED: "yes", CONTRADICTED: "no"}.get(ours["of_trainings"], ours["of_trainings"])
-        return Judgement(ours["verdict"], "holds for these trainings", of_trainings)
+        met = {SUPPORTED: "yes", CONTRADICTED: "no"}.get(ours["of_trainings"], ours["of_trainings"])
+        return Judgement(ours["verdict"], "holds for these trainings", met)
     if row.rule == "each":
         return _judge_each(ours)
     if row.rule in DIFFERENCES:
         return _judge_difference(row, mean_of(printed), ours)
     if row.rule in ("at_most", "at_least", "positive"):
         limit = 0.0 if row.rule == "positive" else mean_of(printed)
-        assert limit is not None, "a row that is judged by a limit prints one"
+        assert limit is not None, "a row with this rule has a number of the paper as its limit"
         return _judge_limit(row.rule, limit, ours if isinstance(ours, Mapping) else {"mean": float(ours)})
     return _judge_number(printed, ours, target=row.rule == "target" and simulated)
 
 
 def _judge_difference(row: Row, printed: float | None, ours: Stat) -> Judgement:
-    """Judge a paired difference: a gain beyond a limit, or equivalence to 0 within a margin."""
+    """Judge a paired difference: whether it is a gain above a limit, or equivalent to 0 within a margin."""
     if row.rule in ("slight", "plateau"):
         margin = FEW_POINTS if row.rule == "slight" else PLATEAU_POINTS
         verdict = statistics.verdict_within(ours, margin)
         return Judgement(verdict, f"within ±{margin:g} points", _yes(abs(ours["mean"]) < margin))
-    better = gain(ours, row.metric)
+    improvement = gain(ours, row.metric)
     limit, criterion = 0.0, "gain above 0"
     if row.rule == "sizeable":
         limit = sizeable(printed)
         criterion = f"gain above {limit:.3g}, half of the paper's"
-    low, high = better.get("ci95", (-float("inf"), float("inf")))
+    low, high = improvement.get("ci95", (-float("inf"), float("inf")))
     notes = (EQUIVALENT,) if printed and max(-low, high) < sizeable(printed) else ()
-    return Judgement(statistics.verdict(better, above=limit), criterion, _yes(better["mean"] > limit), notes=notes)
+    return Judgement(
+        statistics.verdict(improvement, above=limit), criterion, _yes(improvement["mean"] > limit), notes=notes
+    )
 
 
 def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
-    """Judge whether a number is beyond a limit (the paper's, or 0)."""
+    """Judge whether a number is within a limit (the paper's number, or 0)."""
     mean = ours["mean"]
     if rule == "at_most":
         verdict = statistics.verdict(statistics.negate(ours), above=-limit)
@@ -269,18 +283,18 @@ def _judge_limit(rule: str, limit: float, ours: Stat) -> Judgement:
 
 
 def _judge_each(contrasts: Sequence[Mapping[str, Any]]) -> Judgement:
-    """Judge by accuracy a claim that must hold for every number of training skins."""
+    """Judge a claim about accuracy that must hold for every number of training skins."""
     verdicts = {row["skins_n"]: statistics.verdict(row["accuracy_pct"]) for row in contrasts}
     return Judgement(
         statistics.combine_verdicts(list(verdicts.values())),
         "gain above 0 at every number of training skins",
         _yes(all(row["accuracy_pct"]["mean"] > 0 for row in contrasts)),
-        notes=(", ".join(f"{skins_n} skins: {verdict}" for skins_n, verdict in verdicts.items()),),
+        notes=("by number of skins: " + ", ".join(f"{skins_n} {verdict}" for skins_n, verdict in verdicts.items()),),
     )
 
 
 def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
-    """Judge whether our mean is near the paper's: within its sd, or within 10 % if the paper gives no sd."""
+    """Judge whether our mean is within one sd of the paper's, or within 10 % if the paper gives no sd."""
     value, mean = mean_of(ours), mean_of(printed)
     if value is None or mean is None:
         return Judgement()
@@ -292,7 +306,7 @@ def _judge_number(printed: Any, ours: Any, *, target: bool) -> Judgement:
 
 def sizeable(printed: float | None) -> float:
     """Return the gain that counts as sizeable: half of the paper's own difference."""
-    assert printed is not None, "a row that is judged by the paper's difference prints one"
+    assert printed is not None, "a row with rule `sizeable` has a difference of the paper"
     return SIZEABLE * abs(printed)
 
 
@@ -300,37 +314,37 @@ def _yes(holds: bool) -> str:
     return "yes" if holds else "no"
 
 
-def _both(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
+def _paper_and_ours(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
     """Return the paper's number and ours."""
     printed = look_up(numbers, row.paper) if row.paper else None
     return printed, resolve(numbers, row.ours) if row.ours else None
 
 
 def resolve(numbers: Any, path: str) -> Any:
-    """Follow a dotted path; `name=3,other=x` selects that row of a list. None if the scene has no such number."""
-    here = numbers
+    """Follow a dotted path, in which `key=3,other=x` selects a row of a list; None if the scene has no such number."""
+    value = numbers
     for part in path.split("."):
-        if isinstance(here, list) and "=" in part:
+        if isinstance(value, list) and "=" in part:
             wanted = dict(pair.split("=", 1) for pair in part.split(","))
-            here = next((row for row in here if wanted.items() <= {key: str(row[key]) for key in row}.items()), None)
-        elif isinstance(here, Mapping) and part in here:
-            here = here[part]
+            value = next((row for row in value if wanted.items() <= {key: str(row[key]) for key in row}.items()), None)
+        elif isinstance(value, Mapping) and part in value:
+            value = value[part]
         else:
             return None
-    return here
+    return value
 
 
 def look_up(numbers: Mapping[str, Any], name: str) -> Any:
-    """Find a number by its dotted name: a constant of `pipeline.report.paper` (`SHEAR.mse_fz_N2`), or one of ours."""
-    found = resolve(vars(paper) if name[0].isupper() else numbers, name)
-    if found is None:
-        what = f"{name} is neither a constant of pipeline.report.paper nor a path in numbers.json"
-        raise SchemaError(f"{FILE.name}: {what}. Correct the name.")
-    return found
+    """Look up a dotted name: a constant of `pipeline.report.paper` (`SHEAR.mse_fz_N2`) or a path in numbers.json."""
+    value = resolve(vars(paper) if name[0].isupper() else numbers, name)
+    if value is None:
+        problem = f"{name} is neither a constant of pipeline.report.paper nor a path in numbers.json"
+        raise SchemaError(f"{FILE.name}: {problem}. Correct the name.")
+    return value
 
 
 def mean_of(value: Any) -> float | None:
-    """Return the mean of a summary or of the paper's pair, or a plain number; None if there is none."""
+    """Return the mean of a summary or of a pair (mean, sd), or a plain number; None for anything else."""
     if isinstance(value, Mapping):
         return value.get("mean")
     if isinstance(value, tuple):
@@ -339,7 +353,7 @@ def mean_of(value: Any) -> float | None:
 
 
 def _paper_in_interval(printed: Any, ours: Any) -> str:
-    """Write whether our interval over boards includes the paper's number, if both exist."""
+    """Say whether our interval over boards includes the paper's number, if both exist."""
     mean = mean_of(printed)
     if mean is None or not isinstance(ours, Mapping) or "ci95" not in ours:
         return NONE
@@ -348,11 +362,11 @@ def _paper_in_interval(printed: Any, ours: Any) -> str:
 
 
 def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
-    """Say how far ours went, and how far the paper did."""
+    """Return a note on the size of our experiment and of the paper's."""
     if row.reach is None or ours is None:
         return []
     ours_n, paper_n = resolve(numbers, row.reach.ours), look_up(numbers, row.reach.paper)
-    return [f"{SHORT_OF if ours_n < paper_n else ''}{ours_n:,.0f} {row.reach.of}, paper {paper_n:,.0f}"]
+    return [f"{SHORT_OF if ours_n < paper_n else ''}{ours_n:,.0f} {row.reach.of} (paper: {paper_n:,.0f})"]
 
 
 def _reason(numbers: Mapping[str, Any], row: Row, judgement: Judgement) -> list[str]:
@@ -373,7 +387,7 @@ def _show_ours(row: Row, ours: Any) -> str:
 
 
 def _show(row: Row, value: Any) -> str:
-    """Write a number with its unit, from the last part of the path `ours` that has one; differences with their sign."""
+    """Write a number with its unit (from the last part of the path `ours` that names one); differences get a sign."""
     ends = [part.rsplit("_", 1)[-1] for part in reversed((row.ours or "").split("."))]
     unit = next((UNITS[end] for end in ends if end in UNITS), "")
     if row.rule in DIFFERENCES:

@@ -1,4 +1,4 @@
-"""Error against run time: tables and figures of what was timed on this machine (`reports/<scene>/runtime`)."""
+"""Tables and figures of error against the run times measured on this machine (`reports/<scene>/runtime`)."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,26 +13,28 @@ from pipeline.report.drawing import COLOURS, MARKERS, drawing, svg
 from pipeline.report.formatting import scored, tabulate, to_markdown
 
 TRADE_OFFS = {
-    "training": ("train_s", "median time of a training / s"),
-    "inference": ("inference_us", "median time of one reading / µs"),
+    "training": ("train_s", "median time of a training run / s"),
+    "inference": ("inference_us", "median time per reading / µs"),
 }
 STUDIES = ("quadratures", "integrators")
 COMPUTED = (
-    "Computed: what the stage cost when its results were computed, its trainings added up as if one ran after another "
-    "(two run side by side, so that less time passes). Last run: the time of the last run, which reuses trainings that "
-    "were finished before."
+    "Computed: the time in which the stage computed all its results, as if its training runs had run one after "
+    "another. Two of them run side by side, so less time passes. Last run: the time of the last run, which reuses the "
+    "training runs that were completed before."
 )
-MARGIN = 1.6  # factor beyond the outermost points on a logarithmic axis
-LOWEST = 1e-16  # size of rounding errors; smaller errors are drawn here, because the axis is logarithmic
+MARGIN = 1.6  # factor by which a logarithmic axis extends beyond the outermost points
+ERROR_SHOWN_MIN = (
+    1e-16  # size of rounding errors; smaller ones are drawn at this value, because the axis is logarithmic
+)
 COLUMNS_N = 3
-CAPTION_LETTERS = 38  # letters that fit in the width of a panel or of the legend
+CAPTION_CHARACTERS = 38  # characters that fit in the width of a panel or of the legend
 
 Row = Mapping[str, Any]
 Rows = Sequence[Row]
 
 
 def cost_pages(runtime: Row, source: str) -> dict[str, str]:
-    """Draw and tabulate errors against costs: text by file name; there is no figure of what was not timed here."""
+    """Draw and tabulate errors against costs: text by file name. Studies that were not timed here get no figure."""
     texts = {f"{name}.md": to_markdown(table) for name, table in cost_tables(runtime, source).items()}
     for name, (key, cost) in TRADE_OFFS.items():
         if any(key in row for row in runtime.get("learning", [])):
@@ -48,10 +50,10 @@ def cost_pages(runtime: Row, source: str) -> dict[str, str]:
 
 
 def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate, by name, the costs of stages, and the errors and costs of methods, adaptation and timed studies."""
+    """Tabulate the costs of stages, and the errors and costs of methods, adaptation and timed studies, by name."""
     methods = [
         {"method": row["method"], "inputs": row["inputs"], "training, s": _time(row, "train_s")}
-        | {"one reading, µs": _time(row, "inference_us"), "source": source}
+        | {"per reading, µs": _time(row, "inference_us"), "source": source}
         | scored(row)
         for row in runtime.get("learning", [])
     ]
@@ -61,7 +63,7 @@ def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
     ]
     references = [
         {"method": row["method"], "until ready, s": _time(row, "train_s")}
-        | {"one reading, µs": _time(row, "inference_us"), "source": source}
+        | {"per reading, µs": _time(row, "inference_us"), "source": source}
         | scored(row)
         for row in runtime.get("rivals_costs", [])
         if "train_s" in row
@@ -74,16 +76,16 @@ def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
 
 
 def stage_costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
-    """List what each stage cost when it was computed, and what its last run took."""
+    """List the cost of computing each stage and the time of its last run."""
     lines = [
         {
             "stage": name,
             "computed, s": f"{cost['computed_s']:.1f}",
             "last run, s": f"{cost['seconds']:.1f}",
-            "CPU of it, s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # older costs lack it
-            "trainings": str(cost["trainings_n"]),
-            "of them reused": str(cost["reused_n"]),
-            "peak memory of a process, MB": f"{cost['peak_process_memory_MB']:.0f}",
+            "last run, CPU s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # older costs lack it
+            "training runs": str(cost["trainings_n"]),
+            "reused training runs": str(cost["reused_n"]),
+            "peak memory per process, MB": f"{cost['peak_process_memory_MB']:.0f}",
         }
         for name, cost in stages.items()
     ]
@@ -99,7 +101,7 @@ def study_table(rows: Rows, source: str) -> pd.DataFrame:
             "setting": row["setting"],
             "nodes or right-hand sides": str(row["work_n"]),
             "error": "–" if row["error"] is None else f"{row['error']:.2g}",
-            "median ms an indentation": f"{1e3 * row['median_s']:.3g}" if "median_s" in row else "–",
+            "median ms per indentation": f"{1e3 * row['median_s']:.3g}" if "median_s" in row else "–",
             "failed": row["failure"] or "",
             "source": source,
         }
@@ -114,68 +116,68 @@ def _time(row: Row, name: str) -> str:
 
 @dataclass(frozen=True)
 class Point:
-    """A method or setting in a figure of error against cost; members of the Pareto front have a label."""
+    """A method or setting in a figure of error against cost; in `trade_off`, only the Pareto front has labels."""
 
     name: str
     label: str
-    place: tuple[float, float]  # cost, error
+    position: tuple[float, float]  # cost, error
     look: Mapping[str, Any]
 
 
 def trade_off(rows: Rows, key: str, *, title: str, cost: str) -> str:
-    """Draw errors of methods against the cost `key`, log-log; a step line joins the numbered Pareto front."""
+    """Draw the errors of methods against the cost `key` on logarithmic axes; a step line joins the Pareto front."""
     points = trade_off_points(rows, key)
     members = [point for point in points if point.label]
     with drawing(7.6, 4.2) as figure:
         axes = _trade_off_axes(figure, points, title=title, xlabel=cost, xscale="log")
         for point in points:
-            mark = axes.plot(*point.place, **point.look, linestyle="none")[0]
+            mark = axes.plot(*point.position, **point.look, linestyle="none")[0]
             mark.set_label(f"{point.label}  {point.name}" if point.label else point.name)
-            _label(axes, point, (-5, -5))  # no point is to the lower left of one on the front
-        steps = zip(*(point.place for point in members), strict=True)
-        axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbers)")
+            _label(axes, point, (-5, -5))  # a point on the front has no other point to its lower left
+        steps = zip(*(point.position for point in members), strict=True)
+        axes.step(*steps, where="post", color="0.4", linewidth=1, zorder=1, label="Pareto front (numbered)")
         figure.legend(loc="outside right upper", frameon=False, fontsize=8)
         return svg(figure)
 
 
 def trade_off_points(rows: Rows, key: str) -> list[Point]:
-    """List the timed methods by cost, those of the Pareto front first and numbered; each method has its own look."""
+    """List the timed methods by cost; those on the Pareto front come first and are numbered."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     inputs = list(dict.fromkeys(row["inputs"] for row in rows))
     timed = sorted((row for row in rows if key in row), key=lambda row: (row[key], row["mse_xy_mm2"]["mean"]))
-    places = [(row[key], row["mse_xy_mm2"]["mean"]) for row in timed]
-    best = front(places)
+    positions = [(row[key], row["mse_xy_mm2"]["mean"]) for row in timed]
+    pareto = front(positions)
     points = []
-    for row, place in zip(timed, places, strict=True):
+    for row, position in zip(timed, positions, strict=True):
         look = look_of(methods.index(row["method"]))
         if row["inputs"] != inputs[0]:
             look["markerfacecolor"] = "white"
-        label = str(best.index(place) + 1) if place in best else ""
-        points.append(Point(f"{row['method']} ({row['inputs']})", label, place, look))
+        label = str(pareto.index(position) + 1) if position in pareto else ""
+        points.append(Point(f"{row['method']} ({row['inputs']})", label, position, look))
     return sorted(points, key=lambda point: not point.label)
 
 
 def adaptation(rows: Rows, source: str) -> str:
-    """Draw the error after adaptation against its duration; every point is labelled with its number of pokes."""
+    """Draw the error after adaptation against its duration; each label is the number of pokes."""
     timed = sorted((row for row in rows if "seconds" in row), key=lambda row: row["pokes_n"])
     points = [Point("", str(row["pokes_n"]), (row["seconds"], row["mse_xy_mm2"]["mean"]), look_of(1)) for row in timed]
     with drawing(7.6, 4.2) as figure:
         title = f"Error on a new skin against adaptation time ({source})"
-        axes = _trade_off_axes(figure, points, title=title, xlabel="median time of an adaptation / s", xscale="linear")
+        axes = _trade_off_axes(figure, points, title=title, xlabel="median time per adaptation / s", xscale="linear")
         for point in points:
-            axes.plot(*point.place, **point.look, linestyle="none")
+            axes.plot(*point.position, **point.look, linestyle="none")
             _label(axes, point, (-6, 0))
-        figure.supxlabel("A number: unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=9)
+        figure.supxlabel("Labels: number of unlabelled pokes of the new skin.", x=0.01, ha="left", fontsize=9)
         return svg(figure)
 
 
 def _trade_off_axes(figure: Any, points: Sequence[Point], *, title: str, xlabel: str, xscale: str) -> Any:
-    """Make axes of error against cost with room around the points for their labels; a linear axis begins at 0."""
+    """Make axes of error against cost that leave room for the labels of points; a linear cost axis begins at 0."""
     axes = figure.subplots()
     axes.set(xscale=xscale, yscale="log", xlabel=xlabel, ylabel="MSE_xy / mm²")
     axes.grid(alpha=0.25)
     figure.suptitle(title, x=0.01, ha="left", fontsize=10)
-    costs, errors = zip(*(point.place for point in points), strict=True)
+    costs, errors = zip(*(point.position for point in points), strict=True)
     axes.set_ylim(min(errors) / MARGIN, max(errors) * MARGIN)
     axes.set_xlim((min(costs) / MARGIN, max(costs) * MARGIN) if xscale == "log" else (0.0, 1.15 * max(costs)))
     return axes
@@ -183,18 +185,18 @@ def _trade_off_axes(figure: Any, points: Sequence[Point], *, title: str, xlabel:
 
 def _label(axes: Any, point: Point, offset_pt: tuple[float, float]) -> None:
     vertical = "center" if offset_pt[1] == 0 else "top"
-    where = {"xytext": offset_pt, "textcoords": "offset points", "ha": "right", "va": vertical, "fontsize": 8}
-    axes.annotate(point.label, point.place, **where)
+    text_style = {"xytext": offset_pt, "textcoords": "offset points", "ha": "right", "va": vertical, "fontsize": 8}
+    axes.annotate(point.label, point.position, **text_style)
 
 
 def look_of(i: int) -> dict[str, Any]:
-    """Return a colour and a marker for each of the first 49 methods, no two alike."""
+    """Return the colour and marker of method i, which are distinct for the first 49 methods."""
     marker = MARKERS[(i + i // len(COLOURS)) % len(MARKERS)]
     return {"color": COLOURS[i % len(COLOURS)], "marker": marker, "markersize": 6}
 
 
 def front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the Pareto front of points (cost, error), by cost."""
+    """Return the Pareto front of points (cost, error), sorted by cost."""
     kept: list[tuple[float, float]] = []
     for cost, error in sorted(points):
         if not kept or error < kept[-1][1]:
@@ -203,25 +205,26 @@ def front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def quadratures(rows: Rows, choice: Mapping[str, Any], source: str) -> str:
-    """Draw the study of quadratures, with the error limit, the cheapest rule below it and the rule in use."""
+    """Draw the study of quadratures: the error limit, the cheapest rule below the limit, and the rule in use."""
     study = rows[0]["study"]
     rings = {}
     if choice["setting"]:
-        rings[f"cheapest below it: {choice['setting']}"] = (study, CANDIDATES, choice["setting"])
+        rings[f"cheapest below the limit: {choice['setting']}"] = (study, CANDIDATES, choice["setting"])
     if choice["used_error"]:
         rings[f"in use: {choice['used_setting']}"] = (study, CANDIDATES, choice["used_setting"])
     return draw_study(
         rows,
-        title=f"Error of dB against run time ({source})",
+        title=f"Error of the field change dB against run time ({source})",
         error="rms error / rms dB, worst skin and depth",
-        note="Kernel alone and magpylib: the field only, their nodes were moved before. All else: flow and field.",
+        note="Methods kernel alone and magpylib: time of the field only, at nodes moved beforehand. "
+        "All other methods: time of flow and field.",
         limit=ERROR_MAX,
         rings=rings,
     )
 
 
 def integrators(rows: Rows) -> str:
-    """Draw the study of integrators, a panel for each ratio of the slowest relaxation to the fastest."""
+    """Draw the study of integrators, with one panel per ratio of the slowest to the fastest relaxation."""
     return draw_study(rows, title="Error of the relaxed force against run time", error="rms error / rms force")
 
 
@@ -234,21 +237,21 @@ def draw_study(
     limit: float | None = None,
     rings: Mapping[str, tuple[str, str, str]] | None = None,
 ) -> str:
-    """Draw error against median time, log-log: one panel per study, one colour and marker per method, failures below.
+    """Draw error against median time on logarithmic axes, with one panel per study and the failures below.
 
-    Lines join the Pareto front of each method. `limit` is drawn as a line. Each point of `rings`, which maps a label to
-    study, method and setting, is circled. Rows that were not timed are left out.
+    Each method has its own colour and marker, and a line joins its Pareto front. `limit` is drawn as a line. `rings`
+    maps a label to the study, method and setting of the point to ring. Rows that were not timed are left out.
     """
     studies = list(dict.fromkeys(row["study"] for row in rows))
     methods = [name for name in dict.fromkeys(row["method"] for row in rows) if name != REFERENCE]
     points_ms = {
-        (row["study"], row["method"], row["setting"]): (1e3 * row["median_s"], max(row["error"], LOWEST))
+        (row["study"], row["method"], row["setting"]): (1e3 * row["median_s"], max(row["error"], ERROR_SHOWN_MIN))
         for row in rows
         if row["method"] != REFERENCE and row["error"] is not None and "median_s" in row
     }
     columns_n = min(COLUMNS_N, len(studies))
     lines_n = ceil(len(studies) / columns_n)
-    caption = "\n".join(fill(line, CAPTION_LETTERS * (1 + columns_n)) for line in (note, *failures(rows)))
+    caption = "\n".join(fill(line, CAPTION_CHARACTERS * (1 + columns_n)) for line in (note, *failures(rows)))
     with drawing(3.2 + 2.6 * columns_n, max(1.2 + 2.6 * lines_n + 0.15 * caption.count("\n"), 5.0)) as figure:
         panels = figure.subplots(lines_n, columns_n, sharex=True, sharey=True, squeeze=False)
         for axes, study in zip(panels.flat, studies, strict=False):
@@ -263,21 +266,21 @@ def draw_study(
                     axes.plot(*zip(*points, strict=True), marker, color=colour, markersize=4.5, label=method)
             for row in rows:
                 if (row["study"], row["method"]) == (study, REFERENCE):
-                    label = f"{REFERENCE}'s own error, at most"
+                    label = f"upper bound of the {REFERENCE}'s own error"
                     axes.axhline(row["error"], color="0.5", linestyle=":", linewidth=1, label=label)
             if limit is not None:
-                axes.axhline(limit, color="0.3", linestyle="--", linewidth=1, label=f"{100 * limit:.3g} %")
+                axes.axhline(limit, color="0.3", linestyle="--", linewidth=1, label=f"limit: {100 * limit:.3g} %")
             for i, (label, key) in enumerate((rings or {}).items()):
                 if key not in points_ms:
                     continue
                 ring = {"color": "0.2", "fillstyle": "none", "markersize": 11 + 2 * i}
                 axes.plot(*points_ms[key], "so"[i % 2], label=label, **ring)
         for axes in panels[-1]:
-            axes.set_xlabel("median time an indentation / ms")
+            axes.set_xlabel("median time per indentation / ms")
         for axes in panels[:, 0]:
             axes.set_ylabel(error)
         labelled = [axes.get_legend_handles_labels() for axes in panels.flat[: len(studies)]]
-        handles = {label: handle for found in reversed(labelled) for handle, label in zip(*found, strict=True)}
+        handles = {label: handle for panel in reversed(labelled) for handle, label in zip(*panel, strict=True)}
         names = dict.fromkeys(label for _, labels in labelled for label in labels)
         figure.legend([handles[name] for name in names], names, loc="outside right upper", frameon=False, fontsize=8)
         for axes in panels.flat[len(studies) :]:
@@ -288,13 +291,14 @@ def draw_study(
 
 
 def failures(rows: Rows) -> list[str]:
-    """List failures: one line for each method and kind of failure, with the studies and settings concerned."""
-    found: dict[tuple[str, str], dict[str, list[str]]] = {}
+    """List failures: one line per method and kind of failure, with the settings that failed in each study."""
+    failed: dict[tuple[str, str], dict[str, list[str]]] = {}
     for row in rows:
         if row["failure"] is not None:
             kind = row["failure"].split(":")[0]
-            found.setdefault((row["method"], kind), {}).setdefault(row["study"], []).append(row["setting"])
+            failed.setdefault((row["method"], kind), {}).setdefault(row["study"], []).append(row["setting"])
     return [
-        f"Failed: {method}, {kind}: " + "; ".join(f"{study} ({', '.join(where)})" for study, where in places.items())
-        for (method, kind), places in found.items()
+        f"Failed: {method}, {kind}: "
+        + "; ".join(f"{study} ({', '.join(settings)})" for study, settings in by_study.items())
+        for (method, kind), by_study in failed.items()
     ]

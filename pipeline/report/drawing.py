@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
-MARKS_MAX_N = 150  # marks of one artist; with more, titles would make the file too large
-USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")  # a few marks are written as separate paths
+MARKS_MAX_N = 150  # a line or scatter with more marks gets no titles, which would make the file too large
+USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")  # how Matplotlib writes marks: many, a few
 GROUP = re.compile(r"<g[ >]|</g>")
-Titles = Mapping[str, list[str]]  # by id of a group: a title for each mark, in order; one for a line without marks
+Titles = Mapping[str, list[str]]  # by id of a group: one title per mark, in order; one title for a line without marks
 Format = Callable[[float], str]
-FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana, used if the first is not installed, has the same width
-# Not written: indentation, metadata, comments, and coordinates finer than a hundredth of a point.
+FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana, the fallback, has letters of the same width
+# Removed from the file: indentation, metadata, comments, and the digits of coordinates beyond a hundredth of a point.
 REMOVED = re.compile(r"(?<=\n) +|<metadata>.*?</metadata>\n|<!--.*?-->\n", re.DOTALL)
 COORDINATES = re.compile(r' (d|x|y|transform)="[^"]*"')
 DIGITS_BEYOND_2 = re.compile(r"(?<=\.\d\d)\d+")
-SVG_DPI = 72  # of points, in which the format counts
+SVG_DPI = 72  # the unit of the file is the point, 1/72 inch
 STYLE = {
     "svg.hashsalt": "reskin",
     "svg.fonttype": "none",
@@ -31,13 +31,13 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
-# Okabe & Ito 2008, distinguishable by colour-blind readers; their yellow is left out, as it is pale on white.
+# Okabe & Ito 2008: colours that colour-blind readers can distinguish; their yellow is omitted, as it is pale on white.
 COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def name_marks(figure: Any) -> Titles:
-    """Set an id for each line and scatter of a figure; return the titles of their marks by id."""
+    """Set an id for each line and scatter of a figure; return the titles of their marks, by id."""
     titles = {}
     for i, axes in enumerate(figure.axes):
         for j, (artist, texts) in enumerate(_titled_artists(axes)):
@@ -47,7 +47,7 @@ def name_marks(figure: Any) -> Titles:
 
 
 def put_titles(svg: str, titles: Titles) -> str:
-    """Write the titles into the groups with their ids, except where the number of drawn marks differs."""
+    """Write titles into the groups with their ids, except into groups whose number of marks differs."""
     for name, texts in titles.items():
         before, head, after = svg.partition(f'<g id="{name}">')
         if head:  # else nothing was drawn
@@ -60,18 +60,18 @@ def _with_titles(group: str, texts: list[str]) -> str:
     pattern = USE if USE.search(group) else PATH
     if len(pattern.findall(group)) != len(texts):
         return group
-    waiting = iter(texts)
-    return pattern.sub(lambda mark: f"{mark[0][:-2]}><title>{escape(next(waiting))}</title></{mark[1]}>", group)
+    remaining = iter(texts)
+    return pattern.sub(lambda mark: f"{mark[0][:-2]}><title>{escape(next(remaining))}</title></{mark[1]}>", group)
 
 
 def _group_end(text: str) -> int:
-    """Return where the group that contains the start of the text ends."""
+    """Return the position of the tag that closes the group in which the text starts."""
     depth = 1
     for tag in GROUP.finditer(text):
         depth += -1 if tag[0] == "</g>" else 1
         if depth == 0:
             return tag.start()
-    raise AssertionError("every group of an SVG ends")
+    raise AssertionError("a group of the SVG is not closed")
 
 
 def _titled_artists(axes: Any) -> Iterator[tuple[Any, list[str]]]:
@@ -85,7 +85,7 @@ def _titled_artists(axes: Any) -> Iterator[tuple[Any, list[str]]]:
             if not name.startswith("_"):
                 yield line, [name]
         elif line not in caps and len(line.get_xydata()) <= MARKS_MAX_N:
-            texts = [_title(name, x(at), y(of)) for at, of in line.get_xydata()]
+            texts = [_title(name, x(x_value), y(y_value)) for x_value, y_value in line.get_xydata()]
             yield line, _with_bars(texts, barred[line]) if line in barred else texts
     for scatter in axes.collections:
         if hasattr(scatter, "get_sizes") and 0 < len(scatter.get_offsets()) <= MARKS_MAX_N:
@@ -94,7 +94,8 @@ def _titled_artists(axes: Any) -> Iterator[tuple[Any, list[str]]]:
 
 def _scatter_titles(scatter: Any, x: Format, y: Format) -> list[str]:
     values, bar = scatter.get_array(), scatter.colorbar
-    texts = [_title(scatter.get_label(), x(at), y(of)) for at, of in np.asarray(scatter.get_offsets())]
+    offsets = np.asarray(scatter.get_offsets())
+    texts = [_title(scatter.get_label(), x(x_value), y(y_value)) for x_value, y_value in offsets]
     if values is None or bar is None:
         return texts
     name = bar.ax.get_ylabel()
@@ -102,7 +103,7 @@ def _scatter_titles(scatter: Any, x: Format, y: Format) -> list[str]:
 
 
 def _with_bars(texts: list[str], container: Any) -> list[str]:
-    """Add the ends of the error bar of each mark."""
+    """Add to each text the ends of the mark's error bar."""
     side = 1 if container.has_yerr else 0
     ends = [ends[:, side] for bars in container.lines[2] for ends in bars.get_segments()]
     if len(ends) != len(texts):
@@ -116,16 +117,16 @@ def _title(name: str, *values: str) -> str:
 
 
 def _value_format(axes: Any, which: str) -> Format:
-    """Return a function that writes a value with its axis's label, or the nearest tick's name if ticks have names."""
+    """Return a function that writes a value with the label of its axis, or as the name of the nearest named tick."""
     axis, siblings = getattr(axes, f"{which}axis"), getattr(axes, f"get_shared_{which}_axes")().get_siblings(axes)
-    labels = [one.get_label_text() for one in (axis, *(getattr(other, f"{which}axis") for other in siblings))]
+    labels = [labelled.get_label_text() for labelled in (axis, *(getattr(other, f"{which}axis") for other in siblings))]
     name = " ".join(next((label for label in labels if label), which).split())
     fixed = type(axis.get_major_locator()).__name__ == "FixedLocator"  # ticks that were set may have names
-    places = axis.get_majorticklocs() if fixed else ()
-    texts = zip(places, axis.get_major_formatter().format_ticks(places), strict=True)
-    ticks = {place: " ".join(text.split()) for place, text in texts if any(map(str.isalpha, text))}
+    positions = axis.get_majorticklocs() if fixed else ()
+    texts = zip(positions, axis.get_major_formatter().format_ticks(positions), strict=True)
+    ticks = {position: " ".join(text.split()) for position, text in texts if any(map(str.isalpha, text))}
     if ticks:
-        return lambda value: ticks[min(ticks, key=lambda place: abs(place - value))]
+        return lambda value: ticks[min(ticks, key=lambda position: abs(position - value))]
     return lambda value: f"{name} = {_number(value)}"
 
 
@@ -152,15 +153,15 @@ def svg(figure: Any) -> str:
     _lay_out(figure)
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = COORDINATES.sub(lambda found: DIGITS_BEYOND_2.sub("", found[0]), REMOVED.sub("", buffer.getvalue()))
-    # Formulas name only one font family; without it, browsers would use a serif font.
+    # Matplotlib writes one font family for formulas. The others are added, lest browsers fall back to a serif font.
     return put_titles(text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\""), titles)
 
 
 def _lay_out(figure: Any) -> None:
-    """Lay out the axes once and turn the layout engine off, so that saving does not draw the figure a second time."""
+    """Lay out the axes once, then turn the layout engine off, so that saving does not lay them out again."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    FigureCanvasSVG(figure)  # so that texts are measured as they will be written
+    FigureCanvasSVG(figure)  # this canvas measures texts as the file will show them
     figure.dpi = SVG_DPI
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine(None)

@@ -1,4 +1,7 @@
-"""What experiments add to a report: tables and figures of their modules, sections and checklist rows of their YAML."""
+"""Tables, figures, page sections and checklist rows that experiments add to a report.
+
+The module of an experiment makes its tables and figures; its YAML file has its section and its checklist rows.
+"""
 
 from collections.abc import Iterable, Mapping
 from importlib import import_module
@@ -13,22 +16,22 @@ from pipeline.stages import module_name
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Make the tables of every experiment in the numbers, by the table's name."""
+    """Make the tables of every experiment with results in numbers.json, by the name of the table."""
     tables: dict[str, pd.DataFrame] = {}
     for key, module in _modules(numbers).items():
         tables |= module.tables(numbers[key], source)
     return tables
 
 
-def experiment_figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the figures of every experiment in the numbers: SVG text by file name.
+def experiment_figures(numbers: Mapping[str, Any], plot_data: Mapping[str, Any], source: str) -> dict[str, str]:
+    """Draw the figures of every experiment with results in numbers.json: SVG text by file name.
 
-    drawn: by the experiment's key in numbers.json, the data that only its figures show.
+    plot_data: data that only figures show, by the experiment's key in numbers.json.
     """
     figures: dict[str, str] = {}
     for key, module in _modules(numbers).items():
         if hasattr(module, "figures"):
-            figures |= module.figures(numbers[key], drawn[key], source)
+            figures |= module.figures(numbers[key], plot_data[key], source)
     return figures
 
 
@@ -39,13 +42,13 @@ def _modules(numbers: Mapping[str, Any]) -> dict[str, ModuleType]:
 
 
 def add_sections(order: Iterable[Any]) -> list[dict[str, Any]]:
-    """Replace names of experiments in `order` by their sections of the page; experiments not named come last."""
+    """Replace each experiment's name in `order` with its section of the page; sections that are not named come last."""
     files = experiment_files().items()
     return _replace({name: {"key": name} | file.section for name, file in files if file.section is not None}, order)
 
 
 def add_rows(order: Iterable[Any]) -> list[dict[str, Any]]:
-    """Replace ids of rows in `order` by the rows of experiments' YAML files; rows not named come last."""
+    """Replace each id in `order` with that row of an experiment's YAML file; rows that are not named come last."""
     rows = [row | {"stage": name} for name, file in experiment_files().items() for row in file.checklist]
     return _replace({row["id"]: row for row in rows}, order)
 

@@ -1,4 +1,4 @@
-"""Scores as text: means, deviations, intervals and paired differences; rows of table 2; tables as Markdown."""
+"""Scores as text (means, deviations, intervals, paired differences), rows of table 2, and tables as Markdown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,32 +10,35 @@ import pandas as pd
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
 from pipeline.statistics import negate
 
-Stat = Mapping[str, Any]  # mean, n, and if known sd and ci95: [low, high], or the values of a few boards
+Stat = Mapping[str, Any]  # mean and n; where known, sd and ci95 ([low, high]), or the values of a few boards
 Results = Mapping[str, Any]  # numbers.json of one scene
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
-OF_FORCE = ("mse_f_N2", "r2_f")  # an offset of places changes neither
-OF_PAPER = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # the scores that the paper gives
-FEW_POINTS = 5.0  # assumed: the paper's own drop is 3.4 points, "slightly affects performance"
-MEANING = "Accuracy: the part of held-out readings whose x and y are both within 1 mm. MSE_xy: mean over the two axes."
+FORCE_METRICS = ("mse_f_N2", "r2_f")  # an offset of positions does not change them
+PAPER_METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")  # metrics that the paper reports
+FEW_POINTS = 5.0  # assumed; the paper says of a drop of 3.4 points that it "slightly affects performance"
+MEANING = (
+    "Accuracy: percentage of held-out readings whose predicted x and y are both within 1 mm of the true position. "
+    "MSE_xy: mean squared error of the position, averaged over x and y."
+)
 INTERVAL = (
-    "[low, high] is the 95 % interval over held-out boards (Student's t), each the mean of its skins and networks; "
-    "below four boards (a; b) are the boards' own values instead"
+    "[low, high] is the 95 % interval over held-out boards (Student's t). The value of a board is the mean over its "
+    "skins and networks. With fewer than four boards there is no interval, and (a; b) are the values of the boards."
 )
 SPREAD = (
-    f"{INTERVAL}; ± is the sd over n repeats on one skin, over n pairs of a training and a "
-    "test skin in rows of one skin on others, or over seeds where it says so."
+    f"{INTERVAL} ± is a standard deviation. For one skin, it is over n repeats. For one skin tested on others, it is "
+    "over n pairs of a training skin and a test skin. Marked (seeds), it is over network seeds."
 )
 SHORT = {
     "single": "single-sensor", "multi": "multi-sensor", "triplet": "multi-sensor + triplet", "adapted": "adapted",
     "control": "control",
 }  # fmt: skip
-CONTROL = "Control: fine-tuned as long, without the new skin's pokes (ours)"
+CONTROL = "Control: fine-tuned equally long, without the new skin's pokes (ours)"
 ONE_TRAINING_SKIN = "Leave-one-board-out, one training skin"
-UNIVERSAL = ("universal", 0)  # rows of experiment population: the whole universal model, without labels
+UNIVERSAL = ("universal", 0)  # in experiment population: rows of the whole universal model without labels
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean with three significant digits, its interval over boards (or else its sd), and its sd over seeds."""
+    """Write a mean with three significant digits, its interval over boards (or else its sd) and its sd over seeds."""
     if value is None:
         return "–"
     if "ci95" in value or "values" in value:
@@ -44,13 +47,13 @@ def show(value: Stat | None) -> str:
 
 
 def show_deviation(value: Stat) -> str:
-    """Write a mean, its standard deviation over n, and its standard deviation over seeds if known."""
+    """Write a mean with its standard deviations over n and over seeds, if known."""
     over_n = f" ± {value['sd']:.2g}" if "sd" in value else ""
     return f"{_three_digits(value['mean'])}{over_n}{_show_seeds(value)}"
 
 
 def show_interval(value: Stat) -> str:
-    """Write only the 95 % interval over boards, or the values of a few boards."""
+    """Write the 95 % interval over boards, or the values of a few boards, without the mean."""
     if "values" in value:
         return f"({'; '.join(map(_three_digits, value['values']))})"
     low, high = value["ci95"]
@@ -58,7 +61,7 @@ def show_interval(value: Stat) -> str:
 
 
 def show_digits(value: Stat, digits: int) -> str:
-    """Write a mean with `digits` decimals, and its interval over boards and deviation over seeds if it has them."""
+    """Write a mean with `digits` decimals, and its interval over boards and its sd over seeds, if known."""
     mean, *ends = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", value.get("values", ())))]
     if not ends:
         return f"{mean}{_show_seeds(value)}"
@@ -67,7 +70,7 @@ def show_digits(value: Stat, digits: int) -> str:
 
 
 def show_both(value: Stat | None) -> str:
-    """Write a mean with its standard deviation, as the paper does, and its interval over boards."""
+    """Write a mean with both its standard deviation, as in the paper, and its interval over boards."""
     if value is None or not {"ci95", "values"} & set(value):
         return show(value)
     return f"{show_deviation(value)} {show_interval(value)}"
@@ -79,7 +82,7 @@ def show_difference(value: Stat | None) -> str:
 
 
 def gain(difference: Stat, metric: str) -> Stat:
-    """Return the difference such that positive is better: the sign of differences of errors is changed."""
+    """Return the difference with a sign such that positive is better: differences of errors are negated."""
     return negate(difference) if metric.startswith("mse_") else difference
 
 
@@ -108,7 +111,7 @@ def beside(
     cells: dict[str, str] = {}
     for metric, title in COLUMNS.items():
         cells |= {f"{title} (ours)": show(row.get(metric))}
-        cells |= {f"{title} ({paper})": printed.get(metric, "–")} if metric in OF_PAPER else {}
+        cells |= {f"{title} ({paper})": printed.get(metric, "–")} if metric in PAPER_METRICS else {}
     return cells | {"n": n_of(row)}
 
 
@@ -118,7 +121,7 @@ def n_of(row: Mapping[str, Any]) -> str:
 
 
 def tabulate(lines: Sequence[Mapping[str, str]], **notes: str) -> pd.DataFrame:
-    """Make a table with notes to show below it: its `meaning`, and its `spread` (what ± and brackets mean)."""
+    """Make a table with notes to show below it: `meaning`, and `spread`, which explains ± and brackets."""
     table = pd.DataFrame(lines)
     table.attrs.update(notes)
     return table
@@ -139,7 +142,7 @@ def to_markdown(table: pd.DataFrame) -> str:
 
 
 def rounded(value: Any, digits: int = 6) -> Any:
-    """Round every float to significant digits, so that committed numbers do not change with the last bit."""
+    """Round every float to significant digits, so that rounding errors do not change committed numbers."""
     if isinstance(value, dict):
         return {key: rounded(item, digits) for key, item in value.items()}
     if isinstance(value, list):
@@ -151,7 +154,7 @@ def rounded(value: Any, digits: int = 6) -> Any:
 
 @dataclass(frozen=True)
 class Model:
-    """A row of table 2: its title, a short title, and the paper's scores for it (empty if it has none)."""
+    """A row of table 2: its title, a short title, and the paper's scores, which are empty if it gives none."""
 
     title: str
     short: str
@@ -159,7 +162,7 @@ class Model:
 
 
 def models(numbers: Results) -> dict[str, Model]:
-    """Return the rows of table 2 in the paper's order; their titles say if there was only one training skin."""
+    """Return the rows of table 2 in the paper's order; their titles mention if there was only one training skin."""
     titles = TABLE_2_ROWS | {"control": CONTROL}
     if "adapt" in numbers and numbers["adapt"]["pokes_n"] != ADAPTED_POKES_N:
         pokes = f"{numbers['adapt']['pokes_n']} indentations (paper: {ADAPTED_POKES_N})"
@@ -176,13 +179,13 @@ def models(numbers: Results) -> dict[str, Model]:
 
 
 def table_2_rows(numbers: Results) -> dict[str, tuple[Model, Mapping[str, Any]]]:
-    """Return the rows of table 2 that were computed, in the paper's order; last the control, which the paper lacks."""
+    """Return the computed rows of table 2 in the paper's order; the control, which the paper lacks, comes last."""
     ours = numbers["table2"] | control_of(numbers)
     return {row: (model, ours[row]) for row, model in models(numbers).items() if row in ours}
 
 
 def universal_rows(numbers: Results) -> list[tuple[Model, Mapping[str, Any]]]:
-    """Return the universal model's row of experiment population without labels and with the most unlabelled pokes."""
+    """Return the universal model's row with the most unlabelled pokes and no labels, from experiment population."""
     rows = [row for row in numbers.get("population", {}).get("told", ()) if (row["way"], row["labels_n"]) == UNIVERSAL]
     if not rows:
         return []
@@ -192,7 +195,7 @@ def universal_rows(numbers: Results) -> list[tuple[Model, Mapping[str, Any]]]:
 
 
 def control_of(numbers: Results) -> dict[str, Any]:
-    """Return the control's row by its name, if there is one."""
+    """Return the control's row under its name, or nothing if there is no control."""
     return {name: row for name, row in numbers.get("adapt", {}).items() if name == "control"}
 
 

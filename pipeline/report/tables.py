@@ -14,9 +14,9 @@ from pipeline.report.checklist import checklist, claims_table
 from pipeline.report.experiments import experiment_tables
 from pipeline.report.formatting import (
     COLUMNS,
+    FORCE_METRICS,
     INTERVAL,
-    OF_FORCE,
-    OF_PAPER,
+    PAPER_METRICS,
     SHORT,
     Model,
     beside,
@@ -217,7 +217,7 @@ def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
 
 def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd.DataFrame:
     """List scores by the number of labelled indentations of the new skin; a constant force, if given, comes last."""
-    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in OF_FORCE}
+    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in FORCE_METRICS}
     uncertainty = UNCERTAINTY if any(metric in row["as_labelled"] for row in rows for metric in UNCERTAINTY) else {}
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "source": source}
@@ -425,7 +425,7 @@ def table_2_summary(numbers: Numbers) -> pd.DataFrame:
         }
         for metric, title in COLUMNS.items():
             paper = f" ({model.paper[metric][0]:.3g})" if metric in model.paper else ""
-            line[f"{title} (paper)" if metric in OF_PAPER else title] = show(row.get(metric)) + paper
+            line[f"{title} (paper)" if metric in PAPER_METRICS else title] = show(row.get(metric)) + paper
         lines.append(line | {"n": n_of(row)})
     return tabulate(lines, spread=f"{INTERVAL}; n boards, or pairs of skins for one skin on others")
 

@@ -18,10 +18,10 @@ from pipeline.report.checklist import (
     Judgement,
     Row,
     checklist,
+    claim_p_value,
     claims_table,
     judge,
     look_up,
-    p_of,
     read_rows,
     resolve,
 )
@@ -173,7 +173,7 @@ def test_each_rule_fails_if_one_count_fails():
     ]
     judgement = judge_value(sweep, rule="each")
     assert (judgement.verdict, judgement.met) == (UNDECIDED, "yes")
-    assert judgement.notes == ("1 skins: supported, 6 skins: undecided, 15 skins: supported",)
+    assert judgement.notes == ("by number of skins: 1 supported, 6 undecided, 15 supported",)
     sweep[0]["accuracy_pct"] = over_boards(-2, -1)
     assert judge_value(sweep, rule="each").verdict == CONTRADICTED
 
@@ -219,13 +219,13 @@ def test_reason_is_shown_only_where_ours_differs():
 
 def test_short_run_is_noted_as_not_reached():
     numbers = all_experiments()
-    assert line(numbers, "figure-5b")["note"] == "45,000 contacts, paper 45,000"
+    assert line(numbers, "figure-5b")["note"] == "45,000 contacts (paper: 45,000)"
     numbers["drift"]["late"]["contacts_n"] = 18_000
-    assert line(numbers, "figure-5b")["note"] == "not reached: 18,000 contacts, paper 45,000"
+    assert line(numbers, "figure-5b")["note"] == "not reached: 18,000 contacts (paper: 45,000)"
     numbers["drift"]["late"]["bias_N"] = -0.1
     bias = line(numbers, "figure-5b")
     assert bias["met"] == "no"
-    assert bias["note"].startswith("not reached: 18,000 contacts, paper 45,000. The paper explains")
+    assert bias["note"].startswith("not reached: 18,000 contacts (paper: 45,000). The paper explains")
     del numbers["drift"]
     assert line(numbers, "figure-5b")["note"] == NOT_RUN
 
@@ -311,7 +311,7 @@ def test_p_value_of_a_claim_of_several_parts():
     def parts(*means: float) -> list[dict]:
         return [{"accuracy_pct": {"mean": mean, "se": se, "df": 5}} for mean, se in zip(means, (0.5, 1.0), strict=True)]
 
-    alone = [p_of(claim, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
-    assert p_of(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the second part's 0.85
-    assert p_of(claim, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
-    assert p_of(claim, None, []) is None
+    alone = [claim_p_value(claim, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
+    assert claim_p_value(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the second part's 0.85
+    assert claim_p_value(claim, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
+    assert claim_p_value(claim, None, []) is None

@@ -65,7 +65,7 @@ def draw_integrators(rows=STIFF) -> str:
 def test_quadrature_figure_labels():
     text = texts_of(draw_quadratures())
     for label in (
-        "median time an indentation / ms",
+        "median time per indentation / ms",
         "rms error / rms dB",
         "2 %",
         "simulated",
@@ -73,9 +73,9 @@ def test_quadrature_figure_labels():
         "midpoint",
     ):
         assert label in text
-    assert "cheapest below it: 0.7 mm x 5" in text
+    assert "cheapest below the limit: 0.7 mm x 5" in text
     assert "in use: 0.5 mm x 6" in text
-    assert "reference's own error, at most" in text
+    assert "upper bound of the reference's own error" in text
 
 
 def test_rule_in_use_is_marked_if_no_rule_meets_the_limit():
@@ -124,8 +124,8 @@ def test_pages_match_the_studies_of_the_scene():
 def test_stage_costs_columns():
     (line,) = stage_costs({"train_multi": cost(seconds=0.25)}).to_dict("records")
     assert line == {
-        "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "CPU of it, s": "–",
-        "trainings": "2", "of them reused": "1", "peak memory of a process, MB": "2",
+        "stage": "train_multi", "computed, s": "3.0", "last run, s": "0.2", "last run, CPU s": "–",
+        "training runs": "2", "reused training runs": "1", "peak memory per process, MB": "2",
     }  # fmt: skip
 
 
@@ -295,7 +295,7 @@ def test_untimed_cells_are_dashes():
     rows = [{"pokes_n": 390, **row(87.0)}, {"pokes_n": 65, "seconds": 1.5, **row(85.0)}]
     tables = cost_tables({"learning": [timed, untimed], "adaptation": rows}, "simulated")
     assert tables["learning"]["training, s"].tolist() == ["0.0123", "–"]
-    assert tables["learning"]["one reading, µs"].tolist() == ["4.56", "–"]
+    assert tables["learning"]["per reading, µs"].tolist() == ["4.56", "–"]
     assert tables["adaptation"]["adaptation, s"].tolist() == ["1.5", "–"]
 
 
@@ -308,4 +308,4 @@ def test_reference_methods_have_times_and_errors():
     found = learning_times({"rivals": {"methods": methods}}, {"reference_methods": took})
     (line,) = cost_tables(found, "recorded")["rivals_costs"].to_dict("records")
     assert (line["method"], line["accuracy, %"]) == ("map", "40 ± 0.1")
-    assert (line["until ready, s"], line["one reading, µs"]) == ("3", "50")
+    assert (line["until ready, s"], line["per reading, µs"]) == ("3", "50")

@@ -32,7 +32,7 @@ def draw_grid(error_mm: float = 0.5) -> str:
 def test_error_grid_has_units_and_source():
     text = draw_grid()
     ET.fromstring(text)
-    for label in ("x / mm", "y / mm", "mean place error / mm", "recorded"):
+    for label in ("x / mm", "y / mm", "mean position error / mm", "recorded"):
         assert label in text
 
 
@@ -162,7 +162,7 @@ def test_headline_figure_has_all_rows_of_table_2():
     labels = texts_of(headline_figures(numbers, "simulated")[HEADLINE])
     for name in numbers["table2"]:
         assert models(numbers)[name].title.split(",")[0] in labels
-    for label in ("simulated", "paper", "accuracy", "MSE_xy", "boards held out"):
+    for label in ("simulated", "paper", "accuracy", "MSE_xy", "held-out boards"):
         assert label in labels
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.report.figures import HEADLINE, headline_figures
-from pipeline.report.formatting import CONTROL, OF_PAPER, models, rounded, show, show_digits, to_markdown
+from pipeline.report.formatting import CONTROL, PAPER_METRICS, models, rounded, show, show_digits, to_markdown
 from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbers, lost_by_protocol
 from pipeline.report.paper import TABLE_2
 from pipeline.report.readme import fill
@@ -198,7 +198,7 @@ def test_fill_replaces_only_marked_blocks():
 
 
 def test_all_metrics_have_a_column():
-    assert {metric for row in TABLE_2.values() for metric in row} == set(OF_PAPER)
+    assert {metric for row in TABLE_2.values() for metric in row} == set(PAPER_METRICS)
 
 
 def test_summary_has_ours_the_papers_and_the_control():
