@@ -1,4 +1,4 @@
-"""Compute the content of `numbers.json`: every number that reports show, nested by experiment."""
+"""Compute the content of `numbers.json`: every number that reports show, by experiment."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -36,33 +36,42 @@ from reskin.metrics import METRICS
 
 Row = Mapping[str, Any]
 Points = Mapping[str, Sequence[dict[str, Any]]]
-Seconds = Sequence[Row]  # of training runs: name, train_s, one_reading_s
+Seconds = Sequence[Row]  # times of training runs: name, train_s, one_reading_s
 
-CONTROL = "control"  # the recipe of adaptation that fine-tunes as long but without the new skin's pokes
+CONTROL = "control"  # the recipe of adaptation that fine-tunes equally long without the new skin's pokes
 PAIRS = (
     ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
     ("adapted", "multi"),
 )  # fmt: skip
-PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these is compared with the paper's numbers
-STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # hold out whole indentations or passes
+PAPERS_SPLITS = ("single_random", "single_temporal")  # the first that exists is compared with the paper's numbers
+STRICTER = {
+    "by_indentation": "single_indentation",
+    "by_pass": "single_pass",
+}  # splits that hold out whole indentations or passes
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
-NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # by method
-OWN_POKES = "its own"  # in experiment reference_methods: a method receives the unlabelled pokes of the tested skin
+NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # experiment by method
+OWN_POKES = "its own"  # in experiment reference_methods: the method receives unlabelled pokes of the tested skin
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 SINGLE = {
     "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
     "by_time": "single_temporal",
 }  # fmt: skip
 POLICIES = ("initial", "regular", "each")
-HOVER = ("hover", "hover_network")  # predictors of the place of a tip that does not touch
-SEEN_PCT = 25.0  # assumed: chips sense the tip itself if this many of its places are right without contact
-OF_DRIFT = ("accuracy_pct", "mse_f_N2")
-OF_TOUCHES = ("single_touches_pct", "mean_left_over_pct")
-SETTINGS = ("scene", "source", "seed")  # keys of the provenance that are equal between equal runs
-TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # of a row below `runtime`
-ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # name a row below `runtime`
-OF_SHEAR = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
+HOVER = ("hover", "hover_network")  # methods that predict the position of a tip that does not touch the skin
+SEEN_PCT = 25.0  # assumed: with this accuracy without contact, the chips sense the tip itself
+DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
+TOUCHES_METRICS = ("single_touches_pct", "mean_left_over_pct")
+SETTINGS = ("scene", "source", "seed")  # keys of the provenance that do not differ between repeats of a run
+TIMES = (
+    "median_s",
+    "repeats_n",
+    "train_s",
+    "inference_us",
+    "seconds",
+)  # keys of a row in `runtime` that differ between repeats of a run
+ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # keys that identify a row in `runtime`
+SHEAR_METRICS = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
 
 def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
@@ -86,10 +95,10 @@ def learning_numbers(table: pd.DataFrame, *, headline: str) -> dict[str, Any]:
         "adapt": adapt,
         "constant_force": {name: row for name, row in constant_force.items() if row},
         "paired": [
-            {"of": of, "over": over}
-            | (paired_with_single if over == "single" else paired)(by_skin(models[of]), by_skin(models[over]))
-            for of, over in PAIRS
-            if of in models and over in models
+            {"of": method, "over": other}
+            | (paired_with_single if other == "single" else paired)(by_skin(models[method]), by_skin(models[other]))
+            for method, other in PAIRS
+            if method in models and other in models
         ],
         **_single(table, headline),
     }
@@ -110,20 +119,20 @@ def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, flo
 
 
 def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join errors of methods with their training times on this machine, by stage; untimed methods have no time."""
+    """Join the errors of methods with their training times on this machine; untimed methods get no time."""
     joined: dict[str, Any] = {}
     if "baselines" in numbers:
         joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
     if "sweep_pokes" in numbers:
-        took = seconds.get("sweep_pokes", [])
+        timed = seconds.get("sweep_pokes", [])
         joined["adaptation"] = []
         for row in numbers["sweep_pokes"]:
-            times_s = [training["train_s"] for training in took if f".{row['pokes_n']}pokes." in training["name"]]
+            times_s = [training["train_s"] for training in timed if f".{row['pokes_n']}pokes." in training["name"]]
             joined["adaptation"].append(row | ({"seconds": float(np.median(times_s))} if times_s else {}))
     if "rivals" in numbers:
-        took = seconds.get("reference_methods", [])
+        timed = seconds.get("reference_methods", [])
         joined["rivals_costs"] = [
-            {"method": row["method"]} | row[AS_LABELLED] | _median_times(took, f"{row['method']}.")
+            {"method": row["method"]} | row[AS_LABELLED] | _median_times(timed, f"{row['method']}.")
             for row in numbers["rivals"]["methods"]
             if row["pokes"] == OWN_POKES
         ]
@@ -131,7 +140,7 @@ def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, An
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
-    """Summarise networks of the leave-one-board-out experiment: with registered places, and board by board."""
+    """Summarise networks of the leave-one-board-out experiment with registered positions, and for each board."""
     by_board = {
         str(board): {
             "trained_on_skins_n": int(group["trained_on_skins_n"].iloc[0]),
@@ -146,7 +155,7 @@ def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
-    """Summarise networks of one skin for each way of splitting it; `single_sensor` is compared with the paper."""
+    """Summarise networks of one skin by split; `single_sensor` is compared with the paper."""
     experiments = (*PAPERS_SPLITS, *STRICTER.values())
     numbers = {
         experiment: over_folds(select(table, question=experiment, recipe=headline)) for experiment in experiments
@@ -162,9 +171,11 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise every recipe of every experiment with models; repeats on one skin are not summarised as boards."""
+    """Summarise every recipe of every experiment with models: over pairs, over repeats on one skin, or over boards."""
     numbers: dict[str, dict[str, Any]] = {}
-    models = table[table["question"].isin([one.name for one in EXPERIMENTS.values() if one.kind == "models"])]
+    models = table[
+        table["question"].isin([experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"])
+    ]
     for (experiment, recipe), group in _groups(models, ["question", "recipe"], sort=False):
         summarise = (
             over_pairs if experiment == "transfer" else over_folds if experiment.startswith("single_") else over_boards
@@ -200,35 +211,37 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
 
 
 def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
-    """Compute the paper's statements on its figure 6a as paired differences over boards.
+    """Compute paired differences over boards for the paper's statements on its figure 6a.
 
-    Compared are: no pokes with the fewest, no pokes with the number where the paper's plateau begins, and that number
-    with the most.
+    Three pairs are compared: no pokes and the fewest pokes; no pokes and the number at which the paper's plateau
+    begins; this number and the most pokes.
     """
-    at = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
-    if 0 not in at or len(at) < 2:
+    groups = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
+    if 0 not in groups or len(groups) < 2:
         return {}
-    known = sorted(at)
-    plateau_n = max((pokes_n for pokes_n in known if 0 < pokes_n <= PLATEAU_POKES_N), default=known[1])
-    steps = {"pokes_first": (0, known[1]), "pokes_gain": (0, plateau_n), "pokes_plateau": (plateau_n, known[-1])}
+    counts = sorted(groups)
+    plateau_n = max((pokes_n for pokes_n in counts if 0 < pokes_n <= PLATEAU_POKES_N), default=counts[1])
+    steps = {"pokes_first": (0, counts[1]), "pokes_gain": (0, plateau_n), "pokes_plateau": (plateau_n, counts[-1])}
     return {
-        name: {"from_pokes_n": few, "to_pokes_n": many, **paired(at[many], at[few])}
+        name: {"from_pokes_n": few, "to_pokes_n": many, **paired(groups[many], groups[few])}
         for name, (few, many) in steps.items()
         if few < many and (name != "pokes_plateau" or plateau_n == PLATEAU_POKES_N)
     }
 
 
 def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
-    """Compute the paper's statements on its figure 6b as paired differences over boards.
+    """Compute paired differences over boards for the paper's statements on its figure 6b.
 
-    Compared are: the most training skins with the fewest, adapted networks with others, and the gain by adaptation with
-    the fewest skins with that with the most.
+    Three pairs are compared: the most and the fewest training skins; adapted networks and the others; the gain from
+    adaptation with the fewest skins and with the most.
     """
-    at = {(method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])}
-    counts = sorted({skins_n for _, skins_n in at})
+    groups = {
+        (method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])
+    }
+    counts = sorted({skins_n for _, skins_n in groups})
     adapted = {
         f"sensors_adapted_over_{method}": [
-            {"skins_n": skins_n, **paired(at["adapted", skins_n], at[method, skins_n])} for skins_n in counts
+            {"skins_n": skins_n, **paired(groups["adapted", skins_n], groups[method, skins_n])} for skins_n in counts
         ]
         for method in ("multi", "triplet")
     }
@@ -236,8 +249,8 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
         return adapted
     few, many = counts[0], counts[-1]
     counts_n = {"from_skins_n": few, "to_skins_n": many}
-    more = {f"sensors_more_{method}": counts_n | paired(at[method, many], at[method, few]) for method in SWEPT}
-    gain_few, gain_many = (differences(at["adapted", n], at["triplet", n]) for n in (few, many))
+    more = {f"sensors_more_{method}": counts_n | paired(groups[method, many], groups[method, few]) for method in SWEPT}
+    gain_few, gain_many = (differences(groups["adapted", n], groups["triplet", n]) for n in (few, many))
     return adapted | more | {"sensors_gain_fewer": counts_n | summarise_differences(gain_few - gain_many)}
 
 
@@ -251,14 +264,14 @@ def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
 
 def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
     for (method, inputs), group in _groups(rows, ["method", "inputs"], sort=False):
-        for labels_n, scored in _groups(group, "labels_n"):
-            parts = {places: over_boards(scored, places) for places in (AS_LABELLED, REGISTERED)}
-            by_board = records(whole(scored).groupby("board")[list(METRICS)].mean())
+        for labels_n, labelled in _groups(group, "labels_n"):
+            parts = {places: over_boards(labelled, places) for places in (AS_LABELLED, REGISTERED)}
+            by_board = records(whole(labelled).groupby("board")[list(METRICS)].mean())
             yield {"method": method, "inputs": inputs, "labels_n": int(labels_n), **parts, "by_board": by_board}
 
 
 def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
-    """Score the mean tested force as a constant prediction; its MSE is the variance of forces, MSE_F / (1 - R^2)."""
+    """Score the mean tested force as a constant prediction; its MSE is the force variance, MSE_F / (1 - R^2)."""
     tested = whole(rows).dropna(subset=["r2_f"])
     tested = tested[tested["r2_f"] < 1]
     variance_N2 = (tested["mse_f_N2"] / (1 - tested["r2_f"])).groupby(tested["board"]).mean()
@@ -267,12 +280,12 @@ def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _groups(rows: pd.DataFrame, by: str | list[str], *, sort: bool = True) -> Iterator[tuple[Any, pd.DataFrame]]:
-    """Group rows by columns; unsorted groups come in the order of their first rows."""
+    """Group rows by columns; unsorted groups are in the order of their first rows."""
     yield from rows.groupby(by, sort=sort)
 
 
 def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, float]:
-    """Return the median seconds of a method's training runs; those of adapted networks include pretraining."""
+    """Return the median times of a method's training runs; those of adapted networks include pretraining."""
     experiment = NETWORKS.get(row["method"])
     if experiment is None:
         return _median_times(seconds.get("train_classical", []), f"{row['name']}.")
@@ -283,18 +296,19 @@ def _times(row: Mapping[str, Any], seconds: Mapping[str, Seconds]) -> dict[str, 
     return times | {"train_s": times["train_s"] + base["train_s"]} if base else {}
 
 
-def _median_times(took: Seconds, start: str) -> dict[str, float]:
-    timed = [training for training in took if training["name"].startswith(start)]
-    if not timed:
+def _median_times(timed: Seconds, prefix: str) -> dict[str, float]:
+    """Return the median times of the training runs whose names start with `prefix`."""
+    trainings = [training for training in timed if training["name"].startswith(prefix)]
+    if not trainings:
         return {}
     return {
-        "train_s": float(np.median([training["train_s"] for training in timed])),
-        "inference_us": 1e6 * float(np.median([training["one_reading_s"] for training in timed])),
+        "train_s": float(np.median([training["train_s"] for training in trainings])),
+        "inference_us": 1e6 * float(np.median([training["one_reading_s"] for training in trainings])),
     }
 
 
 def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Add the counts of all captures (keys that end in `_n`), and all skipped bytes as `lost_bytes_n`."""
+    """Add up the counts of all captures (keys that end in `_n`); `lost_bytes_n` is the number of all skipped bytes."""
     total = Counter({"captures_n": 0})
     for account in accounts:
         total.update({"captures_n": 1} | {name: count for name, count in account.items() if name.endswith("_n")})
@@ -303,9 +317,9 @@ def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
-    """Summarise predictions of places from readings before the contact, over folds: by experiment and predictor.
+    """Summarise, by experiment and predictor, positions predicted from readings before the contact, over folds.
 
-    Scores of a hovering tip are listed by fold (skin), with whether the chips sense the tip itself.
+    For each fold (a skin), the scores of a hovering tip are listed. `seen` says whether the chips sense the tip itself.
     """
     before: dict[str, dict[str, Any]] = {}
     hover: dict[str, dict[str, Any]] = {}
@@ -326,7 +340,7 @@ def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
 def count_trainings(
     cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
-    """Count training runs by experiment: all, those that collapsed, and collapsed ones that had to be kept."""
+    """Count training runs by experiment: all, those that collapsed, and the collapsed ones that had to be kept."""
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)
@@ -337,21 +351,21 @@ def count_trainings(
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
-    """Add up the counts of the captures of each further protocol, and of the rows that its experiments left out."""
-    found: dict[str, dict[str, Any]] = {}
+    """Add up, for each protocol but the main one, the counts of its captures, and list the rows that were left out."""
+    by_protocol: dict[str, dict[str, Any]] = {}
     for experiment, lost in losses.items():
         protocol = EXPERIMENTS[experiment].protocol
         if protocol is None or not lost["accounts"]:
             continue
-        left_out = found.get(protocol, {"left_out": {}})["left_out"]
-        found[protocol] = add_up(lost["accounts"]) | {"left_out": left_out | dict(lost["left_out"])}
-    return found
+        left_out = by_protocol.get(protocol, {"left_out": {}})["left_out"]
+        by_protocol[protocol] = add_up(lost["accounts"]) | {"left_out": left_out | dict(lost["left_out"])}
+    return by_protocol
 
 
 def runtime_numbers(
     trainings_n: int, costs: Mapping[str, Row], study: Row | None, seconds: Sequence[Row]
 ) -> dict[str, Any]:
-    """Return what each stage cost, and the results of experiment runtime (`study`) with the times on this machine."""
+    """Return the cost of each stage, and the results of experiment runtime (`study`) with the times on this machine."""
     numbers: dict[str, Any] = {
         "stages": {stage: _stage_cost(cost) for stage, cost in costs.items()}, "trainings_n": trainings_n,
     }  # fmt: skip
@@ -366,7 +380,7 @@ def runtime_numbers(
 
 
 def _stage_cost(cost: Row) -> dict[str, float]:
-    """Return what a stage cost when it was computed, with its training runs added up, and what its last run took."""
+    """Return the cost of computing a stage, including all its training runs, and the cost of its last run."""
     trainings_s = cost["trainings_s"].values()
     return {
         "computed_s": cost["other_s"] + sum(trainings_s),
@@ -376,7 +390,7 @@ def _stage_cost(cost: Row) -> dict[str, float]:
 
 
 def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split the numbers of a run into numbers.json, which is equal in equal runs, and provenance.json, which is not."""
+    """Split the numbers of a run into numbers.json, equal for every repeat of the run, and provenance.json."""
     own = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
     costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
     studies: dict[str, Any] = {}
@@ -404,7 +418,7 @@ def join(numbers: Row, provenance: Row) -> dict[str, Any]:
 def headline_scores(numbers: Row) -> dict[str, Any]:
     """Select a scene's headline scores, nested by experiment: means with units in their names.
 
-    They contain nothing that differs between equal runs, such as seconds, commit or machine.
+    They contain nothing that differs between repeats of a run, such as times, commit or machine.
     """
     recorded = {
         name for name in ("lobo", "labels") if name in numbers and numbers["provenance"]["source"] == "recorded"
@@ -417,13 +431,13 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         "single_sensor": {
             name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
         },
-        "drift_end": {  # the last window of each policy, already a mean over networks
-            policy: {name: drift[policy][-1][name] for name in OF_DRIFT if name in drift[policy][-1]}
+        "drift_end": {  # the last window of each policy, which is already a mean over networks
+            policy: {name: drift[policy][-1][name] for name in DRIFT_METRICS if name in drift[policy][-1]}
             for policy in POLICIES
             if policy in drift
         },
-        "shear": _means(numbers["shear"], OF_SHEAR) if "shear" in numbers else {},
-        "touches": _means(numbers.get("touches", {}).get("superposition", {}), OF_TOUCHES),
+        "shear": _means(numbers["shear"], SHEAR_METRICS) if "shear" in numbers else {},
+        "touches": _means(numbers.get("touches", {}).get("superposition", {}), TOUCHES_METRICS),
     }
     return {name: part for name, part in parts.items() if part}
 
@@ -433,8 +447,8 @@ def _means(row: Row, names: Sequence[str] = METRICS) -> dict[str, float]:
 
 
 def _best_of_labels(rows: Sequence[Row]) -> dict[str, Any]:
-    """Select the most accurate method with the fewest labels of the new board, and with the most."""
-    found = {}
+    """Select the most accurate method with the fewest labels of the new board, and the most accurate with the most."""
+    selected = {}
     counts = [row["labels_n"] for row in rows]
     for labels_n in sorted({min(counts), max(counts)}):
         best = max(
@@ -442,5 +456,5 @@ def _best_of_labels(rows: Sequence[Row]) -> dict[str, Any]:
             key=lambda row: row["as_labelled"]["accuracy_pct"]["mean"],
         )
         method = f"{best['method']} ({best['inputs']})"
-        found[f"best_of_{labels_n}_labels"] = {"method": method} | _means(best["as_labelled"])
-    return found
+        selected[f"best_of_{labels_n}_labels"] = {"method": method} | _means(best["as_labelled"])
+    return selected

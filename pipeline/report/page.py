@@ -24,38 +24,38 @@ from reskin.errors import SchemaError
 
 Captions = dict[str, str]  # by name of a table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
-NO_NUMBER = ("–", "see file", "")  # cells of the checklist without a number
-FURTHER = "further"  # the section for tables and figures that no other section names
-OPEN = {"table2", "labels", "claims"}  # tables that are open when the page loads; others open on demand
-BESIDE_N = 4  # most results of the paper that a section lists; the checklist has all
-SUMMARY = "Scores on boards never seen"
+NO_NUMBER = ("–", "see file", "")  # cells of the checklist that contain no number
+FURTHER = "further"  # the section of tables and figures that no other section names
+OPEN = {"table2", "labels", "claims"}  # tables that are open when the page loads; the reader opens the others
+BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist has all
+SUMMARY = "Scores on held-out boards"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",
 }
 KINDS = {"recorded": "Recorded boards", "simulated": "Simulated boards"}
-# No line may break within a number and its deviation, or within an interval and its unit.
+# No line break is allowed between a number and its deviation, or between an interval and its unit.
 UNBROKEN = re.compile(r"(?<=\d) ± (?=\d)|\[[-+\d.e]+, [-+\d.e]+\]( (%|mm²|N²|mm|N)(?![\w]))?")
 NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
-LONG = 40  # letters of a cell that needs a wide column
+LONG = 40  # characters; a column with a longer cell is wide
 SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
-LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # in a file measured in points
+LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # in a figure whose unit is the point
 PX_PER_PT = 4 / 3
-WIDE_PT = 500.0  # a wider figure gets a row of its own
-LEGIBLE_PX = 8.0  # smallest size of letters; a figure that would need smaller ones to fit scrolls
-NARROW_PX = 340.0  # width of a telephone
+WIDE_PT = 500.0  # a wider figure gets its own row
+LEGIBLE_PX = 8.0  # smallest legible letters; a figure scrolls before its letters become smaller
+NARROW_PX = 340.0  # width of a phone's screen
 
 
 class Section(Strict):
-    """A part of the page: its heading, a sentence, and its tables and figures in order, with captions by name."""
+    """A section of the page: heading, introductory sentence, and the captions of its tables and figures, in order."""
 
     key: str
     title: str
     sentence: str
     tables: Captions = Field(default_factory=dict)
     figures: Captions = Field(default_factory=dict)
-    folded: Captions = Field(default_factory=dict)  # long tables, last
+    folded: Captions = Field(default_factory=dict)  # long tables, which come last
 
     @property
     def captions(self) -> Captions:
@@ -65,7 +65,7 @@ class Section(Strict):
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure as the page shows it: its file, its size, and the width below which small letters are illegible."""
+    """A figure as the page shows it: its file, its size, and the width below which its letters become illegible."""
 
     file: str
     width_px: int
@@ -75,13 +75,13 @@ class Drawing:
 
     @property
     def scrolls(self) -> bool:
-        """Whether it is wider than the screen of a telephone."""
+        """Whether the figure scrolls on a phone, because its letters are legible only if it is wider than the screen."""
         return self.least_px > NARROW_PX
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table as the page shows it; the look of a column is `number` (aligned right), `text` or `text long`."""
+    """A table as the page shows it; each column looks like `number` (aligned right), `text` or `text long`."""
 
     name: str
     caption: str
@@ -93,7 +93,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene on the page of all scenes."""
+    """A scene as the page of all scenes shows it."""
 
     scene: str
     about: str
@@ -102,7 +102,7 @@ class Entry:
 
 
 def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures: Mapping[str, str]) -> str:
-    """Render the page of a scene, equal for equal runs; figures are SVG text by file name."""
+    """Render the page of a scene, which is the same for every repeat of a run; `figures`: SVG text by file name."""
     source, summary = numbers["provenance"]["source"], summary_table(numbers)
     drawings = {name: measure(f"figures/{name}", text) for name, text in figures.items()}
     checklist = tables.get("checklist", pd.DataFrame())
@@ -122,9 +122,9 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
 
 
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
-    """Render the page of one run, which the page of the scene embeds: its commit, machine, versions and times.
+    """Render the page of one run (commit, machine, versions, times), which the scene's page embeds.
 
-    numbers: joined with their provenance. costs: the other files of the page's folder, text by name.
+    numbers: joined with their provenance. costs: text of the other files in the page's folder, by file name.
     """
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)
@@ -132,7 +132,9 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     provenance = pd.DataFrame(
         {
             "what": key,
-            "value": ", ".join(f"{name} {one}" for name, one in value.items()) if isinstance(value, Mapping) else value,
+            "value": ", ".join(f"{name} {version}" for name, version in value.items())
+            if isinstance(value, Mapping)
+            else value,
         }
         for key, value in numbers["provenance"].items()
     )
@@ -144,27 +146,27 @@ def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     )
 
 
-def index(results: Sequence[Mapping[str, Any]], drawn: Mapping[str, str]) -> str:
-    """Render the page of all scenes, recorded ones first. `drawn`: headline figures by scene."""
+def index(results: Sequence[Mapping[str, Any]], headlines: Mapping[str, str]) -> str:
+    """Render the page of all scenes, with recorded scenes first. `headlines`: headline figures by scene."""
     kinds = []
     for source, title in KINDS.items():
-        entries = [_entry(numbers, drawn) for numbers in results if numbers["provenance"]["source"] == source]
+        entries = [_entry(numbers, headlines) for numbers in results if numbers["provenance"]["source"] == source]
         if entries:
             entries.sort(key=lambda entry: (entry.summary is None, entry.scene))  # scenes with a summary first
             kinds.append({"source": source, "title": title, "sentence": SOURCES[source], "entries": entries})
     return template("page.index.html").render(kinds=kinds)
 
 
-def _entry(numbers: Mapping[str, Any], drawn: Mapping[str, str]) -> Entry:
+def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str]) -> Entry:
     scene = str(numbers["provenance"]["scene"])
     summary = summary_table(numbers)
     table = None if summary is None else lay_out(f"summary-{scene}", SUMMARY, summary)
-    figure = measure(f"{scene}/figures/{HEADLINE}", drawn[scene]) if scene in drawn else None
+    figure = measure(f"{scene}/figures/{HEADLINE}", headlines[scene]) if scene in headlines else None
     return Entry(scene, counts_of(numbers), table, figure)
 
 
 def template(name: str) -> Template:
-    """Load a template of this folder."""
+    """Load a template from this folder."""
     environment = Environment(loader=PackageLoader("pipeline.report", "."), autoescape=True, undefined=StrictUndefined)
     environment.tests["number_text"] = NUMBER.fullmatch
     environment.filters["unbroken"] = unbroken
@@ -172,17 +174,17 @@ def template(name: str) -> Template:
 
 
 def unbroken(text: str) -> str:
-    """Keep a number with its deviation, and the ends of an interval, on one line."""
+    """Keep a number and its deviation on one line, and likewise the ends of an interval."""
     return UNBROKEN.sub(lambda found: found[0].replace(" ", NO_BREAK), text)
 
 
 def read_sections() -> list[Section]:
-    """Read the sections of a page, in order."""
+    """Read the sections of the page, in order."""
     return [parse(Section, entry, f"page, section {entry['key']}") for entry in add_sections(read_yaml(PAGE_FILE))]
 
 
 def arrange(tables: Iterable[str], figures: Iterable[str]) -> list[Section]:
-    """List the sections that have something to show; section `further` shows what no other section names."""
+    """List the sections with tables or figures to show; section `further` shows those that no other section names."""
     sections, names = read_sections(), {"tables": dict.fromkeys(tables), "figures": dict.fromkeys(figures)}
     named = {name for section in sections for name in section.captions}
     further = {kind: {name: _title(name) for name in of_kind if name not in named} for kind, of_kind in names.items()}
@@ -196,7 +198,7 @@ def _title(name: str) -> str:
 
 
 def about(numbers: Mapping[str, Any]) -> str:
-    """Write where the readings of a scene come from, and how many there are."""
+    """Describe where the readings of a scene come from, and how many there are."""
     return f"{SOURCES[numbers['provenance']['source']]} {counts_of(numbers)}"
 
 
@@ -208,17 +210,17 @@ def counts_of(numbers: Mapping[str, Any]) -> str:
 
 
 def beside_paper(section: Section, checklist: pd.DataFrame) -> Table | None:
-    """Select the checklist's rows for a section that have a number of ours; rows with verdicts come first."""
+    """Select the checklist rows of a section in which we have a number; rows with verdicts come first."""
     rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NO_NUMBER and row["note"] != ONE_SKIN]
     if not rows:
         return None
     rows.sort(key=lambda row: row["verdict"] in NO_NUMBER)
     columns = ["result", "ours", "paper", "verdict", "note"]
-    return lay_out(f"beside-{section.key}", "Beside the paper", pd.DataFrame(rows[:BESIDE_N])[columns])
+    return lay_out(f"beside-{section.key}", "Comparison with the paper", pd.DataFrame(rows[:BESIDE_N])[columns])
 
 
 def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]]:
-    """List the stages whose results a section shows, and the files of their code."""
+    """List the stages whose results a section shows, each with the file of its code."""
     stages = dict.fromkeys(row["stage"] for row in _rows_of(section, checklist))
     return [(stage, str(file_of(module_name(stage)).relative_to(ROOT))) for stage in stages if is_stage(stage)]
 
@@ -232,7 +234,7 @@ def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
 
 
 def measure(file: str, svg: str) -> Drawing:
-    """Measure a figure from its text: its size in CSS pixels, and how far it may shrink."""
+    """Read the size of a figure from its SVG text, and compute the smallest legible width, in CSS pixels."""
     size = SVG_SIZE_PT.search(svg)
     if size is None:
         raise SchemaError(f"{file}: the SVG has no size in points: {svg[:80]}. Was it written by drawing.svg?")
@@ -244,7 +246,7 @@ def measure(file: str, svg: str) -> Drawing:
 
 
 def lay_out(name: str, caption: str, table: pd.DataFrame) -> Table:
-    """Prepare a table for the page: the look of its columns, its cells as text, and its notes."""
+    """Prepare a table for the page: how its columns look, its cells as text, and its notes."""
     cells = table.fillna("").astype(str)
     looks = [_look(cells[title]) for title in cells.columns]
     return Table(name, caption, [*map(str, cells.columns)], looks, [*cells.itertuples(index=False)], notes(table))
@@ -259,7 +261,7 @@ def _look(cells: "pd.Series[str]") -> str:
 def _fill(
     section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Drawing], source: str
 ) -> dict[str, Any]:
-    """Prepare a section for the template: its heading, and the tables and figures that exist."""
+    """Prepare a section for the template: its heading, its sentence, and those of its tables and figures that exist."""
     captions = section.tables | section.folded
     return {
         "key": section.key,

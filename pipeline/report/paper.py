@@ -1,4 +1,4 @@
-"""The numbers that the paper reports (Bhirangi et al., CoRL 2021), each with its section or table."""
+"""The numbers and statements of the paper (Bhirangi et al., CoRL 2021), each with its section or table."""
 
 from collections.abc import Mapping
 
@@ -25,12 +25,12 @@ TABLE_2_ROWS = {
 ADAPTED_POKES_N = 390  # table 2
 
 
-def _less(of: Mapping[str, float], over: Mapping[str, float]) -> dict[str, float]:
+def _subtract(means: Mapping[str, float], others: Mapping[str, float]) -> dict[str, float]:
     """Return the differences of printed means, rounded to the digits of the means."""
-    return {name: round(of[name] - over[name], 3) for name in of}
+    return {name: round(means[name] - others[name], 3) for name in means}
 
 
-# Figure 6 is printed without numbers; the text below it says what it shows.
+# Figure 6 is printed without numbers; these are statements of the text about it.
 FIGURE_6A = (
     '"a significant improvement in performance between no self-supervision and using 780 points", which "seems to '
     'plateau as we increase the data beyond this point"'
@@ -42,34 +42,34 @@ FIGURE_6B = (
 
 SLEEVE_SKIN = "2 in x 4 in (50.8 x 101.6)"  # section 6, arm sleeve
 SLEEVE_WORDS = 'it shows "contact localization across larger surface areas" in a video (section 6, figure 1E)'
-# Figures 4 and 5 are printed without numbers too.
+# Figures 4 and 5 are also printed without numbers.
 FIGURE_4 = (
     '"while the general properties of the individual sensors overlap, there is still obvious variation across the '
     'samples"'
 )
-FIGURE_5 = "Figure 5 of the paper is printed without numbers; what its text says of it is the table of findings."
+FIGURE_5 = "Figure 5 of the paper is printed without numbers. The table of findings tests what its text says about it."
 SHEAR: dict[str, Number] = {  # section 4: dragged lines
     "mse_xy_mm2": (0.085, 0.006),
     "mse_fxy_N2": (0.0011, 0.0002),
     "mse_fz_N2": (0.003, 0.001),
 }
-MANUAL_POKES_N = 325  # section 5, manual indentations; without deviations
+MANUAL_POKES_N = 325  # section 5, manual indentations; the paper gives no deviations
 MANUAL: dict[str, dict[str, float]] = {
     "before": {"accuracy_pct": 79.86, "mse_xy_mm2": 0.676, "mse_f_N2": 0.268},
     "after": {"accuracy_pct": 84.84, "mse_xy_mm2": 0.489, "mse_f_N2": 0.192},
 }
 _means = {row: {name: mean for name, (mean, _) in scores.items()} for row, scores in TABLE_2.items()}
-# The gains that the paper claims: differences of its printed means, for which it gives no spread.
+# The gains that the paper claims: differences of its printed means. It gives no deviations of these differences.
 GAINS: dict[str, dict[str, float]] = {
-    "multi_over_single": _less(_means["multi"], _means["single"]),  # "significantly better"
+    "multi_over_single": _subtract(_means["multi"], _means["single"]),  # "significantly better"
     # "slightly affects"
-    "triplet_over_multi": {"accuracy_pct": _less(_means["triplet"], _means["multi"])["accuracy_pct"]},
-    "adapted_over_triplet": _less(_means["adapted"], _means["triplet"]),  # "a sizeable improvement"
-    "adapted_over_multi": _less(_means["adapted"], _means["multi"]),
-    "by_hand": _less(MANUAL["after"], MANUAL["before"]),  # "clearly demonstrating the effectiveness"
+    "triplet_over_multi": {"accuracy_pct": _subtract(_means["triplet"], _means["multi"])["accuracy_pct"]},
+    "adapted_over_triplet": _subtract(_means["adapted"], _means["triplet"]),  # "a sizeable improvement"
+    "adapted_over_multi": _subtract(_means["adapted"], _means["multi"]),
+    "by_hand": _subtract(MANUAL["after"], MANUAL["before"]),  # "clearly demonstrating the effectiveness"
 }
 FLEXIBLE: dict[str, float] = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # section 5: adapted; "about"
-FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: distance between skin and circuit board
+FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: by how much the distance between skin and circuit board is smaller
 SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2N) of water"
 SENSITIVITY_ML = 20.0
 LOG_RATE_HZ = 250.0  # section 6, dog shoe and glove: "logged to an SD card at 250 Hz"
@@ -79,7 +79,7 @@ FORCE_RESOLUTION_MAX_N = 0.1  # section 1: what a good skin should reach
 PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% accuracy)"
 LASTING_CONTACTS_N = 50_000  # section 1: "perform accurate predictions even beyond 50K interactions"
 LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"
-PLATEAU_POKES_N = 780  # section 5: no great gain beyond
+PLATEAU_POKES_N = 780  # section 5: "seems to plateau" beyond this number
 MONOTONIC = '"monotonically increasing sensor measurements"'
 DYNAMICS = '"ReSkin can stream data up to 400 Hz and we aim to leverage this capability": future work'  # section 7
 FLEXIBLE_BIAS = '"an overestimation bias resulting from signals appearing stronger"'

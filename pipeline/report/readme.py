@@ -1,4 +1,4 @@
-"""Fill in the generated parts of README.md and docs from the results in `reports/`."""
+"""Fill in the generated blocks of README.md and docs from the results in `reports/`."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -19,20 +19,20 @@ from reskin.code import ROOT, file_of
 from reskin.config import read_yaml
 from reskin.errors import ParamsError, SchemaError
 
-TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # of each simulated scene in docs/results.md
+TABLES = ("table2", "claims", "manual", "flexible", "single_sensor")  # shown in docs/results.md for simulated scenes
 COMPARED = ("compare", "compare_parameters", "compare_frames")
 NONE_YET = "None yet."
 COSTS_MEANING = (
-    "Computed from nothing, trainings added up as if one ran after another; two run side by side by default, so that "
-    "less time passes."
+    "The time to compute everything from scratch, as if the training runs ran one after another. By default, two of "
+    "them run side by side, so less time passes."
 )
 TIMES = "reports/time.json"  # written by `make time-repro`
-FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README begins with the second
+FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README shows the second first
 Numbers = Mapping[str, Any]  # of one scene
 
 
 def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
-    """Fill in all pages, and write them if `write`; return the pages that changed, and the scenes that they show.
+    """Fill in all pages and, if `write`, write them; return the pages that changed and the scenes that they show.
 
     The pages show the simulated scenes `paper` and `quick`, and every recorded scene with results in `reports/`.
     """
@@ -59,17 +59,17 @@ def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
 
 
 def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
-    """Put each block between its marks `<!-- name -->` and `<!-- /name -->`, in the one page that has them."""
+    """Put each block between its markers `<!-- name -->` and `<!-- /name -->`, in the only page that has them."""
     filled = dict(texts)
     for name, content in blocks.items():
-        marks = re.compile(rf"(<!-- {name} -->\n)(.*?)(<!-- /{name} -->)", re.DOTALL)
-        pages = [page for page, text in filled.items() if marks.search(text)]
+        markers = re.compile(rf"(<!-- {name} -->\n)(.*?)(<!-- /{name} -->)", re.DOTALL)
+        pages = [page for page, text in filled.items() if markers.search(text)]
         if len(pages) != 1:
-            found = ", ".join(pages) or "no page"
             raise SchemaError(
-                f"README.md and docs: block {name} must be in one page; it is in {found}. Restore its marks."
+                f"README.md and docs: block {name} must be in one page; it is in {', '.join(pages) or 'no page'}. "
+                f"Restore its markers <!-- {name} --> and <!-- /{name} -->."
             )
-        before, opening, _, closing, after = marks.split(filled[pages[0]])
+        before, opening, _, closing, after = markers.split(filled[pages[0]])
         filled[pages[0]] = f"{before}{opening}{content.strip()}\n{closing}{after}"
     return filled
 
@@ -79,7 +79,8 @@ def blocks_of(
 ) -> dict[str, str]:
     """Make the generated blocks of the pages, by name.
 
-    The last of `results` is the headline scene: README shows its scores, and its skins are compared with recorded ones.
+    The last of `results` is the headline scene. README shows its scores, and the table of skins compares its skins with
+    recorded ones.
     """
     labelled = [numbers for numbers in recorded if "labels" in numbers]
     compared = [numbers for numbers in recorded if "compare" in numbers]
@@ -93,7 +94,7 @@ def blocks_of(
         "headline": _summary(results[-1]),
         "recorded": "\n\n".join(map(_summary, labelled)) or NONE_YET,
         "results": "\n\n".join(_tables(numbers, TABLES) for numbers in results),
-        "time": "Not timed yet: `make time-repro`." if times is None else _time(times),
+        "time": "Not timed yet. Run `make time-repro`." if times is None else _time(times),
         "costs": to_markdown(costs_table([*results, *recorded])),
         "labels": "\n\n".join(_tables(numbers, ("labels",)) for numbers in labelled) or NONE_YET,
         "compare": "\n\n".join(_tables(numbers, COMPARED) for numbers in compared) or NONE_YET,
@@ -109,9 +110,9 @@ def _summary(numbers: Numbers) -> str:
 
 
 def _tables(numbers: Numbers, names: Sequence[str]) -> str:
-    """Write the named tables of a scene, below a heading with its provenance."""
+    """Write the named tables of a scene below a heading with its provenance."""
     provenance = numbers["provenance"]
-    # Only the experiments shown: committed results of others may not fit their current code.
+    # Tables are made only for the shown experiments: committed results of others may not fit the current code.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
     heading = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
@@ -121,7 +122,7 @@ def _tables(numbers: Numbers, names: Sequence[str]) -> str:
 
 
 def _time(times: Numbers) -> str:
-    """Write how long fresh clones took: medians over their runs."""
+    """Write the time and disk space that fresh clones needed, as medians over clones."""
     runs = times["runs"]
     environment_min, stages_min = (
         median(run[part]["wall_s"] for run in runs) / 60 for part in ("environment", "stages")
@@ -130,18 +131,18 @@ def _time(times: Numbers) -> str:
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
         f"Environment {environment_min:.1f} min, stages {stages_min:.1f} min ({cpu_min:.1f} CPU min); {all_GB:.1f} GB, "
-        f"{environment_GB:.1f} GB of them the environment. Median of {len(runs)} fresh clones on {times['machine']} "
+        f"of which {environment_GB:.1f} GB are the environment. Median of {len(runs)} fresh clones on {times['machine']} "
         f"(`make time-repro`, code {times['git']})."
     )
 
 
 def costs_table(scenes: Sequence[Numbers]) -> pd.DataFrame:
-    """Tabulate what each scene costs when all of it is computed, and the number of its training runs."""
+    """Tabulate the time to compute each scene from scratch and the number of its training runs."""
     lines = [
         {
             "scene": f"`{numbers['provenance']['scene']}`",
             "computed, min": f"{numbers['provenance']['seconds'] / 60:.2g}",
-            "trainings": f"{sum(count['trainings_n'] for count in numbers['trainings'].values()):,}",
+            "training runs": f"{sum(count['trainings_n'] for count in numbers['trainings'].values()):,}",
             "collapsed": str(sum(count["collapsed_n"] for count in numbers["trainings"].values())),
             "machine": numbers["provenance"]["device"],
         }
@@ -151,7 +152,7 @@ def costs_table(scenes: Sequence[Numbers]) -> pd.DataFrame:
 
 
 def _stages(stages: Mapping[str, Any]) -> str:
-    """Tabulate the stages of dvc.yaml with code and outputs; without padding, an edited stage changes one line only."""
+    """Tabulate the stages of dvc.yaml with code and outputs; cells are not padded, so that each edit changes one line."""
     lines = ["| stage | code | writes |", "|---|---|---|"]
     for name, stage in stages.items():
         outs = [

@@ -1,4 +1,4 @@
-"""Tables of a scene, made from numbers.json and written as Markdown for people and as CSV for programs."""
+"""Tables of a scene, made from numbers.json and written as Markdown for readers and as CSV for programs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -39,110 +39,126 @@ from reskin.errors import ParamsError
 Numbers = Mapping[str, Any]
 Rows = Sequence[Mapping[str, Any]]
 SPLITS = {
-    "single_random": "random readings held out (the paper's way: readings of one indentation on both sides)",
-    "single_indentation": "random indentations held out (all readings of one on the same side)",
-    "single_pass": "random passes held out (each visits every place and depth again)",
-    "single_temporal": "first passes → last passes",
+    "single_random": "random readings held out (as in the paper: an indentation has readings in training and test)",
+    "single_indentation": "random indentations held out (an indentation is never split between training and test)",
+    "single_pass": "random passes held out (each pass visits every place and depth again)",
+    "single_temporal": "trained on the first passes, tested on the last",
 }
-UNCERTAINTY = {"coverage_pct": "in 90 % intervals, %", "half_width_mm": "half of them, mm (median)"}
+UNCERTAINTY = {
+    "coverage_pct": "coverage of 90 % intervals, %",
+    "half_width_mm": "half-width of 90 % intervals, mm (median)",
+}
 BEFORE_TOUCH = {
-    "noload": "the no-load reading before the poke alone",
-    "scan": "the number of the poke in its pass alone",
+    "noload": "only the no-load reading before the indentation",
+    "scan": "only the number of the indentation in its pass",
 }
 BEFORE_TOUCH_MEANING = (
-    "Place from ... alone: predicted from the 2 nearest training rows, without any change of field. The number in the "
-    "pass measures how far the rig repeats its order; no network receives it. The no-load reading measures what the "
-    "skin's memory of earlier indentations reveals of that order; a network may use it, because it is part of the "
-    "change of field."
+    "Position from only ...: predicted by the 2 nearest training rows, without the field change. The number of the "
+    "indentation in its pass shows how exactly the rig repeats its order; no network receives this number. The no-load "
+    "reading shows how much the skin's memory of earlier indentations reveals about that order. A network may use this "
+    "memory, because it is part of the field change."
 )
 SEEN_TIP = (
-    "Not comparable with the paper's numbers: a tip that only hovers is placed too, so the indenter itself is magnetic "
-    "and these scores are no evidence of touch"
+    "Some scores are not comparable with the paper's numbers and are not evidence of touch: the position of a tip that "
+    "only hovers is predicted too, so the indenter itself is magnetic"
 )
 HOVER_MEANING = (
-    "Hover control: rows of the tested passes without force, above the place that is touched next, predicted by models "
-    "that were trained on contacts. Without any signal a few in a hundred are right by chance. A tip that the nearest "
-    "contacts place a quarter of the time is called seen (assumed): the chips sense its own magnetism. |dB| without "
-    "contact includes the noise of the no-load reading."
+    "Hover control: models that were trained on contacts predict the position for rows without force, in which the tip "
+    "hovers above the place that it touches next. Without any signal, a few percent of the predictions are within 1 mm "
+    "by chance. If the 2 nearest contacts predict at least a quarter of them within 1 mm (an assumed threshold), the "
+    "chips sense the magnetism of the tip itself. |dB| without contact includes the noise of the no-load reading."
 )
 TABLE_2_SPREAD = (
-    "± is the sd, as in the paper: over n boards held out, or over n pairs of a training and a test skin for one skin "
-    f"on others. {INTERVAL} (for one skin on others: over its training skins and the boards that it was tested on)."
+    "± is the standard deviation, as in the paper. It is over n held-out boards, or, for one skin tested on others, "
+    f"over n pairs of a training skin and a test skin. {INTERVAL} For one skin tested on others, the interval is over "
+    "training skins and tested boards."
+)
+SUMMARY_SPREAD = (
+    f"{INTERVAL} For one skin tested on others, ± is the standard deviation over n pairs of skins. In all other rows, "
+    "n is the number of boards. The last number in parentheses is the paper's mean."
 )
 TARGET = (
-    "An earlier simulated skin was tuned to the paper's row of one skin on others, and some of its spreads remain, so "
-    "agreement in this row is no evidence."
+    "An earlier simulated skin was tuned to the paper's row Single-sensor, and some of its spreads remain, so "
+    "agreement in this row is not evidence."
 )
-CONSTANT = "a constant force, the mean of the tested presses"
+CONSTANT = "constant force: the mean over the tested indentations"
 COLLAPSED_MEANING = (
-    "Collapsed: a network that explains next to nothing of some target on its own training rows, because its output is "
-    "nearly constant. It is trained again with other random draws, at most twice; one that collapses every time is "
-    "kept in all means; those of train_* and adapt are also named in the audit. Very short trainings are not judged."
+    "A network has collapsed if its output is nearly constant, so that it explains almost nothing of some target on "
+    "its own training rows. It is retrained with other random draws, at most twice. A network that collapses every "
+    "time is kept and included in all means; the audit also names such networks of train_* and adapt. Very short "
+    "training runs are not checked for collapse."
 )
-PLACES = (
-    "Registered: places corrected by one offset per board, estimated from its labels, as a diagnosis. Labelled and "
-    "unlabelled indentations are at tested places of the new board, at other depths."
+REGISTERED_MEANING = (
+    "Registered: the positions are corrected by one offset per board, which is estimated from the board's labels as a "
+    "diagnosis. Labelled and unlabelled indentations are at tested places of the new board, but at other depths."
 )
 TRAINING_ROWS = (
-    "Training rows of the first fold; a classical method is given at most so many, drawn at random. Settings of "
-    "classical methods were not searched."
+    "The number of training rows is that of the first fold. For a classical method it is limited, and the rows are "
+    "drawn at random. The settings of classical methods were not tuned."
 )
-CONTROLLED = "0 is the network before fine-tuning; the effect of fine-tuning without pokes is the control of table 2."
-BUDGETS = "The number of steps is a budget of each scene, and no part of the choice."
+CONTROLLED = (
+    "0 pokes: the network before fine-tuning. The effect of fine-tuning without pokes of the new skin is shown by the "
+    "control in table 2."
+)
+BUDGETS = "The number of training steps is set for each scene and was not part of the choice."
 DRAWS = (
-    "[low, high] is the 95 % interval over n held-out boards (Student's t), each with its own draw of training skins; "
-    "networks of one board are averaged first."
+    "[low, high] is the 95 % interval over n held-out boards (Student's t). With fewer than four boards there is no "
+    "interval, and (a; b) are the values of the boards. Each board has its own draws of training skins, and its "
+    "networks are averaged first."
 )
-OF_BOARDS = "± is the sd over n boards."
+OVER_BOARDS = "± is the standard deviation over n boards."
 
 QUANTITIES = {
     "field_at_rest_chip_median_uT": "field at rest, median chip, µT",
     "field_at_rest_channel_max_uT": "field at rest, largest channel, µT",
-    "change_at_0.5_N_uT": "change of field at 0.5 N, µT",
-    "change_at_1_N_uT": "change of field at 1 N, µT",
-    "change_at_2_N_uT": "change of field at 2 N, µT",
-    "change_at_3_N_uT": "change of field at 3 N, µT",
-    "change_at_3_N_over_1_N": "change of field at 3 N over that at 1 N",
-    "weakest_over_strongest_chip": "change at the weakest chip over the strongest",
-    "rest_changes_in_1_uT": "field at rest, rms change from one contact to the next, µT",
+    "change_at_0.5_N_uT": "field change at 0.5 N, µT",
+    "change_at_1_N_uT": "field change at 1 N, µT",
+    "change_at_2_N_uT": "field change at 2 N, µT",
+    "change_at_3_N_uT": "field change at 3 N, µT",
+    "change_at_3_N_over_1_N": "field change at 3 N divided by that at 1 N",
+    "weakest_over_strongest_chip": "field change at the weakest chip divided by that at the strongest",
+    "rest_changes_in_1_uT": "field at rest, rms change over 1 contact, µT",
     "rest_changes_in_10_uT": "field at rest, rms change over 10 contacts, µT",
     "rest_changes_in_100_uT": "field at rest, rms change over 100 contacts, µT",
     "rest_changes_in_1000_uT": "field at rest, rms change over 1,000 contacts, µT",
     "noise_xy_uT": "noise of one reading, x and y, µT",
     "noise_z_uT": "noise of one reading, z, µT",
-    "step_xy_uT": "step of a chip, x and y, µT",
-    "step_z_uT": "step of a chip, z, µT",
-    "rate_hz": "readings a second at one stop",
+    "step_xy_uT": "resolution of a chip (one digital step), x and y, µT",
+    "step_z_uT": "resolution of a chip (one digital step), z, µT",
+    "rate_hz": "readings per second at one stop",
     "force_median_N": "force, median, N",
     "force_max_N": "force, largest, N",
 }
 PAIRED = (
-    "Differences on the same test rows, skin by skin, each side the mean of its networks on a skin and a board the "
-    "mean of its skins; [low, high] is the 95 % interval over n boards (Student's t). One skin on others: on the "
-    "boards that it was tested on, and the interval is over its training skins too. With fewer than 4 boards there "
-    "is no interval: (a; b) are the values of the boards. Verdicts on them: table claims."
+    "Differences are computed on the same test rows, skin by skin: networks on a skin are averaged first, then the "
+    "skins of a board. [low, high] is the 95 % interval over n boards (Student's t). With fewer than four boards there "
+    "is no interval, and (a; b) are the values of the boards. Differences from networks of one skin use only the "
+    "boards that these networks were tested on, and the interval is also over their training skins. The table claims "
+    "has verdicts on the differences."
 )
 SKINS_MEANING = (
-    "Mean over skins [least … most] (number of skins); a change of field is the length of the vector of all channels, "
-    "the median over readings within 20 % of the force. – : too few readings."
+    "Each cell: mean over skins [smallest … largest] (number of skins). The field change of a reading is the length of "
+    "the vector of all channels; the table uses the median over readings within 20 % of the stated force. –: too few "
+    "readings."
 )
 SUMMARY_TITLES = {"accuracy_pct": "within 1 mm, %", "r2_f": "R² of F"}
+HELD_OUT = "model, on held-out boards"  # heading of the first column of a summary
 UNIVERSAL = "universal, "  # prefix of the names of methods that are calibrated to the skin
 CHECKS = {
-    "subject": "what", "law": "law", "against": "against", "error": "error", "tolerance": "allowed",
+    "subject": "subject", "law": "law", "against": "compared with", "error": "error", "tolerance": "allowed",
     "reason": "reason for the tolerance",
 }  # fmt: skip
 CASES = {
-    "area": "area", "case": "case", "should": "should", "happened": "happened", "error": "error", "limit": "allowed",
+    "area": "area", "case": "case", "should": "expected", "happened": "observed", "error": "error", "limit": "allowed",
 }  # fmt: skip
-TABLE_1 = Path(__file__).with_suffix(".yaml")  # the table of the paper
-LOCALISATION = "Localisation (within 1 mm, new skin)"  # a row of ours, which the paper's table lacks
+TABLE_1 = Path(__file__).with_suffix(".yaml")  # table 1 of the paper
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # our additional row
 OURS = "ours, measured"
 NOT_GIVEN = "–"
 
 
 def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
-    """Make every table for which there are numbers, by name."""
+    """Make every table for which the scene has numbers, by name."""
     source = numbers["provenance"]["source"]
     tables = {}
     if "table2" in numbers:
@@ -170,8 +186,8 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
     if "lobo" in numbers:
         tables["lobo_boards"] = _boards(numbers["lobo"]["by_board"], source)
     if "described" in numbers:
-        titled = {f"{protocol} ({skins['source']})": skins for protocol, skins in numbers["described"].items()}
-        tables["skins"] = skins_table(titled)
+        columns = {f"{protocol} ({skins['source']})": skins for protocol, skins in numbers["described"].items()}
+        tables["skins"] = skins_table(columns)
     tables["captures"] = _captures(numbers, source)
     tables["table1"] = table1(read_table1(), measured(numbers))
     tables["checklist"] = checklist(numbers)
@@ -180,20 +196,20 @@ def make_tables(numbers: Numbers) -> dict[str, pd.DataFrame]:
 
 
 def table_texts(tables: Mapping[str, pd.DataFrame]) -> dict[str, str]:
-    """Write every table as Markdown for people and as CSV for programs: text by file name."""
+    """Write every table as Markdown for readers and as CSV for programs: text by file name."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     return texts | {f"{name}.csv": table.to_csv(index=False) for name, table in tables.items()}
 
 
 def sweep_pokes_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List scores by the number of unlabelled pokes of the new skin; the paper gives numbers for two of them."""
+    """List scores by number of unlabelled pokes of the new skin; the paper gives them for two numbers of pokes."""
     printed = {0: TABLE_2["triplet"], ADAPTED_POKES_N: TABLE_2["adapted"]}
     lines = [
         {"pokes": str(row["pokes_n"]), "source": source}
         | beside(row, _printed(printed.get(row["pokes_n"], {})), show, paper="paper, table 2")
         for row in sorted(rows, key=lambda row: row["pokes_n"])
     ]
-    return tabulate(lines, meaning=f"The paper on its figure 6a: {FIGURE_6A}. {CONTROLLED}")
+    return tabulate(lines, meaning=f"The paper says of its figure 6a: {FIGURE_6A}. {CONTROLLED}")
 
 
 def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -202,7 +218,7 @@ def sweep_sensors_table(rows: Rows, source: str) -> pd.DataFrame:
         {"training skins": str(row["skins_n"]), "method": SHORT[row["method"]], "source": source} | scored(row)
         for row in sorted(rows, key=lambda row: (row["skins_n"], list(SHORT).index(row["method"])))
     ]
-    return tabulate(lines, meaning=f"The paper on its figure 6b: {FIGURE_6B}.", spread=DRAWS)
+    return tabulate(lines, meaning=f"The paper says of its figure 6b: {FIGURE_6B}.", spread=DRAWS)
 
 
 def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
@@ -216,13 +232,13 @@ def baselines_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd.DataFrame:
-    """List scores by the number of labelled indentations of the new skin; a constant force, if given, comes last."""
-    places = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in FORCE_METRICS}
+    """List scores by number of labelled indentations of the new skin; a constant force, if given, comes last."""
+    registered = {metric: f"{title} (registered)" for metric, title in COLUMNS.items() if metric not in FORCE_METRICS}
     uncertainty = UNCERTAINTY if any(metric in row["as_labelled"] for row in rows for metric in UNCERTAINTY) else {}
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "source": source}
         | scores(row["as_labelled"])
-        | scores(row["registered"], places)
+        | scores(row["registered"], registered)
         | scores(row["as_labelled"], uncertainty)
         | {"n": n_of(row["as_labelled"])}
         for row in rows
@@ -230,11 +246,11 @@ def labels_table(rows: Rows, source: str, constant: Numbers | None = None) -> pd
     if constant:
         line = {"method": CONSTANT, "inputs": "–", "labels": "all", "source": source}
         lines.append(line | scores(constant) | {"n": n_of(constant)})
-    return tabulate(lines, meaning=PLACES)
+    return tabulate(lines, meaning=REGISTERED_MEANING)
 
 
 def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List scores by the number of labelled indentations, on each held-out board."""
+    """List the scores on each held-out board by number of labelled indentations."""
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "held-out board": board}
         | {title: f"{own[metric]:.3g}" for metric, title in COLUMNS.items() if metric in own}
@@ -242,11 +258,11 @@ def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
         for row in rows
         for board, own in row.get("by_board", {}).items()
     ]
-    return tabulate(lines, spread="As labelled; networks and draws of a board are averaged.")
+    return tabulate(lines, spread="Positions are as labelled. The networks and draws of a board are averaged.")
 
 
 def audit_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List the checks for leaks of test data; a leak that is known and stated is marked as such."""
+    """List the checks for leaks of test data; a known and documented leak is marked as such."""
     lines = [
         {name: str(row[name]) for name in ("what", "where", "rule", "found")}
         | {"holds": "yes" if row["holds"] else "no, known" if row["known"] else "NO", "source": source}
@@ -256,7 +272,7 @@ def audit_table(rows: Rows, source: str) -> pd.DataFrame:
 
 
 def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """List the candidate settings of each stage and which was chosen, by leave-one-board-out on separate boards."""
+    """List the candidate settings of each stage; the chosen ones did best in leave-one-board-out on separate boards."""
     lines = [
         {
             "stage": stage,
@@ -269,11 +285,11 @@ def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
         for stage, choice in choices.items()
         for row in choice["candidates"]
     ]
-    return tabulate(lines, meaning=BUDGETS, spread=OF_BOARDS)
+    return tabulate(lines, meaning=BUDGETS, spread=OVER_BOARDS)
 
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate our table 2 beside the paper's, in its order; the control and the constant force are ours alone."""
+    """Tabulate our table 2 beside the paper's, in its order; the control and the constant force are only ours."""
     rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     constant = numbers.get("constant_force", {}).get("table2")
     if constant:
@@ -283,13 +299,13 @@ def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
     kept_n = sum(trainings[name]["kept_collapsed_n"] for name in scenes.TABLE_2.values() if name in trainings)
     meaning = [TARGET] * (source == "simulated")
     if kept_n:
-        meaning.append(f"{kept_n} networks collapsed in every training run and are included in these means.")
+        meaning.append(f"{kept_n} networks collapsed in each of their training runs and are included in these means.")
     table.attrs |= {"spread": TABLE_2_SPREAD} | ({"meaning": " ".join(meaning)} if meaning else {})
     return table
 
 
 def _single(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate each split of one skin beside the paper's, and predictions of places without any change of field."""
+    """Tabulate each split of one skin beside the paper's scores, and positions predicted without the field change."""
     rows: dict[str, tuple[Mapping[str, Any], Mapping[str, Number]]] = {}
     seen = [skin for skin, own in numbers.get("hover", {}).items() if own["seen"]]
     for name, split in SPLITS.items():
@@ -298,19 +314,21 @@ def _single(numbers: Numbers, source: str) -> pd.DataFrame:
             own = {f"{split}: {skin}": (_stats(scores), skin in seen) for skin, scores in skins.items()}
             own = own or {split: (numbers[name], bool(seen))}
             rows |= {title: (scores, {} if of_seen else SINGLE_SENSOR) for title, (scores, of_seen) in own.items()}
-            alone = numbers.get("before_touch", {}).get(name, {})
-            rows |= {f"{split}: place from {BEFORE_TOUCH[by]}": (alone[by], {}) for by in BEFORE_TOUCH if by in alone}
+            before = numbers.get("before_touch", {}).get(name, {})
+            rows |= {
+                f"{split}: position from {BEFORE_TOUCH[by]}": (before[by], {}) for by in BEFORE_TOUCH if by in before
+            }
     table = _beside_paper(rows, source)
     meaning = [BEFORE_TOUCH_MEANING] if "before_touch" in numbers else []
     if seen:
-        meaning.append(f"{SEEN_TIP} (table hover: {', '.join(seen)}).")
+        meaning.append(f"{SEEN_TIP} (see table hover for {', '.join(seen)}).")
     if meaning:
         table.attrs["meaning"] = " ".join(meaning)
     return table
 
 
 def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List how well places of a tip that does not touch are predicted, by skin, beside the scores of contacts."""
+    """List how well the position of a hovering tip is predicted, by skin, beside the scores of contacts."""
     skins, lines = numbers.get("single_skins", {}), []
     for skin, own in numbers["hover"].items():
         contact = skins.get(skin, _means(numbers["single_temporal"]))
@@ -320,7 +338,7 @@ def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
             for by, model in (("hover", "2 nearest contacts"), ("hover_network", "network"))
         }
         line |= {"|dB| without contact, µT": f"{own['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{own['touch_uT']:.3g}"}
-        lines.append(line | {"the tip": "is seen without touch" if own["seen"] else "is not seen"})
+        lines.append(line | {"tip sensed without contact": "yes" if own["seen"] else "no"})
     return tabulate(lines, meaning=HOVER_MEANING)
 
 
@@ -345,9 +363,12 @@ def _printed(paper: Mapping[str, Number]) -> dict[str, str]:
 
 
 def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
-    places = {"as_labelled": "as labelled", "registered": "after one offset a board (uses its labels: a diagnosis)"}
+    places = {
+        "as_labelled": "as labelled",
+        "registered": "corrected by one offset per board (a diagnosis with its labels)",
+    }
     lines = [
-        {"held-out board": board, "trained on skins": str(parts["trained_on_skins_n"]), "places": title}
+        {"held-out board": board, "trained on skins": str(parts["trained_on_skins_n"]), "positions": title}
         | {"source": source}
         | {name: f"{parts[part][metric]:.3g}" for metric, name in COLUMNS.items() if metric in parts[part]}
         for board, parts in by_board.items()
@@ -357,7 +378,7 @@ def _boards(by_board: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataFrame:
-    """List how many networks were trained, how many collapsed, and how many collapsed ones had to be kept."""
+    """Count the training runs of each experiment, those that collapsed, and the collapsed networks that were kept."""
     columns = {
         "training runs": "trainings_n", "collapsed": "collapsed_n", "collapsed every time, kept": "kept_collapsed_n",
     }  # fmt: skip
@@ -370,7 +391,7 @@ def _trainings(counts: Mapping[str, Mapping[str, int]], source: str) -> pd.DataF
 
 def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
     lines = [
-        {"question": experiment, "recipe": recipe, "source": source} | scored(row)
+        {"experiment": experiment, "recipe": recipe, "source": source} | scored(row)
         for experiment, recipes in variants.items()
         for recipe, row in recipes.items()
     ]
@@ -378,16 +399,16 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List what was read and lost in the main captures and in further protocols; 0 only for main."""
-    further = numbers.get("capture_by_protocol", {})
+    """List what was read and lost in the main captures and in other protocols, whose counts of 0 are omitted."""
+    others = numbers.get("capture_by_protocol", {})
     lines = [
         {"protocol": protocol, "what": what, "count": str(count), "source": source}
-        for protocol, account in {"main": numbers["capture"], **further}.items()
+        for protocol, account in {"main": numbers["capture"], **others}.items()
         for what, count in _counts(account).items()
         if protocol == "main" or count
     ]
-    meaning = {"meaning": "Main: the captures that folds are drawn on. Of other protocols no 0 is listed."}
-    return tabulate(lines, **(meaning if further else {}))
+    meaning = {"meaning": "Main: the captures that folds are made of. For other protocols, counts of 0 are not listed."}
+    return tabulate(lines, **(meaning if others else {}))
 
 
 def _counts(account: Mapping[str, Any]) -> dict[str, int]:
@@ -396,7 +417,7 @@ def _counts(account: Mapping[str, Any]) -> dict[str, int]:
 
 
 def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Compare descriptions of skins, by title; add the nearest ratio if some are simulated and some recorded."""
+    """Compare descriptions of skins, by title; if some are simulated and some recorded, add the ratio nearest to 1."""
     both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
     lines = []
     for name, title in QUANTITIES.items():
@@ -409,7 +430,13 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
         }
         if both:
             means = [(columns[column]["source"], value["mean"]) for column, value in values.items() if value]
-            ratios = [a / b for side, a in means if side == "simulated" for of, b in means if of == "recorded"]
+            ratios = [
+                a / b
+                for source_a, a in means
+                if source_a == "simulated"
+                for source_b, b in means
+                if source_b == "recorded"
+            ]
             nearest = min(ratios, key=lambda ratio: abs(np.log(ratio)), default=None)
             line["simulated / nearest recorded"] = "–" if nearest is None else f"{nearest:.2g}"
         lines.append(line)
@@ -417,45 +444,43 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def table_2_summary(numbers: Numbers) -> pd.DataFrame:
-    """Tabulate the main scores on boards never seen, with the paper's means in brackets."""
+    """Tabulate the main scores on held-out boards, with the paper's means in parentheses."""
     lines = []
     for model, row in [*universal_rows(numbers), *table_2_rows(numbers).values()]:
-        line = {
-            "boards never seen": model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")
-        }
+        line = {HELD_OUT: model.title.replace("Multi-sensor with triplet loss, adapted", "The same, adapted")}
         for metric, title in COLUMNS.items():
             paper = f" ({model.paper[metric][0]:.3g})" if metric in model.paper else ""
             line[f"{title} (paper)" if metric in PAPER_METRICS else title] = show(row.get(metric)) + paper
         lines.append(line | {"n": n_of(row)})
-    return tabulate(lines, spread=f"{INTERVAL}; n boards, or pairs of skins for one skin on others")
+    return tabulate(lines, spread=SUMMARY_SPREAD)
 
 
 def labels_summary(rows: Rows) -> pd.DataFrame:
-    """Tabulate scores on boards never seen, with fewest and most labels, of calibrated methods and the first."""
+    """Tabulate scores on held-out boards with fewest and most labels: calibrated methods, then the first method."""
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
     counts = {row["labels_n"] for row in rows}
     lines = [
-        {"boards never seen": method}
+        {HELD_OUT: method}
         | {
             f"{title}, {labels_n} labels": show(by_method.get((method, inputs, labels_n), {}).get(metric))
             for metric, title in SUMMARY_TITLES.items()
             for labels_n in sorted({min(counts), max(counts)})
         }
-        for method, inputs in dict.fromkeys([*(one for one in methods if one[0].startswith(UNIVERSAL)), methods[0]])
+        for method, inputs in dict.fromkeys([*(key for key in methods if key[0].startswith(UNIVERSAL)), methods[0]])
     ]
-    return tabulate(lines, spread=f"{INTERVAL}.")
+    return tabulate(lines, spread=INTERVAL)
 
 
 def summary_table(numbers: Numbers) -> pd.DataFrame | None:
-    """Tabulate a scene's main scores on boards never seen; None if no board was held out."""
+    """Tabulate a scene's main scores on held-out boards; None if no board was held out."""
     if numbers.get("labels"):
         return labels_summary(numbers["labels"])
     return table_2_summary(numbers) if numbers.get("table2") else None
 
 
 def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List the differences between two models over boards, beside the difference of the paper's means."""
+    """List the paired differences between models, beside the differences of the paper's means."""
     known = models(numbers)
     lines = []
     for row in numbers["paired"]:
@@ -467,7 +492,7 @@ def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
 
 
 def paired_boards_table(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List the difference between two models on each held-out board."""
+    """List the paired differences between models on each held-out board."""
     known = models(numbers)
     lines = [
         {"difference": _difference_of(row, known), "held-out board": board, "source": source}
@@ -483,12 +508,12 @@ def _difference_of(row: Mapping[str, Any], known: Mapping[str, Model]) -> str:
 
 
 def verification_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List the checks of the physics: what was compared with what, its error, and the allowed error with its reason."""
+    """List the checks of the physics: what was compared, the error, and the allowed error with its reason."""
     return _checks(rows, CHECKS, source)
 
 
 def stability_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List stiff, extreme and broken cases: what should happen, what happened, and by how much."""
+    """List stiff, extreme and broken cases: expected and observed behaviour, the error and its limit."""
     return _checks(rows, CASES, source)
 
 
@@ -506,7 +531,7 @@ def _checks(rows: Rows, titles: Mapping[str, str], source: str) -> pd.DataFrame:
 
 
 class Table1(Strict):
-    """Table 1 as printed: for each column the source that the paper cites, for each row a cell per column."""
+    """Table 1 of the paper: the source that it cites for each column, and the cells of each row."""
 
     columns: dict[str, str]
     rows: dict[str, tuple[str, ...]]
@@ -525,7 +550,7 @@ def read_table1(path: Path = TABLE_1) -> Table1:
 
 
 def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
-    """Add our column (cells by row) to the paper's table 1, whose cells remain as printed."""
+    """Add our column (`measured`, by row) and our row to the paper's table 1, whose cells remain as printed."""
     rows = data.rows | {LOCALISATION: (NOT_GIVEN,) * len(data.columns)}
     if unknown := sorted(measured.keys() - rows.keys()):
         raise ParamsError("table 1", "measured rows", f"among {sorted(rows)}", unknown, "Use the names of the table.")
@@ -534,12 +559,14 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
         for name, cells in rows.items()
     ]
     sources = " ".join(f"{name}: {source}" for name, source in data.columns.items())
-    meaning = f"As printed in the paper (table 1), ? included. The last row and column are ours. {sources}"
+    meaning = (
+        f'Cells are as printed in table 1 of the paper, including "?". The last row and column are ours. {sources}'
+    )
     return tabulate(lines, meaning=meaning)
 
 
 def measured(numbers: Numbers) -> dict[str, str]:
-    """Write our cells of table 1, by row: what the scene measured, or its settings."""
+    """Write our cells of table 1, by row: results or settings of the scene."""
     source = numbers["provenance"]["source"]
     simulated = source == "simulated"
     described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
@@ -554,7 +581,7 @@ def measured(numbers: Numbers) -> dict[str, str]:
         last = drift[policy][-1]
         cells["Durable (> 50k contacts)"] = (
             f"{last['accuracy_pct']:.3g} % within 1 mm after {last['contacts_n']:,.0f} contacts, "
-            f"no-load reading: {policy}"
+            f"no-load policy {policy}"
         )
     best = next((row for row in ("adapted", "triplet", "multi") if row in numbers.get("table2", {})), None)
     if best:

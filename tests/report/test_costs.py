@@ -176,14 +176,14 @@ def test_labelled_points_are_not_dominated(places):
             beaten |= dominates(other, place)
         if not beaten:
             naive.add(place)
-    assert {point.place for point in points if point.label} == naive
-    assert sorted(point.place for point in points) == sorted(places)
+    assert {point.position for point in points if point.label} == naive
+    assert sorted(point.position for point in points) == sorted(places)
 
 
 @given(PLACES)
 def test_labels_follow_the_front(places):
     members = [point for point in trade_off_points(rows_of(places), "train_s") if point.label]
-    numbered = {int(point.label): point.place for point in members}
+    numbered = {int(point.label): point.position for point in members}
     assert sorted(numbered) == list(range(1, len(numbered) + 1))
     ordered = [numbered[i] for i in sorted(numbered)]
     for (cheap, error), (dear, next_error) in pairwise(ordered):

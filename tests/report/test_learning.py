@@ -139,7 +139,7 @@ def test_labels_table_has_both_scores():
     }  # fmt: skip
     uncertain = one | {"as_labelled": row(30.0) | {"coverage_pct": {"mean": 91.0, "n": 2}}}
     (_, line) = labels_table([one, uncertain], "recorded").to_dict("records")
-    assert (line["in 90 % intervals, %"], line["half of them, mm (median)"]) == ("91", "–")
+    assert (line["coverage of 90 % intervals, %"], line["half-width of 90 % intervals, mm (median)"]) == ("91", "–")
 
 
 def test_unknown_leak_is_highlighted_in_the_audit():

@@ -123,7 +123,7 @@ def test_figures_have_text_alternatives(read):
 
 def test_order_of_figures_results_and_tables():
     for part in render().split("<section id=")[1:]:
-        places = [part.index(mark) for mark in ("<figure", "Beside the paper", "<details") if mark in part]
+        places = [part.index(mark) for mark in ("<figure", "Comparison with the paper", "<details") if mark in part]
         assert places == sorted(places)
 
 

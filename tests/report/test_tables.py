@@ -13,6 +13,7 @@ from pipeline.report.numbers import add_up, before_touch_numbers, learning_numbe
 from pipeline.report.paper import TABLE_2
 from pipeline.report.readme import fill
 from pipeline.report.tables import (
+    HELD_OUT,
     LOCALISATION,
     NOT_GIVEN,
     OURS,
@@ -80,7 +81,7 @@ def test_before_touch_rows_are_below_their_split():
     assert table["accuracy, % (ours)"].str.partition(" ")[0].tolist() == ["95", "15", "98"]
     assert ["no-load" in row or "number" in row for row in table["model"]] == [False, True, True]
     assert set(table["MSE_F, N² (ours)"][1:]) == {"–"}
-    assert "without any change of field" in table.attrs["meaning"]
+    assert "without the field change" in table.attrs["meaning"]
     assert len(make_tables(shown)["single_sensor"]) == 1
 
 
@@ -102,7 +103,7 @@ def test_splits_of_one_skin_start_with_the_papers():
     table = make_tables(shown)["single_sensor"]
     assert table["accuracy, % (ours)"].tolist() == ["90", "80", "70"]
     assert all(table["accuracy, % (paper)"] == "99.58 ± 0.34")
-    assert "the paper's way" in table["model"][0]
+    assert "as in the paper" in table["model"][0]
 
 
 def test_variants_are_separate_from_the_headline():
@@ -203,7 +204,7 @@ def test_all_metrics_have_a_column():
 
 def test_summary_has_ours_the_papers_and_the_control():
     numbers = all_experiments()
-    table = summary_table(numbers).set_index("boards never seen")
+    table = summary_table(numbers).set_index(HELD_OUT)
     assert len(table) == len(numbers["table2"]) + 1
     for name, model in models(numbers).items():
         if name in numbers["table2"]:
@@ -226,7 +227,7 @@ def test_summary_starts_with_the_universal_model():
     ]  # fmt: skip
     numbers |= {"population": {"told": rows}}
     first = summary_table(numbers).iloc[0]
-    assert "65 unlabelled pokes" in first["boards never seen"]
+    assert "65 unlabelled pokes" in first[HELD_OUT]
     assert first["accuracy, % (paper)"] == "91 [90, 92]"
     assert "65 unlabelled" in texts_of(headline_figures(numbers, "simulated")[HEADLINE])
 
@@ -234,7 +235,7 @@ def test_summary_starts_with_the_universal_model():
 def test_summary_of_recordings_has_labels():
     numbers = read_json(ROOT / "reports/lab/numbers.json")
     table, usual = summary_table(numbers), numbers["labels"][0]["method"]
-    lines = table.set_index("boards never seen").to_dict("index")
+    lines = table.set_index(HELD_OUT).to_dict("index")
     assert list(lines) == [*(f"{METHODS[1]}{way}" for way in WAYS.values()), usual]
     for row in numbers["labels"]:
         if row["method"] in lines and row["labels_n"] in (0, 40):
@@ -332,7 +333,7 @@ def test_simulated_skins_are_compared_with_recorded():
     ratios = dict(zip(table["quantity"], table["simulated / nearest recorded"], strict=True))
     assert ratios["noise of one reading, x and y, µT"] == "1.1"
     assert ratios["force, largest, N"] == "10"
-    assert ratios["step of a chip, z, µT"] == "–"
+    assert ratios["resolution of a chip (one digital step), z, µT"] == "–"
 
 
 CHECK = {
