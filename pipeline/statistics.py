@@ -1,7 +1,7 @@
 """The table of scores of all training runs, and the statistics over boards that reports compute from it.
 
 A row of the table has the scores of one network on one skin, or on all skins that it was tested on. The unit of
-inference is the board, because its skins share the board and the network that was trained without it.
+inference is the board, because the skins of a board share that board and the networks that were trained without it.
 """
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -18,30 +18,33 @@ NAMES = ("question", "method", "recipe", "inputs", "architecture", "base", "fold
 COUNTS = (
     "seed", "labels_n", "pokes_n", "contacts_n", "trained_on_skins_n", "trained_on_rows_n", "rows_n",
 )  # fmt: skip
-KEYS = (*NAMES, *COUNTS)  # every other column is a metric
-UNCERTAINTY = ("coverage_pct", "half_width_mm")  # of 90 % intervals, of methods that give an uncertainty
-ALL_SKINS = ""  # in column `skin`: all skins that a network was tested on
-AS_LABELLED, REGISTERED = "as_labelled", "registered"  # places; the latter after one offset per board, a diagnosis
-METHODS = {"triplet": "network + triplet", "adapt": "network, adapted"}  # of cards, by experiment
-CONFIDENCE = 0.95  # convention
-PERCENTAGES = ("accuracy_pct", "coverage_pct")  # between 0 and 100
-AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")
-DECIMALS = 12  # of a difference in %, mm2 or N2; further decimals are rounding errors of float sums
-BOARDS_MIN = 4  # fewest boards for an interval; with fewer, each board's value is given
+KEYS = (*NAMES, *COUNTS)  # all other columns are metrics
+UNCERTAINTY = ("coverage_pct", "half_width_mm")  # metrics of 90 % intervals, for methods that give an uncertainty
+ALL_SKINS = ""  # value in column `skin` of a row for all skins that a network was tested on
+AS_LABELLED, REGISTERED = "as_labelled", "registered"  # column `places`; registered: one offset per board, a diagnosis
+METHODS = {
+    "triplet": "network + triplet",
+    "adapt": "network, adapted",
+}  # names of methods by experiment; others: "network"
+CONFIDENCE = 0.95  # of intervals; convention
+PERCENTAGES = ("accuracy_pct", "coverage_pct")  # metrics between 0 and 100
+AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
+DECIMALS = 12  # decimals of differences in %, mm2 or N2; further ones are rounding errors of float sums
+BOARDS_MIN = 4  # fewest boards for an interval; with fewer, the values of the boards are given
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
 VERDICTS = (
-    "Supported: the 95 % interval lies wholly on the claim's side of 0 or of the stated threshold. Contradicted: "
-    "wholly on the other side. Undecided: it includes 0 or the threshold. Not judged: fewer than "
-    f"{BOARDS_MIN} boards have no interval, and their own values are given. The interval is over boards (Student's t "
-    "of the boards' means; skins and networks of a board are averaged first), on a scale that keeps it in the possible "
-    "range: logit of accuracies, logarithm of squared errors, differences as they are. Folds share training boards, "
-    "which no interval takes into account."
+    "Supported: the whole 95 % interval is on the claim's side of the threshold, which is 0 unless another one is "
+    "stated. Contradicted: the whole interval is on the other side. Undecided: the interval includes the threshold. "
+    f"Not judged: with fewer than {BOARDS_MIN} boards there is no interval, and the values of the boards are given. "
+    "Intervals are over boards (Student's t); the skins and networks of a board are averaged first. They are computed "
+    "on a scale that keeps them in the possible range: the logit of accuracies and the logarithm of squared errors; "
+    "differences are not transformed. The folds share training boards; the intervals do not account for this."
 )
 
 Cards = Sequence[Mapping[str, Any]]
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
-# mean, n; if n > 1, sd; over boards, also ci95: [low, high], or `values` of each board if there are few
+# mean and n; if n > 1, sd; for boards also ci95 ([low, high]), or the `values` of the boards if there are few
 Stat = Mapping[str, Any]
 
 
@@ -54,9 +57,10 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     Parameters
     ----------
     cards
-        Cards of models. Networks adapted to one skin each also get a joint row for all skins of a fold, for each seed.
+        Cards of models. If networks are adapted to one skin each, the networks of a fold and seed also get a joint row
+        for all skins.
     points
-        Points of sweeps, by experiment.
+        Points of sweeps, by experiment; each point has the scores of one training run.
 
     Returns
     -------
@@ -66,14 +70,14 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     keyed = [(_keys_of_card(card), card["scores"]) for card in cards]
     keyed += [
         (_keys_of_point(experiment, point), point["scores"])
-        for experiment, own in (points or {}).items()
-        for point in own
+        for experiment, experiment_points in (points or {}).items()
+        for point in experiment_points
     ]
     rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
-    alike: dict[Hashable, list[dict[str, Any]]] = {}  # rows for all skins: of one network, or one per skin
+    groups: dict[Hashable, list[dict[str, Any]]] = {}  # rows for all skins: from one network, or from one per skin
     for row in (row for row in rows if row["skin"] == ALL_SKINS):
-        alike.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
-    kept = [*map(_pool, alike.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
+        groups.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
+    kept = [*map(_pool, groups.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
     return pd.DataFrame(kept, columns=[*KEYS, *METRICS, *UNCERTAINTY]).astype(
         dict.fromkeys((*COUNTS, *METRICS, *UNCERTAINTY), float)
     )
@@ -95,17 +99,17 @@ def _keys_of_point(experiment: str, point: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Make the rows of a training run: all skins as labelled and registered, then each skin."""
+    """Make the rows of a training run: for all skins as labelled, for all skins registered, then for each skin."""
     boards = {*scores["board_of"].values()}
-    every = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
-    rows = [every | {"places": AS_LABELLED} | scores["all"], every | {"places": REGISTERED} | scores["registered"]]
-    for skin, own in scores["by_skin"].items():
-        rows.append({**keys, "skin": skin, "board": scores["board_of"][skin], "places": AS_LABELLED, **own})
+    joint = {**keys, "skin": ALL_SKINS, "board": boards.pop() if len(boards) == 1 else "", "rows_n": scores["rows_n"]}
+    rows = [joint | {"places": AS_LABELLED} | scores["all"], joint | {"places": REGISTERED} | scores["registered"]]
+    for skin, skin_scores in scores["by_skin"].items():
+        rows.append({**keys, "skin": skin, "board": scores["board_of"][skin], "places": AS_LABELLED, **skin_scores})
     return rows
 
 
 def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Pool the scores of networks of one fold and seed, each tested on one skin, weighted by their numbers of rows."""
+    """Pool the scores of the networks of one fold and seed, weighted by the number of rows that each was tested on."""
     rows_n = np.array([row["rows_n"] for row in rows])
     known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
     parts = {name: np.array([row[name] for row in rows]) for name in known}
@@ -118,19 +122,19 @@ def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def to_csv(table: pd.DataFrame) -> str:
-    """Write the table with six significant digits, as in numbers.json."""
+    """Write the table as CSV with six significant digits, as in numbers.json."""
     return table.convert_dtypes().to_csv(index=False, float_format="%.6g")
 
 
 def select(rows: pd.DataFrame, **values: str | float) -> pd.DataFrame:
-    """Select the rows whose columns have these values."""
+    """Select the rows that have the given values in these columns."""
     for column, value in values.items():
         rows = rows[rows[column] == value]
     return rows
 
 
 def whole(rows: pd.DataFrame, places: str = AS_LABELLED) -> pd.DataFrame:
-    """Select the rows for all skins that a network was tested on: one row per training run."""
+    """Select the joint rows for all skins that a network was tested on: one row per training run."""
     return select(rows, skin=ALL_SKINS, places=places)
 
 
@@ -140,13 +144,13 @@ def by_skin(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Return the values by index and column, without NaN."""
+    """Return the values as a dict of dicts, by index and column, without NaN."""
     known = {str(index): row.dropna() for index, row in rows.iterrows()}
     return {index: {str(name): float(value) for name, value in row.items()} for index, row in known.items()}
 
 
 def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Count training runs: all, those that collapsed, and collapsed ones kept because every repeat collapsed.
+    """Count training runs: all, those that collapsed, and the collapsed ones kept because every repeat collapsed.
 
     >>> tally([{"collapsed": False, "collapsed_before_n": 1}, {"collapsed": True, "collapsed_before_n": 2}])
     {'trainings_n': 5, 'collapsed_n': 4, 'kept_collapsed_n': 1}
@@ -160,7 +164,7 @@ def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def interval(values: Values, metric: str = "") -> list[float] | None:
-    """Compute the two-sided 95 % interval of a mean by Student's t; None below two values. See `t_interval`.
+    """Compute the two-sided 95 % interval of a mean by Student's t; None for fewer than two values. See `t_interval`.
 
     >>> interval([1.0]) is None
     True
@@ -176,20 +180,21 @@ def interval(values: Values, metric: str = "") -> list[float] | None:
 
 
 def t_interval(mean: float, se: float, df: float, metric: str = "") -> list[float]:
-    """Compute the 95 % interval of a mean with this standard error by Student's t, inside the metric's range.
+    """Compute the 95 % interval of a mean from its standard error by Student's t, within the metric's possible range.
 
-    Delta method: g(mean) +- t g'(mean) se, transformed back by the inverse of g. g is the logit of a percentage, the
-    logarithm of a squared error, -log(1 - x) of a metric that is at most 1, and x itself of any other.
+    The delta method gives the interval g(mean) +- t g'(mean) se, which is transformed back by the inverse of g. The
+    transformation g(x) is the logit for percentages, the logarithm for squared errors, -log(1 - x) for metrics that are
+    at most 1, and x for all other metrics.
     """
-    from scipy.special import expit, logit, stdtrit  # late: only where there are intervals
+    from scipy.special import expit, logit, stdtrit  # imported late, because SciPy is only needed for intervals
 
-    reach = float(stdtrit(df, (1 + CONFIDENCE) / 2)) * se
-    if reach == 0:
+    half_width = float(stdtrit(df, (1 + CONFIDENCE) / 2)) * se
+    if half_width == 0:
         return [mean, mean]
-    ends = np.array([-reach, reach])
+    ends = np.array([-half_width, half_width])
     if metric in PERCENTAGES:
-        share = mean / 100
-        return [float(end) for end in 100 * expit(logit(share) + ends / (100 * share * (1 - share)))]
+        fraction = mean / 100
+        return [float(end) for end in 100 * expit(logit(fraction) + ends / (100 * fraction * (1 - fraction)))]
     if metric.startswith("mse_"):
         return [float(end) for end in mean * np.exp(ends / mean)]
     if metric in AT_MOST_1:
@@ -198,7 +203,7 @@ def t_interval(mean: float, se: float, df: float, metric: str = "") -> list[floa
 
 
 def p_value(mean: float, se: float, df: float) -> float:
-    """Compute the two-sided p-value of a mean difference of 0 by Student's t."""
+    """Compute the two-sided p-value of a mean difference by Student's t; the null hypothesis is a difference of 0."""
     from scipy.special import stdtr
 
     if se == 0:
@@ -207,15 +212,15 @@ def p_value(mean: float, se: float, df: float) -> float:
 
 
 def holm(p_values: Mapping[str, float]) -> dict[str, float]:
-    """Adjust the p-values of a family of tests for their number (Holm 1979).
+    """Adjust the p-values of a family of tests for the number of tests by Holm's method (Holm 1979).
 
     >>> holm({"a": 0.01, "b": 0.04, "c": 0.03})
     {'a': 0.03, 'c': 0.06, 'b': 0.06}
     """
-    adjusted, least = {}, 0.0
-    for i, name in enumerate(sorted(p_values, key=lambda one: p_values[one])):
-        least = max(least, min(1.0, (len(p_values) - i) * p_values[name]))
-        adjusted[name] = least
+    adjusted, lower_bound = {}, 0.0
+    for i, name in enumerate(sorted(p_values, key=lambda key: p_values[key])):
+        lower_bound = max(lower_bound, min(1.0, (len(p_values) - i) * p_values[name]))
+        adjusted[name] = lower_bound
     return adjusted
 
 
@@ -223,10 +228,10 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
 
 
 def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict[str, Any]:
-    """Summarise values: `mean` and `n`, and for two or more values `sd` (n - 1).
+    """Summarise values: `mean` and `n`, and for two or more values the standard deviation `sd` (n - 1).
 
-    boards: the values are those of boards. Then two or more also have the interval `ci95`, or, if they are fewer than
-    `BOARDS_MIN`, the `values` themselves in the order of the boards.
+    boards: whether each value belongs to one board. If so, two or more values also have an interval `ci95`, or, if they
+    are fewer than `BOARDS_MIN`, the `values` themselves in the order of the boards.
     """
     stat = {"mean": float(np.mean(values)), "n": len(values)}
     if len(values) < 2:
@@ -235,11 +240,11 @@ def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict
     if not boards:
         return stat
     few = len(values) < BOARDS_MIN
-    return stat | ({"values": [float(one) for one in values]} if few else {"ci95": interval(values, metric)})
+    return stat | ({"values": [float(value) for value in values]} if few else {"ci95": interval(values, metric)})
 
 
 def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise each column over the rows that have it; columns with `differences` are not bounded as metrics are."""
+    """Summarise each column over its known values; `differences`: the columns are not bounded as metrics are."""
     known = {str(name): units[name].dropna().to_numpy() for name in units}
     return {
         name: statistic(values, boards=boards, metric="" if differences else name)
@@ -249,9 +254,9 @@ def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = 
 
 
 def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise every metric over units, which are groups by these columns; a unit's value is the mean of its rows.
+    """Summarise every metric over units, which are the groups of rows with equal values in the columns `unit`.
 
-    `sd_seeds` is the mean sd within a unit; it is left out for several boards.
+    The value of a unit is the mean of its rows. `sd_seeds` is the mean sd within a unit; several boards do not get it.
     """
     groups = rows.groupby(list(unit))[_metrics(rows)]
     summary = summarise(groups.mean(), boards=boards)
@@ -261,7 +266,7 @@ def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str
 def add_seed_sd(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> dict[str, dict[str, Any]]:
     """Add `sd_seeds` to each statistic: the standard deviation (n - 1) of the rows of a unit, averaged over units.
 
-    The rows of a unit are networks that differ in their seed. Metrics whose units have one row each get none.
+    The rows of a unit are networks that differ in their seed. If every unit has only one row, `sd_seeds` is not added.
     """
     sds = rows.groupby(list(unit))[_metrics(rows)].std().mean().dropna()
     return {
@@ -270,40 +275,41 @@ def add_seed_sd(summary: Mapping[str, Stat], rows: pd.DataFrame, *unit: str) -> 
 
 
 def over_folds(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise training runs over folds; a fold's value is the mean over its seeds."""
+    """Summarise training runs over folds; the value of a fold is the mean over its seeds."""
     return over_units(whole(rows), "fold")
 
 
 def over_boards(rows: pd.DataFrame, places: str = AS_LABELLED) -> dict[str, dict[str, Any]]:
-    """Summarise training runs over held-out boards; a board's value is the mean over its seeds and draws of skins."""
+    """Summarise training runs over held-out boards; a board's value is the mean over seeds and draws of skins."""
     return over_units(whole(rows, places), "board", boards=True)
 
 
 def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Summarise over pairs of a training skin and a test skin, as the paper does (3 x 9 pairs).
 
-    For `ci95`, training skins and test boards are both samples (`two_way_error`); `training_n` and `boards_n` count
-    them.
+    The interval `ci95` treats both training skins and test boards as samples (`two_way_error`). `training_n` and
+    `boards_n` are their numbers.
     """
-    own = by_skin(rows)
-    pairs, crossed = over_units(own, "fold", "skin"), own.groupby(["fold", "board"])[_metrics(own)].mean()
-    found = {}
+    skin_rows = by_skin(rows)
+    pairs = over_units(skin_rows, "fold", "skin")
+    crossed = skin_rows.groupby(["fold", "board"])[_metrics(skin_rows)].mean()
+    summary = {}
     for name, stat in pairs.items():
         table = crossed[name].dropna().unstack()
         error = two_way_error(table)
-        found[name] = stat | {"training_n": len(table), "boards_n": len(table.columns)}
+        summary[name] = stat | {"training_n": len(table), "boards_n": len(table.columns)}
         if error is not None:
-            found[name]["ci95"] = t_interval(stat["mean"], *error, name)
-    return found
+            summary[name]["ci95"] = t_interval(stat["mean"], *error, name)
+    return summary
 
 
 def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
-    """Compute the standard error of a mean over rows and columns that are both samples, and its degrees of freedom.
+    """Compute the standard error, and its degrees of freedom, of a mean over rows and columns that are both samples.
 
-    Training skins are rows, test boards are columns, and cells may be missing. The squared error is the variance of the
+    Rows are training skins and columns are test boards; cells may be missing. The squared error is the variance of the
     row means divided by the number of rows, plus the variance of the column means divided by the number of columns,
-    with Satterthwaite's degrees of freedom. It is slightly too large, because it counts the residual variance of cells
-    twice. Return None for fewer than two rows or `BOARDS_MIN` columns.
+    with Satterthwaite's degrees of freedom. The error is slightly too large, because the residual variance of cells is
+    counted twice. Return None for fewer than two rows or `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None
@@ -329,17 +335,17 @@ def _skin_means(rows: pd.DataFrame) -> pd.DataFrame:
 # --- Paired differences ---
 
 
-def paired(of: pd.DataFrame, over: pd.DataFrame) -> dict[str, Any]:
-    """Summarise over boards the difference of two methods on the same skins; `by_board` has each board's value."""
-    return summarise_differences(differences(of, over))
+def paired(method: pd.DataFrame, other: pd.DataFrame) -> dict[str, Any]:
+    """Summarise over boards the difference between two methods on the same skins; `by_board` has the boards' values."""
+    return summarise_differences(differences(method, other))
 
 
-def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
-    """Subtract the mean over networks of one method from that of the other on each skin; average the skins of a board.
+def differences(method: pd.DataFrame, other: pd.DataFrame) -> pd.DataFrame:
+    """Compute the scores of `method` minus those of `other`; return one row per board.
 
-    Returns one row per board.
+    Networks are averaged on each skin first, then the differences are averaged over the skins of a board.
     """
-    ours, theirs = _skin_means(of), _skin_means(over)
+    ours, theirs = _skin_means(method), _skin_means(other)
     if not ours.index.equals(theirs.index):
         raise _unpaired(sorted(ours.index.symmetric_difference(theirs.index)))
     return (ours - theirs).groupby("board").mean()
@@ -348,8 +354,8 @@ def differences(of: pd.DataFrame, over: pd.DataFrame) -> pd.DataFrame:
 def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
     """Summarise differences over boards; `by_board` has each board's value.
 
-    With `BOARDS_MIN` boards or more, `p` is the p-value of the hypothesis of no difference, from the standard error
-    `se` and the degrees of freedom `df`.
+    With `BOARDS_MIN` boards or more, `p` is the p-value under the null hypothesis of no difference. It follows from the
+    standard error `se` and the degrees of freedom `df`.
     """
     summary = summarise(by_board, boards=True, differences=True)
     means = {name: stat | {"mean": round(stat["mean"], DECIMALS)} for name, stat in summary.items()}
@@ -359,23 +365,24 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
     return {**means, "by_board": records(by_board)}
 
 
-def paired_with_single(of: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
-    """Summarise, like `paired`, how networks of many skins differ from networks of one skin on the latter's test skins.
+def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
+    """Summarise, like `paired`, the difference between a method and networks of one skin on their test skins.
 
-    Both the boards and the single networks' training skins are samples, so the interval and `p` use `two_way_error`.
+    Boards and the training skins of the networks of one skin are both samples, so the interval and `p` use
+    `two_way_error`.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
-    ours, skins = _skin_means(of), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
+    ours, skins = _skin_means(method), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
     if unpaired := sorted(set(skins) - set(ours.index)):
         raise _unpaired(unpaired)
     by_pair = (ours.loc[skins, theirs.columns].set_axis(theirs.index) - theirs).groupby(["fold", "board"]).mean()
-    found = summarise_differences(by_pair.groupby("board").mean())
+    summary = summarise_differences(by_pair.groupby("board").mean())
     for name in by_pair:
-        if name in found:
-            stat = {key: value for key, value in found[name].items() if key in ("mean", "sd", "n", "values")}
+        if name in summary:
+            stat = {key: value for key, value in summary[name].items() if key in ("mean", "sd", "n", "values")}
             error = two_way_error(by_pair[name].dropna().unstack())
-            found[name] = stat if error is None else stat | _t_test(stat["mean"], *error)
-    return found
+            summary[name] = stat if error is None else stat | _t_test(stat["mean"], *error)
+    return summary
 
 
 def _t_test(mean: float, se: float, df: float) -> dict[str, Any]:
@@ -384,13 +391,15 @@ def _t_test(mean: float, se: float, df: float) -> dict[str, Any]:
 
 def _unpaired(skins: Sequence[Any]) -> SchemaError:
     remedy = "Train both on the same folds."
-    return SchemaError(f"a paired difference needs the same held-out skins on both sides; got {skins}. {remedy}")
+    return SchemaError(
+        f"a paired difference needs the same held-out skins for both methods; only one method has {skins}. {remedy}"
+    )
 
 
 def negate(stat: Stat) -> dict[str, Any]:
     """Change the sign of a difference."""
     negative = {**stat, "mean": -stat["mean"]}
-    negative |= {"values": [-one for one in stat["values"]]} if "values" in stat else {}
+    negative |= {"values": [-value for value in stat["values"]]} if "values" in stat else {}
     return negative | ({"ci95": [-end for end in reversed(stat["ci95"])]} if "ci95" in stat else {})
 
 
@@ -398,7 +407,7 @@ def negate(stat: Stat) -> dict[str, Any]:
 
 
 def verdict(stat: Stat, *, above: float = 0.0) -> str:
-    """Judge whether a mean over boards is above a threshold, by its interval."""
+    """Judge by its interval whether a mean over boards is above a threshold."""
     if "ci95" not in stat:
         return FEW_BOARDS
     low, high = stat["ci95"]
@@ -406,7 +415,7 @@ def verdict(stat: Stat, *, above: float = 0.0) -> str:
 
 
 def verdict_within(stat: Stat, margin: float) -> str:
-    """Judge whether a mean over boards is nearer to 0 than `margin`, by its interval (equivalence)."""
+    """Judge by its interval whether a mean over boards is nearer to 0 than `margin` (equivalence)."""
     if "ci95" not in stat:
         return FEW_BOARDS
     low, high = stat["ci95"]
@@ -416,5 +425,5 @@ def verdict_within(stat: Stat, margin: float) -> str:
 
 
 def combine_verdicts(verdicts: Sequence[str]) -> str:
-    """Judge a claim with several parts: contradicted if one part is contradicted, supported if all are supported."""
+    """Judge a claim with several parts: contradicted if any part is contradicted, supported if all are supported."""
     return next((verdict for verdict in (CONTRADICTED, FEW_BOARDS, UNDECIDED) if verdict in verdicts), SUPPORTED)

@@ -75,7 +75,7 @@ class Drawing:
 
     @property
     def scrolls(self) -> bool:
-        """Whether the figure scrolls on a phone, because its letters are legible only if it is wider than the screen."""
+        """Whether the figure scrolls on a phone, because it is legible only if it is wider than the screen."""
         return self.least_px > NARROW_PX
 
 

@@ -131,8 +131,8 @@ def _time(times: Numbers) -> str:
     all_GB, environment_GB = (median(run[part] for run in runs) / 1e3 for part in ("all_MB", "environment_MB"))
     return (
         f"Environment {environment_min:.1f} min, stages {stages_min:.1f} min ({cpu_min:.1f} CPU min); {all_GB:.1f} GB, "
-        f"of which {environment_GB:.1f} GB are the environment. Median of {len(runs)} fresh clones on {times['machine']} "
-        f"(`make time-repro`, code {times['git']})."
+        f"of which {environment_GB:.1f} GB are the environment. Median of {len(runs)} fresh clones on "
+        f"{times['machine']} (`make time-repro`, code {times['git']})."
     )
 
 
@@ -152,7 +152,7 @@ def costs_table(scenes: Sequence[Numbers]) -> pd.DataFrame:
 
 
 def _stages(stages: Mapping[str, Any]) -> str:
-    """Tabulate the stages of dvc.yaml with code and outputs; cells are not padded, so that each edit changes one line."""
+    """Tabulate the stages of dvc.yaml with code and outputs; cells are not padded, so an edit changes one line."""
     lines = ["| stage | code | writes |", "|---|---|---|"]
     for name, stage in stages.items():
         outs = [
