@@ -26,7 +26,7 @@ INTERVAL = (
 )
 SPREAD = (
     f"{INTERVAL} ± is a standard deviation. For one skin, it is over n repeats. For one skin tested on others, it is "
-    "over n pairs of a training skin and a test skin. Marked (seeds), it is over network seeds."
+    "over n pairs of a training skin and a test skin. If marked (seeds), it is over network seeds."
 )
 SHORT = {
     "single": "single-sensor", "multi": "multi-sensor", "triplet": "multi-sensor + triplet", "adapted": "adapted",

@@ -28,7 +28,7 @@ NO_NUMBER = ("–", "see file", "")  # cells of the checklist that contain no nu
 FURTHER = "further"  # the section of tables and figures that no other section names
 OPEN = {"table2", "labels", "claims"}  # tables that are open when the page loads; the reader opens the others
 BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist has all
-SUMMARY = "Scores on held-out boards"
+SUMMARY = "Main scores on held-out boards"
 SOURCES = {
     "simulated": "Every reading of this scene was simulated: no number on this page was measured on hardware.",
     "recorded": "Every reading of this scene was recorded from hardware.",

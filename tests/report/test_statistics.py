@@ -280,7 +280,7 @@ def test_combined_verdicts():
 
 def test_paired_needs_equal_skins():
     few, many = score_table({"b0": [[1.0]]}), score_table({"b0": [[2.0], [3.0]], "b1": [[4.0]]})
-    with pytest.raises(SchemaError, match="the same held-out skins on both sides; got .*'b1_s0'"):
+    with pytest.raises(SchemaError, match="the same held-out skins for both methods; only one method has .*'b1_s0'"):
         paired(few, many)
 
 
