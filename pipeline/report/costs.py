@@ -23,9 +23,8 @@ COMPUTED = (
     "training runs that were completed before."
 )
 MARGIN = 1.6  # factor by which a logarithmic axis extends beyond the outermost points
-ERROR_SHOWN_MIN = (
-    1e-16  # size of rounding errors; smaller ones are drawn at this value, because the axis is logarithmic
-)
+# The size of rounding errors. Smaller errors are drawn at this value, because the axis is logarithmic.
+ERROR_SHOWN_MIN = 1e-16
 COLUMNS_N = 3
 CAPTION_CHARACTERS = 38  # characters that fit in the width of a panel or of the legend
 
@@ -34,7 +33,7 @@ Rows = Sequence[Row]
 
 
 def cost_pages(runtime: Row, source: str) -> dict[str, str]:
-    """Draw and tabulate errors against costs: text by file name. Studies that were not timed here get no figure."""
+    """Draw and tabulate errors against costs: text by file name. Methods that were not timed here are in no figure."""
     texts = {f"{name}.md": to_markdown(table) for name, table in cost_tables(runtime, source).items()}
     for name, (key, cost) in TRADE_OFFS.items():
         if any(key in row for row in runtime.get("learning", [])):

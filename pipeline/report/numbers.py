@@ -44,10 +44,7 @@ PAIRS = (
     ("adapted", "multi"),
 )  # fmt: skip
 PAPERS_SPLITS = ("single_random", "single_temporal")  # the first that exists is compared with the paper's numbers
-STRICTER = {
-    "by_indentation": "single_indentation",
-    "by_pass": "single_pass",
-}  # splits that hold out whole indentations or passes
+STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # hold out whole indentations or passes
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # experiment by method
@@ -63,13 +60,7 @@ SEEN_PCT = 25.0  # assumed: with this accuracy without contact, the chips sense 
 DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
 TOUCHES_METRICS = ("single_touches_pct", "mean_left_over_pct")
 SETTINGS = ("scene", "source", "seed")  # keys of the provenance that do not differ between repeats of a run
-TIMES = (
-    "median_s",
-    "repeats_n",
-    "train_s",
-    "inference_us",
-    "seconds",
-)  # keys of a row in `runtime` that differ between repeats of a run
+TIMES = ("median_s", "repeats_n", "train_s", "inference_us", "seconds")  # keys in `runtime` that differ between repeats
 ROW_KEYS = ("study", "method", "inputs", "setting", "pokes_n")  # keys that identify a row in `runtime`
 SHEAR_METRICS = ("mse_xy_mm2", "mse_fxy_N2", "mse_fz_N2")
 
@@ -173,9 +164,8 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Summarise every recipe of every experiment with models: over pairs, over repeats on one skin, or over boards."""
     numbers: dict[str, dict[str, Any]] = {}
-    models = table[
-        table["question"].isin([experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"])
-    ]
+    names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
+    models = table[table["question"].isin(names)]
     for (experiment, recipe), group in _groups(models, ["question", "recipe"], sort=False):
         summarise = (
             over_pairs if experiment == "transfer" else over_folds if experiment.startswith("single_") else over_boards
@@ -213,8 +203,8 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6a.
 
-    Three pairs are compared: no pokes and the fewest pokes; no pokes and the number at which the paper's plateau
-    begins; this number and the most pokes.
+    The comparisons are: the fewest pokes with none; the number at which the paper's plateau begins with none; and the
+    most pokes with that number.
     """
     groups = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
     if 0 not in groups or len(groups) < 2:
@@ -232,8 +222,8 @@ def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6b.
 
-    Three pairs are compared: the most and the fewest training skins; adapted networks and the others; the gain from
-    adaptation with the fewest skins and with the most.
+    The comparisons are: the most training skins with the fewest; adapted networks with the other networks; and the gain
+    from adaptation with the fewest skins with the gain with the most.
     """
     groups = {
         (method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])
@@ -351,7 +341,7 @@ def count_trainings(
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
-    """Add up, for each protocol but the main one, the counts of its captures, and list the rows that were left out."""
+    """Add up the counts of captures for each protocol except the main one, and list counts of rows left out."""
     by_protocol: dict[str, dict[str, Any]] = {}
     for experiment, lost in losses.items():
         protocol = EXPERIMENTS[experiment].protocol

@@ -53,10 +53,10 @@ BEFORE_TOUCH = {
     "scan": "only the number of the indentation in its pass",
 }
 BEFORE_TOUCH_MEANING = (
-    "Position from only ...: predicted by the 2 nearest training rows, without the field change. The number of the "
-    "indentation in its pass shows how exactly the rig repeats its order; no network receives this number. The no-load "
-    "reading shows how much the skin's memory of earlier indentations reveals about that order. A network may use this "
-    "memory, because it is part of the field change."
+    'Rows "position from only ...": the 2 nearest training rows predict the position without the field change. The '
+    "row with the number of the indentation shows how exactly the rig repeats its order of places; no network receives "
+    "this number. The row with the no-load reading shows how much the skin's memory of earlier indentations reveals "
+    "about that order. A network may use this memory, because it is part of the field change."
 )
 SEEN_TIP = (
     "Some scores are not comparable with the paper's numbers and are not evidence of touch: the position of a tip that "
