@@ -92,7 +92,7 @@ def stage_costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
 
 
 def study_table(rows: Rows, source: str) -> pd.DataFrame:
-    """List every method and setting of a study: its work, error and time, or why it failed."""
+    """List every method and setting of a study: its work, error and time, or the reason for its failure."""
     lines = [
         {
             "study": row["study"],
@@ -101,7 +101,7 @@ def study_table(rows: Rows, source: str) -> pd.DataFrame:
             "nodes or right-hand sides": str(row["work_n"]),
             "error": "–" if row["error"] is None else f"{row['error']:.2g}",
             "median ms per indentation": f"{1e3 * row['median_s']:.3g}" if "median_s" in row else "–",
-            "failed": row["failure"] or "",
+            "failure": row["failure"] or "",
             "source": source,
         }
         for row in rows
@@ -215,8 +215,8 @@ def quadratures(rows: Rows, choice: Mapping[str, Any], source: str) -> str:
         rows,
         title=f"Error of the field change dB against run time ({source})",
         error="rms error / rms dB, worst skin and depth",
-        note="Methods kernel alone and magpylib: time of the field only, at nodes moved beforehand. "
-        "All other methods: time of flow and field.",
+        note="Kernel alone and magpylib: the time of the field only, because nodes were moved beforehand. "
+        "Other methods: the time of flow and field.",
         limit=ERROR_MAX,
         rings=rings,
     )
