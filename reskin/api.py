@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from reskin.universal.model import Universal
 
 AnyModel = Union[Path, str, "Model", "Universal", Sequence[Union[Path, str, "Model", "Universal"]]]
-Changes = Mapping[str, Any]  # values by name, for the settings that differ from the nominal ones
+Changes = Mapping[str, Any]  # setting name -> value, for settings that differ from the nominal ones
 NOMINAL_BOARD = "rigid"
 
 
@@ -79,10 +79,10 @@ def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = Non
     name, seed : str, int
         The same name and seed give the same board.
     spreads : mapping, optional
-        Standard deviations between boards to use instead of the nominal ones, such as `{"chip_offset_uT": 0.0}`.
+        Board-to-board standard deviations that replace the nominal ones, such as `{"chip_offset_uT": 0.0}`.
     **design
-        Settings to use instead of the nominal board's: `chips_xy_mm` [[x, y], ...] relative to the centre of the skin,
-        `chips_turn_deg` [turn, ...], `gap_mm`.
+        Settings that replace those of the nominal board: `chips_xy_mm` [[x, y], ...] relative to the centre of the skin,
+        `chips_turn_deg` [angle, ...], `gap_mm`.
 
     Returns
     -------
@@ -115,14 +115,15 @@ def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = N
     name, seed : str, int
         The same name and seed give the same skin.
     spreads : mapping, optional
-        Standard deviations between skins to use instead of the nominal ones, such as `{"skin_modulus": 0.0}`.
+        Skin-to-skin standard deviations that replace the nominal ones, such as `{"skin_modulus": 0.0}`.
     **design
-        Settings to use instead of the nominal skin's: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
+        Settings that replace those of the nominal skin: `thickness_mm`, `modulus_kPa`, `tip_radius_mm`, ...
 
     Returns
     -------
     Skin
-        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the dipoles that represent its magnetisation.
+        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the positions and moments of the dipoles that represent its
+        magnetisation.
 
     Raises
     ------
@@ -176,7 +177,7 @@ def simulate_pokes(
     seed : int
         Seed of the noise, and of the board if no board is given.
     chip : mapping, optional
-        Settings to use instead of the nominal magnetometer's, such as `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`.
+        Settings that replace those of the nominal magnetometer, such as `{"noise_xy_uT": 0.0, "noise_z_uT": 0.0}`.
 
     Returns
     -------
@@ -211,8 +212,8 @@ def simulate_pokes(
     board = board or draw_board(seed=seed)
     design = parse(ChipDesign, nominal("chip", chip), "chip")
     if not len(places_mm):
-        no_uT = np.zeros((0, 3 * len(board.chips_m)), np.float32)
-        return Pokes(no_uT, no_uT.copy(), np.zeros(0))
+        empty_uT = np.zeros((0, 3 * len(board.chips_m)), np.float32)
+        return Pokes(empty_uT, empty_uT.copy(), np.zeros(0))
     rngs = {part: rng_for(seed, "poking", skin.name, part) for part in ("drift", "noload", "contact")}
     no_tilt = np.zeros((len(tip_m), 2))
     response = simulate_response(board, skin, tip_m[:, None], tilt=no_tilt, terms=Terms(), rng=rngs["drift"])
@@ -222,9 +223,9 @@ def simulate_pokes(
 
 
 class Model:
-    """A trained network and the no-load reading of a skin, returned by `load_model`.
+    """A trained network, as `load_model` returns it.
 
-    Call `zero` with readings without contact, then `predict`.
+    First call `zero` with readings without contact, then `predict`.
 
     Attributes
     ----------
@@ -256,7 +257,7 @@ class Model:
         Raises
         ------
         SchemaError
-            If the number of channels is not the model's.
+            If the number of channels differs from the model's.
         """
         self._noload_uT = self._rows(b_uT).mean(axis=0, dtype=np.float64)
         return self
@@ -279,7 +280,7 @@ class Model:
         ParamsError
             If `zero` has not been called.
         SchemaError
-            If the number of channels is not the model's.
+            If the number of channels differs from the model's.
         """
         if self._noload_uT is None:
             raise ParamsError("predict: the model has no no-load reading. First call zero with fields without contact.")
@@ -301,7 +302,7 @@ class Model:
         if rows_uT.ndim != 2 or rows_uT.shape[1] != channels_n:
             raise SchemaError(
                 f"fields of shape {np.shape(b_uT)} do not fit the {channels_n} channels of the model. "
-                "Give Bx, By, Bz of chip 0, then of chip 1, ..."
+                "Pass Bx, By, Bz of chip 0, then of chip 1, ..."
             )
         return rows_uT
 
@@ -335,15 +336,15 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal(calibration: Path | str | None = None) -> Universal:
-    """Load the universal model that comes with the library. It works for a skin without any recording of it.
+    """Load the universal model that comes with the library. It needs no recordings of the skin.
 
-    Its methods calibrate it to a skin: `zero` uses readings without contact, `see` presses at unknown places, and
-    `label` presses at known places; `next_place` proposes where to press next, and `save` writes the calibration.
+    Its methods calibrate it to a skin: `zero` takes readings without contact, `see` takes presses at unknown places, and
+    `label` takes presses at known places. `next_place` proposes where to press next, and `save` writes the calibration.
 
     Parameters
     ----------
     calibration : path, optional
-        A file that `save` wrote, to continue with that skin.
+        A file that `save` wrote; its calibration is continued.
 
     Returns
     -------
@@ -374,30 +375,30 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     """Open a board's port, to read contacts as they happen.
 
     The `with` statement opens the port, detects wire format and chips, and takes the no-load reading: nothing may touch
-    the skin in the first second. A thread reads the port, so that a slow loop loses no bytes.
+    the skin in the first second. A thread reads the port, so that no bytes are lost when your loop is slow.
 
     Parameters
     ----------
     port : str or list of str
         A serial port or `socket://host:port`; a list for several boards at once.
     model : optional
-        One or more trained networks (files or `Model`s), or one universal model (the file of a calibration, or the
-        object, which is not changed). The uncalibrated universal model if not given.
+        One or more trained networks (files or `Model` objects), or one universal model (a calibration file, or an
+        object, which is not modified). Default: the uncalibrated universal model.
     baud : int
         Baud rate; USB ports ignore it.
 
     Returns
     -------
     LiveSkin or LiveSkins
-        Iterate over it for the latest `Contact`: time, place, force, standard deviation of the place, field, alarms;
-        `every()` yields each reading. For a list of ports, iterate over tuples of contacts, in the order of the ports;
-        a board that is unplugged does not hold up the others.
+        Iteration yields the latest `Contact`: time, place, force, standard deviation of the place, field, alarms.
+        `every()` yields a contact for each reading. With a list of ports, iteration yields tuples of contacts, in the
+        order of the ports; an unplugged board does not delay the others.
 
     Raises
     ------
     ReskinError
-        If a model cannot be read or a port is named twice; in the `with` statement, if a port does not open or sends no
-        frames, or if the board's number of chips is not the model's.
+        If a model cannot be read or a port is named twice; in the `with` statement, if a port cannot be opened or sends
+        no frames, or if the board's number of chips does not match the model.
 
     Examples
     --------
@@ -411,7 +412,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     if isinstance(port, str):
         return LiveSkin(port, models, baud=baud)
     check_ports(port, models, "reskin.open")
-    return LiveSkins([LiveSkin(each, models, baud=baud) for each in port])
+    return LiveSkins([LiveSkin(name, models, baud=baud) for name in port])
 
 
 def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
@@ -420,24 +421,24 @@ def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
     from reskin.universal.model import Universal
 
     given = list(model) if isinstance(model, Iterable) and not isinstance(model, str) else [model]
-    for one in given:
-        if not isinstance(one, str | Path | Model | Universal):
-            remedy = "Give a path, or what load_model or load_universal returned."
-            raise ParamsError("reskin.open", "a model", "a file or a loaded model", type(one).__name__, remedy)
+    for item in given:
+        if not isinstance(item, str | Path | Model | Universal):
+            remedy = "Pass a path, or an object that load_model or load_universal returned."
+            raise ParamsError("reskin.open", "a model", "a file or a loaded model", type(item).__name__, remedy)
     if len(given) == 1 and isinstance(given[0], Universal):
         return given[0]
-    files = [Path(one) for one in given if isinstance(one, str | Path)]
+    files = [Path(item) for item in given if isinstance(item, str | Path)]
     read = read_models(files) if files or not given else []
     if isinstance(read, Universal) and len(given) <= 1:
         return read
-    if isinstance(read, Universal) or any(isinstance(one, Universal) for one in given):
-        raise ParamsError("reskin.open: a universal model cannot be combined with other models. Give it alone.")
-    of_files = iter(read)
-    return [one._network if isinstance(one, Model) else next(of_files) for one in given]
+    if isinstance(read, Universal) or any(isinstance(item, Universal) for item in given):
+        raise ParamsError("reskin.open: a universal model cannot be combined with other models. Use it alone.")
+    from_files = iter(read)
+    return [item._network if isinstance(item, Model) else next(from_files) for item in given]
 
 
 def lifted() -> Label:
-    """Make the label of an untouched board, for `record`. One such label must come before each touch."""
+    """Return the label of an untouched board, for `record`. One such label must come before each touch."""
     from reskin.recordings.labels import Label
 
     return Label(False)
@@ -453,7 +454,7 @@ def touch(
     Fz_N: float = math.nan,
     pass_i: int = 0,
 ) -> Label:
-    """Make the label of a stationary touch, for `record`.
+    """Return the label of a stationary touch, for `record`.
 
     Parameters
     ----------
@@ -487,12 +488,12 @@ def record(
 ) -> Path:
     """Record a board while a program moves a robot and reports its position.
 
-    Prints to stderr what was recorded, lost and left out.
+    Prints a summary to stderr: what was recorded, lost and left out.
 
     Parameters
     ----------
     labels : iterable or callable
-        Yields `lifted()` or `touch(...)` once the robot stands still. A callable is called for each label, until it
+        Yields `lifted()` or `touch(...)` once the robot has stopped. A callable is called for each label, until it
         returns None.
     port : str, optional
         The board's port; if not given, the only board that is connected.
@@ -513,7 +514,7 @@ def record(
     Raises
     ------
     ReskinError
-        If no board is found, or it sends no frames.
+        If no board is detected, or it sends no frames.
     Exception
         Any exception that the program raises; what was recorded until then is kept.
 
@@ -533,10 +534,10 @@ def record(
 
     given = {"board": board, "skin": skin, "scan": scan}
     names = {key: name for key, name in given.items() if name is not None}
-    found = find_board(None if port is None else [port])
+    detected = find_board(None if port is None else [port])
     folder = Path(out) if out is not None else None
-    done = record_board(found, from_program(labels, dwell_s), folder=folder, seconds=seconds, names=names)
-    print(done.summary, file=sys.stderr)
-    if done.error is not None:
-        raise done.error
-    return done.folder
+    result = record_board(detected, from_program(labels, dwell_s), folder=folder, seconds=seconds, names=names)
+    print(result.summary, file=sys.stderr)
+    if result.error is not None:
+        raise result.error
+    return result.folder

@@ -28,19 +28,19 @@ BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (
     "Recordings",
     "Pipeline",
     "Maintenance",
-)  # groups of commands in help
+)  # groups of commands in `reskin --help`
 
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Learning for magnetic tactile skins: read boards, record, see contacts live, turn logs into contacts.",
+    help="Learning for magnetic tactile skins: read boards, record, see contacts live, estimate contacts from logs.",
     epilog=f"In a checkout of the project also: {', '.join(CHECKOUT_COMMANDS)}.",
 )
 
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
-Chips = Annotated[int, Option("--chips", help="Chips in a frame.", min=1, max=64)]
-SOURCE = "A capture's folder, nominal (a simulated skin), or the YAML file of a simulated scene."
+Chips = Annotated[int, Option("--chips", help="Number of chips in a frame.", min=1, max=64)]
+SOURCE = "A capture folder, `nominal` (a simulated skin), or the YAML file of a simulated scene."
 ON_FAULT = (
     "NAME=flag keeps the estimates of readings with that fault, such as stuck=flag; NAME=drop hides them. May be "
     "repeated. Names: params.yaml, section faults."
@@ -56,11 +56,11 @@ FAULT = (
     "saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = "A trained model (.safetensors with its JSON card) or a saved calibration. Default: the universal model."
-LOG = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder of `record`, or a file of `decode`."
+LOG = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder written by `record`, or a file written by `decode`."
 
 
 def main() -> None:
-    """Run the command; print a user's error without a traceback."""
+    """Run the command; print errors that a user can fix without a traceback."""
     try:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `finally` and `with` clean up
         with explaining("reskin"):
@@ -121,7 +121,7 @@ def template(
     out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
     chips_n: Chips = 5,
 ) -> None:
-    """Write an empty CSV for a recording of your own (layout `table`). Add one row per reading; see data/README.md."""
+    """Write an empty CSV for your own recording (layout `table`). Add one row per reading; see data/README.md."""
     from reskin import io
     from reskin.recordings.readers.table import NEEDED, columns_of
 
@@ -162,15 +162,15 @@ def record(
             raise ParamsError(
                 "--wire and --chips describe the board on --port. Add --port, or omit them to detect both."
             )
-        found = find_board()
-        typer.echo(str(found))
+        detected = find_board()
+        typer.echo(str(detected))
     else:
-        found = DetectedBoard(port, None, wire or "binary", chips_n or 5)
+        detected = DetectedBoard(port, None, wire or "binary", chips_n or 5)
     given = {"board": board, "skin": skin, "scan": scan}
     names = {key: name for key, name in given.items() if name is not None}
-    done = record_board(found, source, folder=out, seconds=seconds, baud=baud, names=names)
-    typer.echo(done.summary)
-    if done.error is not None:
+    result = record_board(detected, source, folder=out, seconds=seconds, baud=baud, names=names)
+    typer.echo(result.summary)
+    if result.error is not None:
         raise typer.Exit(2)
 
 
@@ -178,7 +178,7 @@ def record(
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
     port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
-    speed: Annotated[float, Option(help="Multiple of the source's rate; inf: as fast as it is read.", min=0.01)] = 1.0,
+    speed: Annotated[float, Option(help="Multiple of the source's rate; inf: as fast as the bytes are read.", min=0.01)] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
 ) -> None:
@@ -187,10 +187,10 @@ def emulate(
 
     faults = [parse_fault(text) for text in fault or ()]
     script = read_script(source)
-    for one in faults:
-        script = inject(script, one)
+    for each in faults:
+        script = inject(script, each)
     emulated, stop = make_port(port), threading.Event()
-    typer.echo(f"{emulated.name}: {len(script)} frames of {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
+    typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; press Ctrl-C to stop")
     started_s = time.monotonic()
     try:
         sent_n = play(script, emulated, stop, speed=speed, loop=loop)
@@ -204,8 +204,8 @@ def emulate(
 @app.command(rich_help_panel=BOARD)
 def live(
     port: Annotated[list[str] | None, Option(help="Port of a board; may be repeated. Default: all boards.")] = None,
-    model: Annotated[list[Path] | None, Option(help=f"{MODEL} Several models are averaged.")] = None,
-    replay: Annotated[str | None, Option(help="Instead of a board: the folder of a capture.")] = None,
+    model: Annotated[list[Path] | None, Option(help=f"{MODEL} The estimates of several models are averaged.")] = None,
+    replay: Annotated[str | None, Option(help="Instead of a board: a capture folder.")] = None,
     emulate: Annotated[str | None, Option(help="Instead of a board: nominal, or a simulated scene's YAML.")] = None,
     host: Annotated[
         str, Option(help="Address to listen on. 0.0.0.0 serves other machines; the printed address then has a token.")
@@ -227,7 +227,7 @@ def live(
     fault_policy = override(LIVE_POLICY, on_fault or (), "--on-fault")
     given = [name for name, value in (("--port", port), ("--replay", replay), ("--emulate", emulate)) if value]
     if len(given) > 1:
-        raise ParamsError(f"live: give only one of {', '.join(given)}.")
+        raise ParamsError(f"live: use only one of {', '.join(given)}.")
     models = read_models(model or ())
     with ExitStack() as stack:
         shown = "a board"
@@ -240,7 +240,7 @@ def live(
 
 @app.command(rich_help_panel=RECORDINGS)
 def decode(
-    stream: Annotated[Path, Argument(help="A file with the bytes that a port sent.")],
+    stream: Annotated[Path, Argument(help="A file of the bytes that a port sent.")],
     out: Annotated[Path, Option(help="The Parquet file to write.")],
     wire: Annotated[Wire, Option(help="Wire format.")] = "binary",
     chips_n: Chips = 5,
@@ -260,10 +260,10 @@ def predict(
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
     model: Annotated[Path | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[
-        float, Option("--rate-hz", help="Frames per second of a `decode` file without a clock.")
+        float, Option("--rate-hz", help="Frames per second, for a `decode` file without a clock.")
     ] = 400.0,
 ) -> None:
-    """Turn a log into contacts, places and forces. The log must begin with 0.5 s or more without contact."""
+    """Estimate contacts, places and forces from a log. The log must begin with 0.5 s or more without contact."""
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 

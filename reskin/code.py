@@ -1,4 +1,4 @@
-"""Digests of code: of the modules that a stage imports, without comments and docstrings, and of whole packages."""
+"""Digests of code: of single modules, ignoring comments and docstrings, and of whole packages."""
 
 import ast
 import hashlib
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 PACKAGES = ("pipeline", "reskin")
-DATA = (".yaml", ".html")  # files that belong to the module of their name
+DATA = (".yaml", ".html")  # data files that belong to the module of the same name
 ROOT = Path(__file__).parents[1]
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
@@ -21,16 +21,16 @@ def digest(name: str, *, data: bool = True) -> str:
     Formatting, comments and the version of Python do not change it. `page.yaml` belongs to `page.py` beside it; with
     `data=False`, such files do not count.
     """
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for file in files_of(name) if data else [file_of(name)]:
-        found.update(normalised(file.name, file.read_bytes()))
-    return found.hexdigest()[:32]
+        hasher.update(normalised(file.name, file.read_bytes()))
+    return hasher.hexdigest()[:32]
 
 
 def files_of(name: str) -> list[Path]:
-    """Return the files of a module or package: its own, and data files of the same name beside it."""
+    """Return the files of a module or package: its Python file, and data files of the same name beside it."""
     file, path = file_of(name), ROOT / name.replace(".", "/")
-    return [file, *sorted(one for one in path.parent.glob(f"{path.name}.*") if one.suffix in DATA)]
+    return [file, *sorted(data for data in path.parent.glob(f"{path.name}.*") if data.suffix in DATA)]
 
 
 def normalised(file: str, content: bytes) -> bytes:
@@ -40,15 +40,17 @@ def normalised(file: str, content: bytes) -> bytes:
 
 def package_digest(*packages: Path, suffixes: Sequence[str] = (".py",)) -> str:
     """Return a digest of all files of packages with these suffixes, byte by byte."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for package in packages:
         for file in sorted(file for file in package.rglob("*") if file.suffix in suffixes):
-            found.update(f"{file.relative_to(package)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
-    return found.hexdigest()[:32]
+            hasher.update(f"{file.relative_to(package)} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
+    return hasher.hexdigest()[:32]
 
 
 def imported(*names: str) -> list[str]:
-    """Return the modules of our packages that modules import, directly or not, with themselves and their packages.
+    """Return the modules of `PACKAGES` that the named modules import, directly or indirectly.
+
+    The result includes the named modules themselves and the packages that contain any of these modules.
 
     Imports under `if TYPE_CHECKING:` do not count.
     """
@@ -58,7 +60,7 @@ def imported(*names: str) -> list[str]:
 
 @cache
 def _graph() -> Any:
-    import grimp  # imported late: only stages that follow imports need it
+    import grimp  # imported late: only stages that trace imports need it
 
     return grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True, cache_dir=None)
 
@@ -77,18 +79,18 @@ def _syntax(node: ast.AST) -> list[Any]:
     >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})
     2
     """
-    found: list[Any] = [type(node).__name__]
+    items: list[Any] = [type(node).__name__]
     for key in node._fields:
         part: Any = getattr(node, key, None)
         if key == "body" and isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
             part = part[1:]
         if isinstance(part, list):
             if part:
-                found.append([key, [_part(one) for one in part]])
+                items.append([key, [_part(item) for item in part]])
         elif part is not None:
-            found.append([key, _part(part)])
-    return found
+            items.append([key, _part(part)])
+    return items
 
 
-def _part(of: Any) -> Any:
-    return _syntax(of) if isinstance(of, ast.AST) else repr(of)
+def _part(value: Any) -> Any:
+    return _syntax(value) if isinstance(value, ast.AST) else repr(value)

@@ -1,6 +1,6 @@
 """Settings: YAML files, and strict pydantic models that validate them.
 
-A model of settings is frozen, allows no unknown keys and has few defaults; it is defined beside the code that uses it.
+A settings model is frozen, allows no unknown keys and has few defaults; it is defined beside the code that uses it.
 """
 
 import json
@@ -17,7 +17,7 @@ from reskin.errors import ParamsError, did_you_mean
 
 
 class Strict(BaseModel):
-    """Base of all models of settings: missing keys and unknown keys are errors."""
+    """Base class of all settings models: missing keys and unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -37,16 +37,17 @@ def read_yaml(path: Path) -> Any:
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
-    """Validate plain values against a model; raise a `ParamsError` that names the wrong key and what is allowed."""
+    """Validate plain values against a model; raise a `ParamsError` that names the wrong key and the allowed values."""
     try:
-        # Through JSON, so that a YAML list may fill a tuple while "3" still does not become 3.
+        # Validated as JSON: a YAML list may then fill a tuple, but the text "3" is still not accepted for the number 3.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         # A misspelt key makes another key missing: report the unknown key first.
-        faults = error.errors(include_url=False)
-        first = min(faults, key=lambda found: found["type"] != "extra_forbidden")
-        beside = [found for found in faults if found["type"] == "missing" and found["loc"][:-1] == first["loc"][:-1]]
-        names = [".".join(_path_in_file(found["loc"], value)) for found in (beside if first in beside else [first])]
+        details = error.errors(include_url=False)
+        first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
+        missing = [detail for detail in details if detail["type"] == "missing" and detail["loc"][:-1] == first["loc"][:-1]]
+        reported = missing if first in missing else [first]
+        names = [".".join(_path_in_file(detail["loc"], value)) for detail in reported]
         name = ", ".join(names) or "the file"
         got = repr(first.get("input"))[:80]
         if first["type"] == "missing":
@@ -56,7 +57,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
                 f"{where}: {name} is not a known parameter (its value: {got}). Correct or remove it there."
             ) from None
         rule = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-        if first["type"] == "value_error":  # parameters contradict each other: the rule names them and their values
+        if first["type"] == "value_error":  # from a validator: its message names the parameters and their values
             place = f"{where}: {name}" if first["loc"] else where
             raise ParamsError(f"{place}: {rule}. Correct it there.") from None
         choices = re.findall("'([^']*)'", rule) if first["type"] == "literal_error" else []
@@ -65,7 +66,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
 
 
 def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:
-    """Return the keys of a location that are in the file: pydantic also names the types that it tried."""
+    """Return the keys of an error's location that are in the file; pydantic also lists the types that it tried."""
     kept = []
     for i, part in enumerate(loc):
         known = part in value if isinstance(value, dict) else isinstance(value, list | tuple) and isinstance(part, int)

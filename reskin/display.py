@@ -1,4 +1,4 @@
-"""One-line texts of objects that hold arrays, for notebooks and error messages."""
+"""One-line representations of dataclasses that hold arrays, for notebooks and error messages."""
 
 from dataclasses import fields
 from typing import Any
@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 
-def one_line(of: Any) -> str:
-    """Return the name of a dataclass and its fields; of arrays their shape, of other large values their type.
+def one_line(instance: Any) -> str:
+    """Return the name and fields of a dataclass, with the shapes of arrays and the types of other large values.
 
     Use it as `__repr__`: the default prints every number.
     """
-    shown = (f"{one.name}={_show(getattr(of, one.name))}" for one in fields(of))
-    return f"{type(of).__name__}({', '.join(shown)})"
+    parts = (f"{field.name}={_show(getattr(instance, field.name))}" for field in fields(instance))
+    return f"{type(instance).__name__}({', '.join(parts)})"
 
 
 def _show(value: Any) -> str:

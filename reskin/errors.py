@@ -1,4 +1,4 @@
-"""Errors that a user can cause or fix, and explanations of errors from the machine and of missing packages."""
+"""Errors that a user can cause or fix, and messages for machine failures and missing packages."""
 
 import errno
 from collections.abc import Iterable, Iterator
@@ -9,13 +9,13 @@ from importlib.util import find_spec
 
 
 class ReskinError(ValueError):
-    """Base class: an input that is wrong. Commands print its message without a traceback and exit with `exit_code`.
+    """Base class of the errors below. Commands print the message without a traceback and exit with `exit_code`.
 
     Parameters
     ----------
     where : object
-        The whole message, if it is the only argument: what is wrong, where, and what to try. Otherwise the place: a
-        file with its line or byte, an option, a setting.
+        If it is the only argument, the whole message: where, what is wrong, and what to try. Otherwise only the place:
+        a file with its line or byte, an option, a setting.
     what, rule, got, remedy
         The parts of a message: what is wrong, what it must be, what it is, and what to try.
 
@@ -34,11 +34,11 @@ class ReskinError(ValueError):
 
 
 class CaptureError(ReskinError):
-    """Bytes, headers or recordings cannot be read, or a board does not answer."""
+    """Bytes, headers or recordings cannot be read, or a board sends nothing."""
 
 
 class SchemaError(ReskinError):
-    """A table, file or array has other columns, types, units or shapes than it needs."""
+    """A table, file or array cannot be read, or its columns, types, units or shapes are wrong."""
 
 
 class ParamsError(ReskinError):
@@ -57,7 +57,7 @@ class MachineError(ReskinError):
     """The machine failed: no disk space, no memory, no permission, or a dead worker process. Finished work is kept."""
 
 
-EXTRAS = {  # by package; all others come with `pipeline`
+EXTRAS = {  # package -> extra that installs it; the extra `pipeline` installs all others
     "torch": "train",
     "onnx": "onnx",
     "onnxruntime": "onnx",
@@ -80,7 +80,7 @@ RETRY = "Run it again: finished work is kept."
 
 @contextmanager
 def explaining(where: str) -> Iterator[None]:
-    """Turn errors of the machine into `MachineError`, and a missing package into `ParamsError`; pass on all others.
+    """Turn machine failures into `MachineError`, and a missing package into `ParamsError`; pass on all other errors.
 
     >>> with explaining("split"):
     ...     raise OSError(errno.ENOSPC, "No space left on device", "data/folds/lab.json")
@@ -109,7 +109,7 @@ Run it again: finished work is kept.
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return a question with the most similar known name, after a space; empty if none is similar.
+    """Return a space and a question with the most similar known name; empty if no name is similar.
 
     >>> did_you_mean("stuk", ["zeros", "stuck"])
     ' Did you mean stuck?'
@@ -119,12 +119,12 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def require(package: str, where: object) -> None:
-    """Raise if an optional package is not installed, before another thread or a long computation needs it."""
+    """Raise `ParamsError` if an optional package is not installed; call it before a thread or a long computation starts."""
     if find_spec(package) is None:
         raise missing_package(package, where)
 
 
 def missing_package(package: str, where: object) -> ParamsError:
-    """Make the error for a missing package; it names the extra that installs the package."""
+    """Return the error for a missing package; it names the extra that installs the package."""
     extra = EXTRAS.get(package, "pipeline")
     return ParamsError(f"{where}: package {package} is not installed. In the checkout: pip install '.[{extra}]'")

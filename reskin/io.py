@@ -1,4 +1,4 @@
-"""Read and write Parquet, safetensors, JSON and text files, each written whole or not at all; and a cache of arrays."""
+"""Read and write Parquet, safetensors, JSON and text files (every write is atomic), and cache computed arrays."""
 
 import errno
 import hashlib
@@ -26,23 +26,23 @@ from reskin.schema import Readings, arrow_schema, from_table, to_table
 
 COUNTS_KEY = b"reskin.account"
 DIGEST = "digest"  # in the metadata of a safetensors file
-HEADER_AT = 8  # bytes of a safetensors file before its header: the header's length
+HEADER_AT = 8  # a safetensors file begins with the length of its header, in this many bytes
 REMEDY = (
     "It was cut or changed. If `dvc repro` wrote it: delete it, then `reskin check-cache` and `dvc repro`. "
     "If not: copy it again."
 )
-OF_MACHINE = {
+MACHINE_ERRNOS = {
     errno.EACCES,
     errno.EIO,
     errno.EMFILE,
     errno.ENFILE,
     errno.ESTALE,
-}  # a file that cannot be read now is not damaged
+}  # with these errors, the file may be intact
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary sibling of `path` to write (a file or a folder), and rename it when the block succeeds."""
+    """Yield a temporary path beside `path` for a file or folder, and rename it to `path` when the block succeeds."""
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -72,11 +72,11 @@ def _is_written(error: OSError, temporary: Path) -> bool:
 @contextmanager
 def restoring(*files: Path) -> Iterator[None]:
     """Restore the content of files if the block fails or is interrupted."""
-    before = {file: file.read_bytes() for file in files}
+    contents = {file: file.read_bytes() for file in files}
     try:
         yield
     except BaseException:
-        for file, content in before.items():
+        for file, content in contents.items():
             if file.read_bytes() != content:
                 with replacing(file) as temporary:
                     temporary.write_bytes(content)
@@ -158,7 +158,7 @@ def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mappi
     dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     metadata = {**metadata, DIGEST: _digest(dense, metadata)}
     content = safetensors.numpy.save(dense, metadata)
-    with replacing(path) as temporary, temporary.open("wb") as stream:  # save_file hides errors of the disk
+    with replacing(path) as temporary, temporary.open("wb") as stream:  # save_file hides disk errors
         stream.write(content[:HEADER_AT] + _sorted_header(content, metadata))
         stream.write(memoryview(content)[stream.tell() :])
 
@@ -168,8 +168,8 @@ def read_tensors(
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
     """Read arrays and metadata that `write_tensors` wrote; no pickle is ever opened.
 
-    A file that is read whole is compared with its digest (files from older code may lack one, unless `digest_needed`);
-    single arrays are not checked.
+    If all arrays are read, they are compared with the file's digest. Files from older code have no digest; they are
+    accepted unless `digest_needed`. If only some arrays are read, nothing is checked.
     """
     _check_is_file(path)
     try:
@@ -177,7 +177,7 @@ def read_tensors(
             tensors = {name: file.get_tensor(name) for name in names or file.keys()}
             metadata: dict[str, str] = file.metadata() or {}
     except (safetensors.SafetensorError, OSError) as error:
-        _raise_if_of_machine(error)
+        _raise_machine_error(error)
         raise SchemaError(f"{path}: the file is not safetensors: {error}. Is it a trained model? {REMEDY}") from None
     written = metadata.pop(DIGEST, None)
     is_checked = not names and (digest_needed or written is not None)
@@ -187,15 +187,15 @@ def read_tensors(
 
 
 def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> str:
-    found = hashlib.sha256(repr(sorted(metadata.items())).encode())
+    hasher = hashlib.sha256(repr(sorted(metadata.items())).encode())
     for name, values in sorted(tensors.items()):
-        found.update(f"{name} {values.dtype} {values.shape}".encode())
-        found.update(values.data)
-    return found.hexdigest()[:32]
+        hasher.update(f"{name} {values.dtype} {values.shape}".encode())
+        hasher.update(values.data)
+    return hasher.hexdigest()[:32]
 
 
 def _sorted_header(content: bytes, metadata: Mapping[str, str]) -> bytes:
-    # The library's order of the metadata differs from process to process.
+    # The order in which the library writes the metadata differs from process to process.
     length = int.from_bytes(content[:HEADER_AT], "little")
     header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(metadata.items()))}
     return json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(length)
@@ -212,7 +212,7 @@ def read_table(path: Path) -> pa.Table:
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block; `counts` may change until the last block has arrived."""
+    """Write the readings of one capture block by block; `counts` is written last, so it may change until then."""
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:
@@ -231,11 +231,11 @@ def read_readings(path: Path) -> Readings:
 
 
 def read_ingest_counts(path: Path) -> dict[str, int]:
-    """Read what ingest counted for one capture: bytes, frames, rows, and what was dropped, by reason."""
+    """Read the ingestion counts of one capture: bytes, frames and rows, and those dropped, by reason."""
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
     if COUNTS_KEY not in metadata:
-        raise SchemaError(f"{path}: the file's metadata lacks the counts of losses. Ingest it again.")
+        raise SchemaError(f"{path}: the file's metadata lacks the ingestion counts. Ingest it again.")
     counts: dict[str, int] = json.loads(metadata[COUNTS_KEY])
     return counts
 
@@ -245,9 +245,9 @@ def _check_is_file(path: Path) -> None:
         raise SchemaError(f"{path}: file not found. Check the path, or run the stage that writes it.")
 
 
-def _raise_if_of_machine(error: Exception) -> None:
-    """Raise an error of the disk, of permissions or of limits, which does not mean that the file is damaged."""
-    if isinstance(error, OSError) and error.errno in OF_MACHINE:
+def _raise_machine_error(error: Exception) -> None:
+    """Raise the error if it comes from the disk, permissions or limits; the file may be intact then."""
+    if isinstance(error, OSError) and error.errno in MACHINE_ERRNOS:
         raise error
 
 
@@ -257,7 +257,7 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
     try:
         yield pq.ParquetFile(path, page_checksum_verification=True)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError, UnicodeDecodeError, OSError) as error:
-        _raise_if_of_machine(error)
+        _raise_machine_error(error)
         reason = " ".join(str(error).split()).rstrip(".")
         raise SchemaError(f"{path}: the file is not readable as Parquet: {reason}. {REMEDY}") from None
 
@@ -276,7 +276,7 @@ def load_cached_array(package: Path, name: str) -> np.ndarray | None:
 
 
 def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
-    """Cache an array, and delete cached arrays that other code computed."""
+    """Cache an array, and delete cached arrays that were computed by other code."""
     file = _cache_file(package, name)
     try:
         with replacing(file) as temporary, temporary.open("wb") as stream:
@@ -285,7 +285,7 @@ def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
         for old in set(file.parent.glob("kept-*.npy")) - current:
             remove(old)
     except (OSError, SchemaError):
-        return  # on a read-only or full disk, the array is computed again
+        return  # on a read-only or full disk, the array is computed again next time
 
 
 def _cache_file(package: Path, name: str) -> Path:

@@ -1,4 +1,4 @@
-"""Contacts, places and forces in a log without labels (paper section 6: dog shoe, glove), and their scores.
+"""Estimate contacts, places and forces in a log without labels (paper section 6: dog shoe, glove), and score them.
 
 The no-load reading is the mean of the log's quiet start.
 """
@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Float32, Float64
 from reskin.errors import CaptureError
 from reskin.metrics import score
 
-WINDOW_S = 0.1  # assumed: length of the windows whose means are compared with the start
+WINDOW_S = 0.1  # assumed: length of the windows whose means are compared with that of the start
 QUIET_MIN_S = 0.5  # assumed: a shorter start gives no reliable no-load reading
-WANDER_SDS = 4.0  # standard errors of a window's mean; in some of 15 channels, 1 in 1,000 windows is beyond by chance
-START_WINDOWS_N = 2  # number of windows at the start that the noise is estimated from
-# A contact: |dB| is this many standard deviations of one channel's noise above its median in the quiet start.
+WANDER_SDS = 4.0  # standard errors of a window's mean; with 15 channels, 1 in 1,000 windows exceeds it by chance
+START_WINDOWS_N = 2  # the noise is estimated from this many windows at the start
+# In contact, |dB| exceeds its median in the quiet start by this many standard deviations of one channel's noise.
 CONTACT_SDS = 6.0
 POINTS_MAX_N = 1500  # points of a series in a figure
 
@@ -38,7 +38,7 @@ class LogEstimates:
 def estimate(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str
 ) -> LogEstimates:
-    """Find the quiet start of a log, subtract its mean, and estimate for every reading.
+    """Find the quiet start of a log, subtract its mean field, and estimate place and force for every reading.
 
     Raises CaptureError, which names `where`, if the log does not start without contact.
     """
@@ -48,12 +48,12 @@ def estimate(
 def estimate_after(
     quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator]
 ) -> LogEstimates:
-    """Subtract the mean of the first `quiet_n` readings, and estimate for every reading."""
+    """Subtract the mean of the first `quiet_n` readings, and estimate place and force for every reading."""
     noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
     db_uT = (b_uT - noload_uT).astype(np.float32)
     noise_uT = float(np.sqrt((db_uT[:quiet_n].astype(np.float64) ** 2).mean()))
-    length_uT = np.linalg.norm(db_uT, axis=1)
-    contact = length_uT > np.median(length_uT[:quiet_n]) + CONTACT_SDS * noise_uT
+    magnitude_uT = np.linalg.norm(db_uT, axis=1)
+    contact = magnitude_uT > np.median(magnitude_uT[:quiet_n]) + CONTACT_SDS * noise_uT
     targets = np.stack([model(db_uT) for model in models]).astype(np.float64)
     return LogEstimates(t_s, targets, contact, quiet_n, noise_uT)
 
@@ -70,11 +70,11 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if windows_n > START_WINDOWS_N:
         first_uT = b_uT[:start_n].astype(np.float64)
         means_uT = b_uT[: windows_n * window_n].reshape(windows_n, window_n, -1).mean(axis=1, dtype=np.float64)
-        # From differences of consecutive readings, so that a contact at the very start does not count as noise.
+        # From differences of consecutive readings, so that a contact at the very start is not taken for noise.
         sd_uT = np.diff(first_uT, axis=0).std(axis=0) / np.sqrt(2)
         error_uT = sd_uT * np.sqrt(1 / window_n + 1 / start_n)
-        wandered = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
-        quiet_n = window_n * (int(wandered.argmax()) if wandered.any() else windows_n)
+        moved = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
+        quiet_n = window_n * (int(moved.argmax()) if moved.any() else windows_n)
     else:
         quiet_n = 0
     if (logged_s := len(b_uT) * step_s(t_s)) < QUIET_MIN_S:
@@ -96,45 +96,45 @@ def step_s(t_s: Float64[np.ndarray, " f"]) -> float:
 
 
 def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
-    """Count runs of readings in contact. A single reading in contact is noise; a gap of one reading ends no run."""
+    """Count contacts: runs of two or more readings in contact. A gap of one reading does not end a run."""
     padded = np.concatenate([[False], contact, [False]])
     closed = padded | (np.roll(padded, 1) & np.roll(padded, -1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(int)))
     return int((np.diff(edges)[::2] > 1).sum())
 
 
-def describe(of: LogEstimates) -> dict[str, Any]:
+def describe(log: LogEstimates) -> dict[str, Any]:
     """Summarise a log: duration, rate, noise, contacts, and the largest force (mean over models)."""
     return {
-        "rate_hz": 1 / step_s(of.t_s),
-        "duration_s": float(of.t_s[-1] - of.t_s[0] + step_s(of.t_s)),
-        "readings_n": len(of.t_s),
-        "quiet_start_s": of.quiet_n * step_s(of.t_s),
-        "noise_uT": of.noise_uT,
-        "contact_readings_n": int(of.contact.sum()),
-        "contacts_n": contacts_n(of.contact),
-    } | ({"force_max_N": float(of.targets[:, of.contact, 2].max(axis=1).mean())} if of.contact.any() else {})
+        "rate_hz": 1 / step_s(log.t_s),
+        "duration_s": float(log.t_s[-1] - log.t_s[0] + step_s(log.t_s)),
+        "readings_n": len(log.t_s),
+        "quiet_start_s": log.quiet_n * step_s(log.t_s),
+        "noise_uT": log.noise_uT,
+        "contact_readings_n": int(log.contact.sum()),
+        "contacts_n": contacts_n(log.contact),
+    } | ({"force_max_N": float(log.targets[:, log.contact, 2].max(axis=1).mean())} if log.contact.any() else {})
 
 
-def score_contacts(of: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
+def score_contacts(log: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
     """Score estimates against the truth, which is NaN without contact; count missed and false readings.
 
-    Each model is scored separately: the scores are means over the models, and `spread` holds standard deviations.
+    Each model is scored separately: the scores are means over the models, and `spread` holds their standard deviations.
     """
-    touched = np.isfinite(true[:, 2])
-    both = of.contact & touched
+    truly_touched = np.isfinite(true[:, 2])
+    both_touched = log.contact & truly_touched
     counts: dict[str, Any] = {
-        "contacts_true_n": contacts_n(touched),
-        "missed_readings_n": int((touched & ~of.contact).sum()),
-        "false_readings_n": int((of.contact & ~touched).sum()),
+        "contacts_true_n": contacts_n(truly_touched),
+        "missed_readings_n": int((truly_touched & ~log.contact).sum()),
+        "false_readings_n": int((log.contact & ~truly_touched).sum()),
         "force_true_max_N": float(np.nanmax(true[:, 2])),
     }
     if counts["missed_readings_n"]:
-        counts["missed_force_max_N"] = float(true[touched & ~of.contact, 2].max())
-    if not both.any():
+        counts["missed_force_max_N"] = float(true[truly_touched & ~log.contact, 2].max())
+    if not both_touched.any():
         return counts
-    scores = [score(true[both], target[both]) for target in of.targets]
-    by_name = {name: np.array([one[name] for one in scores]) for name in scores[0]}
+    scores = [score(true[both_touched], target[both_touched]) for target in log.targets]
+    by_name = {name: np.array([model_scores[name] for model_scores in scores]) for name in scores[0]}
     spread = {name: float(values.std(ddof=1)) for name, values in by_name.items()} if len(scores) > 1 else {}
     return (
         counts
@@ -155,17 +155,17 @@ def truth_at(
     return np.where(inside[:, None], true[dwell_i].astype(np.float64), np.nan)
 
 
-def thin(of: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Return at most 1,500 evenly spaced readings for figures; estimates without contact are None.
+def thin(log: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
+    """Return at most 1,500 evenly spaced readings for figures; without contact, the estimates are None.
 
     `estimated` is the estimate of the first model; with several models, `low` and `high` are their range.
     """
-    kept = np.unique(np.linspace(0, len(of.t_s) - 1, POINTS_MAX_N).astype(int))
-    targets = np.where(of.contact[:, None], of.targets, np.nan)[:, kept]
-    drawn: dict[str, Any] = {"t_s": np.round(of.t_s[kept], 3).tolist(), "estimated": _columns(targets[0])}
+    kept = np.unique(np.linspace(0, len(log.t_s) - 1, POINTS_MAX_N).astype(int))
+    targets = np.where(log.contact[:, None], log.targets, np.nan)[:, kept]
+    plot_data: dict[str, Any] = {"t_s": np.round(log.t_s[kept], 3).tolist(), "estimated": _columns(targets[0])}
     if len(targets) > 1:
-        drawn |= {"low": _columns(targets.min(axis=0)), "high": _columns(targets.max(axis=0))}
-    return drawn if true is None else drawn | {"true": _columns(true[kept])}
+        plot_data |= {"low": _columns(targets.min(axis=0)), "high": _columns(targets.max(axis=0))}
+    return plot_data if true is None else plot_data | {"true": _columns(true[kept])}
 
 
 def _columns(rows: Float64[np.ndarray, "f 3"]) -> dict[str, list[float | None]]:

@@ -11,7 +11,7 @@ TRUTH = ("force_mean_N", "force_var_N2")  # of the scored rows, so that scores o
 
 
 def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
-    """Score predictions of (x_mm, y_mm, F_N).
+    """Score predictions of (x_mm, y_mm, F_N) by the names in `METRICS` and `TRUTH`.
 
     MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages). R^2 of the force is
     1 - MSE_F / (variance of the true forces); a constant prediction of their mean scores 0. The force has no scores if
@@ -38,7 +38,7 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
     """Shift predicted places by one constant offset, so that their mean error is zero.
 
     Each rig's origin was set by hand; this shows how much of the error is due to registration. It uses the true
-    places, so it is a diagnosis and not a result.
+    places, so it is a diagnostic, not a result.
     """
     shifted = predicted.astype(float)
     shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)
@@ -48,7 +48,7 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
 def score_groups(
     true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"], board: np.ndarray, skin: np.ndarray
 ) -> dict[str, Any]:
-    """Score all test rows, each test skin, and (as a diagnosis) all rows after removing one offset per test board."""
+    """Score all test rows, each test skin, and (as a diagnostic) all rows after removing one offset per test board."""
     registered = predicted.copy()
     for name in np.unique(board):
         registered[board == name] = register(true[board == name], predicted[board == name])

@@ -1,6 +1,6 @@
 """Estimate contacts, places and forces in a log with a trained model, and write them as CSV.
 
-Whether the model was trained on the board of the log is not checked: the user has to know.
+It is not checked whether the model was trained for the board that wrote the log; the user has to choose it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ from reskin.recordings.readers import sd_card
 from reskin.universal.calibration import CHANNELS_N, is_calibration
 from reskin.universal.model import MISFIT_MAX, Universal, load_universal
 
-FORCE_LIMIT = 1.05  # a force within this factor of an end of the model's range is at the limit
+FORCE_LIMIT = 1.05  # a force within this factor of either end of the model's range counts as at the limit
 PARQUET_MAGIC = b"PAR1"
 
 
@@ -41,7 +41,7 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     Returns
     -------
     Counts of frames, contacts and dropped frames; for the universal model also the counts of readings in
-    contact whose misfit is above `MISFIT_MAX`, and whose force is at a limit of the model's range
+    contact with a misfit above `MISFIT_MAX`, and of those with a force at a limit of the model's range
     """
     models = read_models([] if model is None else [model])
     inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
@@ -51,7 +51,7 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     channels_n = CHANNELS_N if isinstance(models, Universal) else models[0].card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         raise SchemaError(
-            f"{log}: the log has {b_uT.shape[1]} channels, but the model {channels_n}. Give a model for such boards."
+            f"{log}: the log has {b_uT.shape[1]} channels, but the model {channels_n}. Use a model for such boards."
         )
     estimators: Sequence[Estimator]
     if isinstance(models, Universal):
@@ -59,48 +59,48 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
         estimators = [universal := _UniversalOfLog(models)]
     else:
         estimators, universal = models, None
-    found = estimate(t_s, b_uT, estimators, where=str(log))
-    io.write_text(out, render(found))
-    return describe(found) | ({} if universal is None else universal.count_suspects(found)) | account
+    estimates = estimate(t_s, b_uT, estimators, where=str(log))
+    io.write_text(out, render(estimates))
+    return describe(estimates) | ({} if universal is None else universal.count_suspects(estimates)) | account
 
 
 class _UniversalOfLog:
-    """The universal model as an estimator of a log; it keeps the misfits of its readings."""
+    """The universal model as an estimator for a log; it stores the misfit of each reading."""
 
     def __init__(self, model: Universal) -> None:
         self._model = model
         self._misfit = np.empty(0)
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
-        found = self._model.estimate(db_uT + self._model.noload_uT)
-        self._misfit = found.misfit
-        return np.column_stack([found.place_mm, found.force_N]).astype(np.float32)
+        result = self._model.estimate(db_uT + self._model.noload_uT)
+        self._misfit = result.misfit
+        return np.column_stack([result.place_mm, result.force_N]).astype(np.float32)
 
-    def count_suspects(self, found: LogEstimates) -> dict[str, int]:
+    def count_suspects(self, estimates: LogEstimates) -> dict[str, int]:
         """Count readings in contact with a large misfit, and those at a limit of the model's force range."""
-        force_N = found.targets[0, found.contact, 2]
-        least_N, most_N = self._model.tables.force_N[[0, -1]]
-        at_limit = (force_N <= FORCE_LIMIT * least_N) | (force_N >= most_N / FORCE_LIMIT)
+        force_N = estimates.targets[0, estimates.contact, 2]
+        lowest_N, highest_N = self._model.tables.force_N[[0, -1]]
+        at_limit = (force_N <= FORCE_LIMIT * lowest_N) | (force_N >= highest_N / FORCE_LIMIT)
         return {
-            "unknown_skin_readings_n": int((self._misfit[found.contact] > MISFIT_MAX).sum()),
+            "unknown_skin_readings_n": int((self._misfit[estimates.contact] > MISFIT_MAX).sum()),
             "force_at_limit_readings_n": int(at_limit.sum()),
         }
 
 
 def warnings(counts: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each count of `predict` that makes its estimates doubtful."""
-    found, all_n = [], counts["contact_readings_n"]
+    """Return a sentence for each count of `predict` that casts doubt on its estimates."""
+    sentences, contact_n = [], counts["contact_readings_n"]
     if unknown_n := counts.get("unknown_skin_readings_n"):
-        found.append(
-            f"unknown skin: the misfit is above {MISFIT_MAX:g} in {unknown_n} of {all_n} readings in contact. Are the "
-            "chips in another order, or is this another kind of skin?"
+        sentences.append(
+            f"unknown skin: the misfit is above {MISFIT_MAX:g} in {unknown_n} of {contact_n} readings in contact. Are "
+            "the chips in another order, or is this another kind of skin?"
         )
     if limit_n := counts.get("force_at_limit_readings_n"):
-        found.append(
-            f"{limit_n} of {all_n} readings in contact are at a limit of the model's force range; the true force may "
-            "be outside it."
+        sentences.append(
+            f"{limit_n} of {contact_n} readings in contact are at a limit of the model's force range; the true force "
+            "may be outside it."
         )
-    return found
+    return sentences
 
 
 def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
@@ -124,8 +124,8 @@ def _read_capture(folder: Path) -> sd_card.Log:
         return sd_card.read_log(folder / LOG_FILE)
     if header.wire is None:
         raise CaptureError(
-            f"{folder}: a capture of layout {header.layout} cannot be predicted from. Give a capture of `reskin "
-            "record` or the log of an SD card."
+            f"{folder}: cannot predict from a capture of layout {header.layout}. Use a capture that `reskin record` "
+            "wrote, or the log of an SD card."
         )
     stream = folder / STREAM_FILE
     frames, account = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
@@ -142,7 +142,7 @@ def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
     if not calibrations:
         return [read_network(file) for file in files] or load_universal()
     if len(files) > 1:
-        raise ParamsError(f"{calibrations[0]}: a calibration cannot be combined with other models. Give it alone.")
+        raise ParamsError(f"{calibrations[0]}: a calibration cannot be combined with other models. Use it alone.")
     return load_universal(calibrations[0])
 
 
@@ -155,12 +155,12 @@ def _is_calibration(file: Path) -> bool:
         return False  # another kind of file, which `read_network` refuses
 
 
-def render(found: LogEstimates) -> str:
+def render(estimates: LogEstimates) -> str:
     """Return the estimates of one model as CSV: mm and N to three decimals, empty fields without contact."""
-    (target,) = found.targets
-    target = np.where(found.contact[:, None], np.round(target, 3), np.nan)
+    (target,) = estimates.targets
+    target = np.where(estimates.contact[:, None], np.round(target, 3), np.nan)
     fields = dict(zip(("x_mm", "y_mm", "F_N"), target.T, strict=True))
-    table = {"t_s": pa.array(np.round(found.t_s, 4))}
+    table = {"t_s": pa.array(np.round(estimates.t_s, 4))}
     # from_pandas: NaN becomes null, which CSV writes as an empty field
     table |= {name: pa.array(values, from_pandas=True) for name, values in fields.items()}
-    return tables.render_csv(pa.table(table | {"contact": pa.array(found.contact.astype(np.int8))}))
+    return tables.render_csv(pa.table(table | {"contact": pa.array(estimates.contact.astype(np.int8))}))

@@ -25,9 +25,9 @@ AXES_PER_CHIP_N = 3
 class Readings:
     """The readings of one capture, one row each; NaN where a recording lacks a value.
 
-    Recorded and simulated forces have the signs of `FORCE_SIGNS`. `b_uT` is the field as read, `noload_uT` the mean
-    field of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without contact.
-    `n_contacts` counts the skin's contacts before this one.
+    Recorded and simulated forces have the signs of `FORCE_SIGNS`. `b_uT` is the field as read; `noload_uT` is the
+    mean field of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without
+    contact. `n_contacts` counts the skin's contacts before this one.
     """
 
     capture: str
@@ -70,10 +70,10 @@ _PER_CHIP_N = {"b_uT": AXES_PER_CHIP_N, "noload_uT": AXES_PER_CHIP_N, "temperatu
 
 def arrow_schema(chips_n: int) -> pa.Schema:
     """Return the Arrow schema of a table of readings; each field's metadata holds its unit."""
-    rows = [pa.field(name, pa.string(), False, {"unit": ""}) for name in LABELS]
+    columns = [pa.field(name, pa.string(), False, {"unit": ""}) for name in LABELS]
     for name, unit in UNITS.items():
-        rows.append(pa.field(name, _arrow_type(name, chips_n), True, {"unit": unit}))
-    return pa.schema(rows, metadata={"reskin.schema": SCHEMA_VERSION, "reskin.force": FORCE_SIGNS})
+        columns.append(pa.field(name, _arrow_type(name, chips_n), True, {"unit": unit}))
+    return pa.schema(columns, metadata={"reskin.schema": SCHEMA_VERSION, "reskin.force": FORCE_SIGNS})
 
 
 def _arrow_type(name: str, chips_n: int) -> pa.DataType:
@@ -121,7 +121,7 @@ def check_schema(schema: pa.Schema, where: str) -> int:
     """Check names, types and units against `arrow_schema`; return the number of chips."""
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
-        raise SchemaError(f"{where}: column {', '.join(missing)} is missing. Ingest it again.")
+        raise SchemaError(f"{where}: column {', '.join(missing)} is missing. Ingest the capture again.")
     b_type = schema.field("b_uT").type
     if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
         raise SchemaError(where, "b_uT", "a fixed list of 3 values per chip", b_type, "Ingest it again.")

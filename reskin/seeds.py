@@ -1,6 +1,6 @@
 """Random generators by name.
 
-`rng_for(seed, "skin", "b3_s1")` stays the same when another board, skin or fold is added before it.
+The numbers of `rng_for(seed, "skin", "b3_s1")` stay the same when another board, skin or fold is added.
 """
 
 from __future__ import annotations

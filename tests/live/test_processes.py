@@ -167,7 +167,7 @@ def test_invalid_options_print_one_sentence(shell):
     process = shell.start("live", "--port", "x", "--replay", "y")
     _, errors = process.communicate(timeout=LONG_S)
     assert process.returncode == 2
-    assert "give only one of --port, --replay" in errors
+    assert "use only one of --port, --replay" in errors
     assert "Traceback" not in errors
     for arguments, message in (
         (["nothing"], "not the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
