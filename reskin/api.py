@@ -81,7 +81,7 @@ def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = Non
     spreads : mapping, optional
         Board-to-board standard deviations that replace the nominal ones, such as `{"chip_offset_uT": 0.0}`.
     **design
-        Settings that replace those of the nominal board: `chips_xy_mm` [[x, y], ...] relative to the centre of the skin,
+        Settings that replace those of the nominal board: `chips_xy_mm` [[x, y], ...] relative to the skin's centre,
         `chips_turn_deg` [angle, ...], `gap_mm`.
 
     Returns
@@ -338,8 +338,9 @@ def load_model(file: Path | str) -> Model:
 def load_universal(calibration: Path | str | None = None) -> Universal:
     """Load the universal model that comes with the library. It needs no recordings of the skin.
 
-    Its methods calibrate it to a skin: `zero` takes readings without contact, `see` takes presses at unknown places, and
-    `label` takes presses at known places. `next_place` proposes where to press next, and `save` writes the calibration.
+    Its methods calibrate it to a skin: `zero` takes readings without contact, `see` takes presses at unknown places,
+    and `label` takes presses at known places. `next_place` proposes where to press next, and `save` writes the
+    calibration.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ FAULT = (
     "saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = "A trained model (.safetensors with its JSON card) or a saved calibration. Default: the universal model."
-LOG = "A log of an SD card (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder written by `record`, or a file written by `decode`."
+LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), or what `record` or `decode` wrote (folder, file)."
 
 
 def main() -> None:
@@ -178,7 +178,7 @@ def record(
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
     port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
-    speed: Annotated[float, Option(help="Multiple of the source's rate; inf: as fast as the bytes are read.", min=0.01)] = 1.0,
+    speed: Annotated[float, Option(help="Multiple of the source's rate; inf: as fast as possible.", min=0.01)] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
 ) -> None:
@@ -190,7 +190,7 @@ def emulate(
     for each in faults:
         script = inject(script, each)
     emulated, stop = make_port(port), threading.Event()
-    typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; press Ctrl-C to stop")
+    typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
     started_s = time.monotonic()
     try:
         sent_n = play(script, emulated, stop, speed=speed, loop=loop)

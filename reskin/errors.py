@@ -119,7 +119,7 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def require(package: str, where: object) -> None:
-    """Raise `ParamsError` if an optional package is not installed; call it before a thread or a long computation starts."""
+    """Raise `ParamsError` if an optional package is not installed; call this before long computations."""
     if find_spec(package) is None:
         raise missing_package(package, where)
 

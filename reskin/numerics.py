@@ -1,9 +1,10 @@
 """Select the same arithmetic on every x86-64 processor with AVX2, by environment variables that libraries read on load.
 
 PyTorch, NumPy, OpenBLAS and Numba choose their code by the instructions that a processor offers, and OpenBLAS splits
-matrix products among threads. Each choice changes the order of summation, and training amplifies the rounding errors. With the
-values below, and `reskin.models.reproducible` in place of MKL, results are bit-identical on every such processor
-(tests/test_numerics.py). `pin` must run before NumPy is imported, so this module imports nothing that needs NumPy.
+matrix products among threads. Each choice changes the order of summation, and training amplifies the rounding errors.
+With the values below, and `reskin.models.reproducible` in place of MKL, results are bit-identical on every such
+processor (tests/test_numerics.py). `pin` must run before NumPy is imported, so this module imports nothing that needs
+NumPy.
 """
 
 import os
@@ -21,8 +22,8 @@ PINNED = {
     "OPENBLAS_NUM_THREADS": "1",
     "NUMBA_CPU_NAME": "haswell",
 }
-# NumPy feature to disable -> CPU flag of its newest instructions. NumPy warns about disabled features that the processor
-# lacks, so only features whose flag is present are disabled.
+# NumPy feature to disable -> CPU flag of its newest instructions. NumPy warns about disabled features that the
+# processor lacks, so only features whose flag is present are disabled.
 BEYOND_AVX2 = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_vbmi2", "AVX512_SPR": "avx512_fp16"}
 VARIABLES = (*PINNED, "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_FEATURES")
 TOO_LATE = "NumPy was imported before pipeline"
@@ -65,7 +66,7 @@ def departures(environment: Mapping[str, str]) -> list[str]:
     ['ATEN_CPU_CAPABILITY=default']
     """
     pinned_to = {name: {value} for name, value in PINNED.items()}
-    features = " ".join(BEYOND_AVX2)  # on a processor that has only the first of them, only those are disabled
+    features = " ".join(BEYOND_AVX2)  # all or only the first of them, depending on the processor
     pinned_to["NPY_DISABLE_CPU_FEATURES"] = {features[:end].rstrip() for end in range(len(features) + 1)}
     values = {name: environment.get(name, "") for name in VARIABLES}
     changed = [f"{name}={value}" for name, value in values.items() if value and value not in pinned_to.get(name, set())]
@@ -73,12 +74,12 @@ def departures(environment: Mapping[str, str]) -> list[str]:
 
 
 def signature() -> tuple[str, ...]:
-    """Return the settings that may change the last bits of a training run here; they are part of the keys of cached results."""
+    """Return the settings that may change the last bits of a training run here; they are part of cache keys."""
     return ("pinned" if "avx2" in cpu_flags() else "not pinned", *departures(os.environ))
 
 
 def cpu_flags(cpuinfo: Path = CPUINFO) -> frozenset[str]:
-    """Read the instruction sets of this processor; empty if the system does not list them or the processor is not x86-64."""
+    """Read the instruction sets of this processor; empty if they are not listed or the processor is not x86-64."""
     if platform.machine().lower() not in ("x86_64", "amd64") or not cpuinfo.is_file():
         return frozenset()
     lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()

@@ -1,7 +1,7 @@
 """Detect the faults of a board: failed reads, stuck or reset chips, values out of range, repeated or missing frames.
 
-Each function detects one fault; `FaultDetector` finds all of them in a stream that arrives in portions. What is done
-about faulty readings is decided in `recordings.fault_policy` for recordings, and in `live.health` for live boards.
+Each function detects one fault; `FaultDetector` finds all of them in a stream that arrives in portions. What happens
+to faulty readings is decided in `recordings.fault_policy` for recordings, and in `live.health` for live boards.
 """
 
 from typing import NamedTuple
@@ -17,53 +17,52 @@ FAILED_B_uT = (8028.16, 5194.00, 12943.36)
 FAILED_TEMPERATURE_degC = -880.49
 FAILED_TOLERANCE = 0.01  # text wires round to two decimals
 
-# The steps of a chip with its power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
+# The LSB of a chip with its power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
 RESET_LSB_XY_uT = 0.98
 RESET_LSB_Z_uT = 1.58
-LSB_TOLERANCE = 0.1  # gains of the MLX90393 are a fifth or more apart (data sheet, table 17)
+LSB_TOLERANCE = 0.1  # gains of the MLX90393 differ by 20 % or more (data sheet, table 17)
 
-# A grid is visible if neighbouring values are often one step apart: in the first 200 frames of 14 real recordings, 5 %
-# or more of all gaps are one step. Values without a grid have one smallest gap, and by chance one or two gaps close to
-# it.
+# A grid is visible if neighbouring values often differ by one step: in the first 200 frames of 14 real recordings, 5 %
+# or more of all gaps are one step. Without a grid, only one or two gaps are, by chance, close to the smallest gap.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
 # Relative standard deviation of the gaps: 0.02 for a step of 0.242 uT with two decimals; 0.12 for gaps that are by
 # chance up to 1.5 times the smallest one.
 STEP_SPREAD_MAX = 0.06
-SURE_STEPS_MIN_N = 20  # this many equal gaps do not occur by chance, even among few values without noise
+SURE_STEPS_MIN_N = 20  # so many equal gaps do not occur by chance, even if there are few values and no noise
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
 SAME_VALUE_uT = 1e-3  # float32 arithmetic may represent one value in two ways
 
 # Noise changes the readings of a working chip. They repeat only if the chip is read again before its next conversion
-# (1.84 ms), or if its LSB is coarse: for at most 3 frames in 14 real recordings.
+# (1.84 ms), or if its LSB is coarse. In 14 real recordings, they repeat for at most 3 frames.
 STUCK_FRAMES_MIN_N = 20
-OTHERS_MOVE_MIN = 0.5  # without noise, readings change only while the board is pressed or released
+OTHERS_MOVE_MIN = 0.5  # not 1, because without noise, readings change only while the board is pressed or released
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
 CLOCK_STEP_MAX_S = 1.0
-REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: this share of this many frames (a tenth of a second at 400 Hz)
+REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: this fraction of this many frames (0.1 s at 400 Hz)
 MISSING_STEPS = 1.6  # times the usual step of the board's clock
 SILENCE_S = 1.0
-SILENCE_STEPS = 50.0  # times the usual time between two frames, so that a slow log is not silent
-GARBAGE_FRAMES_N = 10  # stray bytes of more than this many frames in a row are not just a torn frame
+SILENCE_STEPS = 50.0  # times the usual time between two frames, so that a slow log does not count as silent
+GARBAGE_FRAMES_N = 10  # more stray bytes than this many frames have suggest a wrong baud rate, not a torn frame
 LONG_LINE = 1.5  # times the usual length of a line of text
 
-SCALE_FRAMES_N = 400  # enough frames to find the LSB of every good chip in real recordings; 200 may not be enough
-GRID_ROWS_N = 1000  # rows of a table in which the LSB is searched
+SCALE_FRAMES_N = 400  # enough to find the LSB of every good chip in real recordings; 200 may be too few
+GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of this many rows
 
 
 def failed_reads(
     b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]
 ) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip whose I2C read failed; a recording without temperatures has NaN there."""
+    """Mark the readings of a chip whose I2C read failed; unknown temperatures are NaN."""
     same_b = np.abs(_by_chip(b_uT) - FAILED_B_uT) <= FAILED_TOLERANCE
     same_temperature = np.abs(temperature_degC - FAILED_TEMPERATURE_degC) <= FAILED_TOLERANCE
     return same_b.all(axis=2) & (same_temperature | np.isnan(temperature_degC))
 
 
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip whose three fields are exactly 0, the content of memory without a reading.
+    """Mark the readings of a chip whose three field components are exactly 0, as in memory that was never filled.
 
     Some rows of eFlashTeam7 have zeros on all chips. In the earth's field, a chip cannot read 0 on three axes at once.
     """
@@ -86,10 +85,10 @@ def find_lsb(
 
 
 def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
-    """Flag the chips whose grid is not the expected one (x and y, z).
+    """Mark the chips whose LSB is not the expected one (along x and y, and along z).
 
-    If no grid is expected, flag the chips whose grid differs from that of most chips, or is that of a chip after a
-    reset. A chip without a visible grid is not flagged.
+    Without an expected LSB, mark the chips whose LSB differs from that of most chips or equals that of a chip after a
+    reset. A chip without a visible grid is not marked.
     """
     return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
 
@@ -97,7 +96,7 @@ def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, f
 def unusual_lsb(
     lsb_uT: Float[np.ndarray, "k 2"], expected_lsb_uT: tuple[float, float] | None
 ) -> Bool[np.ndarray, " k"]:
-    """Flag chips as `reset_chips` does, from the steps that `find_lsb` returned."""
+    """Mark chips as `reset_chips` does, given the LSB that `find_lsb` returned."""
     if expected_lsb_uT is not None:
         return _not_on_grid(lsb_uT, expected_lsb_uT)
     after_reset = ~_not_on_grid(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
@@ -106,15 +105,15 @@ def unusual_lsb(
 
 
 def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip that has stayed the same for `STUCK_FRAMES_MIN_N` frames while the board moved."""
+    """Mark the readings of a chip that stay the same for `STUCK_FRAMES_MIN_N` frames while other chips change."""
     return StuckChips(b_uT.shape[1] // 3).feed(b_uT)
 
 
 class StuckChips:
-    """Remembers since when the readings of each chip have not changed, so that a recording may arrive in any portions.
+    """Find stuck chips in a recording that arrives in portions of any length.
 
     A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th of a run of equal readings, and other chips changed
-    in `OTHERS_MOVE_MIN` or more of the run. A board without any changes, or without noise, is not broken.
+    in at least the fraction `OTHERS_MOVE_MIN` of this run. A board on which nothing changes is not broken.
     """
 
     def __init__(self, chips_n: int) -> None:
@@ -123,7 +122,7 @@ class StuckChips:
         self._moved_n = np.zeros(chips_n, np.int64)  # number of these in which another chip changed
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-        """Take the next readings; mark the stuck ones."""
+        """Process the next readings; mark those that are stuck."""
         chips = _by_chip(b_uT)
         if not len(chips):
             return np.zeros(chips.shape[:2], bool)
@@ -140,9 +139,10 @@ class StuckChips:
 
 
 class ConstantChannels:
-    """Finds channels with one value in a whole recording while others change; it may arrive in any portions.
+    """Find channels that never change in a recording while other channels of the same chip do.
 
-    A chip with three constant channels is not reported here, because it is stuck.
+    The recording may arrive in portions of any length. A chip with three constant channels is stuck; it is not reported
+    here.
     """
 
     def __init__(self, chips_n: int) -> None:
@@ -151,7 +151,7 @@ class ConstantChannels:
         self._readings_n = 0
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Take the next readings, without failed ones."""
+        """Process the next readings, without failed ones."""
         chips = _by_chip(b_uT)
         if not len(chips):
             return
@@ -160,34 +160,35 @@ class ConstantChannels:
         self._changed |= (chips != self._first_uT).any(axis=0)
         self._readings_n += len(chips)
 
-    def found(self) -> list[str]:
-        """Name the constant channels and their values, `Bz of chip 0 (12.5 uT)`; empty for a short recording."""
+    def describe(self) -> list[str]:
+        """List the constant channels with their values, `Bz of chip 0 (12.5 uT)`; empty for a short recording."""
         if self._readings_n < STUCK_FRAMES_MIN_N:
             return []
-        odd = ~self._changed & self._changed.any(axis=1, keepdims=True)
+        constant = ~self._changed & self._changed.any(axis=1, keepdims=True)
         return [
-            f"B{'xyz'[axis]} of chip {chip} ({self._first_uT[chip, axis]:.6g} uT)" for chip, axis in np.argwhere(odd)
+            f"B{'xyz'[axis]} of chip {chip} ({self._first_uT[chip, axis]:.6g} uT)"
+            for chip, axis in np.argwhere(constant)
         ]
 
 
 def too_hot(temperature_degC: Float[np.ndarray, "f k"]) -> Bool[np.ndarray, "f k"]:
-    """Mark temperatures out of the chip's range; unknown temperatures (NaN) are not marked."""
+    """Mark temperatures outside the chip's range; unknown temperatures (NaN) are not marked."""
     return (temperature_degC < TEMPERATURE_MIN_degC) | (temperature_degC > TEMPERATURE_MAX_degC)
 
 
 def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip that are at the end of its range."""
+    """Mark the readings of a chip that are at a limit of its range."""
     return np.asarray((np.abs(b_uT) > B_MAX_uT).reshape(len(b_uT), b_uT.shape[1] // 3, 3).any(axis=2))
 
 
-def wrapped(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark steps from frame to frame that exceed int16; none for a chip whose LSB is unknown."""
+def int16_wraps(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
+    """Mark frame-to-frame steps that exceed the range of int16; chips with unknown LSB have no marks."""
     wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
     return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
 
 
 def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames that repeat the previous one, if many do; a fast loop may repeat some frames."""
+    """Mark frames that repeat the previous one, where many do; a few repeated frames are normal in a fast loop."""
     same = np.asarray((step_uT == 0).all(axis=1))
     if len(same) < REPEATED_LOOK_N:
         return np.zeros(len(same), bool)
@@ -203,7 +204,7 @@ def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"
 
 
 def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Count the missing frames before each frame, by the board's clock; zeros without a clock."""
+    """Count the missing frames before each frame, according to the board's clock; all 0 without a clock."""
     usual_s = np.median(device_step_s) if len(device_step_s) else np.nan
     if not usual_s > 0:
         return np.zeros(len(device_step_s), np.int64)
@@ -227,15 +228,15 @@ def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: 
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
-    """Find the step of the common grid of all values of some axes; NaN if there is none."""
+    """Return the step of the grid that the values of all given axes share; NaN if there is no grid."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):
         return np.nan
     single = gaps_uT[gaps_uT < 1.5 * gaps_uT.min()]
-    alike = single.std() <= STEP_SPREAD_MAX * single.mean()
-    shows = alike and len(single) >= max(steps_min_n, STEP_SHARE_MIN * len(gaps_uT))
-    return float(single.mean()) if shows else np.nan
+    equal = single.std() <= STEP_SPREAD_MAX * single.mean()
+    is_grid = equal and len(single) >= max(steps_min_n, STEP_SHARE_MIN * len(gaps_uT))
+    return float(single.mean()) if is_grid else np.nan
 
 
 def _median(known: Float[np.ndarray, " k"]) -> float:
@@ -278,7 +279,8 @@ def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float
 class ScaleWindow(NamedTuple):
     """The LSB of each chip in `SCALE_FRAMES_N` frames, with the number of the first frame (from 1) and all times.
 
-    `unusual` chips differ from the expected LSB or from the other chips, `changed` chips from their own earlier LSB.
+    `unusual` marks chips whose LSB is not the expected one or differs from that of the other chips; `changed` marks
+    chips whose LSB differs from their own earlier one.
     """
 
     first_frame: int
@@ -298,9 +300,9 @@ class Faults(NamedTuple):
     repeated: Bool[np.ndarray, " f"]
     clock_jump: Bool[np.ndarray, " f"]
     unplug: Bool[np.ndarray, " f"]
-    missing_frames_n: Int[np.ndarray, " f"]  # before each frame, by the board's clock
+    missing_frames_n: Int[np.ndarray, " f"]  # before each frame, according to the board's clock
     torn_bytes_n: Int[np.ndarray, " f"]  # before each frame
-    garbage_bytes_n: Int[np.ndarray, " f"]  # before each frame, if they are so many that the baud rate may be wrong
+    garbage_bytes_n: Int[np.ndarray, " f"]  # before each frame; so many that the baud rate may be wrong
     scale: tuple[ScaleWindow, ...]  # newly completed windows
 
 
@@ -313,8 +315,8 @@ class FaultDetector:
     ----------
     chips_n : number of chips.
     frame_bytes_n : length of a binary frame; None for text, where it varies.
-    expected_lsb_uT : LSB along x and y, and along z, from the header if it has them.
-    steps_min_n : how many equal gaps between neighbouring values show a chip's LSB.
+    expected_lsb_uT : LSB along x and y, and along z; None if unknown.
+    steps_min_n : how many equal gaps between neighbouring values are needed to find a chip's LSB.
     """
 
     def __init__(
@@ -331,11 +333,11 @@ class FaultDetector:
         self._window_uT, self._window_s = np.zeros((0, 3 * chips_n), np.float32), np.zeros(0)
         self._windowed_n = 0  # frames in complete windows
         self._lsb_uT = np.full((chips_n, 2), np.nan)  # of each chip, once known
-        self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # of the last frame without a faulty reading
+        self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # field of the last frame without a faulty reading
         self._last: tuple[float, float, int] | None = None  # time, board's time and end byte of the last frame
 
     def feed(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> Faults:
-        """Take the next frames and their times in s; return their faults."""
+        """Process the next frames and their times in s; return their faults."""
         b_uT, chips_n = frames.b_uT, frames.temperature_degC.shape[1]
         readings = find_reading_faults(b_uT, frames.temperature_degC)
         read = np.isfinite(b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1) & ~readings.failed_rows
@@ -346,17 +348,18 @@ class FaultDetector:
         stuck[read] = self._stuck.feed(b_uT[read])
         stuck[~sound] = False
         if sound.any():
-            last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT  # the first is no repetition
+            # The first frame must not count as repeated.
+            last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT
             step_uT = np.diff(b_uT[sound], axis=0, prepend=last_uT)
             self._last_b_uT = b_uT[sound][-1:]
-            int16_wrap[sound] = wrapped(step_uT, self._lsb_uT)
+            int16_wrap[sound] = int16_wraps(step_uT, self._lsb_uT)
             repeated[sound] = repeated_frames(step_uT)
         self._constant.feed(b_uT[sound])
         return Faults(readings, stuck, int16_wrap, repeated, *self._find_gaps(frames, t_s), scale)
 
     def constant_channels(self) -> list[str]:
-        """Name the channels that have never changed so far, see `ConstantChannels`."""
-        return self._constant.found()
+        """List the channels that have never changed so far; see `ConstantChannels`."""
+        return self._constant.describe()
 
     def _find_scale(self, b_uT: Float[np.ndarray, "f ch"], t_s: Float64[np.ndarray, " f"]) -> tuple[ScaleWindow, ...]:
         held_uT, held_s = np.concatenate([self._window_uT, b_uT]), np.concatenate([self._window_s, t_s])

@@ -10,17 +10,17 @@ from jaxtyping import Float64
 
 from reskin.board import faults
 from reskin.board.port import open_port, port_names, read_waiting
-from reskin.board.stream import decode_all, fitting
+from reskin.board.stream import decode_all, matching_formats
 from reskin.board.wire import Frames, Wire
 from reskin.errors import CaptureError, ParamsError
 from reskin.physics.chip import GAINS, steps_uT
 
-BAUD = 115200  # USB ports ignore it
+BAUD = 115200  # USB ports ignore the baud rate
 LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the steps of its chips
-HUNTING_S = 60.0
+REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
-BOARDS_MAX_N = 16  # at the same time
-LSB_TOLERANCE = 0.05  # gains differ by a fifth or more
+BOARDS_MAX_N = 16  # opened at the same time
+LSB_TOLERANCE = 0.05  # gains differ by 20 % or more
 Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
 
@@ -36,7 +36,7 @@ class DetectedBoard(NamedTuple):
 
     @property
     def gain_sel(self) -> int | None:
-        """GAIN_SEL of the chips, from their LSB; None if no gain has this LSB."""
+        """GAIN_SEL of the chips, derived from their LSB; None if no gain has this LSB."""
         for gain_sel in range(len(GAINS)):
             xy_uT, _, z_uT = steps_uT(gain_sel)
             if np.allclose(self.lsb_uT, (xy_uT, z_uT), rtol=LSB_TOLERANCE):
@@ -53,9 +53,9 @@ class DetectedBoard(NamedTuple):
     @property
     def scale(self) -> str:
         if np.isfinite(self.lsb_uT).all():
-            gain = f", GAIN_SEL {self.gain_sel}" if self.gain_sel is not None else ", no gain at its usual resolution"
-            return f"steps {self.lsb_uT[0]:.3f} uT in x, y and {self.lsb_uT[1]:.3f} uT in z{gain}"
-        return "steps not seen yet: does it move?"
+            gain = "of no known gain" if self.gain_sel is None else f"GAIN_SEL {self.gain_sel}"
+            return f"steps {self.lsb_uT[0]:.3f} uT in x, y and {self.lsb_uT[1]:.3f} uT in z, {gain}"
+        return "steps not known yet: do the readings change?"
 
 
 def scan_ports(names: Sequence[str] | None = None, *, listening_s: float = LISTENING_S) -> list[DetectedBoard]:
@@ -77,12 +77,12 @@ def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
 
 def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     """Return the boards that are connected; raise `CaptureError` if there are none."""
-    found = scan_ports(names)
-    boards = [each for each in found if each.problem is None]
+    results = scan_ports(names)
+    boards = [board for board in results if board.problem is None]
     if not boards:
-        got = "; ".join(map(str, found)) or "no serial port at all"
+        problems = "; ".join(map(str, results)) or "no serial port found"
         raise CaptureError(
-            f"no board found ({got}). Plug one in, or give --port. To try without one: reskin live --emulate nominal"
+            f"no board found ({problems}). Plug one in, or use --port. To try it without: reskin live --emulate nominal"
         )
     return boards
 
@@ -99,7 +99,7 @@ def detect_board(port: str, listening_s: float = LISTENING_S) -> DetectedBoard:
     except CaptureError as error:
         return DetectedBoard(port, str(error).removeprefix(f"{port}: "))
     except OSError as error:
-        return DetectedBoard(port, f"gone while it was read: {error}")
+        return DetectedBoard(port, f"disappeared while it was read: {error}")
     return recognise(port, chunks)
 
 
@@ -108,27 +108,27 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     data = b"".join(chunk for chunk, _ in chunks)
     if not data:
         return DetectedBoard(port, "no bytes arrived: is the board running?")
-    fits = fitting(data)
-    if not fits:
-        return DetectedBoard(port, f"no frame in {len(data)} bytes: another baud rate, or another device")
-    decoded = [(decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in fits]
-    # Text may have temperatures first or last; they vary less than fields.
-    frames, wire, chips_n = min(decoded, key=lambda found: float(found[0].temperature_degC.std(dtype=np.float64)))
+    formats = matching_formats(data)
+    if not formats:
+        return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
+    decoded = [(decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in formats]
+    # Text may have temperatures first or last. Temperatures vary less than fields, so the least variation is right.
+    frames, wire, chips_n = min(decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64)))
     with np.errstate(over="ignore"):  # a frame may contain any finite number
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
     return DetectedBoard(port, None, wire, chips_n, _rate_hz(frames, chunks), (lsb_uT[0], lsb_uT[1]))
 
 
 def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
-    shown_uT = steps_uT[np.isfinite(steps_uT)]
-    return float(np.median(shown_uT)) if len(shown_uT) else np.nan
+    finite_uT = steps_uT[np.isfinite(steps_uT)]
+    return float(np.median(finite_uT)) if len(finite_uT) else np.nan
 
 
 def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
-    """Return the rate of the frames after the first chunk, which may have been waiting in the port."""
+    """Return the rate of the frames after the first chunk, whose bytes may have been waiting in the port."""
     later_n = int((frames.end_byte > len(chunks[0][0])).sum())
-    took_s = chunks[-1][1] - chunks[0][1]
-    return later_n / took_s if took_s > 0 else np.nan
+    elapsed_s = chunks[-1][1] - chunks[0][1]
+    return later_n / elapsed_s if elapsed_s > 0 else np.nan
 
 
 def find_replugged_port(
@@ -136,31 +136,31 @@ def find_replugged_port(
     *,
     names: Callable[[], Iterable[str]] = port_names,
     pause: Callable[[float], None] = time.sleep,
-    hunting_s: float = HUNTING_S,
+    timeout_s: float = REPLUG_TIMEOUT_S,
 ) -> str:
     """Ask the user to unplug and replug a board, and return the name of the port that disappears and comes back.
 
-    Waits up to `hunting_s` seconds for each of the two. The name may differ after replugging. The port is not read, so
-    any serial device is accepted. If there are several ports, the first by name is returned.
+    Waits up to `timeout_s` seconds for each of the two steps. The name may differ after replugging. The port is not
+    read, so any serial device is accepted. If several ports appear, the first by name is returned.
     """
     say("Unplug the board.")
     before = set(names())
-    gone = _wait(lambda: before - set(names()), pause, hunting_s, "disappeared")
+    gone = _wait(lambda: before - set(names()), pause, timeout_s, "disappeared")
     say(f"{', '.join(sorted(gone))} disappeared. Plug it in again.")
     left = before - gone
-    return min(_wait(lambda: set(names()) - left, pause, hunting_s, "appeared"))
+    return min(_wait(lambda: set(names()) - left, pause, timeout_s, "appeared"))
 
 
-def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], hunting_s: float, what: str) -> set[str]:
-    for _ in range(round(hunting_s / POLL_S)):
-        if found := change():
-            return found
+def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], timeout_s: float, what: str) -> set[str]:
+    for _ in range(round(timeout_s / POLL_S)):
+        if ports := change():
+            return ports
         pause(POLL_S)
-    raise CaptureError(f"no port {what} within {hunting_s:g} s. Is it a board with a serial port?")
+    raise CaptureError(f"no port {what} within {timeout_s:g} s. Does the board have a serial port?")
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:
     """Raise `ParamsError` unless each of several boards has its own port."""
     if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
         rule = f"1 to {BOARDS_MAX_N}, each named once"
-        raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Give each port once.")
+        raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Name each port once.")

@@ -14,7 +14,7 @@ from serial.tools import list_ports
 
 from reskin.errors import CaptureError
 
-READ_TIMEOUT_s = 0.1  # maximum delay until a stop, silence or the end of the duration is noticed
+READ_TIMEOUT_s = 0.1  # maximum delay until a stop request, silence or the end of the duration is noticed
 READ_BYTES_MAX_N = 65536
 SOCKET = "socket://"
 
@@ -24,8 +24,8 @@ Device = SerialBase  # an open port
 def open_port(port: str, baud: int) -> Device:
     """Open a serial port, exclusively for this process, or connect to `socket://host:port`.
 
-    Boards and force gauges are opened here. Bytes that were waiting in the port are discarded. A socket becomes
-    non-blocking; use `read_waiting` to read from either kind.
+    Both boards and force gauges are opened by this function. Bytes that were waiting in the port are discarded. A
+    socket becomes non-blocking; use `read_waiting` to read from serial ports and sockets.
     """
     check_name(port)
     try:
@@ -44,7 +44,7 @@ def open_port(port: str, baud: int) -> Device:
 
 
 def check_name(port: str) -> None:
-    """Raise `CaptureError` for a name that no port can have, such as that of a file."""
+    """Raise `CaptureError` for a name that cannot be a port, such as the name of a file."""
     reason = ""
     if port.startswith(SOCKET):
         if not re.fullmatch(r".+:\d{1,5}([/?].*)?", port.removeprefix(SOCKET)):
@@ -65,13 +65,13 @@ def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
         first = device.read(min(1, bytes_max_n))
         waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
         return first + device.read(waiting_n) if waiting_n > 0 else first
-    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket does not tell how many bytes are waiting
+    ready, _, _ = select.select([device], [], [], READ_TIMEOUT_s)  # a socket does not report how many bytes are waiting
     return device.read(min(READ_BYTES_MAX_N, bytes_max_n)) if ready else b""
 
 
 def port_names() -> list[str]:
     """List the serial ports of this machine."""
-    return sorted(found.device for found in list_ports.comports())
+    return sorted(port.device for port in list_ports.comports())
 
 
 def found_ports() -> str:

@@ -1,4 +1,4 @@
-"""Read a port in a thread of its own; the port of an unplugged board is opened again when the board is back."""
+"""Read a port in its own thread; after a board was unplugged, reopen its port when it is back."""
 
 import threading
 import time
@@ -34,13 +34,13 @@ class Reader:
         self.writer_problem = ""
         self._clock_s = time.time() - time.monotonic()  # the system's clock may be adjusted during reading
         self._chunks: deque[Chunk] = deque()
-        self._came = threading.Condition()
+        self._arrived = threading.Condition()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, name=f"reader of {port}", daemon=True)
 
-    def start(self, *, there: bool) -> None:
-        """Begin to read. With `there`, the port is opened at once; raise `CaptureError` if this fails."""
-        self._device = open_port(self.port, self.baud) if there else None
+    def start(self, *, must_exist: bool) -> None:
+        """Begin to read. With `must_exist`, open the port immediately, and raise `CaptureError` if this fails."""
+        self._device = open_port(self.port, self.baud) if must_exist else None
         self._thread.start()
 
     def stop(self) -> None:
@@ -52,21 +52,21 @@ class Reader:
         return self._clock_s + time.monotonic()
 
     def take(self, wait_s: float) -> list[Chunk]:
-        """Take all queued chunks; wait for one at most `wait_s`."""
-        with self._came:
-            self._came.wait_for(lambda: bool(self._chunks), wait_s)
-            taken = list(self._chunks)
+        """Remove and return all queued chunks; if there are none, wait for one for at most `wait_s`."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: bool(self._chunks), wait_s)
+            chunks = list(self._chunks)
             self._chunks.clear()
             self.waiting_bytes_n = 0
             self.taken_s = self.unix_s()
-        return taken
+        return chunks
 
     def write_to(self, writer: ChunkWriter | None) -> None:
-        """Write later chunks to another recording, or to none; the previous recording is closed."""
-        with self._came:
-            before, self.writer, self.writer_problem = self.writer, writer, ""
-        if before is not None:
-            before.close()
+        """Write later chunks to `writer`, or to no recording; close the previous recording."""
+        with self._arrived:
+            previous, self.writer, self.writer_problem = self.writer, writer, ""
+        if previous is not None:
+            previous.close()
 
     def _read(self) -> None:
         device: Device | None = self._device
@@ -91,19 +91,19 @@ class Reader:
         return device
 
     def _keep(self, chunk: bytes) -> None:
-        with self._came:
-            now_s = self.unix_s()  # within the lock, so that no chunk is older than a `take` that missed it
+        with self._arrived:
+            now_s = self.unix_s()  # within the lock, so that a chunk is never older than a `take` that missed it
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)
             while self.waiting_bytes_n > QUEUE_BYTES_MAX_N:
                 oldest_n = len(self._chunks.popleft()[0])
                 self.waiting_bytes_n -= oldest_n
                 self.missed_bytes_n += oldest_n
-            self._came.notify()
+            self._arrived.notify()
             writer = self.writer
             if writer is not None:
                 try:
                     writer.write(chunk, now_s)
-                except OSError as error:  # a full disk ends the recording only
+                except OSError as error:  # a full disk ends only the recording, not the reading
                     self.writer, self.writer_problem = None, f"cannot be written any more: {error.strerror}"
                     writer.close()

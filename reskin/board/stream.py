@@ -17,13 +17,13 @@ from reskin.board.wire import BLOCK_FRAMES_N, CR, LF, Frames, Run, Wire
 from reskin.errors import CaptureError
 
 BLOCK_LINES_N = 8192
-CHIPS_MAX_N = 64  # as in the header
+CHIPS_MAX_N = 64  # the same limit as in the header of a capture
 ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n",
            "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
 
 # An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. These limits are used only if the positions of CR
-# LF allow frames in two ways. A value outside the limits is not a reason to drop a frame: failed reads are outside too,
-# see `faults`.
+# LF allow more than one division into frames. A frame is not dropped because a value is outside the limits:
+# failed reads are outside too, see `faults`.
 TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
 B_MAX_uT = 6e4
 VALUE_MIN = 1e-3  # in uT or degC; smaller values, except 0, are below the chip's LSB
@@ -33,7 +33,7 @@ SEARCH_FRAMES_N = 64  # a search uses the bytes of this many frames at once
 
 @dataclass(frozen=True)
 class _Scan:
-    """Result of a scan: frames, counts (keys of `ACCOUNT`), settled bytes; and whether a frame begins after them."""
+    """Result of a scan: frames, counts (keys of `ACCOUNT`), settled bytes, and whether a frame follows these bytes."""
 
     frames: Frames
     count: Counter[str]
@@ -42,11 +42,11 @@ class _Scan:
 
 
 class FrameStream:
-    """Keeps the bytes that are not settled yet; returns frames as soon as they are certain.
+    """Incremental decoder: return frames as soon as they are certain, and keep the bytes that are not settled yet.
 
-    `_lay_frames` defines which bytes are a binary frame. A text frame is a line of exactly 4 k numbers with two
-    decimals. A stream is assumed to begin with a frame, so a first line that was cut inside its first number is a
-    frame with a wrong number.
+    `_find_runs` defines which bytes are a binary frame. A text frame is a line of exactly 4 k numbers with two
+    decimals. A stream is assumed to begin with a frame, so a first line that was cut inside its first number is
+    decoded as a frame with a wrong number.
     """
 
     def __init__(self, wire: Wire, chips_n: int) -> None:
@@ -58,8 +58,8 @@ class FrameStream:
         self._count: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> Frames:
-        """Take the next bytes; return the frames that are now certain."""
-        assert not self._closed, "a closed stream takes no more bytes"
+        """Process the next bytes; return the frames that are now certain."""
+        assert not self._closed, "the stream is closed"
         return self._advance(data, final=False)
 
     def close(self) -> Frames:
@@ -84,7 +84,7 @@ class FrameStream:
 
 
 def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frames, dict[str, int]]:
-    """Decode a whole stream; raise `CaptureError` if there is not one frame in it."""
+    """Decode a whole stream; raise `CaptureError` if it contains no frame."""
     stream = FrameStream(wire, chips_n)
     frames = wires.concatenate([part for part in (stream.feed(data), stream.close()) if len(part)], chips_n)
     if not stream.account()["frames_n"]:
@@ -93,8 +93,8 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
 
 
 def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
-    """Make the error for a stream without frames, from its (first) bytes, with the formats that would fit them."""
-    hint = " or ".join(f"{fit} with {k} chips" for fit, k in fitting(data))
+    """Return the error for a stream without frames, given its first bytes; it names the formats that would fit them."""
+    hint = " or ".join(f"{fit} with {k} chips" for fit, k in matching_formats(data))
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
         remedy = "Is the board running and sending?"
@@ -103,8 +103,8 @@ def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
     )
 
 
-def fitting(data: bytes) -> list[tuple[Wire, int]]:
-    """List the formats in which most of the first 16 KiB of `data` is frames, for the least number of chips."""
+def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
+    """List the formats in which most of the first 16 KiB of `data` is frames, for the smallest number of chips."""
     data = data[:16384]
     for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # every format has 16 bytes or more per chip
         streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
@@ -120,7 +120,7 @@ def _scan_binary(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int
 ) -> _Scan:
     record = wires.record_type(wire, chips_n)
-    runs, settled_n, at_boundary = _lay_frames(octets, at_boundary, final, record)
+    runs, settled_n, at_boundary = _find_runs(octets, at_boundary, final, record)
     frames, finite = wires.decode_runs(octets, runs, wire, chips_n)
     lost_n = len(frames) - int(np.count_nonzero(finite))
     if lost_n:
@@ -133,7 +133,7 @@ def _scan_binary(
     return _Scan(frames, count, settled_n, at_boundary)
 
 
-def _lay_frames(
+def _find_runs(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[list[Run], int, bool]:
     """Find the runs of frames; also return how many bytes are settled and whether a frame begins after them.
@@ -141,7 +141,7 @@ def _lay_frames(
     A frame is accepted directly if it begins where the previous one ended (or the stream began) and ends with CR LF,
     unless CR LF is also in its payload *and* its values are implausible. In this case, and after an interruption, the
     next frame is searched: it has CR LF before it and at its end. If several positions fit, the one with the most
-    plausible chips in two frames is chosen, and among equal ones the first.
+    plausible chips in two frames is chosen; of equally good ones, the first.
     """
     runs: list[Run] = []
     position = 0
@@ -166,7 +166,7 @@ def _lay_frames(
 
 
 def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Count the frames from the first byte on that can be accepted without the bytes after them."""
+    """Count the frames from the first byte on that can be accepted without looking at later bytes."""
     sure_n, frames_n = 0, len(octets) // record.itemsize
     while sure_n < frames_n:
         block_n = min(frames_n - sure_n, BLOCK_FRAMES_N)
@@ -183,19 +183,19 @@ def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.voi
     closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
     closed_n = len(rows) if closed.all() else int(closed.argmin())
     ends = _terminators(block[: closed_n * record.itemsize])
-    if np.count_nonzero(ends) == closed_n:  # all of them are at the end of a frame
+    if np.count_nonzero(ends) == closed_n:  # each CR LF is at the end of a frame
         return closed_n
     inside = np.flatnonzero(ends)
     inside = inside[inside % record.itemsize != record.itemsize - 2]
     suspect_i = np.unique(inside // record.itemsize)
-    sane = _plausible(block.view(record)["txyz"][suspect_i]).all(axis=1)
-    return closed_n if sane.all() else int(suspect_i[sane.argmin()])
+    plausible = _plausible(block.view(record)["txyz"][suspect_i]).all(axis=1)
+    return closed_n if plausible.all() else int(suspect_i[plausible.argmin()])
 
 
 def _search(
     window: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[int, bool]:
-    """Return the number of bytes to skip, and whether a frame begins after them; otherwise more bytes are needed.
+    """Return the number of bytes to skip, and whether a frame begins after them; if not, more bytes are needed.
 
     The two bytes before the first undecided start are not skipped: when the window is searched again with more bytes,
     they may be the end of a frame.
@@ -217,7 +217,7 @@ def _search(
     )
     best_i = int((here_n + next_n).argmax())
     start = int(starts[best_i])
-    # The tail of a frame after a CR LF in its payload looks like a frame, but the frame after it is more plausible.
+    # What follows a CR LF in a frame's payload may look like a frame, but the frame after it is more plausible.
     is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
     return start + length_n * int(is_tail), True
 
@@ -235,13 +235,13 @@ def _plausible_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void])
 def _plausible(txyz: Float32[np.ndarray, "f k 4"]) -> Bool[np.ndarray, "f k"]:
     """Mark the chips whose values are possible for the magnetometer."""
     temperature_degC, b_uT = txyz[..., 0], txyz[..., 1:]
-    warm = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
-    no_dust = ((txyz == 0) | (np.abs(txyz) >= VALUE_MIN)).all(axis=-1)
-    return warm & no_dust & (np.abs(b_uT) <= B_MAX_uT).all(axis=-1)
+    possible_temperature = (temperature_degC >= TEMPERATURE_MIN_degC) & (temperature_degC <= TEMPERATURE_MAX_degC)
+    not_tiny = ((txyz == 0) | (np.abs(txyz) >= VALUE_MIN)).all(axis=-1)
+    return possible_temperature & not_tiny & (np.abs(b_uT) <= B_MAX_uT).all(axis=-1)
 
 
 def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int) -> _Scan:
-    """Decode whole lines; do not wait for the end of a line that is longer than any frame."""
+    """Decode whole lines; a line that is longer than any frame is skipped without waiting for its end."""
     line_end = np.flatnonzero(octets == LF) + 1
     settled_n = int(line_end[-1]) if len(line_end) else 0
     parts: list[Frames] = []

@@ -24,7 +24,7 @@ Run = tuple[int, int]  # first byte, number of consecutive frames
 
 @dataclass(frozen=True)
 class Frames:
-    """Decoded frames in order; `end_byte` counts the stream's bytes to a frame's end, `device_s` is NaN if unknown."""
+    """Decoded frames in order; `end_byte` counts the stream's bytes up to a frame's end; unknown `device_s` is NaN."""
 
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
@@ -42,7 +42,7 @@ class Frames:
 def concatenate(parts: Sequence[Frames], chips_n: int) -> Frames:
     """Join frames in order; without parts, return zero frames of `chips_n` chips."""
     if not parts:
-        return _room_for(0, chips_n)
+        return _allocate(0, chips_n)
     if len(parts) == 1:
         return parts[0]
     return Frames(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Frames)))
@@ -60,7 +60,7 @@ def line_bytes_max_n(chips_n: int) -> int:
 
 
 def encode(frames: Frames, wire: Wire) -> bytes:
-    """Encode frames as the firmware does; text has two decimals, and only `binary-clock` has the device's time."""
+    """Encode frames as the firmware does. Text has two decimals; only `binary-clock` includes the device's time."""
     frames_n, chips_n = frames.temperature_degC.shape
     b_uT = frames.b_uT.reshape(frames_n, chips_n, 3)
     if wire in TEXT_WIRES:
@@ -92,7 +92,7 @@ def decode_runs(
 ) -> tuple[Frames, Bool[np.ndarray, " f"]]:
     """Decode the binary frames at `runs` of `octets`; the mask marks frames whose values are all finite."""
     record = record_type(wire, chips_n)
-    frames = _room_for(sum(frames_n for _, frames_n in runs), chips_n)
+    frames = _allocate(sum(frames_n for _, frames_n in runs), chips_n)
     finite = np.ones(len(frames), bool)
     is_b = np.arange(NUMBERS_PER_CHIP_N * chips_n) % NUMBERS_PER_CHIP_N > 0
     b_i, temperature_i = np.flatnonzero(is_b), np.flatnonzero(~is_b)
@@ -100,7 +100,7 @@ def decode_runs(
     for first_byte, frames_n in _blocks(runs, record.itemsize):
         rows, stop_byte = slice(row_i, row_i + frames_n), first_byte + frames_n * record.itemsize
         records = octets[first_byte:stop_byte].view(record)
-        # Copied once, because reads of unaligned floats are slow; "clip" lets take write without a buffer.
+        # Copied once, because reading unaligned floats is slow; with mode "clip", `take` writes without a buffer.
         values = np.ascontiguousarray(records["txyz"]).reshape(frames_n, -1)
         values.take(b_i, axis=1, out=frames.b_uT[rows], mode="clip")
         values.take(temperature_i, axis=1, out=frames.temperature_degC[rows], mode="clip")
@@ -142,27 +142,27 @@ def _numbers(
     line_end: Int64[np.ndarray, " f"],
 ) -> tuple[Float64[np.ndarray, "f c"], Bool[np.ndarray, " f"]]:
     """Read the number around each decimal point; the mask marks lines that consist of numbers and tabs only."""
-    # Unsigned bytes wrap around, so that other characters are above 9. Two zeros are added: a point may end the line.
+    # Unsigned bytes wrap around, so that other characters are above 9. A point may end the line, so append two zeros.
     digit = np.append(octets, np.zeros(2, np.uint8)) - np.uint8(ZERO)
     stop = dot + 3
-    floor = np.column_stack([line_start, stop[:, :-1]])  # where the previous number ends
+    previous_stop = np.column_stack([line_start, stop[:, :-1]])  # where the previous number ends
     well_formed = (digit[dot + 1] <= 9) & (digit[dot + 2] <= 9)
     hundredths = digit[dot + 1] * np.int64(10) + digit[dot + 2]
-    first, alive, scale = dot.copy(), np.ones(dot.shape, bool), 100
+    first, in_number, scale = dot.copy(), np.ones(dot.shape, bool), 100
     for _ in range(INTEGER_DIGITS_MAX_N):
-        alive &= (first > floor) & (digit[first - 1] <= 9)
-        if not alive.any():
+        in_number &= (first > previous_stop) & (digit[first - 1] <= 9)
+        if not in_number.any():
             break
-        hundredths += np.where(alive, digit[first - 1] * np.int64(scale), 0)
-        first -= alive
+        hundredths += np.where(in_number, digit[first - 1] * np.int64(scale), 0)
+        first -= in_number
         scale *= 10
     well_formed &= first < dot
-    negative = (first > floor) & (octets[first - 1] == MINUS)
-    gap = first - negative - floor
-    well_formed &= (gap == 0) | ((gap == 1) & (octets[floor.clip(max=len(octets) - 1)] == TAB))
+    negative = (first > previous_stop) & (octets[first - 1] == MINUS)
+    gap = first - negative - previous_stop
+    well_formed &= (gap == 0) | ((gap == 1) & (octets[previous_stop.clip(max=len(octets) - 1)] == TAB))
     well_formed[:, 0] &= gap[:, 0] == 0
-    whole = well_formed.all(axis=1) & _ends_well(octets, stop[:, -1], line_end)
-    return np.where(negative, -hundredths, hundredths) / 100, whole
+    is_frame = well_formed.all(axis=1) & _ends_well(octets, stop[:, -1], line_end)
+    return np.where(negative, -hundredths, hundredths) / 100, is_frame
 
 
 def _ends_well(
@@ -175,7 +175,7 @@ def _ends_well(
     return np.where(tab, rest_n == 1, rest_n == 0)
 
 
-def _room_for(frames_n: int, chips_n: int) -> Frames:
+def _allocate(frames_n: int, chips_n: int) -> Frames:
     b_uT, temperature_degC = (np.empty((frames_n, n), np.float32) for n in (3 * chips_n, chips_n))
     return Frames(b_uT, temperature_degC, np.full(frames_n, np.nan), np.empty(frames_n, np.int64))
 

@@ -196,7 +196,7 @@ class Session:
         return f"{self.source} on {self.skin.port}"
 
     def start(self) -> None:
-        self.skin.reader.start(there=False)
+        self.skin.reader.start(must_exist=False)
         self._thread.start()
 
     def stop(self) -> None:

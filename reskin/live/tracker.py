@@ -278,7 +278,7 @@ class LiveSkin:
 
     def __enter__(self) -> "LiveSkin":
         """Open the port, detect the wire format, and take the no-load reading; nothing may touch the skin meanwhile."""
-        self.reader.start(there=True)
+        self.reader.start(must_exist=True)
         try:
             end_s = self.reader.unix_s() + OPENING_S
             while not self.zeroed:

@@ -282,7 +282,7 @@ def check_rows(
         )  # fmt: skip
     constant = ConstantChannels(temperature_degC.shape[1])
     constant.feed(b_uT[read])
-    log.record_constant(constant.found(), row)
+    log.record_constant(constant.describe(), row)
     stuck = log.record("stuck", stuck_chips(b_uT).any(axis=1) & read, row) & ~failed
     out_of_range &= ~stuck
     return CheckedRows(~(failed | stuck | out_of_range), failed, stuck, out_of_range, log.account())

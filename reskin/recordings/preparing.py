@@ -89,7 +89,7 @@ def layouts_of(recording: Path) -> list[str]:
         return ["capture"]
     if found := [layout for layout in get_args(ReaderLayout) if _reads(recording, layout)]:
         return [layout for layout in found if layout != "table"] or found  # a plain table may leave labels unread
-    fits = stream.fitting(io.read_bytes(recording)) if recording.is_file() else []
+    fits = stream.matching_formats(io.read_bytes(recording)) if recording.is_file() else []
     return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in fits})
 
 

@@ -39,7 +39,7 @@ def test_wire_chips_rate_and_lsb_are_detected(wire, chips_n, rate_hz):
 def test_other_devices_are_not_boards():
     script = make_script(pokes_n=0)
     wrong_baud = chunks_of(inject(script, parse_fault("wrong-baud@0+99")))
-    assert "another baud rate" in str(find.recognise("port", wrong_baud))
+    assert "wrong baud rate" in str(find.recognise("port", wrong_baud))
     assert "no bytes arrived" in str(find.recognise("port", []))
     assert "cannot open the port" in str(find.detect_board("/dev/none"))
 
@@ -62,7 +62,7 @@ def test_frames_of_random_values_are_described(seed, chips_n):
 def test_noiseless_chips_show_no_lsb():
     script = make_script(pokes_n=0)
     still = replace(script, pieces=[script.pieces[0]] * len(script))
-    assert "steps not seen yet" in str(find.recognise("port", chunks_of(still)))
+    assert "steps not known yet" in str(find.recognise("port", chunks_of(still)))
 
 
 def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
@@ -72,7 +72,7 @@ def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
         with pytest.raises(CaptureError, match=r"2 boards are connected: .*5 chips.*; .*5 chips.*--port"):
             find.find_board([name, other])
         assert [found.port for found in find.find_boards([name, "/dev/none", other])] == [name, other]
-    with pytest.raises(CaptureError, match="no serial port at all"):
+    with pytest.raises(CaptureError, match="no serial port found"):
         find.find_board([])
 
 
@@ -86,7 +86,7 @@ class TestReplugging:
             last[0] = set(next(polls, last[0]))
             return last[0]
 
-        return find.find_replugged_port(printed.append, names=names, pause=lambda _: None, hunting_s=1.0), printed
+        return find.find_replugged_port(printed.append, names=names, pause=lambda _: None, timeout_s=1.0), printed
 
     def test_replugged_port_is_found(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")

@@ -167,7 +167,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
         target=lambda: sent.extend(play(script, end, stop, speed=100.0) for _ in range(minutes_n))
     )
     skin = LiveSkin(end.name)
-    skin.reader.start(there=True)
+    skin.reader.start(must_exist=True)
     player.start()
     while skin.poll(1.0) is not None or player.is_alive():
         pass
@@ -224,7 +224,7 @@ def test_other_chip_count_and_missing_port_raise(tmp_path):
 def test_port_held_by_another_program_is_not_open():
     with plugged_in(SCRIPT, loop=True) as name, open_port(name, 115200):
         skin = LiveSkin(name)
-        skin.reader.start(there=False)
+        skin.reader.start(must_exist=False)
         try:
             while not skin.reader.problem:  # the suite's time limit ends an endless loop
                 time.sleep(0.01)

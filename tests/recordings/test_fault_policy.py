@@ -176,12 +176,12 @@ def test_constant_channels_are_found_in_any_chunks(ends):
 def test_still_chips_and_boards_have_no_constant_channel():
     channels = ConstantChannels(2)
     channels.feed(np.zeros((50, 6)))
-    assert channels.found() == []
+    assert channels.describe() == []
     moving = np.zeros((50, 6))
     moving[:, 3:] = rng_for(0, "still").normal(0, 5, (50, 3))
     channels = ConstantChannels(2)
     channels.feed(moving)
-    assert channels.found() == []  # chip 0 is stuck
+    assert channels.describe() == []  # chip 0 is stuck
 
 
 CHIPS_N = 5
