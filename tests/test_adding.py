@@ -127,7 +127,7 @@ def test_exchanged_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
         rows.to_csv(tmp_path / f"board{i}.csv", index=False)
         prepared = preparing.foreign(tmp_path / f"board{i}.csv", "table", labels(f"board{i}", f"skin{i}"), {})
         add.add(root, "small", prepared, allow_copy=False)
-        assert ("other captures only with x and y exchanged" in capsys.readouterr().err) == exchanged
+        assert ("other captures only with x and y swapped" in capsys.readouterr().err) == exchanged
 
 
 def test_duplicates_are_refused_unless_allowed(root, lab_file):

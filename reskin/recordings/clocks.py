@@ -18,7 +18,7 @@ TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
 
 @dataclass(frozen=True)
 class Arrivals:
-    """The chunks of a stream in order, axis c: number of bytes up to the end of each, and its time of arrival."""
+    """For each chunk of a stream, in order (axis c): the number of bytes up to its end, and its time of arrival."""
 
     byte_end: Int64[np.ndarray, " c"]
     t_s: Float64[np.ndarray, " c"]
@@ -32,7 +32,7 @@ def parse(source: str | Path, where: str) -> Arrivals:
     table = tables.parse_csv(source, TYPES, where)
     if len(table) < 2:
         raise CaptureError(
-            f"{where}: {len(table)} rows of arrivals; two or more are needed. Give a rate in the header instead."
+            f"{where}: {len(table)} rows of arrivals; two or more are needed. Set a rate in the header instead."
         )
     byte_end, t_s = (table.column(name).to_numpy() for name in TYPES)
     for bad, name, rule in (
@@ -57,7 +57,7 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
     """Return the time of each frame's last byte, interpolated linearly between the ends of chunks.
 
     A byte arrived before its chunk was read and, apart from the port's buffer, after the previous chunk was read, so
-    the error is less than the time between the two. In the first chunk, times are extrapolated at the stream's mean
+    the error is less than the time between these reads. In the first chunk, times are extrapolated at the stream's mean
     rate. The time of a frame after the last chunk is NaN.
     """
     byte_end, t_s = arrivals.byte_end, arrivals.t_s
@@ -69,24 +69,25 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
 def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
     """Return the time of each frame in a stream of constant rate; 0 at the start of the stream.
 
-    `frame` is the position in frames. If all frames have the same length, it is the number of bytes up to the frame's
-    end over the length, so that damaged bytes take up their share of the time; otherwise it is a running count. Frames
-    that were lost before they were dumped shift all later times.
+    `frame` is the position of each frame in the stream, in frames. If all frames have the same length, it is the number
+    of bytes up to the frame's end, divided by this length, so that damaged bytes also take time; otherwise it is a
+    running count. Frames that were lost before the stream was saved shift all later times.
     """
     return frame / rate_hz
 
 
-RATE_LIMIT = 0.1  # a nominal rate may be off by some per cent; more means a mark in milliseconds or of another event
+RATE_LIMIT = 0.1  # a nominal rate may be off by some per cent; if more, a mark is in milliseconds or of another event
 STEPS_PER_DWELL_N = 16
 STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
-SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths for the first search, over which 50 ppm of rate shift by 0.2 dwells
-WINDOW_STEPS_N = 2**14  # then each window of 1,000 dwell lengths gets its own offset, from which the rate follows
-EXPLAINED_MIN = 0.5  # share of dwell time that must agree: 0 by chance, 1 if every dwell agrees
-# In indentations. A periodic protocol that is shifted by one period loses one, and one contact may be too weak to see.
+SEARCH_STEPS_N = 2**16  # first search: 4,000 dwell lengths, over which a rate error of 50 ppm shifts by 0.2 dwells
+WINDOW_STEPS_N = 2**14  # then: one offset per window of 1,000 dwell lengths; the rate is fitted to these
+EXPLAINED_MIN = 0.5  # fraction of dwell time that must agree: 0 by chance, 1 if every dwell agrees
+# Required lead over every other offset, in indentations. If a periodic protocol is shifted by one period, it loses one
+# indentation, and one contact may be too weak to detect.
 MARGIN_MIN = 1.5
-SEEN_MIN = 0.5  # a shift must overlap this share of the dwells that the best shift overlaps: a few fit by chance
+SEEN_MIN = 0.5  # required overlap with the dwells, over the largest overlap: a few dwells can fit by chance
 PEAK_DROP = 0.05  # the offset is the peak's middle at this relative depth below its top, which can be flat
-AWAY_NOISES = 1.5  # times the median distance without load: 2.7 sd for the 15 channels of a board
+AWAY_NOISES = 1.5  # contact threshold / median no-load distance: 2.7 sd for the 15 channels of a board
 STRETCH_PERIODS_N = 32
 START_FRAMES_N = 4
 REFERENCE_FRAMES_N = 4096
@@ -100,7 +101,7 @@ Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
 class ClockMap:
     """The line between the clocks; `residual_s` is the largest misfit of the marks (or windows) that it was fitted to.
 
-    `explained` is the share of dwell time that the field agrees with, 0 by chance; it is 1 if marks were given.
+    `explained` is the fraction of dwell time that agrees with the field: 0 by chance, 1 if marks were given.
     """
 
     offset_s: float
@@ -147,7 +148,7 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
     if matched <= EXPLAINED_MIN * dwelt:
         agreed = matched / max(dwelt, 1e-9)
         raise CaptureError(
-            f"{where}: the field agrees with {agreed:.0%} of the dwells, not over {EXPLAINED_MIN:.0%}. {_REMEDY}"
+            f"{where}: the field agrees with {agreed:.0%} of the dwells; over {EXPLAINED_MIN:.0%} must agree. {_REMEDY}"
         )
     return _line(np.array(mid_s), np.array(offsets_s), matched / dwelt, where)
 
@@ -184,21 +185,21 @@ def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
     """Find the offset among all lags, by FFT; raise if another offset fits about as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
-    samples = signal / np.abs(signal).mean()  # most steps may be between two frames
-    weights, dwelt = (of(pattern.start_s, steps_n, step_s) for of in (pattern.signed, pattern.dwelt))
+    samples = signal / np.abs(signal).mean()  # scaled, because most steps may have no frame
+    weights, dwelt = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.dwelt))
     seen = _correlate(dwelt, np.abs(samples))
-    # The match, minus what a poor fit would match. Without this, a shift that loses a dwell could compensate for it by
-    # overlapping more of the log.
+    # The match, minus what a poor fit would match. Without this term, a shift that loses a dwell could compensate for it
+    # by overlapping more of the log.
     score = _correlate(weights, samples) - EXPLAINED_MIN * seen
     score[seen < SEEN_MIN * seen.max()] = 0.0
     top_i = int(score.argmax())
-    away = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
-    margin = score[top_i] - score[away].max(initial=0.0)
-    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # seen but not matched; a wrong dwell counts twice
+    elsewhere = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
+    margin = score[top_i] - score[elsewhere].max(initial=0.0)
+    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # a wrong dwell counts twice
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
-            f"{where}: the field fits the dwells at two times almost equally well, {margin:.2g} of {dwelt.sum():.0f} "
-            f"indentations apart. {_REMEDY}"
+            f"{where}: the field fits the dwells at two times almost equally well: the matches differ by {margin:.2g} "
+            f"of {dwelt.sum():.0f} indentations. {_REMEDY}"
         )
     return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
 
@@ -218,7 +219,7 @@ def _follow(
 
 def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
     """Correlate at every lag with an overlap, by FFT, like scipy.signal.correlate, whose import takes a second."""
-    from scipy.fft import irfft, next_fast_len, rfft  # imported late: only needed for captures without clock marks
+    from scipy.fft import irfft, next_fast_len, rfft  # imported late: only captures without clock marks need it
 
     lags_n = len(signal) + len(window) - 1
     size = next_fast_len(lags_n, real=True)
@@ -226,7 +227,7 @@ def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " 
 
 
 def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
-    """Return the middle of a peak between its flanks, `PEAK_DROP` below its top, with a resolution below a step."""
+    """Return the middle of a peak between its flanks, `PEAK_DROP` below its top, resolved to less than one step."""
     level = (1 - PEAK_DROP) * score[top_i]
     below_i = np.flatnonzero(score < level)
     left_i, right_i = below_i[below_i < top_i][-1:], below_i[below_i > top_i][:1]
@@ -244,7 +245,7 @@ def _contact_signal(
     """Return the time of the first step, and +1 (contact), -1 (no-load) or 0 (no frame) for each step of the stream."""
     parts: list[tuple[int, Int8[np.ndarray, " g"]]] = []
     start_s = None
-    for t_s, contact in _touched(blocks, pattern):
+    for t_s, contact in _detect_contact(blocks, pattern):
         start_s = t_s[0] if start_s is None else start_s
         step_i = (t_s - start_s) / step_s
         if step_i[-1] > STEPS_MAX_N:
@@ -260,23 +261,23 @@ def _contact_signal(
     return float(start_s), signal
 
 
-def _touched(
+def _detect_contact(
     blocks: Iterable[Block], pattern: _Pattern
 ) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
     """Decide for each frame whether its field differs from a running no-load field by more than noise.
 
-    The log tells in which share of the time the skin is not touched. This share of the frames, those nearest to the
-    previous no-load field, are taken as no-load. The nearer half of them gives the next no-load field and the noise.
+    The log gives the fraction of time without contact. The same fraction of the frames, those nearest to the previous
+    no-load field, is taken as no-load. The nearer half of these frames gives the next no-load field and the noise.
     """
     noload_uT, noise_uT = None, np.inf
     for t_s, b_uT in _stretches(blocks, STRETCH_PERIODS_N * pattern.period_s):
         if noload_uT is None:
             noload_uT = np.median(b_uT[:START_FRAMES_N], axis=0)
-        # A short stretch may be all contact.
+        # A short stretch may consist of contact only.
         if noise_uT == np.inf or t_s[-1] - t_s[0] > STRETCH_PERIODS_N * pattern.period_s / 4:
             sample = b_uT[:: -(-len(b_uT) // REFERENCE_FRAMES_N)]
-            far_uT = np.linalg.norm(sample - noload_uT, axis=1)
-            noload_uT = sample[far_uT <= np.quantile(far_uT, pattern.quiet / 2)].mean(axis=0)
+            distance_uT = np.linalg.norm(sample - noload_uT, axis=1)
+            noload_uT = sample[distance_uT <= np.quantile(distance_uT, pattern.quiet / 2)].mean(axis=0)
             noise_uT = float(np.quantile(np.linalg.norm(sample - noload_uT, axis=1), pattern.quiet / 2))
         yield t_s, np.linalg.norm(b_uT - noload_uT, axis=1) > AWAY_NOISES * noise_uT
 

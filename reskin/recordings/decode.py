@@ -27,8 +27,8 @@ def read_frames(
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
     """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
 
-    Time is the device's if all frames have it, otherwise that of a constant rate. If all frames have the same length,
-    lost bytes take up their share of the time.
+    The time is the device's if all frames have one; otherwise it follows from the constant rate. If all frames have the
+    same length, lost bytes also take time.
     """
     chips_n = sum(name.startswith("temperature") for name in table.column_names)
     if table.column_names != list(_columns(chips_n)):

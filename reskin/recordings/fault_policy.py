@@ -27,8 +27,8 @@ from reskin.errors import CaptureError, ParamsError, did_you_mean
 USUAL_LSB = "that of the other chips, and not that of a reset chip"
 
 Action = Literal["drop", "flag", "refuse"]
-DropOrRefuse = Literal["drop", "refuse"]  # bytes between frames cannot be kept
-FlagOrRefuse = Literal["flag", "refuse"]  # there is no reading that could be dropped
+DropOrRefuse = Literal["drop", "refuse"]  # for bytes between frames, which cannot be kept
+FlagOrRefuse = Literal["flag", "refuse"]  # for faults without a faulty reading that could be dropped
 
 
 class FaultPolicy(Strict):
@@ -38,16 +38,16 @@ class FaultPolicy(Strict):
     zeros: Action  # zeros in place of a reading
     stuck: Action  # the readings of a chip stay the same while others change
     constant_channel: FlagOrRefuse  # Bx, By or Bz of a chip never changes while its other channels do
-    chip_reset: FlagOrRefuse  # a chip's LSB is not that of the others, or changes
+    chip_reset: FlagOrRefuse  # a chip's LSB differs from that of the other chips, or changes
     too_hot: Action  # or too cold: temperature out of range
     saturated: Action  # field at the end of the chip's range
-    int16_wrap: Action  # field jumps by more than int16 holds
-    repeated: Action  # identical frames follow each other, far more often than in a fast loop
+    int16_wrap: Action  # field jumps by more than the range of int16
+    repeated: Action  # identical frames follow each other far more often than in a fast loop
     dropped: FlagOrRefuse  # frames are missing, according to the board's clock
     clock_jump: FlagOrRefuse  # the board's clock goes backwards, or jumps
     unplug: FlagOrRefuse  # no data arrives for a second or more
-    torn: DropOrRefuse  # bytes between frames that belong to no frame
-    wrong_baud: DropOrRefuse  # many such bytes in a row
+    torn: DropOrRefuse  # bytes between frames
+    wrong_baud: DropOrRefuse  # many bytes between frames, in a row
 
 
 REFUSE_ALL = FaultPolicy.model_validate(dict.fromkeys(FaultPolicy.model_fields, "refuse"))
@@ -82,7 +82,7 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
 
 @dataclass
 class FaultRecord:
-    """How often a fault was seen, where it was first and last (s of the stream, or rows from 1), and the action taken.
+    """How often a fault occurred, its first and last positions (s of the stream, or rows from 1), and the action taken.
 
     The positions are NaN until a time is known: the last bytes before a recorder was killed may have no time.
     """
@@ -94,7 +94,7 @@ class FaultRecord:
 
 
 class CheckedRows(NamedTuple):
-    """Masks of the frames or rows to keep, and of those dropped, by the first reason: failed read, stuck chip, range.
+    """Masks of the frames or rows to keep, and of those dropped, by the first reason that applies.
 
     `counts` has the count, action and span of each fault, under the keys of an account.
     """
@@ -116,7 +116,7 @@ class CheckedRows(NamedTuple):
         }
 
     def part(self, rows: slice) -> "CheckedRows":
-        """Return some of the rows; `counts` stays that of all rows."""
+        """Return a slice of the rows; `counts` still covers all rows."""
         return CheckedRows(self.keep[rows], self.failed[rows], self.stuck[rows], self.out_of_range[rows], self.counts)
 
 
@@ -136,7 +136,7 @@ class FaultLog:
         at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
         count_n: int | None = None,
     ) -> Bool[np.ndarray, " f"]:
-        """Count a fault where `mask` is set, or `count_n` times; return the mask of what the policy drops for it.
+        """Count a fault where `mask` is set, or `count_n` times; return the mask of the rows that the policy drops.
 
         Raises `CaptureError` if the policy refuses recordings with this fault.
         """
@@ -149,7 +149,7 @@ class FaultLog:
                 place = f"{self._unit} {first * self._per_unit:.0f}" if len(known) else "an unknown time"
                 raise CaptureError(
                     f"{self._where}: found fault {fault.replace('_', ' ')} {count_n} x, the first at {place}. Repair "
-                    f"the board and record again, or set faults: {fault} in params.yaml."
+                    f"the board and record again, or change faults: {fault} in params.yaml."
                 )
             found = self.records.setdefault(fault, FaultRecord(0, first, last, action))
             found.count_n += count_n
@@ -207,7 +207,7 @@ class FaultLog:
             chips = np.flatnonzero(wrong)
             xy_uT, z_uT = lsb_uT[chips[0]]
             known = np.isfinite([xy_uT, z_uT]).any()
-            got = f"{xy_uT:.3g} uT in x, y and {z_uT:.3g} uT in z" if known else "no one step"
+            got = f"{xy_uT:.3g} uT in x, y and {z_uT:.3g} uT in z" if known else "no common step"
             rule = rule if expected_lsb_uT is None else f"{expected_lsb_uT} uT"
             remedy = "A chip lost its settings: reset the board, record again."
             raise CaptureError(where, f"the LSB of chip {', '.join(map(str, chips))}", rule, got, remedy)
@@ -219,12 +219,12 @@ class FaultLog:
     ) -> None:
         """Record channels that never changed in a whole recording, or refuse the recording.
 
-        `at` holds the positions; None stands for the span of the stream.
+        `at` holds the positions of the readings; None stands for the span of the stream.
         """
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
                 f"{self._where}: {', '.join(channels)} never changed in the whole recording. Check the wiring, the "
-                "chip and the columns, and record again; or accept it by faults: constant_channel: flag in params.yaml."
+                "chip and the columns, and record again; or accept it: faults: constant_channel: flag in params.yaml."
             )
         if channels:
             at = np.array(self._span) if at is None else at
@@ -257,7 +257,7 @@ def check_rows(
 
     Parameters
     ----------
-    row : the rows' numbers in their file, if some were left out before; counted from 1 if None.
+    row : the rows' numbers in their file, if some rows were left out before; None: rows are counted from 1.
 
     Raises
     ------

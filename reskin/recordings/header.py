@@ -35,9 +35,9 @@ class _Frozen(BaseModel):
 
 
 class Clock(_Frozen):
-    """How frames get a time: from `arrivals.csv`, from a constant rate, or not at all (`recording`).
+    """Source of the frames' times: `arrivals.csv`, a constant rate, or the recording's own files, if any (`recording`).
 
-    `marks` are pairs (stream time, probe time) in seconds, each for one event seen by both clocks; without marks,
+    `marks` are pairs (stream time, probe time) in seconds, each for one event that both clocks recorded; without marks,
     ingest aligns the clocks by the contacts.
     """
 
@@ -46,7 +46,7 @@ class Clock(_Frozen):
     marks: tuple[tuple[float, float], ...]
 
     @model_validator(mode="after")
-    def _rate_is_there(self) -> "Clock":
+    def _check_rate(self) -> "Clock":
         if (self.kind == "rate") != (self.rate_hz is not None):
             raise ValueError("rate_hz must be given for clock kind 'rate', and only for it")
         return self
@@ -61,7 +61,7 @@ class Firmware(_Frozen):
 
 
 class Header(_Frozen):
-    """One capture's header; every field is written, none has a default."""
+    """The header of a capture. All fields must be present in the file; there are no defaults."""
 
     format: Literal["reskin-capture/1"]
     capture: Name
@@ -79,16 +79,16 @@ class Header(_Frozen):
     protocol: str
     contacts_before_n: Annotated[int, Field(ge=0)]
     options: dict[str, str]
-    files: dict[str, str]  # name -> sha256, of all files but this header
+    files: dict[str, str]  # name -> sha256 of each file except this header
     note: str
 
     @property
     def expected_lsb_uT(self) -> tuple[float, float] | None:
-        """LSB along x and y, and LSB along z, by the firmware's settings; None if they are unknown."""
+        """LSB along x and y, and LSB along z, from the firmware's settings; None if these are unknown."""
         return None if self.firmware is None else (self.firmware.lsb_xy_uT, self.firmware.lsb_z_uT)
 
     @model_validator(mode="after")
-    def _stream_has_wire(self) -> "Header":
+    def _check_wire(self) -> "Header":
         if (self.layout == "native") != (self.wire is not None):
             raise ValueError("wire must be given for layout 'native', and only for it")
         return self
@@ -101,20 +101,20 @@ def parse(text: str, where: str) -> Header:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = ".".join(map(str, first["loc"])) or "header"
-        got = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
+        value = "nothing" if first["type"] == "missing" else repr(first.get("input"))[:80]
         rule = first["msg"].removeprefix("Value error, ")
-        raise CaptureError(f"{where}: {field}: {rule}; got {got}. Correct the header or record again.") from None
+        raise CaptureError(f"{where}: {field}: {rule}; got {value}. Correct the header or record again.") from None
 
 
 def make_header(where: str, **fields: Any) -> Header:
-    """Make and check the header of a recording; defaults are for a recording that needs nothing but its own files."""
-    usual: dict[str, Any] = {
+    """Make and check the header of a recording; the defaults are for recordings in another layout."""
+    defaults: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
         "contacts_before_n": 0, "options": {}, "files": {},
     }  # fmt: skip
-    given = usual | fields
-    return parse(render(Header.model_construct(**{name: given[name] for name in Header.model_fields})), where)
+    values = defaults | fields
+    return parse(render(Header.model_construct(**{name: values[name] for name in Header.model_fields})), where)
 
 
 def render(header: Header) -> str:
@@ -123,7 +123,7 @@ def render(header: Header) -> str:
 
 
 def check_same_capture(header: Header, folder: str) -> None:
-    """Raise if a capture folder was renamed by hand, so that its name differs from that in its header."""
+    """Raise if the name of a capture folder differs from the name in its header, because the folder was renamed."""
     if header.capture != folder:
         rule = f"the folder's name {folder!r}"
         raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename it back.")

@@ -62,7 +62,7 @@ class TimedFrames:
 
 
 @dataclass(frozen=True)
-class _Held:
+class _DwellFrames:
     """Frames within a dwell, in order of time."""
 
     dwell_i: Int64[np.ndarray, " f"]
@@ -70,18 +70,18 @@ class _Held:
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
 
-    def where(self, rows: Bool[np.ndarray, " f"] | slice) -> "_Held":
-        return _Held(self.dwell_i[rows], self.t_s[rows], self.b_uT[rows], self.temperature_degC[rows])
+    def where(self, rows: Bool[np.ndarray, " f"] | slice) -> "_DwellFrames":
+        return _DwellFrames(self.dwell_i[rows], self.t_s[rows], self.b_uT[rows], self.temperature_degC[rows])
 
-    def then(self, later: "_Held") -> "_Held":
+    def then(self, later: "_DwellFrames") -> "_DwellFrames":
         pairs = ((getattr(self, name), getattr(later, name)) for name in self.__dataclass_fields__)
-        return _Held(*map(np.concatenate, pairs))
+        return _DwellFrames(*map(np.concatenate, pairs))
 
 
 def join(
     blocks: Iterable[TimedFrames], log: ProbeLog, clock: ClockMap, header: Header, account: dict[str, int]
 ) -> Iterator[Readings]:
-    """Yield the readings of finished indentations; `account` is complete once the last was yielded."""
+    """Yield the readings of finished indentations; `account` is complete once all have been yielded."""
     joiner = Joiner(log, clock, header)
     for block in blocks:
         readings = joiner.feed(block)
@@ -94,7 +94,7 @@ def join(
 
 
 class Joiner:
-    """Sorts frames into dwells; holds back the indentation that may still get frames.
+    """Assign frames to dwells; hold back the indentation that may still receive frames.
 
     A dropped frame is counted under the first reason that applies: no time, not finite, failed read, stuck chip, out of
     range, between dwells. The no-load field of an indentation is the mean over its no-load dwell. `t_s` of a reading is
@@ -108,26 +108,26 @@ class Joiner:
         touched = np.zeros(int(opens.sum()), np.int64)
         touched[self._group_i[log.contact]] = 1
         self._before_n = header.contacts_before_n + np.cumsum(touched) - touched
-        self._held = self._nothing()
+        self._held = self._empty()
         self._count: Counter[str] = Counter()
 
     def feed(self, block: TimedFrames) -> Readings:
-        """Take the next frames; return the readings of all indentations that are now over (often none)."""
+        """Process the next frames; return the readings of all indentations that have now ended (often none)."""
         probe_s = self._clock.probe_s(block.t_s)
-        held = self._held.then(self._sort(block, probe_s))
+        held = self._held.then(self._assign(block, probe_s))
         known_s = probe_s[np.isfinite(probe_s)]
         if not len(known_s) or not len(held.dwell_i):
             self._held = held
-            return self._readings(self._nothing())
-        # Times never fall, so an indentation is over once a frame belongs to a later one.
+            return self._readings(self._empty())
+        # Times never decrease, so an indentation has ended once a frame belongs to a later one.
         now_i = np.searchsorted(self._log.t_start_s, known_s[-1], "right") - 1
-        over_n = int(np.searchsorted(self._group_i[held.dwell_i], self._group_i[now_i], "left"))
-        self._held = held.where(slice(over_n, None))
-        return self._readings(held.where(slice(0, over_n)))
+        ended_n = int(np.searchsorted(self._group_i[held.dwell_i], self._group_i[now_i], "left"))
+        self._held = held.where(slice(ended_n, None))
+        return self._readings(held.where(slice(0, ended_n)))
 
     def close(self) -> Readings:
-        """Return the readings of the last indentation, as far as the stream went."""
-        held, self._held = self._held, self._nothing()
+        """Return the readings of the last indentation, as far as it was recorded."""
+        held, self._held = self._held, self._empty()
         return self._readings(held)
 
     def account(self) -> dict[str, int]:
@@ -138,7 +138,7 @@ class Joiner:
         unseen_n = logged_n - counted["indentations_n"] - counted["dropped_no_noload_indentations_n"]
         return counted | {"logged_indentations_n": logged_n, "dropped_no_frame_indentations_n": unseen_n}
 
-    def _sort(self, block: TimedFrames, probe_s: Float64[np.ndarray, " f"]) -> _Held:
+    def _assign(self, block: TimedFrames, probe_s: Float64[np.ndarray, " f"]) -> _DwellFrames:
         frames, log = block.frames, self._log
         dwell_i = np.searchsorted(log.t_start_s, probe_s, "right") - 1
         lost = {
@@ -156,10 +156,10 @@ class Joiner:
         for reason, mask in lost.items():
             self._count[reason] += int((keep & mask).sum())
             keep &= ~mask
-        return _Held(dwell_i[keep], block.t_s[keep], frames.b_uT[keep], frames.temperature_degC[keep])
+        return _DwellFrames(dwell_i[keep], block.t_s[keep], frames.b_uT[keep], frames.temperature_degC[keep])
 
-    def _readings(self, held: _Held) -> Readings:
-        """Turn the frames of whole indentations into readings; count those without a no-load dwell or a contact."""
+    def _readings(self, held: _DwellFrames) -> Readings:
+        """Convert the frames of whole indentations to readings; count those without a no-load dwell or a contact."""
         group_i, contact = self._group_i[held.dwell_i], self._log.contact[held.dwell_i]
         with_noload, with_contact = group_i[~contact], group_i[contact]
         paired_noload, paired = np.isin(with_noload, with_contact), np.isin(with_contact, with_noload)
@@ -174,10 +174,10 @@ class Joiner:
             indentations_n=len(noload_uT),
             dropped_no_noload_indentations_n=len(np.unique(with_contact[~paired])),
         )
-        return self._labelled(rows, noload_uT[row_group_i], group_i)
+        return self._make_readings(rows, noload_uT[row_group_i], group_i)
 
-    def _labelled(
-        self, rows: _Held, noload_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"]
+    def _make_readings(
+        self, rows: _DwellFrames, noload_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"]
     ) -> Readings:
         log, header = self._log, self._header
         return Readings(
@@ -188,10 +188,10 @@ class Joiner:
             n_contacts=self._before_n[group_i].astype(np.int32),
         )  # fmt: skip
 
-    def _nothing(self) -> _Held:
+    def _empty(self) -> _DwellFrames:
         k = self._header.chips_n
         empty = np.zeros((0, 4 * k), np.float32)
-        return _Held(np.zeros(0, np.int64), np.zeros(0), empty[:, : 3 * k], empty[:, :k])
+        return _DwellFrames(np.zeros(0, np.int64), np.zeros(0), empty[:, : 3 * k], empty[:, :k])
 
 
 def _means(
@@ -213,15 +213,15 @@ def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
 
 BLOCK_BYTES_N = 2**22
 SPREAD_MAX_degC = 10.0  # between the chips of one board, in one block
-# The key of a total, and the prefix and suffix of the keys that count its lost parts.
+# Key of a total, and prefix and suffix of the keys that count its losses.
 LOSSES = (
     ("bytes_n", "skipped_", "_bytes_n"),
     ("frames_n", "dropped_", "_frames_n"),
     ("rows_read_n", "dropped_", "_rows_n"),
     ("logged_indentations_n", "dropped_", "_indentations_n"),
 )
-# Not losses: frames between dwells, frames of a dwell without its counterpart, and rows of zeros, which a recorder
-# writes when it polls faster than the chips measure (the reader limits their number).
+# Not losses: frames between dwells, frames of an indentation without a no-load dwell or without a contact, and rows of
+# zeros, which a recorder writes when it polls faster than the chips measure (the reader limits their number).
 NO_LOSS = (
     "dropped_between_dwells_frames_n",
     "dropped_no_noload_frames_n",
@@ -232,7 +232,7 @@ NO_LOSS = (
 Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]  # frames, number of earlier frames -> stream time of each
 
 
-class Opened(NamedTuple):
+class OpenedCapture(NamedTuple):
     """A capture being read; `account` is complete when `blocks` is exhausted."""
 
     header: Header
@@ -240,7 +240,7 @@ class Opened(NamedTuple):
     account: Mapping[str, int]
 
 
-def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
+def open_capture(folder: Path, policy: FaultPolicy) -> OpenedCapture:
     """Check a capture's header and files, and begin to read it; `policy` decides what to do about faults."""
     header = read_header(folder)
     check_same_capture(header, folder.name)
@@ -253,31 +253,31 @@ def open_capture(folder: Path, policy: FaultPolicy) -> Opened:
                 "it again."
             )
     if header.layout == "native":
-        return Opened(header, *read_native(folder, header, policy))
+        return OpenedCapture(header, *read_native(folder, header, policy))
     if header.layout not in READERS:
         remedy = "An SD card's log has no labels to learn from; try: reskin predict."
         raise CaptureError(folder, "layout", f"native or one of {sorted(READERS)}", header.layout, remedy)
     readings, account = READERS[header.layout].read(folder, header, policy)
-    return Opened(header, [readings], account)
+    return OpenedCapture(header, [readings], account)
 
 
 def read_header(folder: Path) -> Header:
     file = folder / HEADER_FILE
     if not file.is_file():
         fault = "this is a file" if folder.is_file() else f"there is no {HEADER_FILE} in it"
-        raise CaptureError(f"{folder}: not a capture folder: {fault}. Give a folder that `reskin record` wrote.")
+        raise CaptureError(f"{folder}: not a capture folder: {fault}. Use a folder that `reskin record` wrote.")
     return parse(file.read_text(encoding="utf-8", errors="replace"), str(file))
 
 
 def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
     """Raise if a capture lost more than the fraction `limit` of its bytes, frames, rows or indentations."""
-    for whole, prefix, suffix in LOSSES:
+    for total, prefix, suffix in LOSSES:
         lost = [key for key in account if key.startswith(prefix) and key.endswith(suffix) and key not in NO_LOSS]
         lost_n = sum(account[key] for key in lost)
-        if lost_n > limit * account.get(whole, 0):
+        if lost_n > limit * account.get(total, 0):
             reasons = ", ".join(f"{account[key]} {key.removesuffix('_n')}" for key in lost if account[key])
-            what = f"more than {limit:.0%} of {account[whole]} {whole.removesuffix('_n')} are lost: {reasons}"
-            raise CaptureError(f"{where}: {what}. Record again, or raise lost_fraction_max in params.yaml.")
+            problem = f"more than {limit:.0%} of {account[total]} {total.removesuffix('_n')} are lost: {reasons}"
+            raise CaptureError(f"{where}: {problem}. Record again, or raise lost_fraction_max in params.yaml.")
 
 
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
@@ -310,7 +310,7 @@ def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFr
 def _timed_frames(
     folder: Path, header: Header, times_of: Timer, account: dict[str, int], policy: FaultPolicy
 ) -> Iterator[TimedFrames]:
-    """Decode the stream block by block; the counts of its bytes and faults are added to `account` at its end."""
+    """Decode the stream block by block; at the end, add the counts of its bytes and faults to `account`."""
     wire, where = _wire(header), str(folder / STREAM_FILE)
     stream, log = FrameStream(wire, header.chips_n), FaultLog(policy, where, "ms")
     frame_bytes_n = None if wire in TEXT_WIRES else record_type(wire, header.chips_n).itemsize
@@ -335,7 +335,7 @@ def _timed_frames(
 
 
 def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
-    """Check the first good frames for wrong units, and for the other column order of text formats.
+    """Check the first good frames for wrong units and, in text formats, for the other column order.
 
     Returns False if there is no such frame yet.
     """
@@ -346,10 +346,10 @@ def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
     b_uT, temperature_degC = frames.b_uT[read], frames.temperature_degC[read]
     if wire in TEXT_WIRES:
         other, axis = ("text-txyz", 0) if wire == "text-xyzt" else ("text-xyzt", 2)
-        swapped_degC = b_uT[:, axis::3]  # the temperatures, if the order is the other one
+        swapped_degC = b_uT[:, axis::3]  # the temperatures, if the columns have the other order
         (low, high), swapped = np.percentile(temperature_degC, [5, 95]), np.percentile(swapped_degC, [5, 95])
-        alike = float(swapped[1] - swapped[0]) < SPREAD_MAX_degC < float(high - low)
-        if not _mostly_possible(temperature_degC) or (alike and _mostly_possible(swapped_degC)):
+        is_swapped = float(swapped[1] - swapped[0]) < SPREAD_MAX_degC < float(high - low)
+        if not _mostly_possible(temperature_degC) or (is_swapped and _mostly_possible(swapped_degC)):
             rule = f"{TEMPERATURE_MIN_degC:g} to {TEMPERATURE_MAX_degC:g} degC, and similar on all chips"
             remedy = f"Is the wire format {other}?"
             raise CaptureError(where, f"temperatures of {wire}", rule, f"{low:.4g} to {high:.4g}", remedy)
@@ -363,7 +363,7 @@ def _mostly_possible(temperature_degC: Float32[np.ndarray, "f k"]) -> bool:
 
 
 def timer(folder: Path, header: Header) -> Timer:
-    """Return the function that assigns times to frames, by the kind of the header's clock."""
+    """Return the function that assigns times to frames, depending on the kind of the header's clock."""
     rate_hz = header.clock.rate_hz
     if header.clock.kind == "arrivals":
         table = _arrivals(folder)
@@ -378,7 +378,7 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the arrivals; raise if the stream has fewer bytes, which means that it was cut after recording."""
+    """Read the arrivals; raise if the stream has fewer bytes, because it was cut after recording."""
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:
@@ -390,5 +390,5 @@ def _arrivals(folder: Path) -> Arrivals:
 
 
 def _wire(header: Header) -> Wire:
-    assert header.wire is not None, "the header's own check: a native capture has a wire"
+    assert header.wire is not None, "checked by `Header`: a native capture has a wire format"
     return header.wire

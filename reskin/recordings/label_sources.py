@@ -36,7 +36,7 @@ class LabelContext:
     writer: ProbeLogWriter
     unix_s: Callable[[], float]
     stop: threading.Event
-    mark: Callable[[float, float], object]  # takes the times of one event by unix time and by the source's own clock
+    mark: Callable[[float, float], object]  # takes an event's unix time and its time on the source's own clock
 
     def hold(self, label: Label, dwell_s: float) -> Dwell:
         """Wait `dwell_s`, or until the recording stops; return the dwell."""
@@ -58,10 +58,10 @@ def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: 
 
     The program moves the robot before it returns a label; the next label is requested after the dwell.
     """
-    each = iter(labels, None) if callable(labels) else iter(labels)
+    label_iterator = iter(labels, None) if callable(labels) else iter(labels)
 
     def run(context: LabelContext) -> str:
-        for label in each:
+        for label in label_iterator:
             if not isinstance(label, Label):
                 remedy = "Yield reskin.lifted() or reskin.touch(x_mm, y_mm)."
                 raise ParamsError(
@@ -86,7 +86,7 @@ class LabelThread:
         self._thread.start()
 
     def end(self, wait_s: float = 1.0) -> str:
-        """Stop, and return a summary. A program that hangs is not waited for, and its labels are kept."""
+        """Stop, and return a summary. If the source hangs, wait at most `wait_s`; the labels so far are kept."""
         self._label_context.stop.set()
         self._thread.join(wait_s)
         writer = self._label_context.writer
@@ -143,23 +143,24 @@ def parse_places(text: str) -> Places | None:
 
 
 TABLE_POLL_s = 0.02
-BETTER_s = 0.005  # a clock mark is replaced if the delay of a new one is less by this much
+BETTER_s = 0.005  # a clock mark is replaced if a new one has a delay that is shorter by this much
 
 
 def from_table(file: Path) -> LabelSource:
     """Follow a CSV that a robot's program appends to; rows from before the recording are skipped."""
 
     def run(context: LabelContext) -> str:
-        table, dwells, best_s = SampleTable(str(file)), DwellBuilder(), math.inf
+        table, dwells, least_delay_s = SampleTable(str(file)), DwellBuilder(), math.inf
         try:
-            for data, is_new in _grown(file, context.stop):
-                came_s, samples = context.unix_s(), table.feed(data)
+            for data, is_new in _follow(file, context.stop):
+                arrival_s, samples = context.unix_s(), table.feed(data)
                 if not samples or not is_new:
                     continue
-                late_s = came_s - samples[-1].t_s if table.clock == "t_s" else best_s
-                if late_s < best_s - BETTER_s:  # rows arrive after their time: the least delay is nearest to zero
-                    best_s = late_s
-                    context.mark(came_s, samples[-1].t_s)
+                delay_s = arrival_s - samples[-1].t_s if table.clock == "t_s" else least_delay_s
+                # Rows arrive late, so the mark with the least delay is the most accurate.
+                if delay_s < least_delay_s - BETTER_s:
+                    least_delay_s = delay_s
+                    context.mark(arrival_s, samples[-1].t_s)
                 context.writer.write_all(dwells.feed(samples))
         finally:
             context.writer.write_all(dwells.close())
@@ -172,8 +173,8 @@ def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
     return f"{where}: {lines.bad_n} lines could not be read, the first {lines.first_bad!a}" if lines.bad_n else ""
 
 
-def _grown(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
-    """Yield a file's content and what is appended, each with whether it is new; wait for a missing file."""
+def _follow(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
+    """Yield a file's content and then what is appended, each with whether it is new; wait for a missing file."""
     is_new = not file.exists()
     while not stop.is_set() and not file.exists():
         stop.wait(TABLE_POLL_s)
@@ -192,16 +193,16 @@ def _grown(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
 
 def _check_grows(file: Path, stream: BinaryIO) -> None:
     """Raise `CaptureError` if the file was replaced or shortened."""
-    remedy = "Append rows to it; do not write it anew."
+    remedy = "Append rows to it; do not rewrite it."
     try:
-        there = file.stat()
+        status = file.stat()
     except FileNotFoundError:
         raise CaptureError(f"{file}: the file was removed while it was read. {remedy}") from None
-    if not os.path.samestat(there, os.fstat(stream.fileno())):
+    if not os.path.samestat(status, os.fstat(stream.fileno())):
         raise CaptureError(f"{file}: the file was replaced while it was read. {remedy}")
-    if there.st_size < stream.tell():
+    if status.st_size < stream.tell():
         raise CaptureError(
-            f"{file}: the file was shortened to {there.st_size} bytes, but {stream.tell()} were read. {remedy}"
+            f"{file}: the file was shortened to {status.st_size} bytes, but {stream.tell()} were read. {remedy}"
         )
 
 
@@ -209,25 +210,25 @@ KEPT_N = 10_000  # samples; a touch has a few hundred
 
 
 class ForceGauge:
-    """A force gauge at a port, read in a thread; it keeps the last samples."""
+    """A force gauge at a port, read in a thread; it keeps the latest samples."""
 
     def __init__(self, port: str, baud: int) -> None:
         self.port, self._baud, self._gauge = port, baud, GaugeLines()
         self._kept: deque[Sample] = deque(maxlen=KEPT_N)
-        self._silent = ""
-        self._without_n = 0
+        self._problem = ""
+        self._without_force_n = 0
 
     def during(self, start_s: float, end_s: float) -> Label:
-        """Return the mean force between two times; without a sample, return NaN and count the contact."""
-        found = [one.label for one in list(self._kept) if one.label and start_s <= one.t_s <= end_s]
-        self._without_n += not found
-        return mean_label(found) if found else Label(True)
+        """Return the mean force between two times; if there is no sample, return NaN and count the contact."""
+        labels = [sample.label for sample in list(self._kept) if sample.label and start_s <= sample.t_s <= end_s]
+        self._without_force_n += not labels
+        return mean_label(labels) if labels else Label(True)
 
     def summary(self) -> str:
         """Say how many lines could not be read, and how many contacts have no force."""
         bad = _bad_lines(f"the gauge at {self.port}", self._gauge)
-        without = f"{self._without_n} touches without a force: the gauge at {self.port} sent none during them"
-        return "; ".join(filter(None, (bad, self._silent, without if self._without_n else "")))
+        without = f"{self._without_force_n} touches without a force: the gauge at {self.port} sent none during them"
+        return "; ".join(filter(None, (bad, self._problem, without if self._without_force_n else "")))
 
     @contextmanager
     def listening(self, context: LabelContext) -> Iterator[None]:
@@ -245,7 +246,7 @@ class ForceGauge:
         try:
             self.read(device, context, self._kept.extend)
         except CaptureError as error:
-            self._silent = f"{error} Later forces are missing"
+            self._problem = f"{error} Later forces are missing"
 
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
         """Read until the recording stops; raise `CaptureError` if the gauge is unplugged before that."""
@@ -261,7 +262,7 @@ class ForceGauge:
 
 
 def from_gauge(port: str, baud: int) -> LabelSource:
-    """Take contacts without places from a force gauge."""
+    """Take labels without places from a force gauge: when the skin is touched, and with which force."""
 
     def run(context: LabelContext) -> str:
         forces, dwells = ForceGauge(port, baud), DwellBuilder()
@@ -277,14 +278,14 @@ def from_gauge(port: str, baud: int) -> LabelSource:
 
 POLL_s = 0.05
 ENDS = ("q", "quit", "end")
-# A place, a force, or both separated by a blank; without the blank, 12N could be place 1 with 2 N.
+# A place, a force, or both, separated by a space; without the space, 12N could be place 1 with 2 N.
 REPLY = re.compile(r"(?:(\d{1,5})(?:\s+|$))?(?:(\d{1,3}(?:\.\d{1,4})?)\s*[nN])?")
 Say = Callable[[str], object]
 
 
 @dataclass(frozen=True)
 class Prompts:
-    """Prompt a person to press places one after the other; the person presses Enter when the tip is still."""
+    """Prompt a person to press places one after the other, and to press Enter when the tip does not move."""
 
     places: Places
     dwell_s: float
@@ -343,8 +344,8 @@ class Prompts:
     def _with_force(self, dwell: Dwell) -> Dwell:
         if self.forces is None or not math.isnan(dwell.label.Fz_N):
             return dwell
-        felt = self.forces.during(dwell.t_start_s, dwell.t_end_s)
-        return dwell._replace(label=dwell.label._replace(Fx_N=felt.Fx_N, Fy_N=felt.Fy_N, Fz_N=felt.Fz_N))
+        measured = self.forces.during(dwell.t_start_s, dwell.t_end_s)
+        return dwell._replace(label=dwell.label._replace(Fx_N=measured.Fx_N, Fy_N=measured.Fy_N, Fz_N=measured.Fz_N))
 
 
 def typed_until(lines: Callable[[], Iterable[str]], stop: threading.Event) -> Iterator[str]:

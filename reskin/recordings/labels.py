@@ -25,8 +25,8 @@ TIME_MAX_s = 1e11  # unix time stays below this for 3,000 years, but not in mill
 CLOCKS = ("unix_s", "t_s")  # this machine's clock, or the source's own
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
 CONTACT_N = 0.05  # assumed: above the noise of a gauge
-NOLOAD_N = 0.025  # between this and CONTACT_N, contact begins or ends
-DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer contact is several dwells, each with its own force
+NOLOAD_N = 0.025  # from this to CONTACT_N, a contact may be beginning or ending
+DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer contact is split into several dwells, each with its own force
 DWELL_SAMPLES_MAX_N = 10_000  # limit if the clock stands still
 LINE_BYTES_MAX_N = 4096
 GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # by the number of values in a line, in N
@@ -59,8 +59,8 @@ class Dwell(NamedTuple):
 class ProbeLogWriter:
     """Write the probe log of a recording as labels arrive, each contact together with the no-load dwell before it.
 
-    This way, a killed recorder leaves a log that `probe.parse` accepts. Contacts that it would refuse are counted and
-    not written.
+    Thus even a killed recorder leaves a log that `probe.parse` accepts. Contacts that `probe.parse` would refuse are
+    counted but not written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -68,19 +68,19 @@ class ProbeLogWriter:
         self._indentation = -1
         self._end_s = -math.inf
         self._noload: Dwell | None = None
-        self._touch: Label | None = None  # first label of a touch that may continue
+        self._touch: Label | None = None  # the first label of a touch that may continue
         self._lock = threading.Lock()
         self._file = (folder / PROBE_FILE).open("xb", buffering=0)
         io.append(self._file, (",".join(TYPES) + "\n").encode())
 
     def close(self) -> None:
-        """Take no more labels."""
+        """Stop accepting labels."""
         with self._lock:
             self._file.close()
 
     @contextmanager
     def locked(self) -> Iterator[bool]:
-        """Hold the lock; yield whether labels are still accepted."""
+        """Hold the lock during the block; yield whether labels are still accepted."""
         with self._lock:
             yield not self._file.closed
 
@@ -140,7 +140,7 @@ def _check(dwell: Dwell) -> None:
         if math.isinf(value) or abs(value) > FLOAT32_MAX:
             raise CaptureError("a label", name, "a number", value, remedy)
     if not 0 <= label.pass_i < 2**31:
-        raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Count rounds from 0.")
+        raise CaptureError("a label", "pass_i", "0 or more", label.pass_i, "Count passes from 0.")
     if not -TIME_MAX_s < dwell.t_start_s <= dwell.t_end_s - TIME_STEP_s < TIME_MAX_s:  # False for NaN
         raise CaptureError(
             f"a label: {dwell.t_start_s} to {dwell.t_end_s} s is not a span of time. Is the clock in seconds?"
@@ -177,7 +177,7 @@ class SampleTable:
         self.clock, self.bad_n, self.first_bad = "", 0, ""
 
     def feed(self, data: bytes) -> list[Sample]:
-        """Take the next bytes; return the complete samples. Raises `CaptureError` if columns are missing."""
+        """Process the next bytes; return the complete samples. Raises `CaptureError` if columns are missing."""
         samples = []
         for line in self._lines.feed(data):
             if not self._names:
@@ -212,7 +212,7 @@ class SampleTable:
         if "phase" in row:
             contact = {CONTACT: True, NOLOAD: False}.get(row["phase"].strip())
         else:
-            contact = _touches(known["Fz_N"])
+            contact = _is_contact(known["Fz_N"])
         return Sample(t_s, None if contact is None else Label(contact, **known, pass_i=pass_i))
 
 
@@ -223,8 +223,8 @@ class GaugeLines:
         self._lines = LineBuffer()
         self.bad_n, self.first_bad = 0, ""
 
-    def feed(self, data: bytes, came_s: float) -> list[Sample]:
-        """Take the next bytes and their time of arrival; return the forces of the complete lines."""
+    def feed(self, data: bytes, arrival_s: float) -> list[Sample]:
+        """Process the next bytes, given their time of arrival; return the forces of the complete lines."""
         samples = []
         for line in self._lines.feed(data):
             try:
@@ -233,15 +233,15 @@ class GaugeLines:
             except (ValueError, KeyError):
                 self.bad_n, self.first_bad = self.bad_n + 1, self.first_bad or line[:60]
                 continue
-            contact = _touches(forces["Fz_N"])
-            samples.append(Sample(came_s, None if contact is None else Label(contact, **forces)))
+            contact = _is_contact(forces["Fz_N"])
+            samples.append(Sample(arrival_s, None if contact is None else Label(contact, **forces)))
         return samples
 
 
 class DwellBuilder:
-    """Join samples of one contact at one place, or of a time without contact, to dwells with mean forces and depths.
+    """Join samples of a contact at one place, or of a period without contact, into dwells with mean forces and depths.
 
-    A contact longer than `DWELL_MAX_s` is cut into several dwells, so that a killed recording has labels for it too.
+    A contact longer than `DWELL_MAX_s` is cut into several dwells, so that a killed recorder leaves labels for it.
     `short_n` counts contacts that are too short for a dwell.
     """
 
@@ -251,10 +251,10 @@ class DwellBuilder:
         self.short_n = 0
 
     def feed(self, samples: Iterable[Sample]) -> Iterator[Dwell]:
-        """Take the next samples; yield the dwells that are over."""
+        """Process the next samples; yield the dwells that have ended."""
         for sample in samples:
             run = self._run
-            if run and not _goes_on(run[0], run[-1], sample):
+            if run and not _continues(run[0], run[-1], sample):
                 yield from self.close()
             if sample.label is not None:
                 if len(self._run) > 1 and not sample.label.contact:  # without contact, keep only first and last sample
@@ -267,7 +267,7 @@ class DwellBuilder:
     def close(self) -> Iterator[Dwell]:
         """Yield the dwell of the last samples, if they last long enough."""
         lasts_s, run, self._run = self._lasts_s(), self._run, []
-        rest = bool(run) and self._cut is not None and _goes_on(self._cut, self._cut, run[0])
+        rest = bool(run) and self._cut is not None and _continues(self._cut, self._cut, run[0])
         self._cut = None
         if lasts_s >= DWELL_MIN_s:
             yield Dwell(mean_label([sample.label for sample in run if sample.label]), run[0].t_s, run[-1].t_s)
@@ -275,7 +275,7 @@ class DwellBuilder:
             self.short_n += 1
 
     def summary(self) -> str:
-        """Say how many contacts were too short, as all are in a table with rows only at changes of state."""
+        """Say how many contacts were too short; in a table with rows only at changes of state, all are."""
         if not self.short_n:
             return ""
         least = f"{DWELL_MIN_s:g} s from first to last line"
@@ -291,14 +291,14 @@ def mean_label(labels: list[Label]) -> Label:
     return labels[0]._replace(**means)
 
 
-def _goes_on(first: Sample, last: Sample, sample: Sample) -> bool:
+def _continues(first: Sample, last: Sample, sample: Sample) -> bool:
     a, b = first.label, sample.label
     if a is None or b is None or a.contact != b.contact or a.pass_i != b.pass_i or sample.t_s < last.t_s:
         return False
     return not a.contact or same_place(a, b)
 
 
-def _touches(force_N: float) -> bool | None:
+def _is_contact(force_N: float) -> bool | None:
     """Return whether a force is a contact; None between the thresholds, or for NaN."""
     if abs(force_N) >= CONTACT_N:
         return True

@@ -1,8 +1,9 @@
-"""Find captures whose places are rotated, mirrored or swapped, by comparison with other captures of their scene.
+"""Find captures whose places are rotated, mirrored or swapped, by comparing them with other captures of the scene.
 
 Boards of one scene give similar readings for similar presses, so the place of a press can be looked up among the
 presses of other captures. If the looked-up places agree with the labels only after the labels are rotated or mirrored,
-the labels of either side are probably wrong. Nothing is assumed about the board, so a single capture cannot be checked.
+the labels of this capture or of the others are probably wrong. Nothing is assumed about the board, so a single capture
+cannot be checked.
 """
 
 from collections.abc import Iterable
@@ -14,17 +15,17 @@ from jaxtyping import Float
 from reskin.schema import Readings
 
 PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
-EXPLAINED_MIN = 0.5  # share of the places' variance that another orientation must explain
-GAIN_MIN = 0.5  # and how much more it must explain than the labels as they are
-WAYS = {
+EXPLAINED_MIN = 0.5  # fraction of the looked-up places' variance that another orientation must explain
+GAIN_MIN = 0.5  # difference by which it must explain more than the unchanged labels do
+ORIENTATIONS = {
     "as they are": [[1, 0], [0, 1]],
-    "with x and y exchanged": [[0, 1], [1, 0]],
+    "with x and y swapped": [[0, 1], [1, 0]],
     "with x mirrored": [[-1, 0], [0, 1]],
     "with y mirrored": [[1, 0], [0, -1]],
-    "turned by 90 degrees": [[0, -1], [1, 0]],
-    "turned by 180 degrees": [[-1, 0], [0, -1]],
-    "turned by 270 degrees": [[0, 1], [-1, 0]],
-    "with x and y exchanged and mirrored": [[0, -1], [-1, 0]],
+    "rotated by 90 degrees": [[0, -1], [1, 0]],
+    "rotated by 180 degrees": [[-1, 0], [0, -1]],
+    "rotated by 270 degrees": [[0, 1], [-1, 0]],
+    "with x and y swapped and mirrored": [[0, -1], [-1, 0]],
 }
 
 
@@ -48,10 +49,10 @@ def presses_of(blocks: Iterable[Readings]) -> Presses:
     if not place_mm:
         return Presses(np.zeros((0, 2)), np.zeros((0, 0)))
     places, changes = np.array(place_mm, float), np.array(change_uT)
-    length = np.linalg.norm(changes, axis=1)
-    sound = np.isfinite(length) & (length > 0)
+    magnitude_uT = np.linalg.norm(changes, axis=1)
+    sound = np.isfinite(magnitude_uT) & (magnitude_uT > 0)
     middle_mm = (places[sound].max(axis=0) + places[sound].min(axis=0)) / 2 if sound.any() else 0.0
-    return Presses(places[sound] - middle_mm, changes[sound] / length[sound, None])
+    return Presses(places[sound] - middle_mm, changes[sound] / magnitude_uT[sound, None])
 
 
 def other_orientation(own: Presses, others: Presses) -> str | None:
@@ -68,9 +69,9 @@ def other_orientation(own: Presses, others: Presses) -> str | None:
     looked_up_mm = others.place_mm[nearest].mean(axis=1)
     variance = max(float((looked_up_mm**2).mean()), 1e-12)
     explained = {
-        name: 1 - float(((own.place_mm @ np.array(way).T - looked_up_mm) ** 2).mean()) / variance
-        for name, way in WAYS.items()
+        name: 1 - float(((own.place_mm @ np.array(matrix).T - looked_up_mm) ** 2).mean()) / variance
+        for name, matrix in ORIENTATIONS.items()
     }
     best = max(explained, key=lambda name: explained[name])
-    as_are = explained["as they are"]
-    return best if explained[best] >= EXPLAINED_MIN and explained[best] - as_are >= GAIN_MIN else None
+    unchanged = explained["as they are"]
+    return best if explained[best] >= EXPLAINED_MIN and explained[best] - unchanged >= GAIN_MIN else None

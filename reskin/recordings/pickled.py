@@ -1,6 +1,6 @@
 """Convert archives of pickled samples (.npz, written by the rig of layout `lab`) to one CSV file of that layout.
 
-No pickle is loaded: its opcodes are interpreted as data, so nothing in it is imported, called or run. Anything but
+No pickle is loaded: its opcodes are interpreted as data, so nothing in it is imported or executed. Anything but
 plain values and NumPy numbers is refused.
 """
 
@@ -18,14 +18,14 @@ from reskin.errors import CaptureError
 CHIPS_N = 5
 COLUMNS = [f"{what}{chip}" for chip in range(CHIPS_N) for what in ("T", "Bx", "By", "Bz")]
 HEAD = ",".join(["indent", "phase", "x_mm", "y_mm", *COLUMNS, "Fx", "Fy", "Fz"])
-PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # the archive's name for the samples of each phase
+PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # phase -> name of its samples in the archive
 REMEDY = "Is it the recording of one port and depth, copied whole?"
 BYTES_MAX_N = 500_000_000  # the archives of scene lab have 10 to 30 MB
 MARK = object()
 
 
 def to_lab_csv(archive: bytes, where: str) -> bytes:
-    """Write an archive's samples as CSV, by indentation, the no-load samples of each first.
+    """Write an archive's samples as CSV, sorted by indentation, with the no-load samples of each first.
 
     Values are rounded to 1e-4 degC, 1e-4 uT and 1e-6 N. Lines end in CR LF, as in RFC 4180.
     """
@@ -39,7 +39,7 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
         rows = [(int(sample["Indent"]), phase, _row(sample)) for phase in PHASES for sample in samples[phase]]
     except CaptureError:
         raise
-    except Exception as error:  # an archive may contain anything; the error names the reason
+    except Exception as error:  # an archive may contain anything; the message gives the reason
         samples_of = " and ".join(PHASES.values())
         raise CaptureError(
             f"{where}: not a .npz with samples under {samples_of}: {_describe(error)}. {REMEDY}"
@@ -77,8 +77,8 @@ def decode(pickled: bytes, where: str) -> Any:
         for opcode, arg, at in pickletools.genops(pickled):
             if opcode.name not in STEPS:
                 raise CaptureError(
-                    f"{where} @{at}: the pickle has opcode {opcode.name}, beyond plain values and NumPy numbers. "
-                    f"{REMEDY}"
+                    f"{where} @{at}: the pickle has opcode {opcode.name}, which plain values and NumPy numbers "
+                    f"do not need. {REMEDY}"
                 )
             STEPS[opcode.name](stack, arg)
         return plain(stack.values.pop())
@@ -90,7 +90,7 @@ def decode(pickled: bytes, where: str) -> Any:
 
 @dataclass
 class Call:
-    """A call that a pickle contains: a name, never looked up, and its arguments."""
+    """A call that a pickle contains: the function's name, which is never looked up, and the arguments."""
 
     name: str
     args: Any
@@ -184,7 +184,7 @@ def plain(value: Any, known: dict[int, Any] | None = None) -> Any:
 
 def _plain(value: Any, known: dict[int, Any]) -> Any:
     match value:
-        case list() | tuple():  # probably of a million numbers, which need no conversion
+        case list() | tuple():  # may have a million numbers, which need no conversion
             return type(value)(plain(item, known) if isinstance(item, NESTED) else item for item in value)
         case dict():
             return {plain(key, known): plain(item, known) for key, item in value.items()}

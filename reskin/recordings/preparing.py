@@ -31,7 +31,7 @@ Prepared = tuple[Header, Mapping[str, bytes | Path]]
 
 @dataclass(frozen=True)
 class CaptureNames:
-    """The names of a board, a skin and a capture; without the last, it is made from the others and the file name."""
+    """The names of a board, a skin and a capture; if the last is None, it is made from the others and the file name."""
 
     board: str
     skin: str
@@ -40,7 +40,7 @@ class CaptureNames:
 
 @dataclass(frozen=True)
 class Dump:
-    """What a bare serial dump lacks: wire format, number of chips, rate, the rig's probe log, and clock marks."""
+    """Facts that a bare serial dump lacks: wire format, number of chips, rate, the rig's probe log and clock marks."""
 
     wire: Wire
     chips_n: int
@@ -66,7 +66,7 @@ def parse_marks(texts: list[str]) -> Marks:
 
 @contextmanager
 def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
-    """Add to an error about a recording the layouts that it can be read in, unless `layout` is one of them.
+    """Add to errors about a recording the layouts in which it can be read, unless `layout` is one of them.
 
     A `ParamsError` is about names or options, and is passed on as it is.
     """
@@ -75,25 +75,25 @@ def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
     except ParamsError:
         raise
     except ReskinError as error:
-        fitting = layouts_of(recording)
-        if not fitting or layout in fitting:
+        layouts = layouts_of(recording)
+        if not layouts or layout in layouts:
             raise
         raise type(error)(
-            f"{error} It can be read with {' or '.join(f'--layout {name}' for name in fitting)}."
+            f"{error} It can be read with {' or '.join(f'--layout {name}' for name in layouts)}."
         ) from None
 
 
 def layouts_of(recording: Path) -> list[str]:
-    """List the layouts that a recording can be read in."""
+    """List the layouts in which a recording can be read."""
     if (recording / headers.HEADER_FILE).is_file():
         return ["capture"]
-    if found := [layout for layout in get_args(ReaderLayout) if _reads(recording, layout)]:
-        return [layout for layout in found if layout != "table"] or found  # a plain table may leave labels unread
-    fits = stream.matching_formats(io.read_bytes(recording)) if recording.is_file() else []
-    return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in fits})
+    if found := [layout for layout in get_args(ReaderLayout) if _is_readable(recording, layout)]:
+        return [layout for layout in found if layout != "table"] or found  # read as a plain table, it may lose labels
+    formats = stream.matching_formats(io.read_bytes(recording)) if recording.is_file() else []
+    return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in formats})
 
 
-def _reads(recording: Path, layout: ReaderLayout) -> bool:
+def _is_readable(recording: Path, layout: ReaderLayout) -> bool:
     options = {"force_axis": "z"} if layout == "eflesh" else {}
     try:
         prepared = foreign(recording, layout, CaptureNames("board", "skin", None), options)
@@ -123,7 +123,7 @@ def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
     _need(what.probe)
     if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
         rule = f"above 0, at most {headers.RATE_MAX_HZ:g}"
-        raise CaptureError("--rate-hz", "the rate", rule, what.rate_hz, "Count frames.")
+        raise CaptureError("--rate-hz", "the rate", rule, what.rate_hz, "Count the frames per second.")
     clock = Clock(kind="rate", rate_hz=what.rate_hz, marks=what.marks)
     header = _header(names, recording, layout="native", chips_n=what.chips_n, wire=what.wire, clock=clock)
     return header, {headers.STREAM_FILE: recording, headers.PROBE_FILE: what.probe}
@@ -143,7 +143,7 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
     marks_before = found.clock.marks
     if probe is not None:
         _need(probe)
-        marks_before = () if headers.PROBE_FILE in files else marks_before  # they belong to the log that is replaced
+        marks_before = () if headers.PROBE_FILE in files else marks_before  # they belong to the replaced log
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
         raise CaptureError(f"{recording}: the capture has no labels. Add --probe PROBE.csv, or record with --labels.")
@@ -160,7 +160,7 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
 def _check_names(names: CaptureNames) -> None:
     for option, name in (("--board", names.board), ("--skin", names.skin), ("--name", names.name)):
         if name is not None and not re.fullmatch(headers.NAME, name):
-            raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another.")
+            raise CaptureError(option, "a name", "1 to 64 of A-Z a-z 0-9 _ -", repr(name), "Choose another name.")
 
 
 def _header(names: CaptureNames, recording: Path, *, layout: headers.Layout, chips_n: int, **fields: Any) -> Header:

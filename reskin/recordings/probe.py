@@ -1,7 +1,7 @@
 """The probe log `probe.csv`: places, depths and forces of the rig, one row per dwell, on the rig's own clock.
 
-Rows are in order of time. An indentation is one no-load dwell (robot lifted), followed by its contact dwells (one,
-unless the robot drags).
+Rows are in chronological order. An indentation is one no-load dwell (robot lifted), followed by its contact dwells
+(one, unless the robot drags).
 """
 
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ def parse(source: str | Path, where: str) -> ProbeLog:
         raise CaptureError(f"{where}: the probe log has no rows. Record the capture again.")
     for name in ("indentation", "pass_i", "phase", "t_start_s", "t_end_s"):
         unknown = np.asarray(table.column(name).is_null())
-        refuse_row(unknown, where, name, "known", "an empty field", "Only labels may be left empty.")
+        refuse_row(unknown, where, name, "known", "an empty field", "Only labels may be empty.")
     phases = table.column("phase")
     foreign = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
     refuse_row(foreign, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
@@ -98,8 +98,8 @@ def _check_order(log: ProbeLog, where: str) -> None:
         overlaps, where, "t_start_s", "no earlier than the end of the dwell above", start_s, "Sort dwells by time."
     )
     falls = np.diff(number, prepend=number[0]) < 0
-    refuse_row(falls, where, "indentation", "rising with time", number, "Number indentations on over the passes.")
+    refuse_row(falls, where, "indentation", "rising with time", number, "Continue the numbering from pass to pass.")
     opens = np.diff(number, prepend=-1) != 0
-    remedy = "Log one no-load dwell, and then the contact dwells, of every indentation."
+    remedy = "For every indentation, log one no-load dwell and then the contact dwells."
     refuse_row(opens & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
     refuse_row(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)

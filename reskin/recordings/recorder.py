@@ -28,7 +28,7 @@ CAPTURES = Path("captures")
 
 @dataclass(frozen=True)
 class CaptureInfo:
-    """Facts for the header of a capture: names, the order of the rig's places (random, snake or text), and labels."""
+    """Names for a capture's header, the order of the rig's places (random, snake or text), and the source of labels."""
 
     board: str
     skin: str
@@ -50,27 +50,27 @@ NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
 def record_capture(
     port: str, folder: Path, *, info: CaptureInfo, settings: PortSettings, report: Report, watch: Watch
 ) -> CaptureResult:
-    """Record a port as a native capture, with labels if `info` has a source of labels, until either ends."""
+    """Record a port as a native capture, until it ends or the labels of the source in `info`, if any, end."""
     part, header = begin_capture(folder, info, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
     stop, headers, label_thread = threading.Event(), [header], None
     try:
         if info.labels is not None:
             label_thread = LabelThread(info.labels, _label_context(part, headers, stop))
-        done = record(port, part, settings=settings, stop=stop, report=report, watch=watch)
+        recording = record(port, part, settings=settings, stop=stop, report=report, watch=watch)
     except CaptureError as error:
         if label_thread is not None:
             label_thread.end()
-        io.remove(part)  # no frame arrived: there is nothing to keep
+        io.remove(part)  # no frame arrived, so there is nothing to keep
         if label_thread is not None and label_thread.failed is not None:  # this ended the recording
             raise label_thread.failed from error
         raise
     summary = label_thread.end() if label_thread is not None else ""
     failed = label_thread.failed if label_thread is not None else None
     if isinstance(failed, OSError) and failed.errno == ENOSPC:
-        done = replace(done, ended="not written")
-    if done.ended != "not written":  # otherwise the disk is full; the .part folder can be added as it is
+        recording = replace(recording, ended="not written")
+    if recording.ended != "not written":  # if the disk is full, the .part folder can be added as it is
         end_capture(folder, headers[-1])
-    return CaptureResult(done, summary, failed)
+    return CaptureResult(recording, summary, failed)
 
 
 def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
@@ -123,7 +123,7 @@ def _part_of(folder: Path) -> Path:
 
 
 def new_folder() -> Path:
-    """Return a new capture folder, named after the time."""
+    """Return the path of a new capture folder, named after the current time."""
     return CAPTURES / time.strftime("%Y%m%d-%H%M%S")
 
 

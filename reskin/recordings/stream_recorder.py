@@ -19,7 +19,7 @@ from reskin.board.wire import TEXT_WIRES, Frames, Wire
 from reskin.errors import CaptureError
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 
-HEAD_BYTES_N = 16384  # the first bytes, kept to suggest a wire format if no frame arrives
+HEAD_BYTES_N = 16384  # this many first bytes are kept, to suggest a wire format if no frame arrives
 
 Report = Callable[[Mapping[str, int]], None]  # called with the account many times a second
 Watch = Callable[[Frames], object]  # called with frames as they arrive
@@ -60,8 +60,8 @@ def record(
 ) -> Recording:
     """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or a limit in the settings.
 
-    Raises `CaptureError` if the port does not open or not one frame arrives. The recording also ends if the port falls
-    silent after its first frame; what arrived is kept.
+    Raises `CaptureError` if the port cannot be opened or no frame arrives. The recording also ends if the port falls
+    silent after its first frame; the data received until then are kept.
     """
     with (
         open_port(port, settings.baud) as device,
@@ -76,7 +76,7 @@ def record(
 class CaptureWriter:
     """Write the two files of a recording as it proceeds: each chunk of bytes first, then its time of arrival.
 
-    In this order, no arrival refers to bytes that are missing. A chunk that a full disk takes only in part is removed.
+    In this order, no arrival refers to bytes that are missing. If the disk is full, a partly written chunk is removed.
     """
 
     def __init__(self, folder: Path, wire: Wire) -> None:
@@ -131,7 +131,7 @@ class _Recorder:
         while not (ended := self._reason_to_end(stop)):
             report(self._frames.account())
             try:
-                chunk = read_waiting(device, self._room_n())
+                chunk = read_waiting(device, self._bytes_left_n())
             except OSError:  # pyserial's errors are OSErrors too
                 return "unplugged"
             try:
@@ -158,13 +158,13 @@ class _Recorder:
         reasons: dict[Ended, bool] = {
             "stopped": stop.is_set(),
             "duration": now_s - self._start_s >= settings.duration_s,
-            "bytes": not self._room_n(),
+            "bytes": not self._bytes_left_n(),
             "silent": now_s - self._last_byte_s > settings.silence_s,
             "no frame": not frames_n and now_s - self._first_byte_s > settings.no_frame_s,
         }
-        return next((ended for ended, is_so in reasons.items() if is_so), None)
+        return next((ended for ended, applies in reasons.items() if applies), None)
 
-    def _room_n(self) -> int:
+    def _bytes_left_n(self) -> int:
         bytes_max_n = self._settings.bytes_max_n
         return sys.maxsize if bytes_max_n is None else bytes_max_n - self._writer.bytes_n
 
@@ -185,10 +185,10 @@ def _stopping_on_signals(stop: threading.Event) -> Iterator[None]:
         yield
         return
 
-    def ask(_number: int, _frame: FrameType | None) -> None:
+    def set_stop(_number: int, _frame: FrameType | None) -> None:
         stop.set()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, set_stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:

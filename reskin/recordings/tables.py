@@ -1,7 +1,7 @@
 """Read tables from text and CSV files, with errors that name the line and column.
 
 `parse_csv` reads this project's own files, whose columns and types are known; `read_cells` and `to_numbers` read files
-of other recorders.
+that other recorders wrote.
 """
 
 import re
@@ -82,7 +82,7 @@ def _check_names(names: list[str], types: Mapping[str, pa.DataType], where: str)
     missing = [name for name in types if name not in names]
     unknown = [name for name in names if name not in types]
     if missing or unknown or len(names) != len(types):
-        got = f"missing {_list(missing)}, unknown {ascii(_list(unknown))[1:-1][:80]}, {len(names)} in all"
+        got = f"missing {_list(missing)}, unknown {ascii(_list(unknown))[1:-1][:80]}, {len(names)} in total"
         raise CaptureError(where, "row 1, the column names,", _list(types), got, "Rename or remove columns.")
 
 
@@ -130,9 +130,9 @@ def to_numbers(
 def make_readings(
     header: Header, keep: Bool[np.ndarray, " rows"], **columns: Shaped[np.ndarray, "rows ..."]
 ) -> Readings:
-    """Make readings of the rows to keep; a column that is not given is NaN (unknown), but `reading_i` is 0."""
-    no_degC = np.full((len(keep), header.chips_n), np.nan)
-    columns = {"reading_i": np.zeros(len(keep)), "temperature_degC": no_degC, **columns}
+    """Make readings of the rows to keep; a missing column becomes NaN (unknown), but `reading_i` becomes 0."""
+    unknown_degC = np.full((len(keep), header.chips_n), np.nan)
+    columns = {"reading_i": np.zeros(len(keep)), "temperature_degC": unknown_degC, **columns}
     unknown = np.full(len(keep), np.nan)
     typed = {name: columns.get(name, unknown)[keep].astype(_dtype(name)) for name in UNITS}
     return Readings(capture=header.capture, board=header.board, skin=header.skin, source=header.source, **typed)
@@ -179,9 +179,9 @@ def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first
                 place = f"{name} in line {first_line_n + row_i}"
                 rule = f"a finite number below {MAGNITUDE_MAX:g}"
                 return CaptureError(
-                    where, place, rule, repr(cell[:20]), "Correct or remove this row, then add it again."
+                    where, place, rule, repr(cell[:20]), "Correct or remove this row, then add the recording again."
                 )
-    raise AssertionError("numbers refused, though every cell is one")
+    raise AssertionError("the numbers were refused, although every cell is a number")
 
 
 def is_number(cell: str) -> bool:
@@ -225,6 +225,6 @@ def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.nd
 
 
 def count_within(press: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
-    """Number the rows of each block of equal numbers 0, 1, 2, ..."""
+    """Number the rows within each block of equal press numbers: 0, 1, 2, ..."""
     begins = np.flatnonzero(np.diff(press, prepend=-1))
     return np.arange(len(press)) - np.repeat(begins, np.diff(begins, append=len(press)))

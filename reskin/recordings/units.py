@@ -10,25 +10,25 @@ from reskin.recordings.tables import FIRST_ROW
 
 # MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
 FULL_SCALE_uT = 32768 * 9.680
-# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT. The same in mT or T is below this.
+# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT. Numbers in mT or T are below this.
 WEAKEST_uT = 20.0
-# The strongest skin known, 13000 uT, would be 130 G. Values below this, in steps finer than any step of the chip, are
-# in gauss.
+# The strongest known skin, 13000 uT, would be 130 G. Values below this limit, in steps finer than any step of the chip,
+# are in gauss.
 GAUSS_MAX = 200.0
 NANO_STEP_MIN = 100.0  # the finest step is 150 nT, the coarsest 9.68 uT
-# Skins are a few mm thick and bear less; a force of 1 N in grams would be 102.
+# Skins are a few mm thick and bear smaller forces; 1 N in grams would be 102.
 FORCE_MAX_N = 100.0
-FORCE_MIN_N = 0.05  # every recording has a stronger touch; a touch of 0.4 N in kg is weaker
+FORCE_MIN_N = 0.05  # every recording has a stronger touch; 0.4 N in kg is a smaller number
 SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
 EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
-FAR_SHARE_MAX = 0.1  # of places far from the others: with more, all places are in another unit
+FAR_SHARE_MAX = 0.1  # fraction of places far from the others; if there are more, all places are in another unit
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 
 
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
     """Raise if fields exceed the chip's full scale, are weaker than the earth's, or have steps that no chip has in uT.
 
-    The steps are visible only if values were not averaged, and not if they were rounded to decimals.
+    The steps are visible only if values were neither averaged nor rounded to decimals.
     """
     _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
@@ -48,7 +48,7 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
     step_uT = _find_step(db_uT)
     if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
         rule = "in the steps of an MLX90393, 0.15 to 9.68 uT"
-        raise CaptureError(where, "change of field", rule, f"steps of {step_uT:.3g}", "Convert nT, mT or G to uT.")
+        raise CaptureError(where, "field change", rule, f"steps of {step_uT:.3g}", "Convert nT, mT or G to uT.")
 
 
 def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
@@ -79,7 +79,10 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
         far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
         if 0 < far.sum() <= FAR_SHARE_MAX * len(far):
             i = int(far.argmax())
-            line_n, place = first_line_n + int(np.flatnonzero(known)[i]), ", ".join(f"{of:g}" for of in known_mm[i])
+            line_n, place = (
+                first_line_n + int(np.flatnonzero(known)[i]),
+                ", ".join(f"{value:g}" for value in known_mm[i]),
+            )
             got += f": line {line_n} ({place} mm) is far from the others"
             remedy = "Correct that place, or convert its unit to mm."
         raise CaptureError(where, "places", rule, got, remedy)
@@ -94,7 +97,7 @@ def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
 
 
 def check_log(log: ProbeLog, where: str) -> None:
-    """Raise if places, depths or forces of the contacts are not in mm and N, or compression is negative."""
+    """Raise if places, depths or forces of the contacts are not in mm and N, or if compression is negative."""
     contact = log.contact
     force_N = np.stack([log.Fx_N, log.Fy_N, log.Fz_N], axis=1)
     for axis_N in force_N.T:
@@ -106,7 +109,7 @@ def check_log(log: ProbeLog, where: str) -> None:
     known_N = log.Fz_N[contact & np.isfinite(log.Fz_N)]
     if len(known_N) and np.median(known_N) < 0:
         got = f"{np.median(known_N):.4g} N"
-        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
+        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Reverse its sign.")
 
 
 def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n: int) -> None:

@@ -5,13 +5,13 @@ import shutil
 import numpy as np
 import pytest
 
-from reskin.recordings.orientation import WAYS, Presses, other_orientation, presses_of
+from reskin.recordings.orientation import ORIENTATIONS, Presses, other_orientation, presses_of
 from reskin.recordings.readers import lab
 from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 from tests.universal.skins import fields_uT
 
-DEPARTURES = [name for name in WAYS if name != "as they are"]
+DEPARTURES = [name for name in ORIENTATIONS if name != "as they are"]
 
 
 def board(name: str, presses_n: int = 60) -> Presses:
@@ -24,12 +24,12 @@ def board(name: str, presses_n: int = 60) -> Presses:
 
 
 def relabel(presses: Presses, way: str) -> Presses:
-    return Presses(presses.place_mm @ np.array(WAYS[way]).T, presses.direction)
+    return Presses(presses.place_mm @ np.array(ORIENTATIONS[way]).T, presses.direction)
 
 
 def inverse_of(way: str) -> str:
-    inverse = np.array(WAYS[way]).T.tolist()
-    return next(name for name, matrix in WAYS.items() if matrix == inverse)
+    inverse = np.array(ORIENTATIONS[way]).T.tolist()
+    return next(name for name, matrix in ORIENTATIONS.items() if matrix == inverse)
 
 
 @pytest.mark.parametrize("way", DEPARTURES)

@@ -120,7 +120,7 @@ UNITS_LOG = probe.parse(
         ("Fz_N", 102.0, "force must be below 100 N; got 127.5 in line 3. Convert grams"),
         ("Fz_N", 1e3, "force must be below 100 N"),
         ("Fz_N", 1e-3, "force must be 0.05 N or more somewhere in contact; got 0.0025 at most"),
-        ("Fz_N", -1.0, "the usual Fz_N in contact must be positive; got -1.875 N. Turn its sign"),
+        ("Fz_N", -1.0, "the usual Fz_N in contact must be positive; got -1.875 N. Reverse its sign"),
     ],
 )
 def test_other_units_or_signs_are_refused(column: str, factor: float, message: str) -> None:

@@ -116,7 +116,7 @@ def test_time_in_another_unit_is_refused(log, factor, rate):
     header, *rows = lines(log)
     rows = [f"{factor * float(t_s):.7f},{rest}" for t_s, rest in (row.split(",", 1) for row in rows)]
     log.write_text("".join([header, *rows]))
-    rule = "the rate must be 1 to 10000 lines a second; got " + rate
+    rule = "the rate must be 1 to 10000 lines per second; got " + rate
     with pytest.raises(CaptureError, match=rule + ". t_s is in seconds: was it written in milliseconds?"):
         read_log(log)
 

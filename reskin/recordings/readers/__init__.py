@@ -11,10 +11,10 @@ from reskin.schema import Readings
 
 
 class Reader(Protocol):
-    """The functions that the module of each layout has."""
+    """The functions that each reader module defines."""
 
     def collect(self, recording: Path) -> dict[str, Path]:
-        """Find a recording's files; return source paths by the name in the capture folder."""
+        """Find a recording's files; return their paths, by the file name to use in the capture folder."""
 
     def count_chips(self, files: Mapping[str, Path]) -> int:
         """Count the chips from the columns of the collected files."""

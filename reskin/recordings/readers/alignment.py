@@ -9,16 +9,16 @@ LAGS = np.arange(-2, 6)  # possible lags of the fields behind their labels, in r
 ROWS_MIN_N = 300  # in a shorter recording, a change cannot be detected
 BLOCK_ROWS_N = 500  # length of the blocks over which the field's slow drift is removed
 ROUNDS_N = 4
-OUTLIER = 4.0  # larger distances are clipped to this multiple of the median distance
-# A change is reported if it explains as much as this many misaligned rows. In the two public recordings and windows of
-# them, the largest value without a change is 12; a row lost 100 rows before the end gives 40 or more.
+OUTLIER = 4.0  # distances are clipped to this multiple of the median distance
+# A change is reported if it explains as much as this many misaligned rows. In the two public recordings and in windows
+# of them, the largest value without a change is 12; a row lost 100 rows before the end gives 40 or more.
 EVIDENCE_ROWS_MIN_N = 30
-# Least mean cost of a misaligned row, over its standard deviation. Noise alone reaches 0.17 in 300 rows.
+# Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. Noise alone reaches 0.17 in 300 rows.
 CONTRAST_MIN = 0.3
 
 
 class Change(NamedTuple):
-    """From label row `row` (counted from 0) on, fields lag by `after` rows; before it, by `before` rows."""
+    """Fields lag by `before` rows up to label row `row` (counted from 0), and by `after` rows from this row on."""
 
     row: int
     before: int
@@ -32,8 +32,8 @@ def find_change(
     """Return where the lag changes; None if a single lag explains the rows as well.
 
     For each place, a line of field against force is fitted to all rows, as they are aligned so far. Then the rows are
-    split into two parts with different lags such that the fields are nearest to these lines, and the lines are fitted
-    again. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
+    split into two parts with different lags such that the fields are nearest to these lines, and the lines are
+    fitted again. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
     """
     if len(label) < ROWS_MIN_N or not contact.any():
         return None
@@ -42,14 +42,16 @@ def find_change(
     row, lag = np.arange(len(label)), _best_lag(field_uT, sound, force_N, place)
     for _ in range(ROUNDS_N):
         distance = _distances(field_uT, sound, _fit_lines(field_uT, sound, force_N, place, lag))
-        before_i, after_i, at = _split(distance)
-        lag = np.where(row < at, LAGS[before_i], LAGS[after_i])
-    gain = distance.sum(axis=1).min() - distance[before_i, :at].sum() - distance[after_i, at:].sum()
-    apart = distance[after_i] - distance[before_i]
-    misaligned = float(np.where(row < at, apart, -apart).mean())  # mean cost of giving a row the lag of the other part
-    if misaligned <= CONTRAST_MIN * apart.std() or gain < EVIDENCE_ROWS_MIN_N * misaligned:
+        before_i, after_i, change_row = _split(distance)
+        lag = np.where(row < change_row, LAGS[before_i], LAGS[after_i])
+    gain = distance.sum(axis=1).min() - distance[before_i, :change_row].sum() - distance[after_i, change_row:].sum()
+    extra_cost = distance[after_i] - distance[before_i]
+    misaligned = float(
+        np.where(row < change_row, extra_cost, -extra_cost).mean()
+    )  # mean cost of giving a row the lag of the other part
+    if misaligned <= CONTRAST_MIN * extra_cost.std() or gain < EVIDENCE_ROWS_MIN_N * misaligned:
         return None
-    return Change(at, int(LAGS[before_i]), int(LAGS[after_i]))
+    return Change(change_row, int(LAGS[before_i]), int(LAGS[after_i]))
 
 
 def _without_drift(b_uT: Float64[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
@@ -74,19 +76,19 @@ def _fit_lines(
     place: Int64[np.ndarray, " f"], lag: Int64[np.ndarray, " f"],
 ) -> Float64[np.ndarray, "f ch"]:  # fmt: skip
     """Return the expected field of each label row, from a least-squares line of field against force at its place."""
-    at = np.arange(len(place)) + lag
-    used = (at >= 0) & (at < len(place))
-    used[used] &= sound[at[used]]
-    at, of, force = at[used], place[used], force_N[used]
+    field_row = np.arange(len(place)) + lag
+    used = (field_row >= 0) & (field_row < len(place))
+    used[used] &= sound[field_row[used]]
+    field_row, place_i, force = field_row[used], place[used], force_N[used]
     places_n = place.max() + 1
-    count = np.maximum(np.bincount(of, minlength=places_n), 1)
-    mean_N = np.bincount(of, force, places_n) / count
-    off_N = force - mean_N[of]
-    spread = np.bincount(of, off_N**2, places_n)
+    count = np.maximum(np.bincount(place_i, minlength=places_n), 1)
+    mean_N = np.bincount(place_i, force, places_n) / count
+    off_N = force - mean_N[place_i]
+    spread = np.bincount(place_i, off_N**2, places_n)
     expected_uT = np.empty_like(field_uT)
-    for channel, values_uT in enumerate(field_uT[at].T):
-        mean_uT = np.bincount(of, values_uT, places_n) / count
-        slope = np.bincount(of, off_N * values_uT, places_n) / np.where(spread > 0, spread, np.inf)
+    for channel, values_uT in enumerate(field_uT[field_row].T):
+        mean_uT = np.bincount(place_i, values_uT, places_n) / count
+        slope = np.bincount(place_i, off_N * values_uT, places_n) / np.where(spread > 0, spread, np.inf)
         expected_uT[:, channel] = mean_uT[place] + slope[place] * (force_N - mean_N[place])
     return expected_uT
 
@@ -99,8 +101,8 @@ def _distances(
     row = np.arange(len(field_uT))
     known = (row + LAGS[0] >= 0) & (row + LAGS[-1] < len(row))
     known[known] &= np.all([sound[row[known] + lag] for lag in LAGS], axis=0)
-    for lag, of_lag in zip(LAGS, distance, strict=True):
-        of_lag[known] = np.linalg.norm(field_uT[row[known] + lag] - expected_uT[known], axis=1)
+    for lag, lag_distance in zip(LAGS, distance, strict=True):
+        lag_distance[known] = np.linalg.norm(field_uT[row[known] + lag] - expected_uT[known], axis=1)
     return np.minimum(distance, OUTLIER * np.median(distance[:, known].min(axis=0))) if known.any() else distance
 
 
@@ -116,9 +118,11 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
 
 
 AGREEMENT_MIN = 0.95
-SEEN_TWICE_MIN = 0.25  # a shift by half the recording leaves half the moves to compare, some of them without contact
+SEEN_TWICE_MIN = (
+    0.25  # a shift by half the recording leaves only half the moves to compare, some of them without contact
+)
 PROBES_N = 256
-PROBES_MIN_N = 8  # with fewer, a period is not excluded
+PROBES_MIN_N = 8  # with fewer probes, no period is excluded
 GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
@@ -142,12 +146,12 @@ def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " 
 def _likely_periods(
     place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"], moves: Int64[np.ndarray, "moves 2"]
 ) -> Int64[np.ndarray, " p"]:
-    """Return the periods that a sample of moves from the first half does not exclude; testing all is quadratic."""
+    """Return the periods that are compatible with a sample of moves from the first half; testing all moves is quadratic."""
     half_n = len(contact) // 2
     early = moves[moves[:, 1] < half_n]
     if not len(early):
         return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
-    # Multiples of the golden ratio are evenly spread, and not in phase with any grid.
+    # Multiples of the golden ratio modulo 1 are evenly spread, and not in phase with any grid.
     probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
     tried_n, same_n = np.zeros((2, half_n), np.int64)
     for first, second in probes:
@@ -161,9 +165,9 @@ def _likely_periods(
 
 
 def _find_moves(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, "moves 2"]:
-    """Return the rows of the last contact at each place and of the first at the next place.
+    """Return the rows of the last contact at each place and of the first contact at the next place.
 
-    A shift within a dwell cannot match both.
+    A shift that stays within a dwell cannot match both.
     """
     rows = np.flatnonzero(contact)
     pairs = np.stack([rows[:-1], rows[1:]], axis=1)

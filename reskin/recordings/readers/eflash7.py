@@ -2,7 +2,7 @@
 
 One or two places of a 3 x 3 grid of unknown pitch are touched, so `x_mm` and `y_mm` are NaN. The account counts the
 rows of each place by its number n, as `place_<n>_rows_n`: n is 1 + column + 3 row, with columns and rows counted from
-0. The recorder subtracted a baseline that it does not give, so `b_uT` lacks a constant in each channel. The no-load
+0. The recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel. The no-load
 field is the mean over the untouched rows at the start of a recording, and forces are relative to their mean force.
 """
 
@@ -29,7 +29,7 @@ SIDE_N = 3  # places per side of the grid
 ONE, TWO = ("x_pos", "y_pos"), ("pos1_x", "pos1_y", "pos2_x", "pos2_y")
 FORCES = ("fx", "fy", "fz")
 ON_SKIN = -1.0  # the file has compression as negative fz
-TOUCH_N = 0.5  # assumed, as the file does not mark touches: a touch begins when the force rises above this
+TOUCH_N = 0.5  # assumed: a touch, which the file does not mark, begins when the force rises above this
 # The chips measure about ten times a second, and the recorder writes zeros when it polls too early.
 ZERO_FRACTION_MAX = 0.25  # 4 to 10 % in 19 recordings
 GAP_s = 0.5
@@ -55,7 +55,7 @@ def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording: the CSV file itself."""
     if not recording.is_file():
         raise CaptureError(
-            f"{recording}: not a file. A recording of layout eflash7 is one CSV file: add each file by itself."
+            f"{recording}: not a file. A recording of layout eflash7 is one CSV file: add each file separately."
         )
     return {READINGS: recording}
 
@@ -79,7 +79,9 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
-    written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)  # of all chips; `rows` has zeros of some chips
+    written = ~log.record(
+        "zeros", _zero_rows(table.b_uT, where), row
+    )  # zeros on all chips; `rows` counts zeros on some chips
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
     b_uT = table.b_uT[written]
     rows = check_rows(b_uT, unknown_degC, header.expected_lsb_uT, where=where, policy=policy, row=row[written])
@@ -152,11 +154,11 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
     """Number the touched places from their columns and rows, each 1 to 3; a recording has one place or one pair."""
     moved = np.flatnonzero((place != place[0]).any(axis=1))
     if len(moved):
-        raise CaptureError(f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Add each place by itself.")
+        raise CaptureError(f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Add each place separately.")
     pairs = place[0].reshape(-1, 2)
     if not np.isin(pairs, np.arange(1, SIDE_N + 1)).all():
         rule = f"columns and rows 1 to {SIDE_N} of a grid"
-        raise CaptureError(where, "places", rule, place[0].tolist(), "Places in mm belong to layout table.")
+        raise CaptureError(where, "places", rule, place[0].tolist(), "Use layout table for places in mm.")
     numbers = sorted(int(column + SIDE_N * (row - 1)) for column, row in pairs)
     if len(set(numbers)) < len(numbers):
         raise CaptureError(f"{where}: both places are place {numbers[0]}. Correct the columns of places.")
@@ -164,7 +166,7 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
 
 
 def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows with zeros for all chips, which the recorder writes without a reading; raise for too many."""
+    """Mark the rows with zeros for all chips, which the recorder writes when it has no reading; raise if there are too many."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
         found = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
@@ -173,7 +175,7 @@ def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray
 
 
 def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows at the start before any channel changes by more than `STILL_uT`; raise if they are too few."""
+    """Mark the rows at the start, before any channel changes by more than `STILL_uT`; raise if there are too few."""
     first_uT = np.median(b_uT[whole][:STILL_ROWS_MIN_N], axis=0)
     moved = whole & (np.abs(b_uT - first_uT) > STILL_uT).any(axis=1)
     untouched = whole & ~np.logical_or.accumulate(moved)
@@ -181,7 +183,7 @@ def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"],
         line_n = FIRST_LINE_N + int(moved.argmax())
         raise CaptureError(
             f"{where}: fewer than {STILL_ROWS_MIN_N} rows before the first touch: fields change by more than "
-            f"{STILL_uT:g} uT in line {line_n}. Start the recording earlier before the touch."
+            f"{STILL_uT:g} uT in line {line_n}. Start the recording earlier before the first touch."
         )
     return untouched
 
@@ -192,7 +194,7 @@ def _check_force(gauge_N: Float64[np.ndarray, "f 3"], force_N: Float64[np.ndarra
     check_touch(force_N, where)
     if force_N[:, 2].max() > -force_N[:, 2].min():
         got = f"{force_N[:, 2].max():.4g} N"
-        remedy = "Is compression negative fz in this file? Turn its sign."
+        remedy = "Is compression negative fz in this file? Reverse its sign."
         raise CaptureError(where, "the strongest fz", "negative", got, remedy)
 
 

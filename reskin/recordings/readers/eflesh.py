@@ -2,7 +2,7 @@
 
 Places are robot coordinates minus their minimum, so a scan begins at 0 mm. The depth is counted down from the highest z
 of the recording, which may be above the skin, so its offset is unknown. The force along one axis is known. Its sign is
-unknown along x and y, because the recorder does not state whether it is the force on the skin or on the gauge; such
+unknown along x and y, because the recorder does not state whether it is the force on the skin or on the gauge; these
 rows are counted.
 """
 
@@ -43,8 +43,8 @@ PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
 # 0.15 uT or more.
 SAME_NOLOAD_uT = 0.02
 
-# As a part of the height: a robot that holds its height varies by 1e-4; a press in m, taken for mm, is some hundredths.
-HELD_PART = 1e-3
+# Fraction of the height: 1e-4 for a robot that holds its height; some hundredths for a press in m that is taken for mm.
+HELD_FRACTION = 1e-3
 
 Account = dict[str, int]
 
@@ -65,7 +65,9 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[SENSOR])
     columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
-        raise CaptureError(f"{where}: {columns_n} columns are not a time and 3 for each chip. Is this layout eflesh?")
+        raise CaptureError(
+            f"{where}: {columns_n} columns are not 1 for the time and 3 per chip. Is this layout eflesh?"
+        )
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
@@ -144,7 +146,7 @@ def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
-    """Raise unless the clocks agree row by row, because rows are paired in order, and times increase."""
+    """Raise unless the clocks agree row by row (rows are paired in order) and times increase."""
     apart = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
     if len(apart):
         where = f"{header.capture}/{STATES} line {apart[0] + 1}"
@@ -177,12 +179,12 @@ def _number_passes(
 
 
 def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Return the gauge's force under the name of its column, NaN in rows without a new value; empty without a gauge."""
+    """Return the gauge's force by the name of its column, with NaN in rows without a new value; empty without a gauge."""
     if states.shape[1] <= WEIGHT_COLUMN:
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
         got = header.options if header.options else "no option"
-        remedy = "Say which force the gauge measured."
+        remedy = "State which force the gauge measured."
         raise CaptureError(header.capture, "option force_axis", "x, y or z", got, remedy)
     weight_g, where = states[:, WEIGHT_COLUMN], f"{header.capture}/{STATES}"
     weight_N = np.where(weight_g == NO_NEW_WEIGHT, np.nan, weight_g * NEWTON_PER_GRAM)
@@ -199,4 +201,4 @@ def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[n
 
 
 def _holds_height(z_mm: Float64[np.ndarray, " f"]) -> bool:
-    return bool(np.ptp(z_mm) <= max(SAME_PLACE_mm, min(DEPTH_MIN_mm, HELD_PART * np.abs(z_mm).max())))
+    return bool(np.ptp(z_mm) <= max(SAME_PLACE_mm, min(DEPTH_MIN_mm, HELD_FRACTION * np.abs(z_mm).max())))

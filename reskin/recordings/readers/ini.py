@@ -1,7 +1,7 @@
 """Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row per indentation.
 
-Rows with a force below 0.02 N count as no contact, whatever place the truths give; they are kept without place and with
-zero force. The rows at the start of a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are
+Rows with a force below 0.02 N count as no contact, whatever place the truths state; they are kept without place and
+with zero force. The rows at the start of a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are
 unknown (NaN).
 
 The fields may lag: row i of the truths belongs to a later row of the readings. The lag in rows is given in the header
@@ -30,7 +30,7 @@ CONTACT_MIN_N = 0.02  # the recorder labels weaker rows (10, 10, 0), which is al
 VALUES_PER_CHIP_N = 4
 ROWS_LATE = ("0", "1", "2", "3", "4", "5")
 # A lag is trusted if it was found over this many rows and improves the correlation by this much. In the public
-# recording of 23300 rows, it is 0.65 instead of 0.45.
+# recording of 23300 rows, the lag improves the correlation from 0.45 to 0.65.
 LATE_ROWS_MIN_N, LATE_GAIN_MIN = 100, 0.1
 
 Account = dict[str, int]
@@ -39,7 +39,7 @@ Account = dict[str, int]
 def collect(recording: Path) -> dict[str, Path]:
     """Find the readings file and its truths beside it: `b20_NAME.txt` goes with `truths_NAME.txt`."""
     if not recording.is_file() or recording.name.startswith("truths_"):
-        raise CaptureError(f"{recording}: not the text file of readings. Give b20_NAME.txt, not truths_NAME.txt.")
+        raise CaptureError(f"{recording}: not the text file of readings. Add b20_NAME.txt, not truths_NAME.txt.")
     names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
     found = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
     if not found:
@@ -58,15 +58,15 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
     """Read all rows without faults; the no-load field of a row is the mean over the corner rows of its pass."""
-    said_n = _rows_late(header)
+    given_late_n = _rows_late(header)
     b_uT, temperature_degC = _read_fields(folder, header)
     truths = _read_truths(folder, header)
-    _check_rows_n(len(b_uT), len(truths), said_n or 0, header)
+    _check_rows_n(len(b_uT), len(truths), given_late_n or 0, header)
     rows = check_rows(
         b_uT, temperature_degC, header.expected_lsb_uT, where=f"{header.capture}/{READINGS}", policy=policy
     )
-    best_late_n, tells = _best_rows_late(b_uT, truths[:, 2], rows)
-    late_n = said_n if said_n is not None else best_late_n if tells else 0
+    best_late_n, is_reliable = _best_rows_late(b_uT, truths[:, 2], rows)
+    late_n = given_late_n if given_late_n is not None else best_late_n if is_reliable else 0
     _check_lateness(b_uT, truths, rows, header)
     truths, rows = truths[: len(truths) - late_n], rows.part(slice(late_n, None))
     b_uT, temperature_degC, keep = b_uT[late_n:], temperature_degC[late_n:], rows.keep
@@ -136,12 +136,12 @@ def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Head
 
 
 def _rows_late(header: Header) -> int | None:
-    """Return the lag of the fields in rows, as the header gives it; None if the header does not give it."""
+    """Return the lag of the fields in rows, as stated in the header; None if it is not stated."""
     if "rows_late" not in header.options:
         return None
     rows_late = header.options["rows_late"]
     if rows_late not in ROWS_LATE:
-        remedy = "Say by how many rows the fields come late."
+        remedy = "Set it to the number of rows by which the fields lag."
         raise CaptureError(header.capture, "option rows_late", f"0 to {ROWS_LATE[-1]}", rows_late, remedy)
     return int(rows_late)
 
@@ -179,11 +179,11 @@ def _check_lateness(
         f"{lost} seem to be missing there. Cut both files before that row, or put back what is missing, and add the "
         "recording again."
     )
-    raise CaptureError(f"{header.capture}/{READINGS}: the fields are behind their truths by {found}. {remedy}")
+    raise CaptureError(f"{header.capture}/{READINGS}: the fields lag behind their truths by {found}. {remedy}")
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark the rows of each pass before its first contact, when the indenter is at the first corner, off the skin."""
+    """Mark the rows of each pass before its first contact, while the indenter is at the first corner, off the skin."""
     touches_before_n = np.cumsum(contact)
     begins = np.flatnonzero(np.diff(pass_i, prepend=-1))
     before_pass_n = (touches_before_n - contact)[begins]
@@ -199,7 +199,7 @@ def _noload_field(
     if len(without):
         where = f"{header.capture}/{TRUTHS} line {int(np.argmax(pass_i == without[0])) + 1}"
         raise CaptureError(
-            f"{where}: this pass begins without a whole row without contact (F < {CONTACT_MIN_N} N). Start each pass "
+            f"{where}: this pass does not begin with a fault-free row without contact (F < {CONTACT_MIN_N} N). Start each pass "
             "off the skin, or cut this pass out."
         )
     return noload_uT[pass_i]

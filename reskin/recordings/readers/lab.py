@@ -57,7 +57,7 @@ def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording: the CSV file itself, one depth of one skin."""
     if not recording.is_file():
         raise CaptureError(
-            f"{recording}: not a file. A recording of layout lab is one CSV file: add each depth's file by itself."
+            f"{recording}: not a file. A recording of layout lab is one CSV file: add each depth's file separately."
         )
     return {READINGS: recording}
 
@@ -83,7 +83,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if len(without):
         line_n = FIRST_LINE_N + int(np.argmax(table.press == without[0]))
         raise CaptureError(
-            f"{where}: the indent from line {line_n} on has no whole noload row. Remove it, or record it again."
+            f"{where}: the indent from line {line_n} on has no fault-free noload row. Remove it, or record it again."
         )
     reading_i = np.zeros(len(keep), int)
     reading_i[keep] = count_within(table.press[keep])
@@ -135,7 +135,7 @@ def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.nda
     seen: set[float] = set()
     for row_i in begins:
         if indent[row_i] in seen:
-            found = f"indent {indent[row_i]:g} begins once more in line {FIRST_LINE_N + row_i}"
+            found = f"indent {indent[row_i]:g} begins again in line {FIRST_LINE_N + row_i}"
             raise CaptureError(f"{where}: {found}; its rows must be one block. Was the file joined twice?")
         seen.add(indent[row_i])
     return np.repeat(np.arange(len(begins)), np.diff(begins, append=len(indent)))
@@ -149,11 +149,11 @@ def _check_table(table: _Table, where: str) -> None:
     check_touch(table.force_N[table.contact], where)
     pressed_N = float(np.median(table.force_N[table.contact, 2]))
     if pressed_N > 0:
-        remedy = "Is compression negative Fz in this file? Turn its sign."
+        remedy = "Is compression negative Fz in this file? Reverse its sign."
         raise CaptureError(where, "the usual Fz in contact", "negative", f"{pressed_N:.4g} N", remedy)
     check_places(table.place_mm, where, first_line_n=FIRST_LINE_N)
     begins = np.flatnonzero(np.diff(table.press, prepend=-1))
     moved = np.flatnonzero((table.place_mm != table.place_mm[begins][table.press]).any(axis=1))
     if len(moved):
         found = f"the place changes within an indent, in line {FIRST_LINE_N + moved[0]}"
-        raise CaptureError(f"{where}: {found}. Give each press its own indent.")
+        raise CaptureError(f"{where}: {found}. Number each press as its own indent.")

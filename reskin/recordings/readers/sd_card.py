@@ -18,14 +18,14 @@ from reskin.recordings.units import check_fields
 
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
-HEADER_LETTERS_MAX = 10_000  # a line of 64 chips has 1,500
+HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500
 RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
-SHOWN_CHIPS_MAX = 5  # boards with more have too long a line 1 for an error
+SHOWN_CHIPS_MAX = 5  # with more chips, line 1 is too long for an error message
 KEPT_SHARE_MIN = 0.5  # assumed: with fewer good frames, contacts would be missed
 Log = tuple[
     Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
 ]  # s, uT, degC, account
-GAP_FRAMES = 1.5  # times the usual time step; in a longer step, one frame or more is missing
+GAP_FRAMES = 1.5  # times the usual time step; in longer steps, frames are missing
 
 
 def column_names(chips_n: int) -> list[str]:
@@ -48,8 +48,8 @@ def read_log(path: Path) -> Log:
     """Read time in s, field in uT and temperature in degC of the frames in which every chip was read, and an account.
 
     Frames with failed reads or stuck chips are dropped and counted. A log is refused if fewer than half of its frames
-    are left, or if a chip lost its settings. `gaps_n` counts the time steps that are longer than usual, `gap_frames_n`
-    the frames that are missing there.
+    are left, or if a chip lost its settings. `gaps_n` counts the time steps that are longer than usual, and
+    `gap_frames_n` the frames that are missing in them.
     """
     where = str(path)
     chips_n = _chips_n(path, where)
@@ -70,7 +70,7 @@ def keep_whole(
     *,
     first_row: int = 1,
 ) -> Log:
-    """Keep the frames in which every chip was read, and count the others; `first_row` numbers the first in errors."""
+    """Keep the frames in which every chip was read, and count the others; `first_row` is the number of the first row in errors."""
     _check_time(t_s, where, first_row)
     check_fields(b_uT, where, first_line_n=first_row)
     failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
@@ -86,7 +86,7 @@ def keep_whole(
 
 
 def _check_kept(account: dict[str, int], where: str) -> None:
-    """Raise if too few frames without faults are left, naming the faults."""
+    """Raise an error that names the faults if too few frames without faults are left."""
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
@@ -100,7 +100,7 @@ def _chips_n(path: Path, where: str) -> int:
     """Count the chips that the header line names; raise if the last line has no end, because it was cut."""
     try:
         with path.open("rb") as file:
-            first = file.readline(HEADER_LETTERS_MAX)
+            first = file.readline(HEADER_CHARACTERS_MAX)
             file.seek(-1, 2)
             last = file.read(1)
     except FileNotFoundError:
@@ -115,13 +115,13 @@ def _chips_n(path: Path, where: str) -> int:
         raise CaptureError(f"{where}: {_header_fault(names)}")
     if last != b"\n":
         raise CaptureError(
-            f"{where}: the last line is cut: no line feed ends it. Remove it, if the board was switched off there."
+            f"{where}: the last line is cut: it has no line feed at its end. Remove it if the board was switched off at that time."
         )
     return chips_n
 
 
 def _header_fault(names: list[str]) -> str:
-    """Say what is wrong with the names in line 1, and what to do."""
+    """Return what is wrong with the names in line 1, and what to do."""
     wanted = column_names(len(names) // len(CHIP_COLUMNS) + 1)
     rule = f"{','.join(column_names(1))}, then T1 and so on"
     if tables.is_number(names[0]):
@@ -157,7 +157,7 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> N
         raise CaptureError(f"{where} row {row_i + first_row}", TIME, "later than the line above", got, remedy)
     rate_hz = 1 / float(np.median(np.diff(t_s)))
     if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
-        rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines a second"
+        rule = f"{RATE_MIN_HZ:g} to {RATE_MAX_HZ:g} lines per second"
         remedy = f"{TIME} is in seconds: was it written in milliseconds?"
         raise CaptureError(where, "the rate", rule, f"{rate_hz:.3g}", remedy)
 
@@ -170,9 +170,9 @@ def _faults(
         raise CaptureError(f"{where}: every line has failed I2C reads. Check the wiring, and log again.")
     read = np.flatnonzero(~failed)
     for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
-        odd = np.flatnonzero(faults.reset_chips(b_uT[block], None))
-        if len(odd):
-            found = f"the step of chip {', '.join(map(str, odd))} differs from that of the other chips"
+        deviating = np.flatnonzero(faults.reset_chips(b_uT[block], None))
+        if len(deviating):
+            found = f"the step of chip {', '.join(map(str, deviating))} differs from that of the other chips"
             raise CaptureError(
                 f"{where}: from row {block[0] + first_row} on, {found}. A chip lost its settings: reset the board and "
                 "log again."

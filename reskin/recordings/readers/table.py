@@ -42,7 +42,7 @@ EMPTY = ("", "nan", "NaN")
 STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
 
-SUBTRACTED_PART = 0.5  # assumed: no-load field over field in contact, both at the chip with the strongest field
+SUBTRACTED_RATIO = 0.5  # assumed: no-load field / field in contact, both at the chip with the strongest field
 
 Account = dict[str, int]
 
@@ -56,7 +56,7 @@ def columns_of(chips_n: int) -> list[str]:
 def collect(recording: Path) -> dict[str, Path]:
     """Find the file of a recording."""
     if not recording.is_file():
-        raise CaptureError(f"{recording}: not a file. A table is one CSV or Parquet file: add each file by itself.")
+        raise CaptureError(f"{recording}: not a file. A table is one CSV or Parquet file: add each file separately.")
     return {PARQUET if recording.suffix == ".parquet" else CSV: recording}
 
 
@@ -95,15 +95,15 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if len(without):
         line_n = FIRST_LINE_N + without[0]
         raise CaptureError(
-            f"{where}: the press in line {line_n} has no whole no-load row before it. Add rows of phase noload."
+            f"{where}: the press in line {line_n} has no fault-free no-load row before it. Add rows of phase noload."
         )
-    still = "depth_mm" in numbers and not numbers["depth_mm"][contact].any()
+    depth_is_zero = "depth_mm" in numbers and not numbers["depth_mm"][contact].any()
     pass_i = numbers["pass"] if "pass" in numbers else _find_passes(numbers, press, contact)
     reading_i = np.zeros(len(keep), int)
     reading_i[keep] = count_within(press[keep])
     readings = make_readings(
         header, keep, indentation=press, pass_i=pass_i, reading_i=reading_i,
-        x_mm=numbers["x_mm"], y_mm=numbers["y_mm"], depth_mm=unknown if still else numbers.get("depth_mm", unknown),
+        x_mm=numbers["x_mm"], y_mm=numbers["y_mm"], depth_mm=unknown if depth_is_zero else numbers.get("depth_mm", unknown),
         **{axis: numbers.get(axis, unknown) for axis in ("Fx_N", "Fy_N", "Fz_N", "t_s")},
         b_uT=b_uT, noload_uT=noload_uT, temperature_degC=temperature_degC, n_contacts=header.contacts_before_n + press,
     )  # fmt: skip
@@ -114,7 +114,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         **rows.account(),
         "ignored_columns_n": len(set(names) - set(columns)),
         "passes_n": len(np.unique(readings.pass_i)),
-        "no_depth_rows_n": len(readings) if still or "depth_mm" not in numbers else 0,
+        "no_depth_rows_n": len(readings) if depth_is_zero or "depth_mm" not in numbers else 0,
     }
 
 
@@ -142,17 +142,17 @@ def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str)
 
 def _is_empty(column: str, names: Sequence[str], cells: Sequence[Sequence[str]]) -> bool:
     """Return whether an optional column is empty, as in a template that was filled in only partly."""
-    at = names.index(column)
-    return (column in OPTIONAL or column[0] == "T") and all(row[at].strip() in EMPTY for row in cells)
+    column_i = names.index(column)
+    return (column in OPTIONAL or column[0] == "T") and all(row[column_i].strip() in EMPTY for row in cells)
 
 
 def _to_numbers(
     names: list[str], cells: list[list[str]], known: Sequence[str], contact: Bool[np.ndarray, " f"], where: str
 ) -> Float64[np.ndarray, "f c"]:
     """Parse the known columns as numbers; in rows without contact, place, depth and force may be empty."""
-    at = [names.index(column) for column in known]
+    column_i = [names.index(column) for column in known]
     may_lack = {column for column in known if column[0] != "B"}
-    picked = [[row[i].strip() for i in at] for row in cells]
+    picked = [[row[i].strip() for i in column_i] for row in cells]
     lacking = np.array([[cell in EMPTY for cell in row] for row in picked], bool).reshape(len(picked), len(known))
     lacking &= ~contact[:, None] & np.isin(known, sorted(may_lack))
     filled = [
@@ -180,29 +180,29 @@ def _check(
             check_touch(numbers[axis][contact], where)
     if "Fz_N" in numbers and np.median(numbers["Fz_N"][contact]) < 0:
         got = f"{np.median(numbers['Fz_N'][contact]):.4g} N"
-        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Turn its sign.")
+        raise CaptureError(where, "the usual Fz_N in contact", "positive", got, "Reverse its sign.")
 
 
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
-    """Raise if fields are weak, and much weaker without contact than in contact: a baseline was subtracted already.
+    """Raise if fields are weak, and much weaker without contact than in contact, because a baseline was subtracted.
 
-    Wrong units also make fields weak, but scale both alike; in raw fields, the field at rest exceeds its change.
+    Wrong units also make fields weak, but scale both equally; in raw fields, the field at rest exceeds its change.
     """
     chips_uT = np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3), axis=2)
     if np.median(chips_uT) >= WEAKEST_uT or contact.all() or not contact.any():
         return
     rest_uT, pressed_uT = (float(np.median(chips_uT[rows].max(axis=1))) for rows in (~contact, contact))
-    if rest_uT < SUBTRACTED_PART * pressed_uT:
+    if rest_uT < SUBTRACTED_RATIO * pressed_uT:
         found = f"the fields are {rest_uT:.3g} uT at most in no-load rows, {pressed_uT:.3g} uT in contact"
         raise CaptureError(
-            f"{where}: {found}. A baseline seems to be subtracted already: write the raw fields of both phases."
+            f"{where}: {found}. A baseline seems to have been subtracted: write the raw fields of both phases."
         )
 
 
 def _number_presses(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str
 ) -> Int[np.ndarray, " f"]:
-    """Number presses from 0: by column `indentation` if given, else a new press at each touch and each new place."""
+    """Number presses from 0: by column `indentation` if present; otherwise each touch and each new place begins a press."""
     if "indentation" in numbers:
         rows = np.flatnonzero(contact)  # the numbers of rows without contact are ignored
         number = numbers["indentation"][rows]
@@ -211,7 +211,7 @@ def _number_presses(
         if (counts > 1).any():
             twice = firsts[counts > 1][0]
             line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
-            found = f"indentation {twice:g} begins once more in line {line_n}"
+            found = f"indentation {twice:g} begins again in line {line_n}"
             raise CaptureError(f"{where}: {found}; its rows must be one block. Was the file joined twice?")
         begins_at = np.zeros(len(contact), bool)
         begins_at[rows[begins]] = True
@@ -225,7 +225,7 @@ def _number_presses(
 def _find_passes(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], press: Int[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]
 ) -> Int[np.ndarray, " f"]:
-    """Number the passes: a new pass begins where the sequence of places and greatest depths of presses repeats."""
+    """Number the passes: a new pass begins where the presses' sequence of places and greatest depths repeats."""
     of_press = [
         np.array([part.max() for part in np.split(numbers[name][contact], np.flatnonzero(np.diff(press[contact])) + 1)])
         for name in ("x_mm", "y_mm", "depth_mm")

@@ -149,8 +149,8 @@ def test_file_is_collected_under_its_capture_name(tmp_path: Path) -> None:
         (4, row(0, "contact", 160.0, place="5,6"), "the place changes within an indent, in line 4"),
         (4, row(0, "contact", 160.0, force="0,0,-356"), "in line 4. Convert grams"),
         (4, row(0, "contact", 4e5), "in line 4"),
-        (6, row(2, "contact", 90.0), "the indent from line 6 on has no whole noload row"),
-        (8, row(0, "noload", 90.0), "indent 0 begins once more in line 8"),
+        (6, row(2, "contact", 90.0), "the indent from line 6 on has no fault-free noload row"),
+        (8, row(0, "noload", 90.0), "indent 0 begins again in line 8"),
     ],
 )
 def test_broken_row_is_named(tmp_path: Path, line_n: int, broken: str, expected: str) -> None:

@@ -148,12 +148,12 @@ MISTAKES = {
     "no row before the first touch": (lambda t: t[3:], "the press in line 2 has no"),
     "no contact": (lambda t: t[t.phase == "noload"], "rows of phase contact"),
     "millitesla": (lambda t: t.assign(**{c: t[c] / 1e3 for c in plain.columns_of(CHIPS_N)[3:9]}), "Convert mT or G"),
-    "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Turn its sign"),
+    "force pulls": (lambda t: t.assign(Fz_N=-t.Fz_N), "Reverse its sign"),
     "nearly a name": (lambda t: t.rename(columns={"Fz_N": "Fz"}), "'Fz'"),
     "a force left out here": (lambda t: with_cell(t, 10, "Fz_N", ""), "Fz_N in line 12"),
     "a press twice": (
         lambda t: t.assign(indentation=np.repeat([0, 1, 0, 2, 3, 4], 7)),
-        "indentation 0 begins once more in line 19",
+        "indentation 0 begins again in line 19",
     ),
 }
 
