@@ -188,8 +188,8 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     samples = signal / np.abs(signal).mean()  # scaled, because most steps may have no frame
     weights, dwelt = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.dwelt))
     seen = _correlate(dwelt, np.abs(samples))
-    # The match, minus what a poor fit would match. Without this term, a shift that loses a dwell could compensate for it
-    # by overlapping more of the log.
+    # The match, minus what a poor fit would match. Without this term, a shift that loses a dwell could compensate for
+    # it by overlapping more of the log.
     score = _correlate(weights, samples) - EXPLAINED_MIN * seen
     score[seen < SEEN_MIN * seen.max()] = 0.0
     top_i = int(score.argmax())
@@ -198,8 +198,8 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # a wrong dwell counts twice
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
-            f"{where}: the field fits the dwells at two times almost equally well: the matches differ by {margin:.2g} "
-            f"of {dwelt.sum():.0f} indentations. {_REMEDY}"
+            f"{where}: the field fits the dwells at two times almost equally well, with matches that differ by "
+            f"{margin:.2g} of {dwelt.sum():.0f} indentations. {_REMEDY}"
         )
     return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
 

@@ -13,7 +13,8 @@ OUTLIER = 4.0  # distances are clipped to this multiple of the median distance
 # A change is reported if it explains as much as this many misaligned rows. In the two public recordings and in windows
 # of them, the largest value without a change is 12; a row lost 100 rows before the end gives 40 or more.
 EVIDENCE_ROWS_MIN_N = 30
-# Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. Noise alone reaches 0.17 in 300 rows.
+# Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. Noise alone reaches 0.17 in 300
+# rows.
 CONTRAST_MIN = 0.3
 
 
@@ -46,9 +47,8 @@ def find_change(
         lag = np.where(row < change_row, LAGS[before_i], LAGS[after_i])
     gain = distance.sum(axis=1).min() - distance[before_i, :change_row].sum() - distance[after_i, change_row:].sum()
     extra_cost = distance[after_i] - distance[before_i]
-    misaligned = float(
-        np.where(row < change_row, extra_cost, -extra_cost).mean()
-    )  # mean cost of giving a row the lag of the other part
+    # Mean cost of giving a row the lag of the other part.
+    misaligned = float(np.where(row < change_row, extra_cost, -extra_cost).mean())
     if misaligned <= CONTRAST_MIN * extra_cost.std() or gain < EVIDENCE_ROWS_MIN_N * misaligned:
         return None
     return Change(change_row, int(LAGS[before_i]), int(LAGS[after_i]))
@@ -118,9 +118,8 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
 
 
 AGREEMENT_MIN = 0.95
-SEEN_TWICE_MIN = (
-    0.25  # a shift by half the recording leaves only half the moves to compare, some of them without contact
-)
+# A shift by half the recording leaves only half the moves to compare, some of them without contact.
+SEEN_TWICE_MIN = 0.25
 PROBES_N = 256
 PROBES_MIN_N = 8  # with fewer probes, no period is excluded
 GOLDEN = (np.sqrt(5.0) - 1) / 2
@@ -146,7 +145,7 @@ def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " 
 def _likely_periods(
     place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"], moves: Int64[np.ndarray, "moves 2"]
 ) -> Int64[np.ndarray, " p"]:
-    """Return the periods that are compatible with a sample of moves from the first half; testing all moves is quadratic."""
+    """Return the periods that fit a sample of moves from the first half; testing all moves would be quadratic."""
     half_n = len(contact) // 2
     early = moves[moves[:, 1] < half_n]
     if not len(early):

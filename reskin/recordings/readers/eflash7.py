@@ -2,8 +2,9 @@
 
 One or two places of a 3 x 3 grid of unknown pitch are touched, so `x_mm` and `y_mm` are NaN. The account counts the
 rows of each place by its number n, as `place_<n>_rows_n`: n is 1 + column + 3 row, with columns and rows counted from
-0. The recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel. The no-load
-field is the mean over the untouched rows at the start of a recording, and forces are relative to their mean force.
+0. The recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel. The
+no-load field is the mean over the untouched rows at the start of a recording, and forces are relative to their mean
+force.
 """
 
 import re
@@ -79,9 +80,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
         )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))
-    written = ~log.record(
-        "zeros", _zero_rows(table.b_uT, where), row
-    )  # zeros on all chips; `rows` counts zeros on some chips
+    # Zeros on all chips are recorded here; `rows` counts zeros on some chips.
+    written = ~log.record("zeros", _zero_rows(table.b_uT, where), row)
     unknown_degC = np.full((int(written.sum()), header.chips_n), np.nan)
     b_uT = table.b_uT[written]
     rows = check_rows(b_uT, unknown_degC, header.expected_lsb_uT, where=where, policy=policy, row=row[written])
@@ -166,7 +166,7 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
 
 
 def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows with zeros for all chips, which the recorder writes when it has no reading; raise if there are too many."""
+    """Mark the rows with zeros for all chips, which the recorder writes without a reading; raise for too many."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
         found = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"

@@ -65,9 +65,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
     where = str(files[SENSOR])
     columns_n = len(read_cells(files[SENSOR], where, separator=",")[0])
     if columns_n < 1 + AXES_PER_CHIP_N or (columns_n - 1) % AXES_PER_CHIP_N:
-        raise CaptureError(
-            f"{where}: {columns_n} columns are not 1 for the time and 3 per chip. Is this layout eflesh?"
-        )
+        raise CaptureError(f"{where}: {columns_n} columns are not a time and 3 per chip. Is this layout eflesh?")
     return (columns_n - 1) // AXES_PER_CHIP_N
 
 
@@ -179,7 +177,7 @@ def _number_passes(
 
 
 def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Return the gauge's force by the name of its column, with NaN in rows without a new value; empty without a gauge."""
+    """Return the gauge's force by column name, with NaN in rows without a new value; empty without a gauge."""
     if states.shape[1] <= WEIGHT_COLUMN:
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:

@@ -1,8 +1,8 @@
 """Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row per indentation.
 
 Rows with a force below 0.02 N count as no contact, whatever place the truths state; they are kept without place and
-with zero force. The rows at the start of a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm` are
-unknown (NaN).
+with zero force. The rows at the start of a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm`
+are unknown (NaN).
 
 The fields may lag: row i of the truths belongs to a later row of the readings. The lag in rows is given in the header
 (`rows_late`); otherwise it is the lag at which |dB| correlates best with the force. If the lag changes within a
@@ -199,7 +199,7 @@ def _noload_field(
     if len(without):
         where = f"{header.capture}/{TRUTHS} line {int(np.argmax(pass_i == without[0])) + 1}"
         raise CaptureError(
-            f"{where}: this pass does not begin with a fault-free row without contact (F < {CONTACT_MIN_N} N). Start each pass "
-            "off the skin, or cut this pass out."
+            f"{where}: this pass does not begin with a fault-free row without contact (F < {CONTACT_MIN_N} N). "
+            "Start each pass off the skin, or cut this pass out."
         )
     return noload_uT[pass_i]

@@ -70,7 +70,7 @@ def keep_whole(
     *,
     first_row: int = 1,
 ) -> Log:
-    """Keep the frames in which every chip was read, and count the others; `first_row` is the number of the first row in errors."""
+    """Keep the frames in which every chip was read, and count the others; errors number rows from `first_row`."""
     _check_time(t_s, where, first_row)
     check_fields(b_uT, where, first_line_n=first_row)
     failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
@@ -115,7 +115,7 @@ def _chips_n(path: Path, where: str) -> int:
         raise CaptureError(f"{where}: {_header_fault(names)}")
     if last != b"\n":
         raise CaptureError(
-            f"{where}: the last line is cut: it has no line feed at its end. Remove it if the board was switched off at that time."
+            f"{where}: the last line is cut: no line feed ends it. Remove it if the board was switched off just then."
         )
     return chips_n
 

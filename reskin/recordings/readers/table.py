@@ -103,7 +103,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     reading_i[keep] = count_within(press[keep])
     readings = make_readings(
         header, keep, indentation=press, pass_i=pass_i, reading_i=reading_i,
-        x_mm=numbers["x_mm"], y_mm=numbers["y_mm"], depth_mm=unknown if depth_is_zero else numbers.get("depth_mm", unknown),
+        x_mm=numbers["x_mm"], y_mm=numbers["y_mm"],
+        depth_mm=unknown if depth_is_zero else numbers.get("depth_mm", unknown),
         **{axis: numbers.get(axis, unknown) for axis in ("Fx_N", "Fy_N", "Fz_N", "t_s")},
         b_uT=b_uT, noload_uT=noload_uT, temperature_degC=temperature_degC, n_contacts=header.contacts_before_n + press,
     )  # fmt: skip
@@ -184,7 +185,7 @@ def _check(
 
 
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
-    """Raise if fields are weak, and much weaker without contact than in contact, because a baseline was subtracted.
+    """Raise if fields are weak, and much weaker without contact than in contact: a baseline was subtracted.
 
     Wrong units also make fields weak, but scale both equally; in raw fields, the field at rest exceeds its change.
     """
@@ -202,7 +203,7 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
 def _number_presses(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str
 ) -> Int[np.ndarray, " f"]:
-    """Number presses from 0: by column `indentation` if present; otherwise each touch and each new place begins a press."""
+    """Number presses from 0: by column `indentation` if present, else one per touch and per new place."""
     if "indentation" in numbers:
         rows = np.flatnonzero(contact)  # the numbers of rows without contact are ignored
         number = numbers["indentation"][rows]
