@@ -1,4 +1,4 @@
-"""An emulated board: plays a capture or a simulation into a pseudo-terminal or TCP socket, with faults if requested."""
+"""An emulated board: sends a capture or a simulation to a pseudo-terminal or TCP socket, with optional faults."""
 
 import os
 import re
@@ -32,8 +32,8 @@ from reskin.simulation.defaults import NOMINAL, SHARED, nominal
 from reskin.simulation.settings import MAIN, parse_simulation
 
 NOMINAL_SOURCE = "nominal"
-SEED = 2021  # of a simulation without a seed of its own
-WALK = "log"  # the protocol that most resembles use by hand: touches with pauses between them
+SEED = 2021  # for a simulation whose file has no seed
+TOUCH_PROTOCOL = "log"  # touches with pauses between them; of all protocols, it resembles manual use the most
 
 START_S, DURATION_S = 3.0, 1.0  # defaults of a fault
 TORN_EVERY_N, TORN_BYTES_N = 10, 7
@@ -48,9 +48,9 @@ VALUE_FAULTS = (
 BYTE_FAULTS = ("repeated", "dropped", "torn", "wrong-baud")
 FAULTS = (*VALUE_FAULTS, *BYTE_FAULTS, "stall", "unplug")
 
-TICK_S = 0.1  # longest delay until a stop is noticed
-LATE_MAX_S = 0.1  # after being blocked for longer, the player does not catch up
-SENT_TOGETHER_N = 256  # maximum number of overdue frames that are sent at once
+TICK_S = 0.1  # longest delay before the player reacts to `stop`
+LATE_MAX_S = 0.1  # if sending is blocked for longer, the script is delayed instead of catching up
+BATCH_MAX_N = 256  # maximum number of overdue frames that are sent at once
 HOST = "127.0.0.1"
 TCP_PORT_MAX = 65535
 
@@ -59,26 +59,29 @@ Source = Literal["simulated", "recorded"]
 
 @dataclass(frozen=True)
 class Script:
-    """A stream to play, cut after each frame: the frames, the pieces of bytes, and when each piece is sent."""
+    """A byte stream to send: its frames, the bytes of each frame (a piece), and the time at which each piece is due."""
 
     source: Source
     wire: Wire
     frames: Frames
     pieces: list[bytes]
-    t_s: Float64[np.ndarray, " f"]  # time since the start
-    away_s: dict[int, float] = field(default_factory=dict)  # by piece, how long the board is unplugged before it
+    t_s: Float64[np.ndarray, " f"]  # due time of each piece since the start
+    unplugged_s: dict[int, float] = field(default_factory=dict)  # time unplugged before a piece, by index of the piece
 
     def __len__(self) -> int:
         return len(self.pieces)
 
     @property
     def duration_s(self) -> float:
-        """Duration, including the pause until the first frame is sent again."""
+        """Duration of one repetition in a loop: up to the time when the first frame is due again."""
         return float(self.t_s[-1] * len(self) / max(len(self) - 1, 1)) if len(self) else 0.0
 
 
 def read_script(source: str) -> Script:
-    """Read a capture's folder, or simulate: `nominal`, or a scene's YAML file (with a section `simulate`)."""
+    """Read a capture, or simulate one.
+
+    `source` is the folder of a capture, `nominal`, or the YAML file of a scene with a section `simulate`.
+    """
     folder = Path(source)
     if (folder / HEADER_FILE).is_file():
         return read_capture(folder)
@@ -88,7 +91,7 @@ def read_script(source: str) -> Script:
     if folder.suffix == ".yaml" and folder.is_file():
         scene = read_yaml(folder)
         if not isinstance(scene, dict) or "simulate" not in scene:
-            raise ParamsError(f"{source}: not a simulated scene. Give the folder of one of its captures.")
+            raise ParamsError(f"{source}: not a simulated scene. Use the folder of one of its captures.")
         return simulate(scene["simulate"], scene.get("seed", SEED), source)
     raise ParamsError(
         f"{source}: not the folder of a capture (with {HEADER_FILE}), {NOMINAL_SOURCE}, or the YAML file of a "
@@ -97,30 +100,30 @@ def read_script(source: str) -> Script:
 
 
 def read_capture(folder: Path) -> Script:
-    """Read a recorded stream, or the log of an SD card, which is sent as binary frames."""
+    """Read a recorded stream, or the log of an SD card, whose readings are encoded as binary frames."""
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)
         return _binary_script(header.source, b_uT, temperature_degC, t_s)
     if header.wire is None:
         raise CaptureError(
-            f"{folder}: a capture of layout {header.layout} cannot be replayed as a serial stream. Give one of layout "
-            "native or sd-card."
+            f"{folder}: a capture of layout {header.layout} cannot be replayed as a serial stream. Use a capture "
+            "with layout native or sd-card."
         )
     data = io.read_bytes(folder / STREAM_FILE)
     frames, _ = decode_all(data, header.wire, header.chips_n, str(folder / STREAM_FILE))
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     frames, t_s = frames.where(timed), t_s[timed]
-    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames go with the second
+    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames belong to the piece of the second
     pieces = [data[first:last] for first, last in pairwise(edges)]
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
 
 
 def simulate(section: Mapping[str, Any], seed: int, where: str) -> Script:
-    """Simulate the first skin of a section `simulate`: its protocol `log` if it has one, otherwise its grid."""
+    """Simulate the first skin of a section `simulate`, with protocol `log` if the section has it, else the grid."""
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
-    protocol = WALK if WALK in simulation.protocols else MAIN
+    protocol = TOUCH_PROTOCOL if TOUCH_PROTOCOL in simulation.protocols else MAIN
     board, skin = list_captures(simulation, protocol)[0]
     capture = simulate_capture(simulation, protocol, board=board, skin=skin, seed=seed)
     chunk_i = np.searchsorted(capture.arrived_frames_n, 1 + np.arange(len(capture.b_uT)))
@@ -133,7 +136,7 @@ def _binary_script(source: Source, b_uT: np.ndarray, temperature_degC: np.ndarra
 
 
 def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
-    """Encode frames as the firmware sends them, one piece of bytes per frame."""
+    """Encode frames as the firmware does; return the bytes of each frame."""
     data = encode(frames, wire)
     if wire in TEXT_WIRES:
         return data.splitlines(keepends=True)
@@ -155,28 +158,28 @@ def parse_fault(text: str) -> Fault:
     >>> parse_fault("stall@2.5+1")
     Fault(name='stall', start_s=2.5, duration_s=1.0)
     """
-    found = re.fullmatch(r"([a-z0-9-]+)(?:@(\d{1,6}(?:\.\d+)?)(?:\+(\d{1,6}(?:\.\d+)?))?)?", text)
-    if found is None or found[1] not in FAULTS:
+    match = re.fullmatch(r"([a-z0-9-]+)(?:@(\d{1,6}(?:\.\d+)?)(?:\+(\d{1,6}(?:\.\d+)?))?)?", text)
+    if match is None or match[1] not in FAULTS:
         raise ParamsError(
             f"--fault: {repr(text)[:40]} is not NAME[@START_S[+DURATION_S]] with one of {', '.join(FAULTS)}. "
             "Try: --fault stuck@3+1"
         )
-    return Fault(found[1], float(found[2] or START_S), float(found[3] or DURATION_S))
+    return Fault(match[1], float(match[2] or START_S), float(match[3] or DURATION_S))
 
 
 def inject(script: Script, fault: Fault) -> Script:
-    """Return a script with a fault. Faults of a single chip are injected into chip 1, or into the only chip."""
+    """Return the script with a fault added. Faults of a single chip affect chip 1, or the only chip of a board."""
     inside = (script.t_s >= fault.start_s) & (script.t_s < fault.start_s + fault.duration_s)
     if not inside.any():
         raise ParamsError(
-            f"--fault: {fault.name} starts at {fault.start_s:g} s, but only {script.duration_s:.1f} s are sent. "
+            f"--fault: {fault.name} starts at {fault.start_s:g} s, but the source ends at {script.duration_s:.1f} s. "
             f"Try: {fault.name}@0"
         )
     rows, first = np.flatnonzero(inside), int(inside.argmax())
     if fault.name in ("stall", "unplug"):
         later_s = script.t_s + fault.duration_s * (np.arange(len(script)) >= first)
-        away_s = script.away_s | ({first: fault.duration_s} if fault.name == "unplug" else {})
-        return replace(script, t_s=later_s, away_s=away_s)
+        unplugged_s = script.unplugged_s | ({first: fault.duration_s} if fault.name == "unplug" else {})
+        return replace(script, t_s=later_s, unplugged_s=unplugged_s)
     if fault.name in VALUE_FAULTS:
         frames = script.frames.where(inside)
         _change_values(frames, fault.name)
@@ -190,7 +193,7 @@ def inject(script: Script, fault: Fault) -> Script:
 
 
 def _change_values(frames: Frames, fault: str) -> None:
-    """Change what the chips of these frames measure, in place."""
+    """Change the measured values of these frames in place."""
     b_uT, temperature_degC = frames.b_uT.reshape(len(frames), -1, 3), frames.temperature_degC
     chip_i = min(1, temperature_degC.shape[1] - 1)
     match fault:
@@ -208,14 +211,14 @@ def _change_values(frames: Frames, fault: str) -> None:
         case "int16-wrap":
             b_uT[::2, chip_i, 2] -= WRAP_uT * np.sign(b_uT[::2, chip_i, 2])
         case "magnet":
-            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated about z only, so the change is the same for all
+            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated about z only, so the change in z is the same for all
         case "too-hot":
             temperature_degC[:, chip_i] = HOT_degC
         case "crlf":
             temperature_degC[:, chip_i] = CRLF_TEMPERATURE_degC
         case "clock-jump":
             if np.isnan(frames.device_s).all():
-                raise ParamsError("--fault: clock-jump needs frames with a clock. Give a capture of wire binary-clock.")
+                raise ParamsError("--fault: clock-jump needs frames with a clock. Use a binary-clock capture.")
             frames.device_s[:] += CLOCK_JUMP_S
 
 
@@ -245,7 +248,7 @@ class EmulatedPort:
         raise NotImplementedError
 
     def unplug(self) -> None:
-        """Remove the port, as when a cable is pulled, and to clean up at the end."""
+        """Remove the port: when the board is unplugged, and at the end to clean up."""
         raise NotImplementedError
 
     def send(self, data: bytes, stop: threading.Event) -> int:
@@ -259,7 +262,7 @@ class EmulatedPort:
 
 
 class Terminal(EmulatedPort):
-    """A pseudo-terminal; with a link, its name stays the same when it is unplugged and plugged in again."""
+    """A pseudo-terminal. A link gives it a name that stays the same after unplugging and plugging in again."""
 
     def __init__(self, link: Path | None = None) -> None:
         if not hasattr(os, "openpty"):
@@ -277,12 +280,12 @@ class Terminal(EmulatedPort):
 
         if self._link is not None and self._link.is_symlink() and self._link.exists():
             raise ParamsError(
-                f"--port: {self._link} leads to {os.readlink(self._link)}, which is in use, perhaps by another "
-                "`reskin emulate`. Stop that one, remove the link, or choose another name."
+                f"--port: {self._link} links to {os.readlink(self._link)}, which is in use, perhaps by another "
+                "`reskin emulate`. Stop that process, remove the link, or choose another name."
             )
         self._open_ends = self._far, self._near = os.openpty()
         tty.setraw(self._near)
-        # Packet mode reports when a reader opens the terminal, because opening flushes it.
+        # Opening a terminal flushes it, and packet mode reports the flush: this shows when a reader opens it.
         fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
         self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)
@@ -294,7 +297,7 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            self._link.unlink(missing_ok=True)  # while unplugged, the link may be another emulator's
+            self._link.unlink(missing_ok=True)  # another emulator may create it meanwhile
         for end in self._open_ends:
             os.close(end)
         self._open_ends = ()
@@ -312,7 +315,7 @@ class Terminal(EmulatedPort):
 
 
 class TcpServer(EmulatedPort):
-    """A TCP server on this machine, for one reader at a time: `socket://127.0.0.1:PORT`."""
+    """A TCP server on this machine that serves one reader at a time, at `socket://127.0.0.1:PORT`."""
 
     def __init__(self, number: int = 0) -> None:
         self._number = number
@@ -344,7 +347,7 @@ class TcpServer(EmulatedPort):
                 sent_n += self._client.send(data[sent_n:])
             except TimeoutError:
                 continue
-            except OSError:  # the reader has disconnected: wait for another
+            except OSError:  # the reader has disconnected: wait for the next one
                 if self._client is not None:
                     self._client.close()
                 self._client = None
@@ -352,7 +355,7 @@ class TcpServer(EmulatedPort):
 
 
 def make_port(kind: str) -> EmulatedPort:
-    """Create the port `pty`, `tcp`, `tcp:NUMBER`, or a pseudo-terminal with a link at a path."""
+    """Create the port that `kind` describes: `pty`, `tcp`, `tcp:NUMBER`, or the path of a link to a pseudo-terminal."""
     name, _, number = kind.partition(":")
     if kind == "pty":
         return Terminal()
@@ -362,39 +365,40 @@ def make_port(kind: str) -> EmulatedPort:
         return TcpServer(int(number or 0))
     if Path(kind).parent.is_dir() and "/" in kind:
         return Terminal(Path(kind))
-    raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT or ./NAME of a link to create. Try: pty")
+    raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT, or ./NAME for a link to create. Try: pty")
 
 
 def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: float = 1.0, loop: bool = False) -> int:
-    """Send a script through a port.
+    """Send the pieces of a script to a port when they are due.
 
     Parameters
     ----------
-    script, port : what to send, and where
-    stop : event that ends sending when another thread sets it
-    speed : multiple of the script's own rate; `math.inf` sends as fast as the reader reads
-    loop : start again at the end, and whenever a reader opens the port
+    script : the pieces to send
+    port : the port to send them to
+    stop : event that another thread sets to end sending
+    speed : factor by which to speed up the script; with `math.inf`, sends as fast as the reader reads
+    loop : whether to restart the script at its end and whenever a reader opens the port
 
     Returns
     -------
-    Number of bytes sent
+    Number of bytes sent.
     """
     sent_n, start_s, replugged = 0, time.monotonic(), False
     while not stop.is_set():
         i = 0
         while i < len(script) and not stop.is_set():
-            if i in script.away_s:
+            if i in script.unplugged_s:
                 port.unplug()
-                stop.wait(script.away_s[i])
+                stop.wait(script.unplugged_s[i])
                 port.plug_in()
-                replugged = True  # the next reader that opens the port continues within the script
+                replugged = True  # when a reader opens the port again, the script continues
             now_s, due_s = time.monotonic() - start_s, float(script.t_s[i]) / speed
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
                 continue
-            lost_s = max(now_s - due_s - LATE_MAX_S, 0.0)
-            start_s += lost_s
-            first, i = i, _end_of_batch(script, i, (now_s - lost_s) * speed)
+            blocked_s = max(now_s - due_s - LATE_MAX_S, 0.0)
+            start_s += blocked_s
+            first, i = i, _end_of_batch(script, i, (now_s - blocked_s) * speed)
             sent_n += port.send(b"".join(script.pieces[first:i]), stop)
             if port.was_opened():
                 if loop and not replugged:
@@ -407,17 +411,17 @@ def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: fl
 
 
 def _end_of_batch(script: Script, first: int, script_s: float) -> int:
-    """Return the end of the pieces that are due and sent together, at the latest at the next unplugging."""
+    """Return the index after the last piece of the batch to send now; no batch extends past an unplugging."""
     last = first + 1
-    end = min(len(script), first + SENT_TOGETHER_N)
-    while last < end and script.t_s[last] <= script_s and last not in script.away_s:
+    end = min(len(script), first + BATCH_MAX_N)
+    while last < end and script.t_s[last] <= script_s and last not in script.unplugged_s:
         last += 1
     return last
 
 
 @contextmanager
 def playing(script: Script) -> Iterator[str]:
-    """Play a script in a loop on another thread; yield the name of its port."""
+    """Send a script in a loop from another thread; yield the name of its port."""
     port, stop = (Terminal() if hasattr(os, "openpty") else TcpServer()), threading.Event()
     player = threading.Thread(target=play, args=[script, port, stop], kwargs={"loop": True}, daemon=True)
     player.start()

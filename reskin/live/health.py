@@ -10,16 +10,17 @@ from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults, find_reading
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
-BATCH_FRAMES_N = 40  # a tenth of a second with five chips: the delay of faults that need several frames
+BATCH_FRAMES_N = 40  # faults that span several frames are detected late by up to this: 0.1 s with five chips
 RATE_WINDOW_S = 1.0
-SLOW_SHARE = 0.7  # assumed: below this share of the usual rate, frames are missing
-USUAL_GAIN = 1e-4  # weight of each new rate in the running mean of the usual rate: half a minute at 400 Hz
-ACTIVE_S = 2.0  # how long an alarm stays on after it was last seen
-# Share of |dB|^2 that is not common to all chips. In all presses of scenes quick and lab it is 0.45 or more.
-COMMON_SHARE_MAX = 0.2
-COMMON_MIN_uT = 50.0  # about the earth's field
+SLOW_FRACTION = 0.7  # assumed: frames are missing if the rate is below this fraction of the usual rate
+USUAL_GAIN = 1e-4  # weight of each new rate in the exponential mean of the usual rate: about half a minute at 400 Hz
+ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrence
+# Fraction of |dB|^2 that is not common to all chips, below which the field is external. In all presses of scenes
+# `quick` and `lab` it is 0.45 or more.
+RESIDUAL_FRACTION_MAX = 0.2
+COMMON_MIN_uT = 50.0  # about the strength of the earth's field
 
-# A controller uses each reading at once, so a reading beyond the chip's range must not give a place and force.
+# A controller uses each reading at once, so a saturated reading must not be converted to a place and a force.
 LIVE_POLICY = FaultPolicy(
     failed_read="drop", zeros="drop", stuck="drop", too_hot="drop", saturated="drop", torn="drop", wrong_baud="drop",
     constant_channel="flag", chip_reset="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag",
@@ -29,7 +30,7 @@ LIVE_POLICY = FaultPolicy(
 
 @dataclass
 class Alarm:
-    """An alarm, with the number of frames or bytes that it concerns, and when it was seen, in unix seconds."""
+    """An alarm, with the number of affected frames or bytes, and the unix times of its first and last occurrence."""
 
     name: str
     count_n: int
@@ -46,27 +47,28 @@ class Health:
         self.alarms: dict[str, Alarm] = {}
         self.rate_hz = self._usual_hz = np.nan
         self._chips_n = chips_n
-        self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)  # an alarm needs less evidence than a refusal
+        # An alarm needs less evidence than the rejection of a capture.
+        self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
-        self._stuck = False  # a chip was stuck at the end of the last batch, and the policy does not only flag this
+        self._stuck = False  # whether a chip was stuck at the end of the last batch and the policy drops such frames
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
 
     def note(self, name: str, count_n: int, now_s: float, fault: str | None = None) -> None:
-        """Count an alarm; its action is the policy's for `fault`, or `flag`."""
+        """Add `count_n` to an alarm. Its action is that of the policy for `fault`; `flag` if no fault is given."""
         if count_n:
             action: Action = getattr(self.policy, fault) if fault is not None else "flag"
             alarm = self.alarms.setdefault(name, Alarm(name, 0, now_s, now_s, action))
             alarm.count_n, alarm.last_s = alarm.count_n + count_n, now_s
 
     def active(self, now_s: float) -> list[Alarm]:
-        """Return the alarms that were seen in the last `ACTIVE_S` seconds."""
+        """Return the alarms that occurred in the last `ACTIVE_S` seconds."""
         return [alarm for alarm in list(self.alarms.values()) if now_s - alarm.last_s <= ACTIVE_S]
 
     def feed(self, frames: Frames, now_s: float) -> Bool[np.ndarray, " f"]:
-        """Take the next frames; return the mask of frames to use, those whose faults, if any, the policy only flags.
+        """Check the next frames for faults; return the mask of usable frames: without faults that the policy drops.
 
-        Faults of single readings are found at once, the others in batches of `BATCH_FRAMES_N` frames.
+        Faults of single readings are detected at once, the others once per `BATCH_FRAMES_N` frames.
         """
         readings = find_reading_faults(frames.b_uT, frames.temperature_degC)
         faulty = self._note_chips("failed I2C reads", readings.failed_read, now_s, "failed_read")
@@ -74,19 +76,22 @@ class Health:
         faulty |= self._note_chips("temperature out of range", readings.too_hot, now_s, "too_hot")
         faulty |= self._note_chips("field at the end of the range", readings.saturated, now_s, "saturated")
         self._measure_rate(len(frames), now_s)
-        self._batch.append(frames.where(~readings.faulty_rows))  # one failed read must not hide what spans frames
+        self._batch.append(frames.where(~readings.faulty_rows))  # a failed read must not hide faults that span frames
         if sum(map(len, self._batch)) >= BATCH_FRAMES_N:
             batch, self._batch = concatenate(self._batch, self._chips_n), []
             self._note_batch(self._detector.feed(batch, np.full(len(batch), now_s)), now_s)
         return np.asarray(~faulty & (not self._stuck))
 
     def feed_change(self, db_uT: Float[np.ndarray, " ch"], turn: Float64[np.ndarray, "k 3 3"], now_s: float) -> None:
-        """Raise an alarm if the field change is common to all chips: an external field, or the board was rotated."""
+        """Raise an alarm if all chips measure nearly the same field change: an external field, or a rotated board.
+
+        `turn` rotates the axes of each chip to those of the board.
+        """
         b_uT = np.einsum("kij,kj->ki", turn, db_uT.reshape(-1, 3).astype(np.float64))
         common_uT = b_uT.mean(axis=0)
-        apart = ((b_uT - common_uT) ** 2).sum() / max((b_uT**2).sum(), 1e-9)
-        alike = len(b_uT) > 1 and apart < COMMON_SHARE_MAX and np.linalg.norm(common_uT) > COMMON_MIN_uT
-        self.note("external field: a magnet or iron is near, or the board was turned", int(alike), now_s)
+        residual = ((b_uT - common_uT) ** 2).sum() / max((b_uT**2).sum(), 1e-9)
+        external = len(b_uT) > 1 and residual < RESIDUAL_FRACTION_MAX and np.linalg.norm(common_uT) > COMMON_MIN_uT
+        self.note("external field: a magnet or iron is near, or the board was rotated", int(external), now_s)
 
     def _note_batch(self, faults: Faults, now_s: float) -> None:
         stuck = self._note_chips("stuck", faults.stuck, now_s, "stuck")
@@ -99,13 +104,13 @@ class Health:
             self._note_chips("step differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_chips(self, name: str, mask: Bool[np.ndarray, "f k"], now_s: float, fault: str) -> Bool[np.ndarray, " f"]:
-        """Count a fault by chip; return the mask of the frames that must not be used because of it."""
+        """Add a fault to the alarms of the affected chips; return the mask of the frames that the policy drops."""
         for chip_i in np.flatnonzero(mask.any(axis=0)):
             self.note(f"chip {chip_i}: {name}", int(mask[:, chip_i].sum()), now_s, fault)
         return np.asarray(mask.any(axis=1)) & (getattr(self.policy, fault) != "flag")
 
     def _measure_rate(self, frames_n: int, now_s: float) -> None:
-        """Measure the frame rate over a second. A low rate shows missing frames, as frames have no numbers."""
+        """Measure the frame rate over one second. Frames have no numbers, so only a low rate reveals missing frames."""
         self._arrivals.append((now_s, frames_n))
         self._arrived_n += frames_n
         while now_s - self._arrivals[0][0] > RATE_WINDOW_S:
@@ -117,5 +122,5 @@ class Health:
         self.rate_hz = (self._arrived_n - first_n) / span_s
         usual_hz = self.rate_hz if np.isnan(self._usual_hz) else self._usual_hz
         self._usual_hz = usual_hz + USUAL_GAIN * (self.rate_hz - usual_hz)
-        slow = self.rate_hz < SLOW_SHARE * self._usual_hz
+        slow = self.rate_hz < SLOW_FRACTION * self._usual_hz
         self.note("slower than before: frames are missing", int(slow), now_s, "dropped")

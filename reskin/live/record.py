@@ -1,4 +1,4 @@
-"""Record a board into a capture, with labels from prompts, a robot's table, a force gauge or a program."""
+"""Record a board into a capture, with labels from prompts, a robot's CSV file, a force gauge or a program."""
 
 import sys
 import time
@@ -39,13 +39,13 @@ class RecordingResult(NamedTuple):
 def label_source(
     labels: str | None, gauge: str | None, scan: str | None, *, dwell_s: float, say: Callable[[str], object]
 ) -> LabelSource | None:
-    """Return the source of labels for the options of `reskin record`; None without such options.
+    """Return the source of labels that the options of `reskin record` describe; None if they describe none.
 
     Parameters
     ----------
-    labels : places to prompt for, such as `grid:5x5:4`, or the CSV file that a robot's program appends to
+    labels : places to prompt for, such as `grid:5x5:4`, or a CSV file to which a robot's program appends labels
     gauge : port of a force gauge, `PORT` or `PORT@BAUD`
-    scan : order of prompts, "random" or "snake"
+    scan : order of the prompts, "random" or "snake"; the default is "random"
     dwell_s : how long a prompted label is valid
     say : called with each prompt
     """
@@ -63,7 +63,7 @@ def label_source(
             )
         return from_table(Path(labels))
     if scan not in (None, RANDOM, SNAKE):
-        raise ParamsError(f"--scan: prompts come in {RANDOM} or {SNAKE} order, not {scan}. The default is {RANDOM}.")
+        raise ParamsError(f"--scan: the order of prompts is {RANDOM} or {SNAKE}, not {scan}. The default is {RANDOM}.")
     forces = ForceGauge(port, gauge_baud) if gauge else None
     rng = rng_for(time.time_ns() % 2**31, "prompts")
     return Prompts(places, dwell_s, say, lambda: sys.stdin, forces, rng, scan or RANDOM).source()
@@ -78,7 +78,7 @@ def record_board(
     baud: int = BAUD,
     names: Mapping[str, str] | None = None,
 ) -> RecordingResult:
-    """Record until stopped, until the labels end, or until the board is unplugged.
+    """Record until the user stops it, `seconds` have passed, the labels end, or the board is unplugged.
 
     Parameters
     ----------
@@ -87,24 +87,27 @@ def record_board(
     folder : the capture's folder, which must be new; the default is captures/DATE-TIME
     seconds : maximum duration
     baud : baud rate; USB ports ignore it
-    names : names of board and skin and the order of places, under the keys board, skin and scan
+    names : values for the capture's header: names of the board and the skin, and the order of places, under the keys
+        board, skin and scan
     """
     folder, health = folder or new_folder(), Health(board.chips_n)
     scan = {"scan": labels.scan} if labels is not None and labels.scan is not None else {}
     settings = PortSettings(
         baud, board.wire, board.chips_n, seconds, bytes_max_n=None, silence_s=SILENCE_S, no_frame_s=NO_FRAME_S
     )
-    stream, of_labels, error = record_capture(
+    stream, labels_summary, error = record_capture(
         board.port, folder, info=replace(NO_INFO, **(scan | dict(names or {})), labels=labels), settings=settings,
         report=print_progress(lambda: [alarm.name for alarm in health.active(time.monotonic())]),
         watch=lambda frames: health.feed(frames, time.monotonic()),
     )  # fmt: skip
     counts = ", ".join(f"{key} {count}" for key, count in stream.account.items() if count)
-    alarms = [f"{one.name} ({one.count_n}, {one.last_s - one.first_s:.1f} s)" for one in health.alarms.values()]
+    alarms = [
+        f"{alarm.name} ({alarm.count_n}, {alarm.last_s - alarm.first_s:.1f} s)" for alarm in health.alarms.values()
+    ]
     where = str(folder)
     if stream.ended == "not written":
         folder = folder.with_name(f"{folder.name}.part")
-        where = f"{folder}: no more could be written"
-    counted = "; ".join([counts, *alarms, *([of_labels] if of_labels else [])])
+        where = f"{folder}, which is incomplete because writing failed"
+    counted = "; ".join([counts, *alarms, *([labels_summary] if labels_summary else [])])
     summary = f"recorded {where} ({stream.ended} after {stream.duration_s:.1f} s): {counted}"
     return RecordingResult(folder, summary, error)

@@ -1,7 +1,7 @@
 """The web server of `reskin live`: the page, and one websocket for each board on it.
 
-By default it listens on this machine only; for other addresses, a token is required. A request can name only the index
-of a board and a button: no path, name or number from a client reaches a file.
+By default, only this machine can connect; on any other address, requests need a token. A client chooses only among
+fixed pages, boards and buttons, so it cannot influence which files are read or written.
 """
 
 import asyncio
@@ -37,11 +37,11 @@ HEADERS = {
 
 
 class Server:
-    """Serves the page of several boards. With an empty token, only requests addressed to this machine are answered."""
+    """Serves the page of one or more boards. If the token is empty, only requests to a local host name are accepted."""
 
     def __init__(self, sessions: Sequence[Session], token: str) -> None:
         self._sessions, self._token = sessions, token
-        self._sockets: list[set[web.WebSocketResponse]] = [set() for _ in sessions]  # a page opens one for each board
+        self._sockets: list[set[web.WebSocketResponse]] = [set() for _ in sessions]  # one socket per page and board
 
     def application(self) -> web.Application:
         @web.middleware
@@ -57,12 +57,12 @@ class Server:
         return app
 
     def check(self, request: web.Request) -> None:
-        """Raise `HTTPForbidden` for a request without the token, or from another web site."""
+        """Raise `HTTPForbidden` if the token is wrong, or if the host or the origin is not allowed."""
         token = request.query.get("token") or request.cookies.get(COOKIE, "")
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
             raise web.HTTPForbidden(text="this page needs its token: use the address that reskin live printed\n")
-        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # another host name may resolve to this machine
+        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # protects from DNS rebinding
             raise web.HTTPForbidden(text="this page is served as localhost and 127.0.0.1 only\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page accepts no requests from other sites\n")
@@ -74,7 +74,7 @@ class Server:
         return response
 
     async def _connect(self, request: web.Request) -> web.StreamResponse:
-        """Open a websocket: send what is new about a board, and receive buttons, until either side closes it."""
+        """Serve a websocket until either side closes it: send the new data of a board, and receive button presses."""
         index = request.query.get("board", "0")
         if index not in map(str, range(len(self._sessions))):
             raise web.HTTPNotFound(text="there is no such board\n")
@@ -85,7 +85,7 @@ class Server:
         sockets.add(socket)
         try:
             await socket.prepare(request)
-            async with asyncio.TaskGroup() as group:  # an error on either side ends both
+            async with asyncio.TaskGroup() as group:  # an error while sending or receiving ends both
                 sending = group.create_task(self._send(session, socket))
                 async for message in socket:
                     if message.type == WSMsgType.TEXT:
@@ -96,17 +96,17 @@ class Server:
         return socket
 
     async def _send(self, session: Session, socket: web.WebSocketResponse) -> None:
-        """Send new data, at most 30 times per second; a slow page gets fewer messages, and nothing is queued."""
-        after_bin, sent, next_state_s, clock = 0, "", 0.0, asyncio.get_running_loop().time
+        """Send new data at most 30 times per second. A slow page receives fewer messages; none are queued for it."""
+        after_bin, sent_state, next_state_s, clock = 0, "", 0.0, asyncio.get_running_loop().time
         with suppress(ConnectionError):
             while not socket.closed:
                 start_s = clock()
                 if start_s >= next_state_s:
                     next_state_s = start_s + STATE_S
                     state = json.dumps({"boards_n": len(self._sessions), **session.state()})
-                    if state != sent:
+                    if state != sent_state:
                         await socket.send_str(state)
-                        sent = state
+                        sent_state = state
                 data, after_bin = session.message(after_bin)
                 if data:
                     await socket.send_bytes(data)
@@ -118,7 +118,7 @@ class Server:
 
 
 def receive(session: Session, text: str) -> None:
-    """Handle a message from a page: a button that was pressed, or the number of a message that was drawn."""
+    """Handle a message from a page: the name of a pressed button, or the number of a message that has been drawn."""
     with suppress(ValueError, RecursionError):
         message = json.loads(text)
         if isinstance(message, dict):
@@ -133,10 +133,10 @@ def serve(sessions: Sequence[Session], *, host: str, http_port: int, say: Callab
         session.start()
     try:
         address = f"http://{'localhost' if host in LOCAL else host}:{http_port}/{f'?token={token}' if token else ''}"
-        sentence = f"{', '.join(map(str, sessions))}: open {address}; Ctrl-C ends it"
+        announcement = f"{', '.join(map(str, sessions))}: open {address}; press Ctrl-C to stop"
         app = Server(sessions, token).application()
-        # `print` is called once the server listens.
-        web.run_app(app, host=host, port=http_port, print=lambda _: say(sentence), handle_signals=True)
+        # aiohttp calls `print` once, when the server listens.
+        web.run_app(app, host=host, port=http_port, print=lambda _: say(announcement), handle_signals=True)
     except OSError as error:
         if isinstance(error, gaierror) or error.errno in (None, errno.EADDRNOTAVAIL):
             remedy = "Try 127.0.0.1 (this machine only) or 0.0.0.0 (other machines too)."

@@ -1,4 +1,4 @@
-"""One board on the page of `reskin live`: the thread that estimates, the messages to pages, and the buttons."""
+"""One board on the page of `reskin live`: the estimating thread, the messages to pages, and the button actions."""
 
 import re
 import struct
@@ -22,29 +22,29 @@ from reskin.recordings.stream_recorder import CaptureWriter
 from reskin.seeds import rng_for
 
 POLL_S = 0.1
-# With several boards, frames are collected over this time: estimating them together is cheaper, and pages do not draw
-# more often.
+# With several boards, frames are collected for this time before estimation: estimating them together is cheaper, and
+# pages are not redrawn more often than this anyway.
 GATHER_S = 0.02
 
-WINDOW_S, BIN_S = 10.0, 0.02  # as in page/trace.js
+WINDOW_S, BIN_S = 10.0, 0.02  # must equal those in page/trace.js
 BINS_N = round(WINDOW_S / BIN_S)
-LATENCIES_N = 4000  # the last frames: ten seconds at 400 Hz
-UNCONFIRMED_MAX_N = 64  # messages sent to a screen and not yet confirmed
+LATENCIES_N = 4000  # number of latencies kept for statistics: those of the last ten seconds at 400 Hz
+UNCONFIRMED_MAX_N = 64  # messages that were sent and are not yet confirmed as drawn
 HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins, time of the last reading since start
 NUMBERS_N = 12  # x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, and four latencies in ms
 
 PRESSES_N = 12
-GUIDED_MM = CENTRE_MM + 3.0 * np.array([-1.5, -0.5, 0.5, 1.5])  # places shown to the user, along x and along y
-READINGS_MIN_N = 4  # readings in a press; shorter contacts are ignored
+GUIDED_MM = CENTRE_MM + 3.0 * np.array([-1.5, -0.5, 0.5, 1.5])  # grid of places to press, along x and along y
+READINGS_MIN_N = 4  # contacts with fewer readings do not count as presses
 
 
 class Traces:
-    """The last ten seconds, as pages draw them: minimum and maximum in bins of 20 ms, in a ring buffer."""
+    """Force and field changes of the last ten seconds: minimum and maximum of each 20 ms bin, in a ring buffer."""
 
     def __init__(self, layout: Layout, start_s: float) -> None:
         self._layout, self._start_s = layout, start_s
         self._chips_n = len(layout.chips_mm)
-        self._bin = np.full(BINS_N, -1)  # number of the bin at each place of the ring
+        self._bin = np.full(BINS_N, -1)  # number of the bin in each slot of the ring; -1 for an empty slot
         self._low = np.full((BINS_N, 1 + self._chips_n), np.nan, np.float32)  # force in N, then |dB| of each chip in uT
         self._high = self._low.copy()
         self._last: Estimates | None = None
@@ -58,7 +58,7 @@ class Traces:
         return int(self._bin.max())
 
     def add(self, estimates: Estimates, now_s: float) -> None:
-        """Add estimates that were ready at `now_s`."""
+        """Add estimates that became ready at `now_s`."""
         self._last = estimates
         self.to_estimate_s.extend((now_s - estimates.t_s).tolist())
         chips_uT = np.linalg.norm(estimates.db_uT.reshape(len(estimates), -1, 3), axis=2)
@@ -72,7 +72,10 @@ class Traces:
             self._high[i] = np.fmax(self._high[i], np.fmax.reduce(rows))
 
     def message(self, after_bin: int, *, rate_hz: float, lost_bytes_n: int) -> bytes:
-        """Return the last reading and the bins from `after_bin` on, whose first may have changed; empty at first."""
+        """Return a message with the last reading and the bins from `after_bin` on; empty before the first reading.
+
+        Bin `after_bin` itself is sent again, because readings may have been added to it.
+        """
         last = self._last
         if last is None:
             return b""
@@ -80,7 +83,7 @@ class Traces:
         self._unconfirmed.append((self._message_i, float(last.t_s[-1])))
         newest = self.newest_bin
         numbers = np.arange(max(after_bin, newest - BINS_N + 1, 0), newest + 1)
-        numbers = numbers[self._bin[numbers % BINS_N] == numbers]  # a bin without readings still holds an older one
+        numbers = numbers[self._bin[numbers % BINS_N] == numbers]  # the slot of a bin without readings has an older bin
         i = numbers % BINS_N
         latencies_ms = [
             1e3 * np.percentile(times_s, [50, 99]) if times_s else np.full(2, np.nan)
@@ -94,21 +97,21 @@ class Traces:
             np.array(now),
             *latencies_ms,
             change_uT.ravel(),
-            numbers * BIN_S - t_s,  # relative, because float32 cannot resolve a bin days after the start
+            numbers * BIN_S - t_s,  # relative: float32 cannot resolve 20 ms days after the start
             self._low[i].ravel(),
             self._high[i].ravel(),
         ]
         return head + np.concatenate(parts).astype("<f4").tobytes()
 
     def confirm(self, message_i: int, now_s: float) -> None:
-        """Record that a screen has shown a message."""
+        """Record the latency of a message that a page has drawn."""
         for sent_i, t_s in self._unconfirmed:
             if sent_i == message_i:
                 self.to_screen_s.append(now_s - t_s)
 
 
 class Presses:
-    """Collects the strongest reading of each contact, until there are enough to calibrate to."""
+    """Collects the strongest reading of each contact until there are enough presses to calibrate to."""
 
     def __init__(self, presses_n: int = PRESSES_N) -> None:
         self.presses_n = presses_n
@@ -138,7 +141,7 @@ class Presses:
         return np.array(self._strongest_uT)
 
     def add(self, estimates: Estimates) -> None:
-        """Add the next readings; a faulty reading does not end a contact."""
+        """Add the next readings; faulty readings are skipped, so they do not end a contact."""
         known = np.isfinite(estimates.db_uT).all(axis=1)
         for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
             if contact:
@@ -152,7 +155,7 @@ class Presses:
 
 
 class GuidedPresses(Presses):
-    """Presses at places that the page shows: a grid in random order. Every other press is held out for the test."""
+    """Presses at grid places that the page shows in random order; every second press is held out to test the result."""
 
     def __init__(self) -> None:
         grid_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2)
@@ -176,7 +179,7 @@ ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # by button
 
 
 class Session:
-    """A board that is polled on a thread of its own, with its traces, recording and calibration."""
+    """A board with its own polling thread, its traces, its recording and its calibration."""
 
     def __init__(
         self, port: str, models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True
@@ -206,7 +209,7 @@ class Session:
         self.skin.reader.stop()
 
     def _run(self) -> None:
-        """Estimate until `stop` is called; an error ends this and becomes an alarm on the page."""
+        """Poll and estimate until `stop` is called; an error ends the thread and appears as an alarm on the page."""
         try:
             while not self._stop.is_set():
                 estimates = self.skin.poll(POLL_S)
@@ -220,11 +223,14 @@ class Session:
                     self._stop.wait(GATHER_S)
         except ReskinError as error:
             self._error = str(error)
-        except Exception as error:  # in a model
-            self._error = f"estimates ended: {error!r}"
+        except Exception as error:  # any error of a model
+            self._error = f"estimation stopped: {error!r}"
 
     def _adapt(self, estimates: Estimates) -> None:
-        """Collect presses if a button requested it, and then calibrate; the reader keeps frames meanwhile."""
+        """Collect presses if a button requested them; calibrate when they are complete.
+
+        Bytes that arrive during the calibration are kept by the reader.
+        """
         presses, estimator = self._presses, self.skin.estimator
         if presses is not None and isinstance(estimator, UniversalEstimator):
             presses.add(estimates)
@@ -234,14 +240,14 @@ class Session:
                         self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
                     else:
                         self._adapted = estimator.adapt(presses.db_uT)
-                except SchemaError as error:  # of these presses
+                except SchemaError as error:  # the presses are unusable
                     self._adapted = str(error)
-                with self._button_lock:  # a button may have replaced the presses meanwhile
+                with self._button_lock:  # a button may have replaced the presses during the calibration
                     if self._presses is presses:
                         self._presses = None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
-        """Return the next binary message for a page that has the bins before `after_bin`, and its newest bin."""
+        """Return the next binary message for a page that has the bins before `after_bin`, and the newest bin."""
         with self._lock:
             if self.traces is None:
                 return b"", 0
@@ -250,7 +256,7 @@ class Session:
             return data, self.traces.newest_bin
 
     def state(self) -> dict[str, Any]:
-        """Return the JSON message of a page: texts, alarms, layout of the board. `page/live.js` reads its keys."""
+        """Return the JSON message for pages: texts, alarms and the board's layout. `page/live.js` reads these keys."""
         skin, detected, presses = self.skin, self.skin.detected, self._presses
         state: dict[str, Any] = {
             "what": self.source if self._alone else str(self), "zeroed": skin.zeroed,
@@ -268,14 +274,17 @@ class Session:
             layout, alarms = skin.layout, list(skin.health.alarms.values())
             state |= {
                 "board": skin.description,
-                "seen": [[one.name, one.count_n, round(one.last_s - one.first_s, 1), one.action] for one in alarms],
+                "seen": [
+                    [alarm.name, alarm.count_n, round(alarm.last_s - alarm.first_s, 1), alarm.action]
+                    for alarm in alarms
+                ],
                 "chips_mm": layout.chips_mm.tolist(), "places_known": layout.known, "corner_mm": layout.corner_mm,
                 "skin_mm": layout.skin_mm,
             }  # fmt: skip
         return state
 
     def confirm(self, message_i: object) -> None:
-        """Record that a screen has shown a message."""
+        """Record the latency of a message that a page has drawn."""
         if isinstance(message_i, int) and self.traces is not None:
             with self._lock:
                 self.traces.confirm(message_i, self.skin.reader.unix_s())
@@ -293,7 +302,7 @@ class Session:
                 self._begin_recording()
 
     def _begin_recording(self) -> None:
-        """Start to write the stream into a new capture."""
+        """Start writing the byte stream to a new capture."""
         folder, detected = new_folder(), self.skin.detected
         if not self._alone:  # recordings of several boards may begin in the same second
             folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', detected.port).strip('-')}")
@@ -320,6 +329,6 @@ class Session:
 def open_sessions(
     ports: Sequence[str], models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY
 ) -> list[Session]:
-    """Make a session for each port; the sessions share only the models' weights."""
+    """Create one session per port; the sessions share only the weights of the models."""
     check_ports(ports, models, "--port")
     return [Session(port, models, source, fault_policy, alone=len(ports) == 1) for port in ports]

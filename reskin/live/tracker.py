@@ -1,7 +1,7 @@
 """Estimate contacts on a running board: bytes from its port -> frames -> field changes -> place and force.
 
-`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes, so that a slow
-controller loses none; the caller's thread decodes them and estimates.
+`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes, so that none are
+lost if the controller is slow; the caller's thread decodes the bytes and estimates.
 """
 
 import threading
@@ -43,21 +43,21 @@ from reskin.universal.model import MISFIT_MAX, Universal
 
 NOLOAD_S = 1.0  # time without contact over which the no-load reading is averaged
 NOLOAD_FRAMES_MAX_N = 10_000
-HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # amount of data from which the wire format is detected
-SILENT_S = 0.3  # after this time without data, a controller receives a contact of NaN
-OPENING_S = 10.0
-ENDS_KEPT_N = 256  # number of chunks whose ends are kept, to time frames that are decoded late
+HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # the wire format is detected when either amount of data has arrived
+SILENT_S = 0.3  # after this time without data, a controller receives a contact whose values are NaN
+OPENING_S = 10.0  # longest time for the detection and the no-load reading when a port is opened
+ENDS_KEPT_N = 256  # number of recent chunks whose ends are kept, for the arrival times of frames that are decoded later
 FRAME_BYTES_MIN_N = 16  # per chip, in any wire format
-SPACING_MM = 5.0  # spacing of chips on the page if their places are unknown
-# Largest input of a network, in standard deviations over training. Assumed; 6 is reached in scene quick, and 7 on the
-# boards of scene lab with its own models.
+SPACING_MM = 5.0  # spacing of chips on the page if their positions are unknown
+# Largest plausible input of a network, in standard deviations over its training rows. Assumed; the largest observed
+# value is 6 in scene `quick`, and 7 for the boards of scene `lab` with that scene's models.
 UNKNOWN_SDS = 10.0
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"
 UNKNOWN_SKIN = "unknown skin: the model has not seen such a field change"
 
-Models = Sequence[Network] | Universal  # an empty sequence: no estimates
+Models = Sequence[Network] | Universal  # without networks, no place or force is estimated
 
 
 class Prediction(NamedTuple):
@@ -65,22 +65,24 @@ class Prediction(NamedTuple):
 
     target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
     sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if unknown
-    unknown: Bool[np.ndarray, " f"]  # unlike the skins that the model was trained on
+    unknown: Bool[np.ndarray, " f"]  # whether the reading is unlike the skins that the model was trained on
 
 
 class NetworkEstimator:
-    """The mean of trained networks. The standard deviation is that between the networks, not of their error."""
+    """The mean prediction of trained networks. `sd_mm` is the spread between the networks, not their error."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         self.channels_n: int = networks[0].card["input"]["channels_n"]
         self.name = f"{len(networks)} network{'s' if len(networks) > 1 else ''}"
         self._networks = networks
-        self._inputs = [(VIEW[one.card["recipe"]["inputs"]], Scaler.of_arrays(one.tensors)) for one in networks]
-        for network in networks:  # import torch and build the network now, not at the first contact
+        self._inputs = [
+            (VIEW[network.card["recipe"]["inputs"]], Scaler.of_arrays(network.tensors)) for network in networks
+        ]
+        for network in networks:  # imports torch and builds the network now, not at the first contact
             network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Do nothing: networks use field changes only."""
+        """Do nothing, because networks use only field changes."""
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
         targets = np.stack([network(db_uT) for network in self._networks]).astype(np.float64)
@@ -90,42 +92,42 @@ class NetworkEstimator:
 
 
 class UniversalEstimator:
-    """The universal model with a further calibration to the no-load field and to presses.
+    """The universal model, calibrated to the board's no-load field and to presses in addition to its own calibration.
 
-    The model that is passed in is not changed, and its own calibration is kept. New presses replace those of an earlier
-    call, so that bad presses can be corrected by repeating them.
+    The given model is not changed. New presses replace those of an earlier call, so that the user can repeat bad
+    presses.
     """
 
     channels_n = CHANNELS_N
     name = "universal model"
 
     def __init__(self, model: Universal) -> None:
-        self._given = model
-        # Until the first no-load reading of the board, zeros.
+        self._given_model = model
+        # Zeros until the first no-load reading, unless the model already has one.
         self._noload_uT = model.noload_uT if model.zeroed else np.zeros(CHANNELS_N)
         self._presses_uT = np.zeros((0, CHANNELS_N))  # field changes for presses at unknown places
         self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))
         self._calibrate()
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Take the mean of readings without contact as the no-load field, and calibrate again."""
+        """Set the no-load field to the mean of readings without contact, and recalibrate."""
         self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
         self._calibrate()
 
     def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
-        """Calibrate to presses at unknown places; return a text with standard deviation and misfit before and after.
+        """Calibrate to presses at unknown places; return a summary of standard deviation and misfit before and after.
 
         Raises
         ------
         SchemaError
-            If no press changes the field; nothing is changed then.
+            If no press changes the field. The calibration is then unchanged.
         """
         check_presses(db_uT)
         before, self._presses_uT = self._estimate(db_uT), db_uT.astype(np.float64)
         self._calibrate()
         after = self._estimate(db_uT)
-        sd_mm = [np.median(each.sd_mm.max(axis=1)) for each in (before, after)]
-        misfit = [np.median(each.misfit) for each in (before, after)]
+        sd_mm = [np.median(estimate.sd_mm.max(axis=1)) for estimate in (before, after)]
+        misfit = [np.median(estimate.misfit) for estimate in (before, after)]
         return (
             f"adapted to {len(db_uT)} presses: standard deviation of a place {sd_mm[0]:.2f} mm before, {sd_mm[1]:.2f} "
             f"mm after; misfit {misfit[0]:.2f} before, {misfit[1]:.2f} after"
@@ -134,20 +136,20 @@ class UniversalEstimator:
     def label(
         self, place_mm: Float[np.ndarray, "n 2"], db_uT: Float[np.ndarray, "n ch"], held_out: Bool[np.ndarray, " n"]
     ) -> str:
-        """Calibrate to presses at known places; return a text with the error at held-out presses before and after.
+        """Calibrate to presses at known places; return a summary of the error at held-out presses before and after.
 
-        The force was not measured; the model's own estimate is used as its label.
+        The forces were not measured, so the model's own estimates are used as force labels.
 
         Raises
         ------
         SchemaError
-            If no press changes the field; nothing is changed then.
+            If no press changes the field. The calibration is then unchanged.
         """
         check_presses(db_uT[~held_out])
 
         def error_mm() -> float:
-            found_mm = self._estimate(db_uT[held_out]).place_mm
-            return float(np.median(np.linalg.norm(found_mm - place_mm[held_out], axis=1)))
+            estimated_mm = self._estimate(db_uT[held_out]).place_mm
+            return float(np.median(np.linalg.norm(estimated_mm - place_mm[held_out], axis=1)))
 
         before_mm = error_mm()
         self._labelled_mm, self._labelled_uT = place_mm[~held_out], db_uT[~held_out].astype(np.float64)
@@ -158,51 +160,52 @@ class UniversalEstimator:
         )
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
-        found = self._estimate(db_uT)
-        target = np.column_stack([found.place_mm, found.force_N])
-        return Prediction(target, found.sd_mm, np.asarray(found.misfit > MISFIT_MAX))
+        estimate = self._estimate(db_uT)
+        target = np.column_stack([estimate.place_mm, estimate.force_N])
+        return Prediction(target, estimate.sd_mm, np.asarray(estimate.misfit > MISFIT_MAX))
 
     def _estimate(self, db_uT: Float[np.ndarray, "n ch"]) -> Estimate:
         return self._model.estimate(db_uT + self._noload_uT)
 
     def _calibrate(self) -> None:
-        model = copy(self._given).zero(self._noload_uT, keep=True)
+        model = copy(self._given_model).zero(self._noload_uT, keep=True)
         if len(self._presses_uT):
             model.see(self._presses_uT + self._noload_uT)
         if len(self._labelled_uT):
             b_uT = self._labelled_uT + self._noload_uT
             model.label(self._labelled_mm, model.estimate(b_uT).force_N, b_uT, keep=True)
-        model.estimate(self._noload_uT)  # prepares the model now, not at the first contact
+        model.estimate(self._noload_uT)  # makes the model do its preparations now, not at the first contact
         self._model = model
 
 
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
-    """Raise ParamsError for ports named twice, too many ports, or one skin's calibration used for several boards."""
+    """Raise ParamsError if a port is invalid or named twice, or if a model calibrated to one skin has several ports."""
     find.check_named_once(ports, where)
-    for port in ports:  # one that is unplugged is waited for
+    for port in ports:  # only the names are checked: an unplugged board may be plugged in later
         check_name(port)
     if len(ports) > 1 and isinstance(models, Universal) and models.presses_n:
         raise ParamsError(
             f"{where}: a model that is calibrated to one skin ({models.presses_n} presses) cannot estimate for "
-            f"{len(ports)} boards. Open that board alone, or give no model."
+            f"{len(ports)} boards. Open only that board, or omit the model."
         )
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of a board's chips, in the frame of the labels."""
+    """Positions of a board's chips, in the coordinate frame of the labels."""
 
-    known: bool
+    known: bool  # False: the positions are unknown, and chips are shown in a row
     chips_mm: Float64[np.ndarray, "k 2"]
-    turn: Float64[np.ndarray, "k 3 3"]  # each chip's axes in the frame of the board
-    corner_mm: tuple[float, float]
-    skin_mm: tuple[float, float]
+    turn: Float64[np.ndarray, "k 3 3"]  # rotation from each chip's axes to the board's axes
+    corner_mm: tuple[float, float]  # lower left corner of the skin
+    skin_mm: tuple[float, float]  # sides of the skin along x and y
 
 
 def layout_of(chips_n: int) -> Layout:
-    """Return the layout of the nominal board with this number of chips; for other numbers, chips are put in a row.
+    """Return the layout of the nominal board with this number of chips; if there is none, arrange the chips in a row.
 
-    The bytes do not identify the board: five chips are assumed to be the paper's board, forty its sleeve.
+    The byte stream does not identify the board, so a board with five chips is assumed to be the paper's board, and one
+    with forty chips its sleeve.
     """
     for name, settings in nominal("boards").items():
         design = parse(BoardDesign, settings["design"], f"nominal board {name}")
@@ -223,26 +226,26 @@ def layout_of(chips_n: int) -> Layout:
 class Contact(NamedTuple):
     """One reading of a board, with its estimate.
 
-    Without contact the place is NaN and the force 0. If nothing is known, all three are NaN, and `alarms` says why: a
-    failed read, or a board that is silent or unplugged.
+    Without contact, the place is NaN and the force 0. Without a usable reading, place and force are NaN, and `alarms`
+    gives the reason, such as a failed read, or a board that is silent or unplugged.
     """
 
-    t_s: float  # unix time at which its last byte arrived
+    t_s: float  # unix time at which the last byte of the reading arrived
     x_mm: float
     y_mm: float
     F_N: float
-    sd_mm: tuple[float, float]  # of x and y, from the universal model or between networks (NaN for one network)
+    sd_mm: tuple[float, float]  # of x and y: of the universal model, or between networks (NaN for a single network)
     b_uT: Float32[np.ndarray, " ch"]
-    alarms: tuple[str, ...]  # what is wrong with the board; empty when all is well
+    alarms: tuple[str, ...]  # current problems of the board; empty if there are none
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Frames that were decoded together, in order, with their estimates."""
+    """Frames that were decoded together, in the order of arrival, with their estimates."""
 
     t_s: Float64[np.ndarray, " f"]
     b_uT: Float32[np.ndarray, "f ch"]
-    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading is taken, and for frames with faults
+    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading is taken, and for faulty frames
     target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N, as in `Contact`; NaN without a model
     sd_mm: Float64[np.ndarray, "f 2"]
     contact: Bool[np.ndarray, " f"]
@@ -254,8 +257,8 @@ class Estimates:
 class LiveSkin:
     """A skin on a port, returned by `reskin.open`.
 
-    Use it in a `with` statement, which opens the port and takes the no-load reading. Iterate over it for the latest
-    contact, or over `every()` for each reading.
+    Use it in a `with` statement, which opens the port and takes the no-load reading. Iterating over it yields the
+    latest contact; iterating over `every()` yields the contact of every reading.
     """
 
     def __init__(
@@ -263,7 +266,7 @@ class LiveSkin:
     ) -> None:
         self.port, self.fault_policy = port, fault_policy
         self.detected = find.DetectedBoard(port, WAITING)
-        self.description = port  # with wire format, chips and scale, once they are detected
+        self.description = port  # once detected: port, wire format and scale
         self.account: Counter[str] = Counter()  # the counts of `FrameStream`, over all streams since the start
         self.reader = Reader(port, baud)
         self.estimator: NetworkEstimator | UniversalEstimator | None = None
@@ -273,11 +276,11 @@ class LiveSkin:
             self.estimator = NetworkEstimator(models)
         self._model_problem = ""
         self._head: list[Chunk] = []
-        self._partial_first_bytes_n = 0  # bytes of frames that were being sent when the port was opened
+        self._partial_first_bytes_n = 0  # bytes of frames that were cut by opening the port
         self._restart_noload()
 
     def __enter__(self) -> "LiveSkin":
-        """Open the port, detect the wire format, and take the no-load reading; nothing may touch the skin meanwhile."""
+        """Open the port, detect the wire format, and take the no-load reading, while nothing touches the skin."""
         self.reader.start(must_exist=True)
         try:
             end_s = self.reader.unix_s() + OPENING_S
@@ -297,15 +300,18 @@ class LiveSkin:
         self.reader.stop()
 
     def __iter__(self) -> Iterator[Contact]:
-        """Yield the latest reading, each at most once; earlier ones are decoded and skipped.
+        """Yield the contact of the latest reading, never the same one twice; readings that became outdated are skipped.
 
-        Yields a contact of NaN if no data arrives for `SILENT_S`, or the board is unplugged.
+        Yields a contact whose values are NaN if no data arrives for `SILENT_S` or the board is unplugged.
         """
         while True:
             yield self._contact(self.poll(SILENT_S, latest=True), -1)
 
     def every(self) -> Iterator[Contact]:
-        """Yield every reading. A caller that is two minutes late loses the oldest; see `reader.missed_bytes_n`."""
+        """Yield the contact of every reading.
+
+        If the caller falls two minutes behind, the oldest readings are lost and counted in `reader.missed_bytes_n`.
+        """
         while True:
             estimates = self.poll(SILENT_S)
             for i in range(max(len(estimates) if estimates else 0, 1)):
@@ -313,21 +319,21 @@ class LiveSkin:
 
     def zero(self) -> None:
         """Take a new no-load reading from the next second without contact; may be called from any thread."""
-        self._noload_asked = True  # the polling thread restarts it, as only that thread may change the collected frames
+        self._noload_requested = True  # only a request, because only the polling thread may change the collected frames
 
     @property
     def zeroed(self) -> bool:
         """Whether the no-load reading has been taken."""
-        return self.noload_uT is not None and not self._noload_asked
+        return self.noload_uT is not None and not self._noload_requested
 
     @property
     def silent(self) -> bool:
-        """Whether no data arrives, so that the last reading is out of date."""
+        """Whether no data has arrived for `SILENT_S`, so that the last reading is outdated."""
         return not self.detected.problem and self.reader.unix_s() - self._ends[-1][1] > SILENT_S
 
     @property
     def lost_bytes_n(self) -> int:
-        """Number of bytes read too late or outside frames, except for a frame that was cut by opening the port."""
+        """Number of bytes read too late or outside frames; a frame that was cut by opening the port does not count."""
         skipped_n = sum(count for name, count in self.account.items() if name.startswith("skipped_"))
         return skipped_n + self.reader.missed_bytes_n - self._partial_first_bytes_n
 
@@ -351,11 +357,11 @@ class LiveSkin:
         Parameters
         ----------
         wait_s : longest time to wait for data
-        latest : whether to estimate for the last frame only
+        latest : whether to return estimates for the last frame only
 
         Returns
         -------
-        Estimates, or None if no frame arrived
+        Estimates, or None if no frame arrived.
         """
         chunks = self.reader.take(wait_s)
         if not chunks:
@@ -378,7 +384,7 @@ class LiveSkin:
         return self._estimate(frames, t_s, sound)
 
     def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Collect bytes until the wire format is detected; then return all of them."""
+        """Collect chunks until there are enough to detect the wire format; then return all of them."""
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
@@ -393,18 +399,22 @@ class LiveSkin:
         self.description = f"{detected.port}: {detected.format}, {detected.scale}"
         self.health, self.layout = Health(detected.chips_n, self.fault_policy), layout_of(detected.chips_n)
         self._start_stream(detected)
-        self.detected = detected  # last: another thread that sees it uses the attributes above
+        self.detected = detected  # set last, because other threads then use the attributes set above
         return chunks
 
     def _reject_model(self, estimator: NetworkEstimator | UniversalEstimator, chips_n: int) -> None:
-        """Raise for networks of other boards; drop the universal model with an alarm, as it may be the default."""
+        """Handle a model for another number of chips.
+
+        Networks raise `SchemaError`, because the user chose them. The universal model may be the default, so it is only
+        disabled, with an alarm.
+        """
         if isinstance(estimator, NetworkEstimator):
             raise SchemaError(
                 f"{self.port}: the board has {3 * chips_n} channels, but the model {estimator.channels_n}. "
-                "Give a model that was trained on such boards."
+                "Use a model that was trained on such boards."
             )
         self.estimator = None
-        self._model_problem = f"no place or force: the {estimator.name} is for five chips. Give a model for this board."
+        self._model_problem = f"no place or force: the {estimator.name} is for five chips. Use a model for this board."
 
     def _start_stream(self, detected: find.DetectedBoard) -> None:
         self._stream = FrameStream(detected.wire, detected.chips_n)
@@ -413,7 +423,7 @@ class LiveSkin:
         self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Return the frames in chunks with arrival times; a board that was plugged in again starts a new stream."""
+        """Return the frames in the chunks and their arrival times; a board plugged in again starts a new stream."""
         starts = [i for i, (chunk, _) in enumerate(chunks) if chunk == PLUGGED_IN]
         parts = []
         for first, last in pairwise([0, *starts, len(chunks)]):
@@ -426,9 +436,9 @@ class LiveSkin:
         return frames, np.concatenate([t_s for _, t_s in parts])
 
     def _decode_stream(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Decode chunks of one stream; the arrival time of a frame is that of the chunk with its last byte."""
-        for chunk, came_s in chunks:
-            self._ends.append((self._ends[-1][0] + len(chunk), came_s))
+        """Decode chunks of one stream. A frame's arrival time is that of the chunk that contains its last byte."""
+        for chunk, arrival_s in chunks:
+            self._ends.append((self._ends[-1][0] + len(chunk), arrival_s))
         frames = self._stream.feed(b"".join(chunk for chunk, _ in chunks))
         self._count_bytes(self._ends[-1][1])
         last = len(self._ends) - 1
@@ -436,14 +446,15 @@ class LiveSkin:
         return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
     def _count_bytes(self, now_s: float) -> None:
-        """Add the stream's counts since the last call to the account, and raise alarms for lost bytes."""
+        """Add the stream's counts since the last call to `account`, and raise alarms for lost bytes."""
         frame_min_n = FRAME_BYTES_MIN_N * self.detected.chips_n
         counted = Counter(self._stream.account())
         new, at_start, self._counted = counted - self._counted, not self._counted["frames_n"], counted
         self.account += new
         lost_n = sum(count for name, count in new.items() if name.startswith("skipped_"))
         frame_n = new["frame_bytes_n"] / new["frames_n"] if new["frames_n"] else frame_min_n
-        # The port was opened within a frame. One byte more may be lost: a last byte alone does not show the next frame.
+        # The port was opened in the middle of a frame, whose bytes do not count as lost. One more byte may be skipped,
+        # because the next frame cannot be recognised from the last byte of the cut frame alone.
         if at_start and self._first_bytes_n + lost_n <= frame_n + 1:
             self._first_bytes_n += lost_n
             self._partial_first_bytes_n += lost_n
@@ -455,31 +466,31 @@ class LiveSkin:
 
     def _restart_noload(self) -> None:
         self.noload_uT: Float64[np.ndarray, " ch"] | None = None
-        self._contact_uT = np.inf  # |dB| above which there is contact
+        self._contact_uT = np.inf  # threshold of |dB| for a contact
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
-        self._noload_asked = False  # last, so that the next `poll` sees any later request
+        self._noload_requested = False  # set last, so that a request during this call is not forgotten
 
     def _take_noload(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
-        """Collect a second of frames; if nothing moved, take their mean as the no-load reading."""
-        if self._noload_asked:
+        """Collect frames for one second; if nothing moved, use their mean as the no-load reading."""
+        if self._noload_requested:
             self._restart_noload()
         self._quiet.append(frames)
         self._quiet_from_s = min(self._quiet_from_s, t_s[0])
-        lasted_s = t_s[-1] - self._quiet_from_s
+        duration_s = t_s[-1] - self._quiet_from_s
         b_uT = np.concatenate([part.b_uT for part in self._quiet])
-        if len(b_uT) < 2 or (lasted_s < NOLOAD_S and len(b_uT) < NOLOAD_FRAMES_MAX_N):
+        if len(b_uT) < 2 or (duration_s < NOLOAD_S and len(b_uT) < NOLOAD_FRAMES_MAX_N):
             return
         self._quiet, self._quiet_from_s = [], np.inf
-        with suppress(CaptureError):  # something moved: the next second may be quiet
-            # Evenly spaced times, because the frames of a chunk have the same arrival time.
-            b_uT = b_uT[: quiet_start(np.linspace(0, lasted_s, len(b_uT)), b_uT, where=self.port)]
+        with suppress(CaptureError):  # something moved: try again with the next second
+            # Times are assumed to be evenly spaced, because all frames of a chunk have the same arrival time.
+            b_uT = b_uT[: quiet_start(np.linspace(0, duration_s, len(b_uT)), b_uT, where=self.port)]
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)
             noload_uT = b_uT.mean(axis=0, dtype=np.float64)
             noise_uT = b_uT - noload_uT
-            length_uT = np.median(np.linalg.norm(noise_uT, axis=1))
-            self._contact_uT = float(length_uT + CONTACT_SDS * np.sqrt((noise_uT**2).mean()))
+            magnitude_uT = np.median(np.linalg.norm(noise_uT, axis=1))
+            self._contact_uT = float(magnitude_uT + CONTACT_SDS * np.sqrt((noise_uT**2).mean()))
             self.noload_uT = noload_uT
 
     def _estimate(self, frames: Frames, t_s: Float64[np.ndarray, " f"], sound: Bool[np.ndarray, " f"]) -> Estimates:
@@ -500,15 +511,15 @@ class LiveSkin:
 
     def _contact(self, estimates: Estimates | None, i: int) -> Contact:
         if estimates is None:
-            nothing_uT = np.full(3 * self.detected.chips_n, np.nan, np.float32)
-            return Contact(self.reader.taken_s, np.nan, np.nan, np.nan, (np.nan, np.nan), nothing_uT, self.alarms())
+            unknown_uT = np.full(3 * self.detected.chips_n, np.nan, np.float32)
+            return Contact(self.reader.taken_s, np.nan, np.nan, np.nan, (np.nan, np.nan), unknown_uT, self.alarms())
         (x_mm, y_mm, force_N), (sd_x_mm, sd_y_mm) = estimates.target[i].tolist(), estimates.sd_mm[i].tolist()
         t_s, sd_mm = float(estimates.t_s[i]), (sd_x_mm, sd_y_mm)
         return Contact(t_s, x_mm, y_mm, force_N, sd_mm, estimates.b_uT[i], self.alarms())
 
 
 class LiveSkins:
-    """Skins on several ports. Iterate over it for tuples of their latest contacts, in the order of the ports."""
+    """Skins on several ports. Iterating over it yields tuples of their latest contacts, in the order of the ports."""
 
     def __init__(self, skins: Sequence[LiveSkin]) -> None:
         self.skins = skins
@@ -522,7 +533,7 @@ class LiveSkins:
         ]
 
     def __enter__(self) -> "LiveSkins":
-        """Open all ports and take all no-load readings at once; if one port fails, none is left open."""
+        """Open all ports and take all no-load readings simultaneously; if one port fails, close all of them."""
         with self._open_ports as ports, ThreadPoolExecutor(len(self.skins)) as pool:
             for opening in [pool.submit(ports.enter_context, skin) for skin in self.skins]:
                 opening.result()
@@ -538,7 +549,7 @@ class LiveSkins:
         self._open_ports.close()
 
     def __iter__(self) -> Iterator[tuple[Contact, ...]]:
-        """Yield the latest contacts of all boards whenever any board has a new one; a silent board's is NaN."""
+        """Yield the latest contacts of all boards whenever a board has a new one; values of silent boards are NaN."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._error or (self._new and None not in self._latest))
@@ -556,7 +567,7 @@ class LiveSkins:
                     self._changed.notify()
                 if self._stop.is_set():
                     return
-        except Exception as error:  # raised again where the caller iterates
+        except Exception as error:  # raised in `__iter__`, on the caller's thread
             with self._changed:
                 self._error = error
                 self._changed.notify()

@@ -136,7 +136,7 @@ def test_link_in_use_is_refused_and_kept(tmp_path):
     link = tmp_path / "board"
     first = make_port(str(link))
     leads_to = link.readlink()
-    with pytest.raises(ParamsError, match=r"--port: .*board leads to /dev/.*, which is in use"):
+    with pytest.raises(ParamsError, match=r"--port: .*board links to /dev/.*, which is in use"):
         make_port(str(link))
     assert link.readlink() == leads_to
     first.unplug()

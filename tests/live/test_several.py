@@ -116,10 +116,10 @@ def test_model_error_is_an_alarm_on_the_page():
     live.skin.estimator = FailingModel()
     live.start()
     end_s = time.monotonic() + 60.0
-    while not any("estimates ended" in alarm for alarm in live.state()["alarms"]) and time.monotonic() < end_s:
+    while not any("estimation stopped" in alarm for alarm in live.state()["alarms"]) and time.monotonic() < end_s:
         time.sleep(0.01)
     live.stop()
-    assert "estimates ended: RuntimeError('out of memory')" in live.state()["alarms"]
+    assert "estimation stopped: RuntimeError('out of memory')" in live.state()["alarms"]
 
 
 def test_invalid_lists_of_ports_raise(tmp_path):

@@ -1,10 +1,10 @@
-// Draws the messages of session.py: binary ones (Traces.message) as numbers, board and traces; JSON (Session.state) as text.
-// Each board has its own socket, state and canvases, so that an unplugged board does not affect the others.
+// Shows the messages of session.py: binary messages (Traces.message) as numbers, board and traces; JSON messages (Session.state)
+// as texts. Each board has its own socket, state and canvases, so that an unplugged board does not affect the others.
 "use strict";
 const NUMBERS_N = 12, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;
-const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a field change of ARROW_UT is an arrow of ARROW_MM; no arrow exceeds twice that
-const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // force, chips
-const style = getComputedStyle(document.documentElement); // live: follows changes of the colour scheme
+const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a field change of ARROW_UT is drawn ARROW_MM long; arrows are always shorter than twice that
+const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // of the force, then of the chips
+const style = getComputedStyle(document.documentElement); // a live object, which follows changes of the colour scheme
 const colour = (name) => style.getPropertyValue(name);
 const ink = (j) => { const name = COLOURS[j ? 1 + (j - 1) % (COLOURS.length - 1) : 0]; return name.startsWith("--") ? colour(name) : name; };
 const number = (value, digits, unit) => value === undefined || Number.isNaN(value) ? "–" : `${value.toFixed(digits)} ${unit}`;
@@ -45,12 +45,12 @@ class Board {
     const [x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50, screen99] = values;
     this.last = {id: view.getUint32(0, true), chips, x, y, force, sdX, sdY, contact, rate, lost, estimate50, estimate99, screen50,
       screen99, change: values.slice(NUMBERS_N, first)};
-    if (bins) { // the last bin may have changed, so it is sent again
+    if (bins) { // the newest bin of the previous message may have changed, so it is sent again
       const low = first + bins, high = low + bins * width, t = view.getFloat64(8, true), bin = (i) => Math.round((t + values[first + i]) / BIN_S);
       while (this.rows.length && this.rows[this.rows.length - 1].n >= bin(0)) this.rows.pop();
       for (let i = 0; i < bins; i++) this.rows.push({n: bin(i), low: values.slice(low + i * width, low + (i + 1) * width),
         high: values.slice(high + i * width, high + (i + 1) * width)});
-      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // a line may enter the window from this bin
+      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // lines that start in this bin can reach into the window
       this.rows = this.rows.slice(Math.max(this.rows.findIndex(({n}) => n >= oldest), 0));
       this.changed = Math.min(this.changed, bin(0));
     }
@@ -60,10 +60,10 @@ class Board {
   show(next) {
     const state = this.state = next;
     this.say("what", state.waiting ? `${state.what || ""}: waiting for data` : state.what);
-    this.say("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "The places of its chips are unknown: they are drawn in a row. "}` +
-      (state.model ? `Model: ${state.model}.` : "No model, so no place or force; try --model."));
+    this.say("about", state.waiting ? "" : `${state.board}. ${state.places_known ? "" : "The positions of its chips are unknown; they are drawn in a row. "}` +
+      (state.model ? `Model: ${state.model}.` : "No model, so no place or force. To load one, use --model."));
     this.list("alarms", state.alarms);
-    this.list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n}, within ${s} s`));
+    this.list("seen", (state.seen || []).map(([name, n, s]) => `${name}: ${n} in ${s} s`));
     this.parts.zero.disabled = this.parts.record.disabled = state.waiting;
     for (const name of ["adapt", "places"]) {
       this.parts[name].disabled = state.waiting || !state.adaptable || Boolean(state.adapting) && name !== this.chosen(state);
@@ -80,7 +80,7 @@ class Board {
   chosen(state) { return state.next_mm ? "places" : "adapt"; }
 
   drawBoard() {
-    const {state, last} = this; // if the board is silent, the last reading is out of date and not drawn
+    const {state, last} = this; // if the board is silent, the last reading is outdated and is not drawn
     const [wide, high] = state.skin_mm || [20, 20], [left, bottom] = state.corner_mm || [-2, -2], margin = MARGIN_PX;
     const scale = Math.max(Math.min((this.parts.board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high), .1); // a hidden window has height 0
     const [pen] = penOn(this.parts.board, high * scale + 2 * margin);
@@ -91,11 +91,11 @@ class Board {
     pen.lineWidth = 2;
     state.chips_mm.forEach(([x, y], i) => {
       const [px, py] = at(x, y), side = Math.max(1.5 * scale, 8);
-      pen.strokeStyle = ink(i + 1); pen.strokeRect(px - side / 2, py - side / 2, side, side); // in the colour of its trace
+      pen.strokeStyle = ink(i + 1); pen.strokeRect(px - side / 2, py - side / 2, side, side); // in the colour of the chip's trace
       pen.fillStyle = colour("--soft"); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
       if (last && !state.silent && last.chips === state.chips_mm.length) arrow(pen, px, py, last.change.subarray(3 * i, 3 * i + 3), scale);
     });
-    if (state.next_mm) { // the next place to press
+    if (state.next_mm) {
       const [px, py] = at(...state.next_mm), size = Math.max(1.2 * scale, 10);
       pen.strokeStyle = colour("--alarm"); pen.lineWidth = 3; pen.beginPath(); pen.arc(px, py, size, 0, 7);
       for (const [dx, dy] of [[1, 0], [0, 1]]) { pen.moveTo(px - 1.5 * size * dx, py - 1.5 * size * dy); pen.lineTo(px + 1.5 * size * dx, py + 1.5 * size * dy); }
@@ -124,11 +124,11 @@ class Board {
     this.say("screen", `${number(last.screen50, 0, "ms")} (median), ${number(last.screen99, 0, "ms")} (99 %)`);
     if (document.hidden || last === this.drawn) return;
     this.drawn = last;
-    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // it has been drawn by then
+    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // by then, the reading has been drawn
   }
 }
 
-function penOn(canvas, high) { // clears a canvas, sets it to the screen's resolution, and returns a context in CSS pixels
+function penOn(canvas, high) { // clears a canvas at the screen's resolution; returns [context in CSS pixels, width, device pixels per CSS pixel]
   const ratio = devicePixelRatio || 1, wide = canvas.clientWidth, size = [Math.floor(wide * ratio), Math.floor(high * ratio)];
   if (canvas.width !== size[0] || canvas.height !== size[1]) { [canvas.width, canvas.height] = size; canvas.style.height = `${high}px`; }
   const pen = canvas.getContext("2d");
@@ -136,7 +136,7 @@ function penOn(canvas, high) { // clears a canvas, sets it to the screen's resol
   return [pen, wide, ratio];
 }
 
-function arrow(pen, px, py, [bx, by, bz], scale) { // an arrow for x and y; a ring for z
+function arrow(pen, px, py, [bx, by, bz], scale) { // an arrow for x and y; a ring for z, dashed if negative
   const size = 2 * ARROW_MM * scale / (ARROW_UT + Math.hypot(bx, by, bz)), dx = bx * size, dy = -by * size, long = Math.hypot(dx, dy), turn = Math.atan2(dy, dx);
   pen.strokeStyle = colour("--ink");
   pen.beginPath(); pen.arc(px, py, Math.abs(bz) * size, 0, 7); pen.setLineDash(bz < 0 ? [3, 3] : []); pen.stroke(); pen.setLineDash([]);
@@ -149,7 +149,7 @@ function arrow(pen, px, py, [bx, by, bz], scale) { // an arrow for x and y; a ri
 function draw() {
   while (boards.length < Math.max(boards[0].state.boards_n || 0, 1)) boards.push(new Board(boards.length));
   document.getElementById("boards").classList.toggle("single", boards.length === 1);
-  const end_ms = performance.now() + DRAWING_MS; // boards take turns if one frame's time is too short for all
+  const end_ms = performance.now() + DRAWING_MS; // if the time of one frame is too short for all boards, they take turns
   for (let i = 0; i < boards.length && performance.now() < end_ms; i++) boards[next++ % boards.length].draw();
   requestAnimationFrame(draw);
 }

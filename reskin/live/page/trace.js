@@ -1,20 +1,20 @@
-// Ten seconds of values as lines. The picture is shifted and only new values are drawn, so that many chips cost little.
-// When the scale or size changes, the picture is stretched at once, then redrawn from the newest values on, in portions of a frame's time.
+// Draws ten seconds of values as lines. To keep many chips cheap, the existing picture is shifted, and only new values are drawn.
+// When the scale or size changes, the picture is first stretched, then redrawn in several frames, starting with the newest values.
 "use strict";
-// WINDOW_S and BIN_S as in session.py.
+// WINDOW_S and BIN_S must equal those in session.py.
 const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, TRACE_PX = 170, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
-const NARROW_PX = 400; // a narrower trace has fewer time labels
-const ANEW_MS = 3, LINE_PX = 1.5;
-const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // possible ends of a scale, so that it seldom changes
+const NARROW_PX = 400; // narrower traces have fewer time labels
+const REDRAW_MS = 3, LINE_PX = 1.5; // REDRAW_MS: time per frame for redrawing old values
+const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // round upper ends of a scale, times a power of ten, so that the scale seldom changes
 
 class Trace {
   constructor(canvas, first, least) {
     this.canvas = canvas; this.first = first; this.least = least;
     this.layer = {width: 0}; this.top = least;
-    this.columns = 64; // columns of pixels that are redrawn per frame: as many as take ANEW_MS
+    this.columns = 64; // pixel columns to redraw per frame, adjusted so that they take REDRAW_MS
   }
 
-  // Draws the minimum and the maximum of each bin; bins from `changed` on are new. Returns whether some bins must still be redrawn.
+  // Draws the minimum and the maximum of each bin; bins from `changed` on are new. Returns whether older bins must still be redrawn.
   draw(rows, changed, count) {
     const [pen, wide, ratio] = penOn(this.canvas, TRACE_PX), newest = rows[rows.length - 1].n, begun_ms = performance.now();
     let greatest = this.least;
@@ -24,17 +24,17 @@ class Trace {
     const {layer} = this, left = this.edge - layer.width, fresh = Math.min(Math.floor(changed * this.bin_px - this.aside), this.edge);
     this.drawLines(rows, fresh, this.edge);
     this.drawn = Math.min(this.drawn, fresh);
-    const anew = Math.max(Math.min(this.columns, this.drawn - left), 0);
-    this.drawLines(rows, this.drawn - anew, this.drawn);
-    this.drawn -= anew;
+    const redrawn = Math.max(Math.min(this.columns, this.drawn - left), 0);
+    this.drawLines(rows, this.drawn - redrawn, this.drawn);
+    this.drawn -= redrawn;
     this.drawScale(pen, wide, top);
     pen.setTransform(1, 0, 0, 1, 0, 0);
-    pen.drawImage(layer, Math.round(LEFT_PX * ratio), 0); // the layer is painted here, within the measured time
-    if (anew) this.columns = Math.min(Math.max(Math.round(this.columns * Math.min(ANEW_MS / (performance.now() - begun_ms), 2)), 8), layer.width);
+    pen.drawImage(layer, Math.round(LEFT_PX * ratio), 0); // drawn before the time is taken below, because the browser paints the layer here
+    if (redrawn) this.columns = Math.min(Math.max(Math.round(this.columns * Math.min(REDRAW_MS / (performance.now() - begun_ms), 2)), 8), layer.width);
     return this.drawn > left;
   }
 
-  fit(wide, ratio, count, top, newest) { // shift the picture; stretch it to a new size and scale
+  fit(wide, ratio, count, top, newest) { // shifts the picture, or stretches it to a new size or scale
     const kind = [wide, ratio, count, ink(0), ink(1)].join(), bin_px = wide * BIN_S / WINDOW_S, edge = Math.round((newest + 1) * bin_px);
     if (kind !== this.kind) {
       const before = this.layer;
@@ -44,7 +44,7 @@ class Trace {
       this.edge = this.drawn = edge;
     }
     const {layer, pen} = this, later = edge - this.edge;
-    if (later < 0 || later >= wide) { // a new stream, or nothing left of the picture
+    if (later < 0 || later >= wide) { // a new stream, or the whole picture has left the window
       pen.clearRect(0, 0, wide, layer.height); this.drawn = edge;
     } else if (later || top !== this.top) {
       const times = this.top / top, zero = (ABOVE_PX + HIGH_PX) * ratio;
@@ -53,13 +53,13 @@ class Trace {
       pen.globalCompositeOperation = "source-over";
       if (top !== this.top) this.drawn = edge;
     }
-    const aside = (GAP_BINS_N + 1) * bin_px + 4 * ratio; // longest line from one bin to the next, plus its width
+    const aside = (GAP_BINS_N + 1) * bin_px + 4 * ratio; // the longest line between two bins, plus the line width
     Object.assign(this, {kind, bin_px, edge, top, ratio, count, aside});
   }
 
   y(value) { return ABOVE_PX + HIGH_PX * (1 - value / (this.top * 1.05)); }
 
-  drawLines(rows, from, to) { // draws everything within these columns of pixels and nothing outside, so that no seam is visible
+  drawLines(rows, from, to) { // draws only within these pixel columns, but everything that crosses them, so that no seam is visible
     if (to <= from) return;
     const {layer, pen, bin_px, ratio, aside} = this, left = this.edge - layer.width, x = (n) => n * bin_px - left;
     let last = rows.length, begin;
