@@ -41,7 +41,7 @@ from pipeline.training.jobs import SceneData, collapse_record, preload_training,
 from reskin.data import baseline
 from reskin.data.baseline import rank, subtract
 from reskin.data.rows import Selection
-from reskin.data.windows import TRAIN, Part, Policy, Windows, check_one_each, make_parts, make_windows, stack
+from reskin.data.windows import TRAIN, Part, Policy, Windows, check_one_per_skin, make_parts, make_windows, stack
 from reskin.errors import ParamsError
 from reskin.metrics import METRICS, score
 from reskin.models.inputs import VIEW
@@ -150,7 +150,7 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
 
 def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
     """Cut the captures into windows that all of them have, and gather the rows of each under every policy."""
-    check_one_each(captures)
+    check_one_per_skin(captures)
     units = [rank(getattr(one, UNIT_COLUMN[section.unit])) for one in captures]
     units_n = [1 + int(own.max()) for own in units]
     windows = make_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)

@@ -1,1 +1,1 @@
-"""Datasets: rows for training and tests, no-load baselines, and splits."""
+"""Datasets: rows for training and testing, baselines, and train/test splits."""

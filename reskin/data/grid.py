@@ -1,6 +1,6 @@
-"""The paper's protocol of pokes: a 65-point grid, depth by depth, pass by pass.
+"""The paper's poking protocol: a grid of 65 points, poked at one depth after the other, in several passes.
 
-Places are in the frame of the labels: 0 to 16 mm, with the centre of the skin at (8, 8) mm.
+Places are in the coordinate frame of the labels: 0 to 16 mm, with the centre of the skin at (8, 8) mm.
 """
 
 from collections.abc import Sequence
@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int32
 
-# "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)"; its "16cm" is a typo for 16 mm.
+# "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)"; the paper's "16cm" is a typo for 16 mm.
 SIDE_POINTS_N = 9
 PITCH_MM = 2.0
-BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # of rows and of columns
+BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns that cross no excluded corner
 CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
 SKIN_MM = (20.0, 20.0)  # sides of the paper's skin, from the authors' CAD
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Commanded pokes in order of time, one row per indentation."""
+    """Commanded pokes in order of time, one array element per indentation."""
 
     indentation: Int32[np.ndarray, " n"]
     pass_i: Int32[np.ndarray, " n"]
@@ -32,7 +32,7 @@ class Protocol:
 
 
 def points_mm() -> Float64[np.ndarray, "65 2"]:
-    """Return (x, y) of the grid points in snake order: along x, every second row backwards."""
+    """Return (x, y) of the grid points in snake order: row by row, every second row with decreasing x."""
     points = []
     for row_i in range(SIDE_POINTS_N):
         row = range(SIDE_POINTS_N)[:: -1 if row_i % 2 else 1]
@@ -41,7 +41,7 @@ def points_mm() -> Float64[np.ndarray, "65 2"]:
 
 
 def protocol(depths_mm: Sequence[float], passes_n: int) -> Protocol:
-    """Poke every point at the first depth, then at the next; a pass covers all depths once, as in the paper."""
+    """Return the pokes of the paper's protocol: in each pass, every point at the first depth, then at the next, ..."""
     xy_mm = points_mm()
     points_n, depths_n = len(xy_mm), len(depths_mm)
     pokes_n = points_n * depths_n

@@ -1,7 +1,8 @@
-"""Pokes along lines: the order along the lines is the only label of an otherwise unlabelled recording.
+"""Pokes along lines, whose order along the lines is their only label.
 
-The paper's method (section 5): "indent in a straight line and incrementally index these points". Here, places of a
-robot's grid are used to find the index, and are not passed on: `Lines` contains only row, line and index.
+This is the paper's method (section 5): "indent in a straight line and incrementally index these points". Here, the
+index is derived from the places of a robot's grid. The places themselves are discarded: `Lines` contains only row
+numbers, lines and indices.
 """
 
 from collections.abc import Sequence
@@ -16,32 +17,32 @@ from reskin.data.rows import TARGETS, Rows, stack
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-PLACE_STEP_MM = 0.1  # assumed: places that are nearer are the same place
+PLACE_STEP_MM = 0.1  # assumed: coordinates are rounded to this step, and equal ones count as the same place
 PLACES_MIN_N = 2  # a line with one place has no order
 X, Y = TARGETS.index("x_mm"), TARGETS.index("y_mm")
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Pokes by line and index, without place and force. A row may belong to two lines (a grid's row and column).
+    """Pokes by line and index, without place and force; sorted by line, then index, then row number.
 
-    Sorted by line, then index, then row.
+    A row number may occur in two lines, because a place of a grid is on a line along x and on one along y.
     """
 
     row: Int64[np.ndarray, " p"]  # row numbers
-    line_i: Int32[np.ndarray, " p"]  # 0.., unique over skins
-    order_i: Int32[np.ndarray, " p"]  # index along the line; the same for all readings and visits of one place
+    line_i: Int32[np.ndarray, " p"]  # counted from 0 over all skins
+    order_i: Int32[np.ndarray, " p"]  # index along the line; equal for all readings at one place
 
     def __len__(self) -> int:
         return len(self.row)
 
 
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
-    """Index the chosen pokes along the rows and columns of each skin's grid.
+    """Index the chosen pokes along the grid lines of each skin, in both directions.
 
-    Uses skins and commanded places. The index is the rank of a coordinate among the distinct coordinates of the skin's
-    chosen pokes, so a place that is missing on one line leaves a gap. A line with one place has no order and is left
-    out.
+    Only skins and commanded places are used. The index is the rank of a coordinate among all distinct coordinates of
+    the skin's chosen pokes, so a place that is missing on one line leaves a gap. Lines with a single place have no
+    order and are left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
@@ -56,10 +57,10 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
 
 
 def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, " f"]) -> Lines:
-    """Index the readings of a capture of pokes by hand: each pass is a line, along which indentations are counted.
+    """Index the readings of a capture of manual pokes: each pass is a line, and the index counts its indentations.
 
-    `row` is the reading's number in the capture. A lost indentation leaves a gap. A line with one indentation has no
-    order and is left out.
+    `row` is the number of the reading in the capture. A lost indentation leaves a gap. Lines with a single indentation
+    have no order and are left out.
     """
     order_i = indentation.astype(np.int64)
     for line in np.unique(pass_i):
@@ -68,15 +69,15 @@ def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, "
 
 
 def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
-    """Make rows of pokes by hand, whose places and forces are unknown, and index the pokes of each skin along lines.
+    """Return stacked rows of manual pokes, whose places and forces are unknown, and the lines of each skin.
 
-    The lines contain row numbers of the returned stack.
+    The row numbers in the lines refer to the returned rows.
     """
     parts: list[Rows] = []
     lines: dict[str, Lines] = {}
     for readings in captures:
         if readings.skin in lines:
-            what = f"skin {readings.skin} is poked by hand in another capture too"
+            what = f"skin {readings.skin} has manual pokes in another capture too"
             raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two.")
         lines[readings.skin] = shift_rows(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
         f = len(readings)
@@ -96,30 +97,30 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
 
 
 def shift_rows(lines: Lines, rows_n: int) -> Lines:
-    """Return the lines after their rows were stacked below `rows_n` others."""
+    """Return the lines with row numbers increased by `rows_n`, for rows that were stacked below `rows_n` others."""
     return replace(lines, row=lines.row + rows_n)
 
 
 def take_pokes(
     rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " d"]:
-    """Choose indentations from one skin's pool, all places equally often; return all their rows, sorted.
+    """Choose indentations from one skin's pool, evenly over the places; return all their rows, sorted.
 
-    Only the place of each indentation (that of its first row) is used. One visit (depth or pass) is drawn for each
-    place, then a second one, and so on; the last round covers random places. For the same state of `rng`, a smaller
-    choice is a subset of a larger one.
+    Only the place of each indentation (that of its first row) is used. In the first round, one indentation is drawn for
+    each place; in the second round, another one, and so on. The last round covers only some places, chosen at random.
+    For the same state of `rng`, a smaller choice is a subset of a larger one.
     """
     _check_pool(rows, pool, indentations_n)
     indentations, first = np.unique(rows.indentation[pool], return_index=True)
     _, place_i = np.unique(_steps(rows.target[pool[first]]), axis=0, return_inverse=True)
     shuffled = rng.permutation(len(indentations))
-    in_turn = np.lexsort((rng.random(len(indentations)), _visit_numbers(place_i.ravel()[shuffled])))
-    taken = indentations[shuffled[in_turn[:indentations_n]]]
+    by_round = np.lexsort((rng.random(len(indentations)), _visit_numbers(place_i.ravel()[shuffled])))
+    taken = indentations[shuffled[by_round[:indentations_n]]]
     return np.sort(pool[np.isin(rows.indentation[pool], taken)])
 
 
 def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
-    """Number the visits of each place in order.
+    """Count the visits of each place from 0, in the given order.
 
     >>> _visit_numbers(np.array([1, 0, 1, 1, 0]))
     array([0, 0, 1, 2, 1])
@@ -136,12 +137,12 @@ def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:
 
 
 def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], order_i: Int64[np.ndarray, " p"]) -> Lines:
-    """Drop lines with one place, number the others from 0, and sort."""
+    """Drop lines with a single place, number the other lines from 0, and sort."""
     line_i = np.unique(line, axis=0, return_inverse=True)[1].ravel()
     places = np.unique(np.stack([line_i, order_i], axis=1), axis=0)
-    ordering = np.bincount(places[:, 0]) >= PLACES_MIN_N
-    keep = ordering[line_i]
-    row, line_i, order_i = row[keep], (np.cumsum(ordering) - 1)[line_i[keep]], order_i[keep]
+    has_order = np.bincount(places[:, 0]) >= PLACES_MIN_N  # by line
+    keep = has_order[line_i]
+    row, line_i, order_i = row[keep], (np.cumsum(has_order) - 1)[line_i[keep]], order_i[keep]
     in_order = np.lexsort((row, order_i, line_i))
     return Lines(row[in_order], line_i[in_order].astype(np.int32), order_i[in_order].astype(np.int32))
 
@@ -154,5 +155,5 @@ def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) 
         )
     if indentations_n > pool_n:
         rule = f"at most the {pool_n} indentations of its pool"
-        remedy = "Choose fewer, or let section split keep a larger pool."
+        remedy = "Choose fewer, or enlarge the pool in section split."
         raise ParamsError(f"skin {', '.join(skins)}", "pokes to choose", rule, indentations_n, remedy)

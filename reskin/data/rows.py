@@ -1,4 +1,4 @@
-"""Rows of a dataset: the readings of many captures, selected and stacked."""
+"""Rows of a dataset: selected readings of several captures, stacked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,23 +15,24 @@ from reskin.errors import ParamsError
 from reskin.schema import Readings
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
-AS_THEY_ARE = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # columns that are stacked unchanged
-SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # of dragged lines (paper section 4)
+UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` does not renumber these
+SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # targets for dragged lines (paper section 4)
 
 
 class Selection(Strict):
-    """Which readings count as a contact: those with a known place and a force of at least `force_min_N` or unknown."""
+    """Which readings are in contact: those with a known place whose force is unknown or at least `force_min_N`."""
 
     force_min_N: float
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Stacked rows of a scene, captures in order of name.
+    """Stacked rows of a scene, with the captures in order of name.
 
-    `db_uT` is the field change relative to the no-load reading of the same indentation. `target` is x_mm, y_mm and Fz_N
-    (NaN if a recording has no force), unless `gather` was given other targets. `pass_i` is numbered consecutively over
-    the captures of a skin, `indentation` over the captures of the scene; readings of one indentation share its number.
+    `db_uT` is the field change relative to the no-load reading of the same indentation. `target` has columns x_mm, y_mm
+    and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` numbers the
+    passes consecutively over the captures of a skin, and `indentation` the indentations over the captures of the scene;
+    all readings of an indentation have the same number. `dropped` counts the readings that were left out, by reason.
     """
 
     capture: np.ndarray
@@ -50,7 +51,7 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Make rows without readings, one per indentation, for examples of folds; `pass_i` is 0 if not given."""
+        """Create rows without readings, one per indentation, for examples of folds; the default of `pass_i` is 0."""
         f = len(boards)
         empty, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
         labels = np.array(["c"] * f), np.array(boards), np.array(skins)
@@ -63,7 +64,10 @@ def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
 
 
 def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
-    """Stack the contacts of a scene's captures, and count dropped rows; `targets` are columns of `Readings`."""
+    """Stack the readings in contact of a scene's captures, and count the dropped ones.
+
+    `targets` are the columns of `Readings` that become `Rows.target`.
+    """
     if not captures:
         raise ParamsError("the scene has no captures. Add one with `reskin add`.")
     _check_one_kind(captures)
@@ -91,39 +95,42 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
         db_uT=np.concatenate([subtract(readings.b_uT[keep], readings.noload_uT[keep]) for readings, keep in pairs]),
         target=np.concatenate(columns),
         pass_i=np.concatenate(pass_i),
-        indentation=_count_on([readings.indentation[keep] for readings, keep in pairs]),
+        indentation=_number_consecutively([readings.indentation[keep] for readings, keep in pairs]),
         dropped={"no_contact_rows_n": places_unknown_n, "low_force_rows_n": weak_n},
     )
 
 
 def stack(above: Rows, below: Rows) -> Rows:
-    """Stack rows below others, whose row numbers do not change; indentations below are numbered after those above."""
+    """Stack two sets of rows.
+
+    Row numbers of `above` do not change. The indentations of `below` are renumbered to follow those of `above`.
+    """
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
         above_n, below_n = above.db_uT.shape[1], below.db_uT.shape[1]
         raise ParamsError(
-            f"capture {below.capture[0]}: {below_n} channels, but {above.capture[0]} has {above_n}. Use boards of one "
-            "kind."
+            f"capture {below.capture[0]}: {below_n} channels, but {above.capture[0]} has {above_n}. Use "
+            "boards with the same number of chips."
         )
-    stacked = {name: np.concatenate([getattr(above, name), getattr(below, name)]) for name in AS_THEY_ARE}
+    stacked = {name: np.concatenate([getattr(above, name), getattr(below, name)]) for name in UNCHANGED_COLUMNS}
     indentation = np.concatenate([above.indentation, below.indentation + above.indentation.max() + 1])
     return Rows(**stacked, indentation=indentation, dropped=above.dropped)
 
 
 def contacts(readings: Readings, selection: Selection) -> np.ndarray:
-    """Mark the readings that count as a contact."""
+    """Return the mask of the readings in contact, as defined by `selection`."""
     placed = ~(np.isnan(readings.x_mm) | np.isnan(readings.y_mm))
-    weak = readings.Fz_N < selection.force_min_N  # unknown force (NaN) is not weak
+    weak = readings.Fz_N < selection.force_min_N  # False for an unknown force (NaN)
     return placed & ~weak
 
 
-def _count_on(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
-    """Number the indentations of each capture after those of the one before."""
-    before_n, counted = 0, []
+def _number_consecutively(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
+    """Renumber the indentations of each capture to follow those of the previous capture."""
+    before_n, renumbered = 0, []
     for numbers in indentations:
         distinct, index = np.unique(numbers, return_inverse=True)
-        counted.append(before_n + index)
+        renumbered.append(before_n + index)
         before_n += len(distinct)
-    return np.concatenate(counted)
+    return np.concatenate(renumbered)
 
 
 def _check_one_kind(captures: Sequence[Readings]) -> None:
@@ -139,5 +146,6 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
             remedy = "Simulated and recorded captures belong to different scenes."
             raise ParamsError(where, "source", rule, readings.source, remedy)
         if boards.setdefault(skin, readings.board) != readings.board:
-            remedy = "A skin moved to another board is a new skin here: give it a new name."
-            raise ParamsError(where, f"the board of skin {skin}", f"{boards[skin]}, as before", readings.board, remedy)
+            remedy = "A skin that is moved to another board counts as a new skin: give it a new name."
+            rule = f"{boards[skin]}, as in another capture"
+            raise ParamsError(where, f"the board of skin {skin}", rule, readings.board, remedy)

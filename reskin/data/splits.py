@@ -1,7 +1,7 @@
-"""Folds: which boards, skins, readings, indentations or passes are held out, and the file `folds.json`.
+"""Folds, which hold out boards, skins, readings, indentations or passes, and the file `folds.json`.
 
-Random splits are drawn by scikit-learn. For folds that hold out skins, this module checks that no skin or board is on
-both sides.
+scikit-learn draws the random splits. For folds that hold out skins, this module checks that no skin or board is both
+trained on and held out.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,19 +19,20 @@ from reskin.data.rows import Rows
 from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for, seed_for
 
-WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}  # and units
+# The unit that each experiment on a single skin holds out at random.
+WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}
 SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that test on the skin that was trained on
 ONE_SKIN = {"transfer", *SAME_SKIN}  # experiments whose networks are trained on one skin
 Count = Annotated[int, Field(ge=1)]
 Fraction = Annotated[float, Field(gt=0, lt=1)]
-DRAW = "-draw"  # in a fold's name, before the number of the draw
-STATES_N = 2**32  # scikit-learn's seeds are below it
+DRAW = "-draw"  # precedes the number of the draw in the name of a fold
+SEED_LIMIT = 2**32  # scikit-learn accepts only smaller seeds
 
 Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and test
 
 
 class Split(Strict):
-    """How folds are drawn; each part is given if, and only if, the scene runs its experiment."""
+    """How folds are drawn; each setting is required if the scene runs its experiment, and must be None otherwise."""
 
     random_test_fraction: Fraction | None = None
     random_repeats_n: Count | None = None
@@ -39,7 +40,7 @@ class Split(Strict):
     transfer_skins_n: Count | None = None
     sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
     sensors_draws_n: Count | None = None
-    pool_passes_n: Count | None = None  # first passes of each held-out skin
+    pool_passes_n: Count | None = None  # the first passes of each held-out skin are its pool
     labels_pool_n: Count | None = None  # number of indentations of each held-out skin that may be labelled
     labels_draws_n: Count | None = None
 
@@ -53,9 +54,9 @@ class Split(Strict):
 
 @dataclass(frozen=True)
 class Fold:
-    """Row numbers (of `Rows`) of the train side, the test side, and the pool of pokes on the held-out skins.
+    """Row numbers (in `Rows`) for training, for testing, and of the pool: pokes on the held-out skins.
 
-    Adaptation may use the pool. The pool is never scored, so that all methods are scored on the same rows.
+    Adaptation may use the pool. No method is scored on the pool, so that all methods are scored on the same rows.
     """
 
     experiment: str
@@ -66,12 +67,12 @@ class Fold:
 
     @property
     def board(self) -> str:
-        """The board that is held out, for a fold of experiment `labels`."""
+        """The held-out board; only for folds of experiment `labels`."""
         return self.name.rpartition(DRAW)[0]
 
     @property
     def draw_i(self) -> int:
-        """The number of the draw of the pool, for a fold of experiment `labels`."""
+        """Which random draw of the pool this is; only for folds of experiment `labels`."""
         return int(self.name.rpartition(DRAW)[2])
 
 
@@ -85,7 +86,7 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
     >>> [(fold.name, fold.train.tolist(), fold.test.tolist()) for fold in draw_folds(rows, ["lobo"], Split(), 0)]
     [('b1', [2], [0, 1]), ('b2', [0, 1], [2])]
 
-    With a pool, the first passes of each held-out skin are for adaptation, and its later passes for the test:
+    With a pool, the first passes of each held-out skin are used for adaptation, and its later passes for testing:
 
     >>> rows = Rows.of_labels(["b1"] * 3 + ["b2"] * 2, ["s1"] * 3 + ["s2"] * 2, pass_i=[0, 1, 2, 0, 1])
     >>> def show(folds):
@@ -95,7 +96,7 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
     b1 [3 4] [0] [1 2]
     b2 [0 1 2] [3] [4]
 
-    Fewer sensors: every board is held out in turn, and within a draw, a larger number of skins adds to a smaller one:
+    With fewer sensors, every board is held out in turn. Within a draw, a larger training set contains the smaller ones:
 
     >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3"], ["s1", "s2", "s3", "s4"])
     >>> show(draw_folds(rows, ["sensors"], Split(sensors_skins_n=(1, 2), sensors_draws_n=1), 0))
@@ -123,11 +124,11 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on k skins of all boards but one, test on that board; one fold per board, k and draw (paper figure 6b).
+    """Train on k skins, test on a board with none of them; one fold per board, k and draw (paper figure 6b).
 
     Every board is held out in turn and has its own draws. Within a draw, the skins of a smaller k are a subset of those
-    of a larger one. If k is the number of all skins, there is one draw: the fold of `lobo`, with the same name, so that
-    its training runs are reused.
+    of a larger one. If k is the number of all skins of the other boards, there is a single fold, which equals that of
+    `lobo` and has the same name, so that its training runs are reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None
@@ -135,7 +136,7 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
     for board in np.unique(rows.board):
         held, skins = np.flatnonzero(rows.board == board), np.unique(rows.skin[rows.board != board])
         if max(split.sensors_skins_n) > len(skins):
-            rule = f"at most the {len(skins)} skins beside held-out board {board}"
+            rule = f"at most the {len(skins)} skins of all boards but {board}"
             remedy = "Reduce it, or add another board's recording."
             raise ParamsError("experiment sensors", "split.sensors_skins_n", rule, max(split.sensors_skins_n), remedy)
         draws = range(split.sensors_draws_n)
@@ -149,10 +150,10 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Hold a board out as in `lobo`, with a random pool of its indentations for labels; one fold per board and draw.
+    """Hold out a board as in `lobo`, with a random pool of its indentations to label; one fold per board and draw.
 
-    The pool is never in the test, whether its labels are used or not, so that the test is the same for all numbers of
-    labels.
+    The whole pool is excluded from the test, even if only some of it is labelled, so that the test rows are the same
+    for all numbers of labels.
     """
     assert split.labels_pool_n is not None
     assert split.labels_draws_n is not None
@@ -176,15 +177,15 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
-    """Draw the order in which the indentations of a fold's pool are labelled; n labels are for the first n of them."""
+    """Draw the order in which indentations of a fold's pool are labelled; with n labels, the first n are labelled."""
     return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """Train on one skin, test on skins of other boards; one fold per training skin.
 
-    If other experiments adapt to a pool, the pool is left out of the test here too, so that all are scored on the same
-    rows.
+    If other experiments adapt to a pool, these folds do not test on the pool either, so that all experiments are scored
+    on the same rows.
 
     The paper trains on 3 skins, one at a time, and tests on 9 others. Here, with 6 boards of 3 skins each, the training
     skins are the first skins of the first three boards, and the test skins are all skins of the other three.
@@ -193,7 +194,7 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     boards, train_n = np.unique(rows.board), split.transfer_skins_n
     if train_n >= len(boards):
         rule = f"less than the scene's {len(boards)} boards"
-        remedy = "Each training skin takes a board; another must be left to test on."
+        remedy = "Each training skin is from another board, and at least one board must remain for testing."
         raise ParamsError("experiment transfer", "split.transfer_skins_n", rule, train_n, remedy)
     held = np.flatnonzero(np.isin(rows.board, boards[train_n:]))
     folds = []
@@ -205,7 +206,10 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
-    """Make a fold from train and held-out rows; `pool_passes_n` first passes of each held-out skin are the pool."""
+    """Make a fold from training rows and held-out rows.
+
+    The first `split.pool_passes_n` passes of each held-out skin are the pool, and its other passes are tested on.
+    """
     train, held = sides
     pooled = np.zeros(len(held), bool)
     if split.pool_passes_n is not None:
@@ -214,7 +218,7 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
             passes = np.unique(rows.pass_i[held[on_skin]])
             if len(passes) <= split.pool_passes_n:
                 what, rule = f"passes of held-out skin {skin}", f"more than split.pool_passes_n, {split.pool_passes_n}"
-                remedy = "Record more passes, or make the pool smaller."
+                remedy = "Record more passes, or reduce the size of the pool."
                 raise ParamsError(f"experiment {experiment}", what, rule, len(passes), remedy)
             pooled |= on_skin & np.isin(rows.pass_i[held], passes[: split.pool_passes_n])
     fold = Fold(experiment, name, train, held[~pooled], held[pooled])
@@ -223,10 +227,10 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
 
 
 def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -> list[Fold]:
-    """Hold out random readings, indentations or passes of the first skin, repeatedly; at least one of them.
+    """Hold out random readings, indentations or passes of the first skin, at least one; one fold per repetition.
 
-    The paper holds out readings (section 4). Readings of one indentation are then on both sides, which flatters the
-    model.
+    The paper holds out readings (section 4). Readings of the same indentation are then in both training and test, so
+    the accuracy is overestimated.
     """
     assert split.random_test_fraction is not None
     assert split.random_repeats_n is not None
@@ -241,7 +245,7 @@ def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -
 
 
 def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on the first passes of a skin, test on its last passes; one fold per skin."""
+    """Train on the first passes of a skin and test on its last passes; one fold per skin."""
     assert split.temporal_test_fraction is not None
     folds = []
     for skin in np.unique(rows.skin):
@@ -262,25 +266,26 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
 def draw_sides(
     group: Shaped[np.ndarray, " f"], *, test_fraction: float, repeats_n: int, state: int, what: str, where: str
 ) -> list[Sides]:
-    """Draw test groups, repeatedly: rows of equal `group` stay together; the test has at least one group.
+    """Split rows at random into training and test, `repeats_n` times.
 
-    `what` names the groups and `where` their setting, for error messages.
+    Rows with the same `group` stay together, and at least one group is tested on. Error messages name the groups by
+    `what` and their setting by `where`.
     """
-    from sklearn.model_selection import GroupShuffleSplit  # imported late: it takes a second, and few stages need it
+    from sklearn.model_selection import GroupShuffleSplit  # imported late: takes a second, and few stages need it
 
     groups_n = len(np.unique(group))
     test_n = _test_n(groups_n, max(test_fraction, 1 / groups_n), what, where)
-    shuffle = GroupShuffleSplit(repeats_n, test_size=test_n, random_state=state % STATES_N)
+    shuffle = GroupShuffleSplit(repeats_n, test_size=test_n, random_state=state % SEED_LIMIT)
     return [(train, test) for train, test in shuffle.split(group, groups=group)]
 
 
 def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
-    """Return the rounded number of held-out groups; raise unless both sides have at least one."""
+    """Return the rounded number of held-out groups; raise `ParamsError` unless training and test have at least one."""
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
-        remedy = "Record more, change the fraction, or remove the experiment from the scene's."
+        remedy = "Record more, change the fraction, or remove the experiment from the scene."
         raise ParamsError(
-            f"{where}: {all_n} {what} are too few for both sides: a fraction of {fraction:g} is {test_n}. {remedy}"
+            f"{where}: {all_n} {what} are too few to split: a fraction of {fraction:g} holds out {test_n}. {remedy}"
         )
     return test_n
 
@@ -291,7 +296,7 @@ def _check_disjoint(rows: Rows, fold: Fold) -> None:
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
         if len(both):
             where = f"fold {fold.experiment}/{fold.name}"
-            remedy = "Give every skin its own name, and each skin one board."
+            remedy = "Give every skin its own name and exactly one board."
             raise ParamsError(f"{where}: {what} {', '.join(both)} is both trained on and held out. {remedy}")
 
 
@@ -311,7 +316,7 @@ SIDES = ("train", "test", "pool")
 
 
 def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> dict[str, Any]:
-    """Convert folds to JSON values; row numbers are half-open ranges, and each side names its boards and skins."""
+    """Convert folds to JSON values: half-open ranges of row numbers, and the boards and skins of each side."""
     content: list[dict[str, Any]] = []
     for fold in folds:
         sides = {side: getattr(fold, side) for side in SIDES}
@@ -325,10 +330,10 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
 
 
 def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
-    """Read folds from JSON values; raise `SchemaError` if they were drawn from other rows."""
+    """Convert JSON values to folds; raise `SchemaError` if the folds were drawn from other rows."""
     if content["rows_n"] != len(rows):
         raise SchemaError(
-            f"{where}: drawn from {content['rows_n']} rows, but its captures have {len(rows)}. Split again."
+            f"{where}: drawn from {content['rows_n']} rows, but its captures have {len(rows)}. Run stage split again."
         )
     return [
         Fold(fold["experiment"], fold["name"], *(from_ranges(fold[side]) for side in SIDES))

@@ -1,6 +1,6 @@
-"""Windows of captures in order of time, for several baseline policies (paper section 4, drift).
+"""Windows of captures in order of time, for several baseline policies (experiment `drift`, paper section 4).
 
-A window is a range of units (indentations or passes); a part is one window of one skin with one policy.
+A window is a range of units (indentations or passes). A part is one window of one skin with one baseline policy.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,12 +14,12 @@ from reskin.errors import ParamsError
 from reskin.schema import LABELS, Readings
 
 Policy = Callable[[Readings], np.ndarray]  # returns the baseline of each row
-TRAIN = -1
+TRAIN = -1  # index of the training window; test windows are numbered from 0
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Half-open ranges of units for training and for each test; incomplete windows are left out."""
+    """Half-open ranges of units for training and for each test; units after the last complete window are left out."""
 
     train: tuple[int, int]
     tests: tuple[tuple[int, int], ...]
@@ -28,13 +28,13 @@ class Windows:
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of a window, and their position in the stack of all parts; window `TRAIN` is the training window."""
+    """The rows of a window, and the number of their first row in the stack of all parts."""
 
     policy: str
     window_i: int
     readings: Readings
     rows: Rows
-    noload_off_uT: float  # rms over rows and channels of baseline minus no-load reading before the contact
+    noload_off_uT: float  # rms over rows and channels of (baseline - no-load reading before the contact)
     first_row_i: int
 
     @property
@@ -44,9 +44,9 @@ class Part:
 
 
 def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
-    """Train on the first `train_n` units, test on `test_n` units after every `every_n`, up to the shortest capture.
+    """Use the first `train_n` units for training, and `test_n` units after every `every_n` units for a test.
 
-    `units_n` is the length of each capture, in units.
+    `units_n` is the length of each capture in units; all windows are within the shortest capture.
 
     >>> make_windows([23], train_n=5, test_n=2, every_n=5)
     Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17), (20, 22)), left_out_units_n=0)
@@ -56,7 +56,7 @@ def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: 
     windows_n = max(0, (min(units_n) - test_n) // every_n)
     if not windows_n:
         rule = f"at least drift.every_n + test_n = {every_n + test_n} long"
-        remedy = "Record more, or make the windows smaller."
+        remedy = "Record more, or reduce the size of the windows."
         raise ParamsError("experiment drift", "the shortest capture", rule, min(units_n), remedy)
     tests = tuple((i * every_n, i * every_n + test_n) for i in range(1, windows_n + 1))
     left_out_n = sum(max(0, length_n - (windows_n + 1) * every_n) for length_n in units_n)
@@ -64,20 +64,21 @@ def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: 
 
 
 def take(readings: Readings, rows: Bool[np.ndarray, " f"]) -> Readings:
+    """Return the readings that the mask `rows` selects."""
     arrays = [name for name in Readings.__dataclass_fields__ if name not in LABELS]
     return replace(readings, **{name: getattr(readings, name)[rows] for name in arrays})
 
 
-def check_one_each(captures: Sequence[Readings]) -> None:
+def check_one_per_skin(captures: Sequence[Readings]) -> None:
     """Raise if a skin has several captures, because their order in time is unknown."""
     names: dict[str, list[str]] = {}
     for readings in captures:
         names.setdefault(readings.skin, []).append(readings.capture)
-    for skin, of_skin in names.items():
-        if len(of_skin) > 1:
-            what = f"the order in time of the {len(of_skin)} captures of skin {skin} is unknown: {', '.join(of_skin)}"
+    for skin, captures_of_skin in names.items():
+        if len(captures_of_skin) > 1:
+            what = f"the order in time of the {len(captures_of_skin)} captures of skin {skin} is unknown"
             remedy = "Record its contacts in one capture, or give each skin its own name."
-            raise ParamsError(f"experiment drift: {what}. {remedy}")
+            raise ParamsError(f"experiment drift: {what}: {', '.join(captures_of_skin)}. {remedy}")
 
 
 def make_parts(
@@ -87,26 +88,26 @@ def make_parts(
     windows: Windows,
     selection: Selection,
 ) -> list[Part]:
-    """Make the part of every capture, policy and window; captures are given with the unit number of each row.
+    """Make one part per capture, policy and window; each capture comes with the unit number of each of its rows.
 
-    A policy is applied to the whole capture, including rows that windows and selection leave out.
+    A policy is applied to the whole capture, including the rows that the windows and the selection leave out.
     """
     parts: list[Part] = []
     next_i = 0
     for readings, unit_i in captures:
-        for policy, choose in policies.items():
-            changed = replace(readings, noload_uT=choose(readings))
-            off_uT = (changed.noload_uT - readings.noload_uT).astype(float)
+        for policy, choose_baseline in policies.items():
+            changed = replace(readings, noload_uT=choose_baseline(readings))
+            difference_uT = (changed.noload_uT - readings.noload_uT).astype(float)
             for window_i, (start, end) in enumerate((windows.train, *windows.tests), TRAIN):
                 inside = (unit_i >= start) & (unit_i < end)
-                window, rms_uT = take(changed, inside), float(np.sqrt((off_uT[inside] ** 2).mean()))
+                window, rms_uT = take(changed, inside), float(np.sqrt((difference_uT[inside] ** 2).mean()))
                 parts.append(Part(policy, window_i, window, gather([window], selection), rms_uT, next_i))
                 next_i += len(parts[-1].rows)
     return parts
 
 
 def stack(parts: Sequence[Part]) -> Rows:
-    """Stack the rows of all parts; dropped rows are counted for one policy, because all policies drop the same rows."""
+    """Stack the rows of all parts; count the dropped rows of only one policy, because all policies drop the same."""
     arrays = [field.name for field in fields(Rows) if field.name != "dropped"]
     stacked = {name: np.concatenate([getattr(part.rows, name) for part in parts]) for name in arrays}
     dropped = [part.rows.dropped for part in parts if part.policy == parts[0].policy]

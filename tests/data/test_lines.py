@@ -284,5 +284,5 @@ def test_other_channels_and_repeated_skin_are_refused():
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], EVERY)
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):
         stack(gather([readings("c0")], EVERY), other)
-    with pytest.raises(ParamsError, match="skin s0 is poked by hand in another capture too"):
+    with pytest.raises(ParamsError, match="skin s0 has manual pokes in another capture too"):
         hand_rows([hand_readings("s0"), hand_readings("s0")])

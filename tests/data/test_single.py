@@ -82,5 +82,5 @@ def test_at_least_one_pass_is_tested():
 
 def test_skin_with_one_pass_is_refused():
     split = Split(random_test_fraction=0.1, random_repeats_n=1)
-    with pytest.raises(ParamsError, match="experiment single_pass: 1 passes of skin b0_s0 are too few for both sides"):
+    with pytest.raises(ParamsError, match="experiment single_pass: 1 passes of skin b0_s0 are too few to split"):
         draw_folds(make_passes(1, 5), ["single_pass"], split, 0)

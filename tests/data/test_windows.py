@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from reskin.data import windows as documented
 from reskin.data.baseline import each, initial, rank
 from reskin.data.rows import Selection, gather
-from reskin.data.windows import TRAIN, check_one_each, make_parts, make_windows, stack, take
+from reskin.data.windows import TRAIN, check_one_per_skin, make_parts, make_windows, stack, take
 from reskin.errors import ParamsError
 from tests.data.tables import readings
 
@@ -62,8 +62,8 @@ def test_parts_are_whole_rows():
 
 def test_two_captures_of_one_skin_are_refused():
     with pytest.raises(ParamsError, match="the order in time of the 2 captures of skin s0 is unknown: c0, c1"):
-        check_one_each([readings("c0"), readings("c1")])
-    check_one_each([readings("c0"), readings("c1", skin="s1")])
+        check_one_per_skin([readings("c0"), readings("c1")])
+    check_one_per_skin([readings("c0"), readings("c1", skin="s1")])
 
 
 def test_documented_windows():
