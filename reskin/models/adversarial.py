@@ -1,8 +1,8 @@
 """Domain-adversarial training (Ganin et al., JMLR 2016), a reference method for adaptation.
 
-A second network, the discriminator, decides from the features whether a reading is from the known skins or from the new
-one, and the features are trained to mislead it. Weight 0 is the control. The training loop is separate from that of
-`train`, because the batches and the second network cannot be written as a loss term there.
+A second network, the discriminator, predicts from the features whether a reading is from a known skin or from the new
+one, and the features are trained to mislead it. With weight 0, this is the control. The module has its own training
+loop, because the two-skin batches and the discriminator cannot be expressed as a loss term in `reskin.models.train`.
 """
 
 from dataclasses import dataclass
@@ -20,18 +20,18 @@ from reskin.models.recipe import Schedule
 from reskin.models.train import AdamW, clip_gradients, one_cycle
 
 DISCRIMINATOR_WIDTH = 64  # assumed
-MOMENTUM = 0.5  # with more, the two opposing networks oscillate (Radford et al., ICLR 2016)
+MOMENTUM = 0.5  # with a larger value, the two opposing networks oscillate (Radford et al., ICLR 2016)
 RAMP_RATE = (
-    10.0  # after a part p of the training, the weight is multiplied by 2 / (1 + exp(-10 p)) - 1, as in the paper
+    10.0  # at fraction p of the training, the weight is multiplied by 2 / (1 + exp(-10 p)) - 1, as in Ganin et al.
 )
-# The third layer is as wide as the features of any `Stack`.
+# A `Stack` requires that the output of its third layer has `FEATURES_N` values.
 DISCRIMINATOR_WIDTHS = (FEATURES_N, DISCRIMINATOR_WIDTH, DISCRIMINATOR_WIDTH, FEATURES_N, 1)
 DISCRIMINATOR = tuple(Layer(in_n, out_n, out_n > 1) for in_n, out_n in pairwise(DISCRIMINATOR_WIDTHS))
 
 
 @dataclass(frozen=True)
 class Domains:
-    """Scaled inputs and targets of known skins, and scaled inputs of the new one."""
+    """Scaled inputs and targets of the known skins, and scaled inputs of the new skin."""
 
     known: Float32[np.ndarray, "n c"]
     target: Float32[np.ndarray, "n t"]
@@ -39,8 +39,8 @@ class Domains:
 
 
 def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: np.random.Generator) -> Weights:
-    """Train one network from random weights; each batch has as many readings of known skins as of the new one."""
-    torch.set_num_threads(1)  # the same sums in the same order, however many processes run beside this one
+    """Train one network from random weights; half of each batch is from the known skins, half from the new skin."""
+    torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
     layers = paper_layers(domains.known.shape[1], domains.target.shape[1])
     net = Stack(layers, [draw_weights(layers, rng)])
     discriminator = Stack(DISCRIMINATOR, [draw_weights(DISCRIMINATOR, rng)])
@@ -65,12 +65,12 @@ def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: 
 
 
 def reverse_gradient(values: Float[torch.Tensor, "m b d"], weight: float) -> Float[torch.Tensor, "m b d"]:
-    """Return the values unchanged; their gradient is multiplied by -`weight`."""
+    """Return the values unchanged, but multiply their gradient by -`weight`."""
     return (1 + weight) * values.detach() - weight * values
 
 
 def ramp(part: float) -> float:
-    """Return the factor of the weight after a part of the training: 0 at first, so that features can form.
+    """Return the factor of the weight at a fraction of the training: 0 at first, so that features can form.
 
     >>> [round(ramp(part), 2) for part in (0.0, 0.1, 1.0)]
     [0.0, 0.46, 1.0]

@@ -1,7 +1,7 @@
-"""Alignment of two skins by a linear map in closed form: reference methods for adaptation.
+"""Reference methods for adaptation that align two skins by a linear map in closed form.
 
-Matching the means and standard deviations of channels, or their covariance (CORAL), needs no labels; direct
-standardisation needs pairs of readings at the same places.
+Matching the mean and the standard deviation of each channel, or the covariance of the channels (CORAL), needs no
+labels. Direct standardisation needs pairs of readings at the same places.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 CORAL_RIDGE = 1.0  # added to every variance of standardised inputs (Sun, Feng & Saenko, AAAI 2016)
-SD_MIN = 1e-6  # a constant channel is shifted, not scaled
-RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # in units of a channel's mean square times the number of pairs
+SD_MIN = 1e-6  # lower limit of standard deviations, so that a constant channel can be divided by it
+RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # in units of (mean square of a channel) * (number of pairs)
 Inputs = Float[np.ndarray, "n c"]
 
 
@@ -24,20 +24,20 @@ class Map:
     after: Float[np.ndarray, " c"]
 
     def __call__(self, inputs: Inputs) -> Inputs:
-        """Map inputs of the first skin to those of the second."""
+        """Map inputs of skin `of` to inputs of skin `to`."""
         return (inputs - self.before) @ self.matrix + self.after
 
 
 def match_channels(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"]) -> Map:
-    """Match the mean and the standard deviation of every channel."""
+    """Fit the map that matches the mean and the standard deviation of each channel."""
     return Map(of.mean(axis=0), np.diag(_sd(to) / _sd(of)), to.mean(axis=0))
 
 
 def coral(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"], ridge: float = CORAL_RIDGE) -> Map:
-    """Whiten inputs and colour them with the other skin's covariance, and match the means (CORAL).
+    """Fit the map that whitens inputs, recolours them with the other skin's covariance, and matches the means (CORAL).
 
-    In units of the first skin's standard deviations, the matrix is C_of^-1/2 C_to^1/2, where `ridge` times the identity
-    is added to each covariance C.
+    With both skins in units of the standard deviations of `of`, the matrix is C_of^-1/2 C_to^1/2, where `ridge` times
+    the identity is added to each covariance C.
     """
     scale = _sd(of)
     covariances = [np.cov(side / scale, rowvar=False) + ridge * np.eye(of.shape[1]) for side in (of, to)]
@@ -46,10 +46,10 @@ def coral(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"], ridge: flo
 
 
 def direct(of: Float[np.ndarray, "p c"], to: Float[np.ndarray, "p c"], ridge: float) -> Map:
-    """Fit the linear map from a few inputs to the paired inputs (direct standardisation, Wang & Kowalski 1991).
+    """Fit the linear map from inputs to paired inputs of another skin (direct standardisation, Wang & Kowalski 1991).
 
-    This is ridge regression of the differences within pairs, so that directions without data are left unchanged. There
-    is no constant term, because without contact the field change is zero on any skin.
+    The map is the identity plus a ridge regression of the differences within pairs, so that it is the identity in
+    directions without data. There is no constant term, because without contact the field change of every skin is zero.
     """
     none = np.zeros(of.shape[1])
     gain = np.linalg.solve(of.T @ of + _penalty(of, ridge), of.T @ (to - of))

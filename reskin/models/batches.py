@@ -1,4 +1,4 @@
-"""Training data of a stack of networks: scaled rows, initial weights, and the batches of every step."""
+"""Training data of a stack of networks: scaled rows, initial weights, and the batches of each step."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ AXES_N = 3
 
 @dataclass(frozen=True)
 class LabelledRows:
-    """Scaled inputs and targets; `points` orders them by distance, for a recipe with a triplet term."""
+    """Scaled inputs and targets; `points` are for sampling triplets, and None if the recipe has no triplet loss."""
 
     inputs: Float32[np.ndarray, "n c"]
     targets: Float32[np.ndarray, "n t"]
@@ -28,9 +28,10 @@ class LabelledRows:
 
 @dataclass(frozen=True)
 class UnlabelledRows:
-    """Scaled inputs of which only the order along lines is known.
+    """Scaled inputs whose only label is their order along lines.
 
-    `points` are points on lines. A row may be on two lines, so `row` is the row number of each point.
+    `points` are the points of the lines, for sampling triplets. A row may be on two lines, so `row` contains the row
+    number of each point.
     """
 
     inputs: Float32[np.ndarray, "p c"]
@@ -40,9 +41,9 @@ class UnlabelledRows:
 
 @dataclass(frozen=True)
 class PreparedJob:
-    """One network of a stack: its initial weights, its generator, and its scaled rows.
+    """One network of a stack: its initial weights, its random generator, and its scaled rows.
 
-    `unlabelled` and `few_labels` are rows of a new skin, for adaptation and for fine-tuning.
+    `unlabelled` (for adaptation) and `few_labels` (for fine-tuning) are rows of a new skin.
     """
 
     initial_weights: Weights
@@ -55,18 +56,20 @@ class PreparedJob:
 def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     """Scale the rows of a job and draw its initial weights.
 
-    The scaler is fitted on the training rows. Fine-tuning uses scaler and weights of the network that it starts from.
+    The scaler is fitted to the training rows. Adaptation and fine-tuning start from a trained network, and use its
+    scaler and its weights.
     """
     recipe, target = job.recipe, data.target[job.train]
-    # The recipe is not part of the name, so that recipes are compared with equal initial weights and equal batches.
+    # The name of the random stream does not include the recipe, so that all recipes have the same initial weights and
+    # the same batches.
     retry = ("again", job.attempt_i) if job.attempt_i else ()
     rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
     if job.tuning is None:
         view = VIEW[recipe.inputs](data.db_uT[job.train])
         scaler = FIT[recipe.scaling](view, target)
         layers = LAYERS[recipe.architecture](view.shape[1], target.shape[1])
-        # If the output has a ReLU (the released network), a random output bias makes an output dead from the start in
-        # about every third network, and a dead output never learns. So the output bias is the mean scaled target.
+        # The outputs of the released network have a ReLU. With a random output bias, about one in three networks would
+        # start with an output that is always 0 and never learns. So the output bias is the mean of the scaled target.
         known = ~np.isnan(target).all(axis=0)
         mean = np.zeros(target.shape[1], np.float32)
         mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
@@ -77,7 +80,7 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     unlabelled = few_labels = None
     if job.loss_weights.unlabelled:
         assert isinstance(job.tuning, Adaptation)
-        lines = job.tuning.lines  # adaptation uses only field changes and the order along lines
+        lines = job.tuning.lines  # the only data of the new skin: field changes and their order along lines
         row, point_row = np.unique(lines.row, return_inverse=True)
         view = VIEW[recipe.inputs](data.db_uT[row])
         points = triplet_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
@@ -108,16 +111,17 @@ def virtual_boards(
     settings: Augmentation,
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
-    """Copy all rows `copies_n` times, each copy of a skin as another board would read it.
+    """Copy all rows `copies_n` times, as if other boards had measured them.
 
-    Each copy of a skin has its own random gains of channels and tilts of chips; each reading has its own noise.
+    For each copy of a skin, the gains of the channels and the tilts of the chips are drawn at random. Noise is drawn
+    for each reading.
 
     Returns
     -------
-    db_uT : row i of copy c is row c * f + i
+    db_uT : field changes; row i of copy c is row c * f + i
     skin : number of the virtual skin of each row
     """
-    from scipy.spatial.transform import Rotation  # imported late: few recipes have virtual boards
+    from scipy.spatial.transform import Rotation  # imported late, because few recipes have virtual boards
 
     codes = np.unique(skin, return_inverse=True)[1]
     skins_n, chips_n = codes.max() + 1, db_uT.shape[1] // AXES_N
@@ -136,18 +140,18 @@ def virtual_boards(
 
 
 Batch = dict[str, torch.Tensor]
-# For each tensor of a batch, the rows that it is gathered from.
+# For each tensor of a batch, the name of the rows from which it is gathered.
 _SOURCE = {
     "inputs": "inputs", "targets": "targets", "positive": "inputs", "negative": "inputs",
     "unlabelled": "unlabelled", "unlabelled_positive": "unlabelled", "unlabelled_negative": "unlabelled",
     "few_labels": "few_labels", "few_labels_targets": "few_labels_targets",
 }  # fmt: skip
-# One generator for each kind of draw, so that a further loss term does not change the other batches.
+# One generator per kind of draw, so that adding a loss term does not change the draws for the other terms.
 _STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
 
 
 class BatchSampler:
-    """The rows of a stack on the device, concatenated over its networks, and batches drawn from them."""
+    """Draws batches from the rows of a stack, which are concatenated over its networks and stored on the device."""
 
     def __init__(self, jobs: Sequence[PreparedJob], batch_n: int, device: str) -> None:
         self.jobs, self.batch_n, self.device = jobs, batch_n, device
@@ -165,11 +169,12 @@ class BatchSampler:
         self.first_row = {name: np.cumsum([0, *map(len, values)])[:-1] for name, values in rows.items()}
 
     def sample(self, steps_n: int) -> Iterator[Batch]:
-        """Draw the batches of `steps_n` steps; each tensor is [m b ...].
+        """Draw the batches of `steps_n` steps; each tensor has dimensions [m b ...].
 
-        `inputs` and `targets` are labelled rows; `positive` and `negative` complete their triplets. With unlabelled
-        rows, there are also `unlabelled` (the anchors), `unlabelled_positive` and `unlabelled_negative`; with a few
-        labelled rows of the new skin, `few_labels` and `few_labels_targets`.
+        A batch contains `inputs` and `targets` of labelled rows. With a triplet loss, it also contains `positive` and
+        `negative`, which form triplets with the anchors `inputs`; with unlabelled rows, the triplets `unlabelled` (the
+        anchors), `unlabelled_positive` and `unlabelled_negative`; with a few labelled rows of the new skin,
+        `few_labels` and `few_labels_targets`.
         """
         shape = (steps_n, self.batch_n)
         drawn = [_draw_rows(job, shape, rngs) for job, rngs in zip(self.jobs, self.rngs, strict=True)]

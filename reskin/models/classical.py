@@ -1,4 +1,4 @@
-"""Classical regression methods, the reference methods for the networks on the same folds."""
+"""Classical regression methods: reference methods for the networks, trained on the same folds."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -26,13 +26,13 @@ from reskin.seeds import rng_for
 
 
 class _Method(Strict):
-    """Base of all methods: the view of the inputs (`reskin.models.inputs`)."""
+    """Base class of the settings of a method: the view of the inputs (see `reskin.models.inputs`)."""
 
     inputs: Literal["raw", "shape"]
 
 
 class Ridge(_Method):
-    """Linear ridge regression; `alpha` weights the penalty against the sum of squared errors, all standardised."""
+    """Linear ridge regression. `alpha` weights the penalty relative to the sum of standardised squared errors."""
 
     title: ClassVar[str] = "ridge"
     method: Literal["ridge"]
@@ -40,7 +40,7 @@ class Ridge(_Method):
 
 
 class CubicRidge(_Method):
-    """Ridge on all products of up to three inputs: 815 products of 15 inputs, 968 of 16."""
+    """Ridge regression on all products of up to three inputs: 815 products of 15 inputs, 968 products of 16."""
 
     title: ClassVar[str] = "cubic ridge"
     method: Literal["cubic_ridge"]
@@ -48,7 +48,7 @@ class CubicRidge(_Method):
 
 
 class Neighbours(_Method):
-    """Mean over the nearest training rows, weighted by row weight / distance."""
+    """Mean over the nearest training rows, weighted by (row weight / distance)."""
 
     title: ClassVar[str] = "k nearest neighbours"
     method: Literal["knn"]
@@ -56,7 +56,10 @@ class Neighbours(_Method):
 
 
 class RbfRidge(_Method):
-    """Kernel ridge with exp(-gamma d^2) around at most `rows_max_n` rows; on average, d^2 is 2 per input."""
+    """Kernel ridge regression with kernel exp(-gamma d^2) and at most `rows_max_n` rows.
+
+    Inputs are standardised, so the squared distance d^2 of two rows is on average 2 per input.
+    """
 
     title: ClassVar[str] = "RBF kernel ridge"
     method: Literal["rbf_ridge"]
@@ -66,7 +69,10 @@ class RbfRidge(_Method):
 
 
 class Boosting(_Method):
-    """Gradient-boosted trees, one model per target; no early stopping, whose hold-out would split indentations."""
+    """Gradient-boosted trees, one model per target.
+
+    Early stopping is disabled, because it would split the readings of an indentation into training and validation.
+    """
 
     title: ClassVar[str] = "gradient boosting"
     method: Literal["boosting"]
@@ -80,27 +86,27 @@ Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Fie
 
 @dataclass(frozen=True)
 class _Part:
-    """A regressor of the targets (columns 0, 1, 2) that are known in the same training rows."""
+    """A regressor for those targets (columns 0, 1, 2) that are known in the same training rows."""
 
     targets: list[int]
-    regressor: Any  # fit(inputs, target, weight), predict(inputs)
+    regressor: Any  # has methods fit(inputs, target, weight) and predict(inputs)
     rows_n: int
 
 
 @dataclass(frozen=True)
 class FittedRegressor:
-    """A fitted method with the scaler of its training rows."""
+    """A fitted method, and the scaler that was fitted to its training rows."""
 
     scaler: Scaler
     parts: tuple[_Part, ...]
 
     @property
     def rows_n(self) -> int:
-        """Number of training rows of the target that is known in most rows."""
+        """Number of training rows for the target that has the most known values."""
         return max(part.rows_n for part in self.parts)
 
     def predict(self, inputs: Float32[np.ndarray, "f c"]) -> Float32[np.ndarray, "f 3"]:
-        """Predict x_mm, y_mm and F_N; NaN if the target was unknown in all training rows."""
+        """Predict x_mm, y_mm and F_N; a target that was unknown in all training rows is NaN."""
         predicted = np.full((len(inputs), 3), np.nan, np.float32)
         encoded = self.scaler.encode(inputs).astype(np.float64)
         with one_thread():
@@ -119,10 +125,10 @@ def fit(
     *,
     weight: Float32[np.ndarray, " n"] | None,
 ) -> FittedRegressor:
-    """Fit a method to the rows with a known target (mm, mm, N).
+    """Fit a method to the rows whose targets (mm, mm, N) are known.
 
-    Targets that are known in different rows are fitted separately. `weight` is the weight of each row in the loss (for
-    neighbours, in the mean); the scaler ignores it.
+    Targets that are known in different rows are fitted separately. `weight` is the weight of each row in the loss, or
+    in the mean over nearest neighbours. The scaler ignores it.
     """
     assert weight is None or (weight > 0).all()
     _check_rows(settings, inputs, target)
@@ -144,13 +150,13 @@ def fit(
 
 
 def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
-    """Scale inputs that are constant in training to 0; with the smallest scale, they would dominate all others."""
+    """Scale inputs that are constant in training to 0; with the smallest scale, they would dominate the distances."""
     constant = scaler.input_scale <= SCALE_FLOOR
     return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
 
 
 def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
-    """Group the targets that are known in the same rows; return these rows with each group."""
+    """Group the targets that are known in the same rows; return each group with its rows."""
     known = ~np.isnan(target)
     together: dict[bytes, list[int]] = {}
     for i in np.flatnonzero(known.any(axis=0)):
@@ -161,10 +167,11 @@ def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], 
 def _thin(
     rows_n: int, most_n: int, weight: Float[np.ndarray, " n"] | None, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
-    """Draw `most_n` of more rows without replacement.
+    """Draw `most_n` of `rows_n` rows without replacement; return their row numbers and weights.
 
-    All rows with more than the least weight are kept: they are the few labelled rows of a new skin. Their weight is
-    reduced in proportion to the number of the other rows, so that their share of the total weight stays the same.
+    All rows that have more than the smallest weight are kept, because they are the few labelled rows of a new skin.
+    Their weight is reduced by the same factor as the number of the other rows, so that their fraction of the total
+    weight does not change.
     """
     if weight is None:
         return np.sort(rng.choice(rows_n, most_n, replace=False)), None
@@ -191,25 +198,25 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
         raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")
 
 
-BLOCK_ROWS_N = 4096  # rows computed at once, to bound memory: their kernel with 6000 rows takes 200 MB
-_THREADS = ThreadpoolController()  # created once: finding the libraries takes 3 ms, limiting them 15 us
+BLOCK_ROWS_N = 4096  # rows per block, to limit memory: the kernel of a block with 6000 rows takes 200 MB
+_THREADS = ThreadpoolController()  # created once, because finding the libraries takes 3 ms; a limit takes 15 us
 
 
 def one_thread() -> Any:
-    """Return a context in which linear algebra uses one thread."""
+    """Return a context manager that limits linear algebra to one thread."""
     return _THREADS.limit(limits=1)
 
 
 def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
-    """Make the regressor of these settings, with fit(inputs, target, weight) and predict(inputs)."""
+    """Create the regressor of these settings, which has methods fit(inputs, target, weight) and predict(inputs)."""
     match settings:
         case Ridge():
             return LinearRidge(settings.alpha)
         case CubicRidge():
             return _BlockwiseCubicRidge(settings.alpha)
         case Neighbours(neighbours_n=k):
-            # A k-d tree is fast, as readings vary along few directions. By default, scikit-learn uses brute force from
-            # 16 inputs on.
+            # A k-d tree is fast, because readings vary along few directions. By default, scikit-learn would use brute
+            # force for 16 or more inputs.
             return _WeightedNeighbours(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
         case RbfRidge():
             return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
@@ -225,11 +232,11 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
 
 
 class _BlockwiseCubicRidge:
-    """Ridge on products, with sums accumulated block by block: all products of the paper's rows would take 5 GB."""
+    """Ridge regression on products of inputs, accumulated block by block: all products at once would take 5 GB."""
 
     def __init__(self, alpha: float) -> None:
         self.alpha = alpha
-        self.lift = PolynomialFeatures(3)  # the first product is 1, the intercept, which is not penalised
+        self.lift = PolynomialFeatures(3)  # the first product is 1; its coefficient is not penalised
 
     def fit(self, inputs: np.ndarray, target: np.ndarray, weight: np.ndarray | None, /) -> None:
         c = self.lift.fit(inputs[:1]).n_output_features_
@@ -247,7 +254,7 @@ class _BlockwiseCubicRidge:
 
 @dataclass(frozen=True)
 class _WeightedNeighbours:
-    """Nearest neighbours with row weights, which scikit-learn lacks: the ratio of its means of w y and of w."""
+    """Nearest neighbours with row weights w, which scikit-learn lacks: its mean of w y, divided by its mean of w."""
 
     neighbours: KNeighborsRegressor
 
@@ -261,15 +268,15 @@ class _WeightedNeighbours:
 
 
 def blocks(rows_n: int) -> list[slice]:
-    """Split rows into blocks that fit into memory."""
+    """Return slices that split `rows_n` rows into blocks of at most `BLOCK_ROWS_N`."""
     return [slice(i, i + BLOCK_ROWS_N) for i in range(0, rows_n, BLOCK_ROWS_N)]
 
 
 @dataclass(frozen=True)
 class ClassicalJob:
-    """A method on one fold, with at most `rows_max_n` training rows, drawn at random.
+    """A method on one fold, with at most `rows_max_n` training rows, which are drawn at random.
 
-    `few_labels` are labelled rows of a new skin, whose total weight is that of all other rows.
+    `few_labels` are numbers of labelled rows of a new skin. Their total weight equals that of all other rows.
     """
 
     name: str
@@ -283,17 +290,17 @@ class ClassicalJob:
 
 @dataclass(frozen=True)
 class ClassicalResult:
-    """Predictions (mm, mm, N) for the test rows, number of training rows, times of the fit and of one prediction."""
+    """Predictions (mm, mm, N) for the test rows, the number of training rows, and computing times."""
 
     predicted: Float32[np.ndarray, "b 3"]
     rows_n: int
-    seconds: float
+    seconds: float  # time of the fit
     one_reading_s: float  # median time of a prediction for a single reading
 
 
 @dataclass(frozen=True)
 class _JobRows:
-    """The rows of one job, small enough to send to another process."""
+    """Only the rows that one job needs, because they are sent to another process."""
 
     train: Float32[np.ndarray, "a c"]
     target: Float32[np.ndarray, "a 3"]
@@ -304,7 +311,7 @@ class _JobRows:
 def run_classical_jobs(
     jobs: Sequence[ClassicalJob], data: TrainingData, executor: Executor, log: Callable[[str], None]
 ) -> list[ClassicalResult]:
-    """Fit every job in the executor, and return the results in their order."""
+    """Run all jobs in the executor, and return the results in the order of `jobs`."""
     running = [executor.submit(_fit, job.method, job.name, job.seed, _rows_of(job, data)) for job in jobs]
     results = []
     for job, future in zip(jobs, running, strict=True):

@@ -1,6 +1,7 @@
-"""Inputs of the models: views of the field change, and scalers between uT, mm, N and the scaled values of a network.
+"""Inputs of the models: views of the field change, and scalers between physical units and a network's scaled values.
 
-A view is a fixed function of one row; a scaler is fitted on training rows only, so that test rows do not leak into it.
+A view is a fixed function of a row. A scaler is fitted only to training rows, so that it contains no information about
+test rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -9,12 +10,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed: least |dB|, below the noise (3 uT in one channel, some 15 uT in fifteen). Its log is 0, so that a zero field
-# change gives zeros in all inputs.
+# Assumed lower limit of |dB|, below the noise (3 uT per channel; the norm over 15 channels is about 15 uT). Its log is
+# 0, so that all inputs are 0 for a field change of 0.
 DB_FLOOR_uT = 1.0
-# Least scale, used for a channel that is constant in training.
+# Lower limit of scales, for channels that are constant in training.
 SCALE_FLOOR = np.float32(1e-6)
-RELEASED_INPUT_SDS = np.float32(5.0)  # the released weights divide by about five standard deviations
+RELEASED_INPUT_SDS = np.float32(5.0)  # the scale in the released weights is about five standard deviations
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 
@@ -23,7 +24,7 @@ def raw(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f ch"]:
 
 
 def shape(db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f c"]:
-    """Return dB / |dB|, which does not depend on the magnet's strength, and the natural log of |dB| / uT."""
+    """Return dB / |dB|, which is independent of the strength of the magnets, and the natural logarithm of |dB| / uT."""
     length_uT = np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True)  # [f 1]
     floored_uT = np.maximum(length_uT, DB_FLOOR_uT)
     return np.hstack([db_uT / floored_uT, np.log(floored_uT)]).astype(np.float32)
@@ -34,7 +35,10 @@ VIEW: Mapping[str, Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "
 
 @dataclass(frozen=True)
 class Scaler:
-    """The input is `(db - input_shift) / input_scale`; `out * target_scale + target_shift` is x_mm, y_mm and F_N."""
+    """Scaling of a network's inputs and outputs.
+
+    inputs = (db - input_shift) / input_scale; x_mm, y_mm and F_N = outputs * target_scale + target_shift.
+    """
 
     input_shift: Float32[np.ndarray, " ch"]
     input_scale: Float32[np.ndarray, " ch"]
@@ -45,11 +49,11 @@ class Scaler:
         return (db_uT - self.input_shift) / self.input_scale
 
     def encode_target(self, target: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
-        """Scale places and forces."""
+        """Convert places and forces (mm, mm, N) to scaled targets."""
         return (target - self.target_shift) / self.target_scale
 
     def decode(self, scaled: Float32[np.ndarray, "f t"]) -> Float32[np.ndarray, "f t"]:
-        """Convert outputs of the network to mm, mm, N."""
+        """Convert outputs of a network to places and forces (mm, mm, N)."""
         return scaled * self.target_scale + self.target_shift
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -61,7 +65,7 @@ class Scaler:
 
 
 def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """Fit a scaler to zero mean and unit standard deviation of every channel and target."""
+    """Fit a scaler that gives each channel and target a mean of 0 and a standard deviation of 1."""
     known = ~np.isnan(target).all(axis=0)
     shift, scale = np.zeros(target.shape[1], np.float32), np.ones(target.shape[1], np.float32)
     shift[known] = np.nanmean(target[:, known], axis=0, dtype=np.float64)
@@ -75,7 +79,7 @@ def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray,
 
 
 def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """Fit the scaler of the released network: 5 sd of each channel, no mean removed; x/16, y/16, F/3."""
+    """Fit the scaler of the released network: each channel / 5 sd, without removing the mean; x / 16, y / 16, F / 3."""
     return Scaler(
         input_shift=np.zeros(db_uT.shape[1], np.float32),
         input_scale=_floored(RELEASED_INPUT_SDS * db_uT.std(axis=0, dtype=np.float64)),

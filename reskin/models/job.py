@@ -1,6 +1,6 @@
 """Training jobs: a recipe on one fold with one seed, or fine-tuning of a trained network on a new skin.
 
-`JobKeys` makes the key under which a job's result is cached: a digest of everything that the result depends on.
+`JobKeys` computes the key under which a job's result is cached: a digest of everything that the result depends on.
 """
 
 import hashlib
@@ -20,8 +20,9 @@ from reskin.models.inputs import Scaler
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe, Schedule
 from reskin.numerics import device, signature
 
-COLLAPSED = 0.05  # explained variance of a target on training rows; sound networks explain more than 0.9
-# The modules whose code the result of training depends on (tests/models/test_job.py compares them with the imports).
+# A network has collapsed if its explained variance of a target on training rows is lower; usually it is above 0.9.
+COLLAPSED = 0.05
+# The modules on whose code the result of training depends (tests/models/test_job.py compares them with the imports).
 CODE_MODULES = (
     "reskin.seeds",
     *(f"reskin.models.{name}" for name in ("batches", "inputs", "job", "losses", "network", "reproducible", "train")),
@@ -36,8 +37,8 @@ Weights = Mapping[str, np.ndarray]
 class LossWeights:
     """Weights of the loss terms that are added to the squared error on labelled rows.
 
-    triplet: triplet loss on labelled rows. unlabelled: triplet loss on unlabelled pokes of the new skin. few_labels:
-    squared error on labelled pokes of the new skin.
+    triplet: of the triplet loss on labelled rows. unlabelled: of the triplet loss on unlabelled pokes of the new skin.
+    few_labels: of the squared error on labelled pokes of the new skin.
     """
 
     triplet: float
@@ -47,7 +48,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row, for triplets."""
+    """Field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row, which groups triplets."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     target: Float32[np.ndarray, "f t"]
@@ -59,10 +60,11 @@ class TrainingResult:
     """The result of a training run.
 
     key: name of the result in the cache. curve: mean squared error in each block of steps. predicted: x, y in mm and
-    F in N for the test rows. stopped_step: step at which the training diverged; the weights are those before it.
-    explained_min: explained variance (R2) on training rows of the worst target; None for a short training run. seconds:
-    time of the training run, its share of the stack's time. one_reading_s: median time of a prediction for one reading.
-    reused: whether an earlier run computed it. collapsed_before_n: earlier training runs of this job, which collapsed.
+    F in N for the test rows. stopped_step: step at which the training diverged, if it did; the weights are then the
+    last ones before this. explained_min: explained variance (R2) of the worst target on training rows; None for a short
+    training run. seconds: training time of the stack, divided by its number of networks. one_reading_s: median time of
+    a prediction for one reading. reused: whether the result is from the cache. collapsed_before_n: number of earlier
+    training runs of this job, all of which collapsed.
     """
 
     key: str
@@ -85,7 +87,7 @@ class TrainingResult:
 
 @dataclass(frozen=True)
 class Pretrained:
-    """A trained network that fine-tuning starts from, and its key."""
+    """A trained network from which adaptation or fine-tuning starts, and its key."""
 
     key: str
     weights: Weights
@@ -96,7 +98,7 @@ class Pretrained:
 class Adaptation:
     """Self-supervised fine-tuning on unlabelled pokes of a new skin (paper section 5).
 
-    Only the field changes of the rows in `lines` are used.
+    The only data of the new skin that are used: the field changes of the rows in `lines`, and their order.
     """
 
     start: Pretrained
@@ -106,7 +108,7 @@ class Adaptation:
 
 @dataclass(frozen=True)
 class FineTuning:
-    """Fine-tuning on a few labelled pokes of a new skin; `row` are their row numbers."""
+    """Fine-tuning on a few labelled pokes of a new skin; `row` contains their row numbers."""
 
     start: Pretrained
     settings: FineTuningRecipe
@@ -117,8 +119,9 @@ class FineTuning:
 class TrainingJob:
     """One training run.
 
-    experiment: the experiment that it is for, such as `lobo` (leave one board out). train, test: row numbers. skin: the
-    skin to adapt to. what: a further part of the name. attempt_i: number of earlier training runs that collapsed.
+    experiment: the experiment that uses the result, such as `lobo` (leave one board out). train, test: row numbers.
+    skin: the skin to adapt to. what: an additional part of the name. attempt_i: number of earlier training runs of this
+    job, all of which collapsed.
     """
 
     experiment: str
@@ -136,7 +139,7 @@ class TrainingJob:
 
     @property
     def name(self) -> str:
-        """File name of the model, unique within a stage."""
+        """File name of the model, which is unique within a stage."""
         parts = [self.experiment, self.recipe_name, self.fold, self.skin, self.what, f"seed{self.seed_i}"]
         return ".".join(part for part in parts if part)
 
@@ -155,7 +158,7 @@ class TrainingJob:
 
 
 class JobKeys:
-    """Keys of results, for jobs on the same data: digests of rows, recipe, seed, start, code and libraries."""
+    """Computes cache keys for jobs on the same data: digests of rows, recipe, seed, start, code and libraries."""
 
     def __init__(self, data: TrainingData) -> None:
         self.data = data
@@ -181,7 +184,7 @@ class JobKeys:
         return _digest(self.data.db_uT, self.data.target, np.unique(self.data.skin, return_inverse=True)[1])
 
     def _train_digest(self, train: np.ndarray) -> str:
-        if id(train) not in self._train_digests:  # the array is kept, so that its id is not reused
+        if id(train) not in self._train_digests:  # the array is kept below, so that its id is not reused
             skin = np.unique(self.data.skin[train], return_inverse=True)[1]
             content = _digest(self.data.db_uT[train], self.data.target[train], skin)
             self._train_digests[id(train)] = (train, content)

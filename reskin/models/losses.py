@@ -1,7 +1,7 @@
-"""Training losses: the squared error, and the triplet loss of the paper (section 5) with the sampling of its triplets.
+"""Training losses: the squared error, and the paper's triplet loss (section 5) with the sampling of triplets.
 
-A triplet is an anchor, a positive and a negative from one group (a skin, or a line of pokes), where the positive is
-strictly nearer to the anchor than the negative.
+A triplet consists of an anchor, a positive and a negative from the same group (a skin, or a line of pokes). The
+positive is strictly nearer to the anchor than the negative.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int64, Shaped
 
 from reskin.errors import TrainingError
 
-MAX_DRAWS_N = 100  # if half of the draws are ties, a share of 1e-30 of the anchors is left after this many
-TIE_RTOL = 1e-5  # relative to the sum of both squared distances; by float32 rounding, equal distances differ by 1e-6
-COMPARED_PLACES_N = 64  # places per group; a place with equal distances to all of these is not used as an anchor
+MAX_DRAWS_N = 100  # if half of all draws are ties, a fraction of 1e-30 of the anchors remains after this many
+TIE_RTOL = 1e-5  # of the sum of both squared distances; float32 rounding makes equal distances differ by 1e-6 of it
+COMPARED_PLACES_N = 64  # compared per group; a place with equal distances to all of them is not used as an anchor
 
 Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
 
@@ -24,10 +24,10 @@ def squared_error(
 ) -> Float[torch.Tensor, " m"]:
     """Mean squared error over the known targets of a batch, for each of m networks.
 
-    An unknown target (NaN) has no gradient.
+    Unknown targets (NaN) contribute neither to the loss nor to the gradient.
     """
     known = ~torch.isnan(truth)
-    # Masked before squaring, because NaN times zero is NaN, also in the gradient.
+    # Masked before squaring: otherwise the gradient would be 0 * NaN = NaN.
     difference = torch.where(known, predicted - truth, 0.0)
     return (difference**2).sum((1, 2)) / known.sum((1, 2))
 
@@ -35,9 +35,9 @@ def squared_error(
 def triplet_loss(
     anchor: Float[torch.Tensor, "m b d"], positive: Float[torch.Tensor, "m b d"], negative: Float[torch.Tensor, "m b d"]
 ) -> Float[torch.Tensor, " m"]:
-    """Batch mean of max(0, |a - p|^2 - |a - n|^2): squared distances of features, without a margin (section 5).
+    """Batch mean of max(0, |a - p|^2 - |a - n|^2), with distances between features and without a margin (section 5).
 
-    With squared distances, the gradient of identical points is 0 and finite.
+    Because the distances are squared, the gradient is finite (0) where points coincide.
     """
     positive_d2 = ((anchor - positive) ** 2).sum(-1)
     negative_d2 = ((anchor - negative) ** 2).sum(-1)
@@ -48,7 +48,7 @@ def triplet_loss(
 class TripletPoints:
     """Points sorted by group: the points of group g are `order[start[g] : start[g] + count[g]]`.
 
-    A point is an anchor if the other points of its group are not all at the same distance from it.
+    A point can be an anchor if the other points of its group are not all at the same distance from it.
     """
 
     place: Float[np.ndarray, "n d"]
@@ -71,7 +71,7 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 
     Raises
     ------
-    TrainingError : all points of a group are at one place, or no point is an anchor
+    TrainingError : if all points of a group are at the same place, or no point can be an anchor
     """
     names, codes = np.unique(group, return_inverse=True)
     order = np.argsort(codes, kind="stable")
@@ -94,8 +94,8 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
     """Draw a positive and a negative for each anchor.
 
-    Both are drawn uniformly from the other points of the anchor's group; ties are drawn again. For a point that is not
-    an anchor, both are the point itself, so its loss and gradient are 0.
+    Both are drawn uniformly from the other points of the anchor's group, and ties are redrawn. For a point that cannot
+    be an anchor, both are the point itself, so that its loss and its gradient are 0.
     """
     positive, negative = anchor.copy(), anchor.copy()
     left = np.flatnonzero(points.is_anchor[anchor])
@@ -120,7 +120,7 @@ def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.G
 
 
 def _find_anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Mark the points that have points at two different distances, among `COMPARED_PLACES_N` places of the group."""
+    """Return the mask of points whose distances to other points, at `COMPARED_PLACES_N` places, are not all equal."""
     places, index, points_n = _unique_places(place)
     others = places[:COMPARED_PLACES_N].astype(np.float64)
     d2 = ((places[:, None].astype(np.float64) - others) ** 2).sum(axis=2)  # [places others]
@@ -134,7 +134,7 @@ def _unique_places(
 ) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
     """Return the sorted unique places, the index of each point's place, and the number of points at each place.
 
-    Like `np.unique(place, axis=0, ...)`, which compares rows as records and takes three times as long.
+    Equals `np.unique(place, axis=0, ...)`, which compares rows as records and takes three times as long.
 
     >>> _unique_places(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
     (array([1, 0, 1]), array([1, 2]))

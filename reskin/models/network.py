@@ -1,7 +1,7 @@
-"""The networks of the paper and of its authors' release: architecture, initial weights, and stacks of many networks.
+"""The paper's network and the one that its authors released: architecture, initial weights, and stacks of networks.
 
-A stack of m networks has one tensor per layer, so that one batched product replaces m small products. For networks of
-this size, the overhead of calls is larger than the cost of the arithmetic.
+A stack of m networks has one weight tensor per layer, so that one batched product replaces m small products. For
+networks of this size, the call overhead exceeds the cost of the arithmetic.
 """
 
 from collections.abc import Sequence
@@ -17,10 +17,10 @@ from reskin.models.job import Weights
 from reskin.models.reproducible import affine
 
 HIDDEN_N = 200
-FEATURES_N = 40  # width of the bottleneck, where the triplet loss is applied (paper section 4)
+FEATURES_N = 40  # width of the bottleneck, to which the triplet loss is applied (paper section 4)
 FEATURE_LAYERS_N = 3
-OUTPUTS_N = 3  # x, y, F; five with shear: x, y, Fx, Fy, Fz
-BLOCK_ROWS_N = 65_536  # rows predicted at once, to bound memory
+OUTPUTS_N = 3  # x, y, F; with shear there are five: x, y, Fx, Fy, Fz
+BLOCK_ROWS_N = 65_536  # rows per forward pass, to limit memory
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,15 @@ class Layer:
 
 
 def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3), as printed."""
+    """Return the paper's layers, which it prints as follows.
+
+    B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
+    """
     return _layers(inputs_n, outputs_n, relus=(True, False, False, True, True, False))
 
 
 def released_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """The network that the authors released, which also has a ReLU after layer 2 and on the output."""
+    """Return the layers of the released network, which also has a ReLU after layer 2 and on the output."""
     return _layers(inputs_n, outputs_n, relus=(True, True, False, True, True, True))
 
 
@@ -46,7 +49,7 @@ LAYERS = {"paper": paper_layers, "released": released_layers}
 
 
 def draw_weights(layers: Sequence[Layer], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw initial weights as PyTorch does for linear layers: uniform within 1/sqrt(fan in)."""
+    """Draw initial weights from PyTorch's distribution for linear layers: uniform within +-1/sqrt(fan-in)."""
     weights = {}
     for i, layer in enumerate(layers, 1):
         limit = layer.in_n**-0.5
@@ -61,7 +64,7 @@ def _layers(inputs_n: int, outputs_n: int, relus: tuple[bool, ...]) -> tuple[Lay
 
 
 class Stack(nn.Module):
-    """Independent networks of one architecture, computed side by side."""
+    """Independent networks of the same architecture, computed together."""
 
     def __init__(self, layers: Sequence[Layer], members: Sequence[Weights]) -> None:
         super().__init__()
@@ -73,18 +76,18 @@ class Stack(nn.Module):
         self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 
     def features(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 40"]:
-        """Output of the first three layers, where the triplet loss is applied."""
+        """Return the output of the first three layers, to which the triplet loss is applied."""
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
     def head(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
-        """Output of the remaining layers."""
+        """Return the output of the remaining layers."""
         return self._run(features, FEATURE_LAYERS_N, len(self.relus))
 
     def forward(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b t"]:
         return self.head(self.features(inputs))
 
     def weights_of(self, i: int) -> dict[str, np.ndarray]:
-        """Copy the weights of one network, as `layer1.weight` [out in], `layer1.bias` [out], ..."""
+        """Return copies of one network's weights: `layer1.weight` [out in], `layer1.bias` [out], ..."""
         weights = {}
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
             weights[f"layer{k}.weight"] = weight.detach()[i].T.contiguous().cpu().numpy().copy()
@@ -102,7 +105,7 @@ class Stack(nn.Module):
 
 
 class Predictor:
-    """One trained network: scaled inputs -> scaled outputs, a block of rows at a time."""
+    """A trained network that maps scaled inputs to scaled outputs, block by block."""
 
     def __init__(self, weights: Weights, architecture: str, device: str) -> None:
         inputs_n, outputs_n = weights["layer1.weight"].shape[1], len(weights[f"layer{len(weights) // 2}.bias"])

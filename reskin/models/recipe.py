@@ -1,4 +1,4 @@
-"""Recipes: the settings of training, adaptation and fine-tuning."""
+"""Recipes: the settings of training, of adaptation and of fine-tuning."""
 
 from typing import Annotated, Literal
 
@@ -6,16 +6,17 @@ from pydantic import Field
 
 from reskin.config import Strict
 
-HEADLINE = "paper"  # the recipe that is compared with the paper; others are variants
+HEADLINE = "paper"  # the recipe whose results are compared with the paper; other recipes are variants
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]  # a name is part of file names
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]  # limited, because names are parts of file names
 Weight = Annotated[float, Field(ge=0)]
 
 
 class Schedule(Strict):
-    """Optimisation: AdamW under a one-cycle learning rate with peak `rate_max`.
+    """Optimisation: AdamW with a one-cycle learning rate that peaks at `rate_max`.
 
-    The gradient (of all weights of a network as one vector, in scaled units) is clipped to norm `gradient_norm_max`.
+    The gradient with respect to all weights of a network, as one vector in scaled units, is clipped to a norm of at
+    most `gradient_norm_max`.
     """
 
     steps_n: Annotated[int, Field(ge=1)]
@@ -26,12 +27,12 @@ class Schedule(Strict):
 
 
 class Recipe(Schedule):
-    """How a network is trained, including what the paper leaves open.
+    """How a network is trained, including the choices that the paper does not specify.
 
     architecture: that of the paper's text, or that of the released network (with ReLU after layer 2 and on the output).
-    inputs: the field change as it is, or its direction and the logarithm of its length. scaling: standardisation of
-    each channel, or the scaling of the released network (divide by 5 sd, without mean; x/16, y/16, F/3).
-    triplet_weight: weight of the triplet loss; with 0, no triplets are drawn.
+    inputs: the field change itself, or its direction and the logarithm of its magnitude. scaling: standardisation of
+    each channel, or the scaling of the released network (each channel / 5 sd, without removing the mean; x / 16,
+    y / 16, F / 3). triplet_weight: weight of the triplet loss; with 0, no triplets are drawn.
     """
 
     architecture: Literal["paper", "released"]
@@ -41,7 +42,10 @@ class Recipe(Schedule):
 
 
 class Augmentation(Strict):
-    """Copies of every training skin as other boards would read it; standard deviations between boards."""
+    """Virtual copies of each training skin, as if other boards had measured it.
+
+    The settings are standard deviations of the differences between boards.
+    """
 
     copies_n: Annotated[int, Field(ge=1, le=100)]
     gain_sd: Weight  # of each channel
@@ -50,27 +54,27 @@ class Augmentation(Strict):
 
 
 class AugmentedRecipe(Recipe):
-    """A recipe that also trains on virtual boards (ours, not the paper's)."""
+    """A recipe that also trains on virtual boards (not in the paper)."""
 
     augmentation: Augmentation
 
 
 class AdaptationRecipe(Schedule):
-    """Adaptation to a new skin: the recipe's loss plus the triplet loss on unlabelled pokes along lines (section 5).
+    """Adaptation to a new skin: the recipe's loss plus a triplet loss on unlabelled pokes along lines (section 5).
 
-    unlabelled_weight: weight of that triplet loss; 0 for the control.
+    unlabelled_weight: weight of this triplet loss; 0 for the control.
     """
 
     unlabelled_weight: Weight
 
 
 class FineTuningRecipe(Schedule):
-    """Fine-tuning on a few labelled pokes of a new skin, whose squared error has weight `own_weight`."""
+    """Fine-tuning to a new skin; the squared error on its few labelled pokes has weight `own_weight`."""
 
     own_weight: Weight
 
 
 class AdaptationWithBase(AdaptationRecipe):
-    """Adaptation of the networks that stage train_triplet trained with recipe `base`."""
+    """Adaptation of the networks that stage `train_triplet` trained with recipe `base`."""
 
     base: Name

@@ -1,10 +1,10 @@
 """Differentiable operations whose results are bit-identical on every x86-64 processor with AVX2.
 
-On a CPU, PyTorch passes matrix products, `exp`, `log`, `sqrt` and `erf` to MKL, which computes them differently on AMD
-and Intel processors, even if MKL_CBWR is set, and training amplifies a difference in the last bit to millimetres. Here,
-products are computed by NumPy's OpenBLAS with the kernels that `reskin.numerics` selects, which is as fast for layers
-of this size; `exp` uses `exp2`, which PyTorch implements itself. PyTorch also implements the other operations of the
-networks (sums, ReLU, sigmoid, AdamW); logarithms of inputs are computed in NumPy.
+On a CPU, PyTorch computes matrix products, `exp`, `log`, `sqrt` and `erf` with MKL. MKL's results differ between AMD
+and Intel processors, even if MKL_CBWR is set, and training amplifies a difference in the last bit to millimetres.
+Therefore, this module computes products with NumPy's OpenBLAS and the kernels that `reskin.numerics` selects, which is
+as fast for layers of this size, and `exp` with `exp2`, which PyTorch computes without MKL. The other operations of the
+networks (sums, ReLU, sigmoid, AdamW) do not use MKL either; logarithms of inputs are computed in NumPy.
 """
 
 import math
@@ -20,7 +20,7 @@ def affine(
 ) -> Float[torch.Tensor, "*n b o"]:
     """Return `values @ weight + bias`.
 
-    `weight` has two dimensions for one layer for all rows, or three for one layer per network of a stack.
+    `weight` is 2-D for a single layer applied to all rows, or 3-D for a stack with one layer per network.
     """
     if weight.ndim == 2 and values.ndim > 2:
         rows = affine(values.flatten(end_dim=-2), weight, bias)
@@ -55,5 +55,5 @@ class _Affine(torch.autograd.Function):
 
 
 def _product(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    with np.errstate(all="ignore"):  # as in PyTorch: an overflow gives inf, which the training loop checks for
+    with np.errstate(all="ignore"):  # as in PyTorch, an overflow results in inf, which the training loop detects
         return torch.from_numpy(np.matmul(left.numpy(), right.numpy()))

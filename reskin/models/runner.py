@@ -1,8 +1,9 @@
-"""Run many training jobs in parallel, with a cache of finished training runs.
+"""Run many training jobs in parallel, with a cache of completed training runs.
 
-Jobs of equal settings and seed are trained as one stack. The position of a network in its stack affects the last bits
-of its weights. Therefore stacks are made from all requested jobs, finished or not, and a result is cached under the
-keys of all members of its stack. A stage that was killed continues with the stacks that are not complete.
+Jobs with equal settings and seed are trained together as a stack. The position of a network in its stack affects the
+last bits of its weights. Therefore, stacks are formed from all requested jobs, whether completed or not, and the cache
+key of a result includes the keys of all jobs in its stack. If a stage is killed and run again, it trains only the
+incomplete stacks.
 """
 
 import hashlib
@@ -22,13 +23,13 @@ from reskin.models.inputs import Scaler
 from reskin.models.job import JobKeys, TrainingData, TrainingJob, TrainingResult
 from reskin.numerics import device
 
-# Training runs per job. A network that collapses in all of them is kept and recorded as such, and `predict` refuses it.
+# Training runs per job. If all of them collapse, the last network is kept and marked, and `predict` rejects it.
 MAX_ATTEMPTS_N = 3
-STACK_N = {"cpu": 3, "cuda": 64}  # networks trained side by side; on a CPU, larger stacks are not faster
-NO_ROWS = np.zeros(0, np.int64)  # placeholder for row numbers that are in the shared file
+STACK_N = {"cpu": 3, "cuda": 64}  # networks per stack; on a CPU, larger stacks are not faster
+NO_ROWS = np.zeros(0, np.int64)  # replaces the row numbers of a `RemoteJob`, which are read from the shared file
 
-RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers, and the names of its `train` and `test` arrays
-FoldRows = Mapping[int, tuple[str, np.ndarray]]  # by id of the array: its name in the shared file, and the array
+RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers; the names of its `train` and `test` arrays
+FoldRows = Mapping[int, tuple[str, np.ndarray]]  # id of an array -> its name in the shared file, the array
 
 
 def run_jobs(
@@ -36,14 +37,14 @@ def run_jobs(
 ) -> list[TrainingResult]:
     """Train the jobs that are not in the cache, and return all results in the order of `jobs`.
 
-    A job that collapses is trained again with other random draws, at most `MAX_ATTEMPTS_N` times in all.
+    A job whose network collapses is retrained with other random draws, up to `MAX_ATTEMPTS_N` runs in total.
 
     Parameters
     ----------
     data : rows that the jobs refer to by number
     executor : where stacks are trained
-    cache : folder of finished training runs
-    log : receives one line for each finished stack, and warnings
+    cache : folder of completed training runs
+    log : receives one line per completed stack, and warnings
     """
     results = _run_once(jobs, data, executor, cache, log)
     for attempt_i in range(1, MAX_ATTEMPTS_N):
@@ -70,9 +71,10 @@ def _run_once(
     if len(fresh) < len(unique):
         log(f"{len(unique) - len(fresh)} of {len(unique)} training runs were finished before")
     if missing:
-        shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"  # one for each process
+        shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"  # one file per process
         work = [([unique[key] for key in stack], files) for stack, files in missing]
-        # Arrays of row numbers are named by their content, so that a worker reads each once and calls stay small.
+        # Arrays of row numbers are passed by name, a digest of their content. This keeps calls small, and a worker
+        # reads each array only once.
         sets = {id(rows): rows for stack, _ in work for job in stack for rows in (job.train, job.test)}
         folds = {i: (hashlib.sha256(rows.tobytes()).hexdigest()[:32], rows) for i, rows in sets.items()}
         skin = np.unique(data.skin, return_inverse=True)[1].astype(np.int64)
@@ -87,7 +89,7 @@ def _run_once(
 
 
 def make_stacks(jobs: Mapping[str, TrainingJob], size_n: int) -> list[list[str]]:
-    """Group the keys of jobs of equal settings and seed, in order, at most `size_n` in a stack."""
+    """Group the keys of jobs with equal settings and seed into stacks of at most `size_n`, in the order of the jobs."""
     alike: dict[tuple[object, ...], list[str]] = {}
     for key, job in jobs.items():
         alike.setdefault((job.recipe, job.schedule, job.loss_weights, job.seed, job.seed_i), []).append(key)
@@ -125,8 +127,8 @@ def _run_stacks(
 
 
 def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Sequence[Path]) -> None:
-    """Train a stack in a worker, and write the result of each job to its file."""
-    from reskin.models.train import train_stack  # imported late: imports torch, which only workers need
+    """Train a stack (in a worker process), and write the result of each job to its file."""
+    from reskin.models.train import train_stack  # imported late, because it imports torch, which only workers need
 
     jobs = [
         replace(job, train=_read_rows(shared_file, train), test=_read_rows(shared_file, test))
@@ -135,7 +137,7 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
     try:
         results = train_stack(jobs, _read_data(shared_file))
     except RuntimeError as error:
-        if "out of memory" in str(error) or "allocate memory" in str(error):  # on a CPU, torch raises only RuntimeError
+        if "out of memory" in str(error) or "allocate memory" in str(error):  # torch raises RuntimeError on a CPU
             raise MemoryError(str(error)) from None
         raise
     for job, file, result in zip(jobs, files, results, strict=True):
@@ -166,7 +168,7 @@ def _read_data(shared_file: Path) -> TrainingData:
     return TrainingData(**io.read_tensors(shared_file, ("db_uT", "target", "skin"))[0])
 
 
-@lru_cache(maxsize=16)  # row numbers of a few folds
+@lru_cache(maxsize=16)  # the row numbers of a few folds
 def _read_rows(shared_file: Path, name: str) -> np.ndarray:
     return io.read_tensors(shared_file, (name,))[0][name]
 

@@ -1,4 +1,4 @@
-"""The training loop: AdamW under a one-cycle rate, for a stack of networks with equal settings."""
+"""The training loop: AdamW with a one-cycle learning rate, for a stack of networks with equal settings."""
 
 import math
 import time
@@ -20,24 +20,24 @@ from reskin.models.network import LAYERS, Predictor, Stack
 from reskin.models.recipe import Schedule
 from reskin.numerics import device
 
-BLOCK_STEPS_N = 50  # steps whose batches are drawn together, and between two checks of the loss
-DIVERGED = 1e8  # mean squared error from which a network hardly ever recovers; predicting the mean has 1
-CHECKED_STEPS_N = 200  # after fewer steps from random weights, a network may not have learned anything yet
-CHECKED_ROWS_N = 2000  # evenly spaced training rows
+BLOCK_STEPS_N = 50  # steps in a block; batches are drawn and the loss is checked once per block
+DIVERGED = 1e8  # from this mean squared error, networks hardly ever recover; predicting the mean has an error of 1
+CHECKED_STEPS_N = 200  # with fewer steps, a network may not have learned anything, so collapse is not checked
+CHECKED_ROWS_N = 2000  # approximate number of training rows for this check, evenly spaced
 
 # Defaults of torch.optim.lr_scheduler.OneCycleLR and torch.optim.AdamW.
-WARM_UP = 0.3  # of all steps
-FIRST_RATE, LAST_RATE = 1 / 25, 1e-4  # of the peak; of the first
+WARM_UP = 0.3  # fraction of the steps
+FIRST_RATE, LAST_RATE = 1 / 25, 1e-4  # fraction of the peak rate; fraction of the first rate
 MOMENTUM_MAX, MOMENTUM_MIN = 0.95, 0.85
 BETA2, EPS = 0.999, 1e-8
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A trained network, and the mean squared error of every block of steps (scaled units).
+    """A trained network, and the mean squared error of each block of steps (scaled units).
 
-    `stopped_step` is set if a loss or a weight was not finite, or the loss exceeded `DIVERGED`; the weights are then
-    the last ones before this.
+    `stopped_step` is set if a loss or a weight was not finite, or if the loss exceeded `DIVERGED`. In this case, the
+    weights are those after the last block without such an error.
     """
 
     weights: Weights
@@ -46,7 +46,7 @@ class Outcome:
 
 
 def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[TrainingResult]:
-    """Train jobs of equal settings side by side, and predict their test rows."""
+    """Train jobs with equal settings together, and predict for their test rows."""
     torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
     start_s, on, first = time.monotonic(), device(), jobs[0]
     if on == "cuda" and not torch.cuda.is_available():
@@ -74,7 +74,8 @@ def train(
 ) -> list[Outcome]:
     """Minimise the squared error plus the weighted loss terms.
 
-    The paper names neither optimiser nor schedule; AdamW with torch's one-cycle rate and momentum are our choice.
+    The paper specifies neither optimiser nor schedule. We chose AdamW with PyTorch's one-cycle learning rate and
+    momentum.
     """
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
     net = Stack(layers, [job.initial_weights for job in jobs]).to(device)
@@ -108,20 +109,20 @@ def train(
 
 
 def clip_gradients(net: Stack, norm_max: float) -> None:
-    """Scale the gradient of each network (of all its weights as one vector) to a norm of at most `norm_max`."""
+    """Scale the gradient of each network, as one vector over all its weights, to a norm of at most `norm_max`."""
     gradients = [parameter.grad for parameter in net.parameters() if parameter.grad is not None]  # [m i o]
     norm = torch.linalg.vector_norm(
         torch.stack([torch.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]), dim=0
     )
-    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # 1 for a gradient of 0
+    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # inf is clamped to 1 for a gradient of 0
     for gradient in gradients:
         gradient.mul_(scale)
 
 
 def one_cycle(step_i: int, steps_n: int, rate_max: float) -> tuple[float, float]:
-    """Return the learning rate and the first momentum of a step: two half cosines.
+    """Return the learning rate and the first momentum (beta1) of a step, which vary as two half cosines.
 
-    The rate rises to its peak, then falls to nearly zero; the momentum falls first, then rises.
+    The rate rises to its peak and then falls to nearly zero. The momentum falls and then rises.
 
     >>> [round(one_cycle(i, 10, 25.0)[0], 4) for i in (0, 2, 9)]
     [1.0, 25.0, 0.0001]
@@ -141,10 +142,10 @@ def _cosine(start: float, end: float, part: float) -> float:
 
 
 class AdamW:
-    """torch's fused AdamW with rate and momentum given at each step.
+    """PyTorch's fused AdamW, with learning rate and momentum passed to each step.
 
-    It uses the functional interface, because the first `torch.optim.AdamW` of a process imports torch's compiler, which
-    takes a second of CPU time. The results are bit-identical.
+    It uses the functional interface, because the first use of `torch.optim.AdamW` in a process imports PyTorch's
+    compiler, which takes a second of CPU time. The results are bit-identical.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], weight_decay: float) -> None:
@@ -155,7 +156,7 @@ class AdamW:
 
     @torch.no_grad()
     def step(self, rate: float, momentum: float) -> None:
-        """Update the parameters from their gradients; torch raises if one has none."""
+        """Update the parameters from their gradients; torch raises an error if a parameter has no gradient."""
         gradients = [parameter.grad for parameter in self.parameters if parameter.grad is not None]
         adamw(
             self.parameters, gradients, self.mean, self.mean_square, [], self.steps_n, fused=True, amsgrad=False,
@@ -164,7 +165,7 @@ class AdamW:
 
 
 class Monitor:
-    """The loss curve of each network of a stack, and its last finite weights."""
+    """Records the loss curve of each network of a stack, and its weights before it diverged, if it did."""
 
     def __init__(self, net: Stack) -> None:
         self.net = net
@@ -173,8 +174,8 @@ class Monitor:
         self.stopped_step: dict[int, int] = {}
 
     def check(self, error: Float[torch.Tensor, " m"], step: int) -> bool:
-        """Record the mean errors of a block; return whether any network of the stack is still training."""
-        is_sound = (self.net.is_finite() & (error <= DIVERGED)).tolist()  # a comparison with NaN is false
+        """Record the mean errors of a block; return whether any network of the stack has not diverged."""
+        is_sound = (self.net.is_finite() & (error <= DIVERGED)).tolist()  # False for NaN
         for i in set(range(len(is_sound))) - set(self.stopped_step):
             if is_sound[i]:
                 self.curves[i].append(float(error[i]))
@@ -191,7 +192,7 @@ class Monitor:
 def _explained_min(
     job: TrainingJob, data: TrainingData, network: Callable[[np.ndarray], np.ndarray], scaler: Scaler
 ) -> float | None:
-    """Return the least explained variance (R2) of the known targets on training rows; None for a short training run."""
+    """Return the smallest explained variance (R2) of the known targets on training rows; None for a short run."""
     if job.schedule.steps_n < CHECKED_STEPS_N:
         return None
     rows = job.train[:: -(-len(job.train) // CHECKED_ROWS_N)]

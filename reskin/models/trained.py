@@ -1,4 +1,4 @@
-"""Trained networks: read from disk, predict, and export as ONNX."""
+"""Trained networks: reading from disk, prediction, and export as ONNX."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from reskin.models.inputs import VIEW, DB_FLOOR_uT, Scaler
 from reskin.models.recipe import HEADLINE
 from reskin.numerics import device
 
-FORMAT = "reskin-model/3"  # of a model's card
-UNIVERSAL = "reskin-universal"  # begins the format of the universal model's card
+FORMAT = "reskin-model/3"  # format of a model's card
+UNIVERSAL = "reskin-universal"  # prefix of the format of the universal model's card
 SUFFIX = ".safetensors"
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class CardRecipe(Strict, extra="ignore"):
-    """The part of a model's recipe that predictions depend on."""
+    """The part of a model's recipe on which predictions depend."""
 
     architecture: Literal["paper", "released"]
     inputs: Literal["raw", "shape"]
@@ -41,11 +41,11 @@ class CardInput(Strict, extra="ignore"):
 
     quantity: Literal["change of field"]
     unit: Literal["uT"]
-    channels_n: Annotated[int, Field(ge=3, le=192, multiple_of=3)]  # of at most 64 chips
+    channels_n: Annotated[int, Field(ge=3, le=192, multiple_of=3)]  # at most 64 chips
 
 
 class Card(Strict, extra="ignore"):
-    """The part of a model's card that predictions depend on; the rest is provenance."""
+    """The part of a model's card on which predictions depend; the rest is provenance."""
 
     format: str
     recipe: CardRecipe
@@ -56,7 +56,7 @@ class Card(Strict, extra="ignore"):
 
 @dataclass(frozen=True)
 class Network:
-    """A trained network with its card: field changes in uT -> x, y in mm and F in N."""
+    """A trained network with its card; it maps field changes in uT to x and y in mm and F in N."""
 
     card: Mapping[str, Any]
     tensors: Mapping[str, np.ndarray]
@@ -64,21 +64,21 @@ class Network:
     __repr__ = one_line
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
-        """Predict row by row."""
+        """Predict x_mm, y_mm and F_N for each row."""
         scaler, view = Scaler.of_arrays(self.tensors), VIEW[self.card["recipe"]["inputs"]](db_uT)
         return scaler.decode(self._predictor(scaler.encode(view)))
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        """The predictor, built once, because a controller predicts for every frame."""
-        from reskin.models.network import Predictor  # imported late: imports torch
+        """The predictor; cached, because controllers predict for every frame."""
+        from reskin.models.network import Predictor  # imported late, because it imports torch
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
         return Predictor(weights, self.card["recipe"]["architecture"], device())
 
 
 def read_network(model: Path) -> Network:
-    """Read a trained network and its card, from the same folder.
+    """Read a trained network, and its card from the same folder.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def read_network(model: Path) -> Network:
 
 
 def _find_models(missing: Path) -> str:
-    """Return how to get a missing model file; stages write model files to data/models/SCENE/STAGE."""
+    """Return advice on a missing model file; stages write model files to data/models/SCENE/STAGE."""
     if found := sorted(file.name for file in missing.parent.glob(f"*{SUFFIX}")):
         return f"Models in this folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
     if missing.parts[-5:-3] != ("data", "models"):
@@ -139,7 +139,7 @@ def _find_models(missing: Path) -> str:
 
 
 def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
-    """Read the networks of stage train_multi with this board held out, one per seed."""
+    """Read the networks of stage `train_multi` that were trained with this board held out, one per seed."""
     found = []
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -152,7 +152,7 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
 
 
 def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Read the networks of an experiment by fold, one per seed; empty if the scene does not run the experiment."""
+    """Return an experiment's networks by fold, one per seed; empty if the scene does not run the experiment."""
     found: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -164,7 +164,7 @@ def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -
 
 # --- ONNX ---
 
-OPSET, IR = 17, 8  # of 2022, which current runtimes read
+OPSET, IR = 17, 8  # versions from 2022, which current runtimes support
 INPUT, OUTPUT = "db_uT", "x_mm y_mm F_N"
 Node = tuple[str, tuple[str, ...], str]  # operator, inputs, output
 
@@ -175,12 +175,12 @@ def write_onnx(network: Network, file: Path) -> None:
 
 
 def build_onnx(network: Network) -> "ModelProto":
-    """Build the ONNX graph of a network: view, scaling, layers, units."""
+    """Build the ONNX graph of a network: view, input scaling, layers, conversion to units."""
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
         raise missing_package("onnx", "export_onnx") from None
-    from reskin.models.network import LAYERS  # imported late: imports torch
+    from reskin.models.network import LAYERS  # imported late, because it imports torch
 
     card, scaler = network.card, dict(network.tensors)
     channels_n = card["input"]["channels_n"]
@@ -218,7 +218,7 @@ def _raw() -> Iterator[Node]:
 
 
 def _shape() -> Iterator[Node]:
-    """Direction and natural log of the length, like `reskin.models.inputs.shape`."""
+    """Yield the nodes for direction and natural logarithm of the magnitude, as in `reskin.models.inputs.shape`."""
     yield "ReduceL2", (INPUT,), "length_uT"
     yield "Max", ("length_uT", "floor_uT"), "floored_uT"
     yield "Div", (INPUT, "floored_uT"), "direction"

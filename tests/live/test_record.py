@@ -145,7 +145,7 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until
 
 @pytest.mark.parametrize(
     ("labels", "gauge", "scan", "message"),
-    [("robot.txt", None, None, "--labels: robot.txt is not grid"), ("grid:2x2:4", None, "spiral", "--scan: prompts"),
+    [("robot.txt", None, None, "--labels: robot.txt is not grid"), ("grid:2x2:4", None, "spiral", "--scan: the order"),
      (None, "/dev/x@fast", None, "--gauge: /dev/x@fast is not PORT"), ("robot.csv", "/dev/x", None, "--labels")],
 )  # fmt: skip
 def test_invalid_label_sources_raise(labels, gauge, scan, message):

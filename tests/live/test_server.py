@@ -134,7 +134,7 @@ def test_page_is_announced_once_it_is_served(monkeypatch):
 
     monkeypatch.setattr(web, "run_app", run_app)
     server.serve([], host="0.0.0.0", http_port=8765, say=printed.append)
-    assert re.search(r"open http://0.0.0.0:8765/\?token=.+; Ctrl-C", printed[0])
+    assert re.search(r"open http://0.0.0.0:8765/\?token=.+; press Ctrl-C", printed[0])
 
 
 def test_file_as_port_is_an_error(tmp_path):
