@@ -54,7 +54,7 @@ class Split(Strict):
 
 @dataclass(frozen=True)
 class Fold:
-    """Row numbers (in `Rows`) for training, for testing, and of the pool: pokes on the held-out skins.
+    """Row numbers (in `Rows`) of the training rows, the test rows, and the pool (pokes on the held-out skins).
 
     Adaptation may use the pool. No method is scored on the pool, so that all methods are scored on the same rows.
     """
@@ -169,7 +169,7 @@ def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
             pool = np.sort(np.concatenate(pools))
             test = np.setdiff1d(whole.test, pool)
             if not len(test):
-                what, rule = "split.labels_pool_n", "less than its indentations"
+                what, rule = "split.labels_pool_n", "less than the number of indentations per skin"
                 remedy = "Reduce it, or record more."
                 raise ParamsError(f"fold labels/{whole.name}", what, rule, split.labels_pool_n, remedy)
             folds.append(Fold("labels", f"{whole.name}{DRAW}{draw_i}", whole.train, test, pool))
@@ -182,7 +182,7 @@ def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on one skin, test on skins of other boards; one fold per training skin.
+    """Train on one skin, test on the skins of boards without training skins; one fold per training skin.
 
     If other experiments adapt to a pool, these folds do not test on the pool either, so that all experiments are scored
     on the same rows.
@@ -193,8 +193,8 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     assert split.transfer_skins_n is not None
     boards, train_n = np.unique(rows.board), split.transfer_skins_n
     if train_n >= len(boards):
-        rule = f"less than the scene's {len(boards)} boards"
-        remedy = "Each training skin is from another board, and at least one board must remain for testing."
+        rule = f"less than the number of boards in the scene, {len(boards)}"
+        remedy = "Each training skin is from a different board, and at least one board must remain for testing."
         raise ParamsError("experiment transfer", "split.transfer_skins_n", rule, train_n, remedy)
     held = np.flatnonzero(np.isin(rows.board, boards[train_n:]))
     folds = []

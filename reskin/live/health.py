@@ -10,13 +10,13 @@ from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults, find_reading
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
-BATCH_FRAMES_N = 40  # faults that span several frames are detected late by up to this: 0.1 s with five chips
+BATCH_FRAMES_N = 40  # frames per check for faults that span several frames: 0.1 s with five chips
 RATE_WINDOW_S = 1.0
 SLOW_FRACTION = 0.7  # assumed: frames are missing if the rate is below this fraction of the usual rate
 USUAL_GAIN = 1e-4  # weight of each new rate in the exponential mean of the usual rate: about half a minute at 400 Hz
 ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrence
-# Fraction of |dB|^2 that is not common to all chips, below which the field is external. In all presses of scenes
-# `quick` and `lab` it is 0.45 or more.
+# A field change is external if the fraction of |dB|^2 that is not common to all chips is smaller. For all presses of
+# scenes `quick` and `lab`, this fraction is 0.45 or more.
 RESIDUAL_FRACTION_MAX = 0.2
 COMMON_MIN_uT = 50.0  # about the strength of the earth's field
 

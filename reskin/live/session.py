@@ -175,7 +175,7 @@ class GuidedPresses(Presses):
         return np.arange(self.presses_n) % 2 == 1
 
 
-ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # by button
+ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # by name of the button
 
 
 class Session:

@@ -47,7 +47,7 @@ HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # the wire format is detected when either
 SILENT_S = 0.3  # after this time without data, a controller receives a contact whose values are NaN
 OPENING_S = 10.0  # longest time for the detection and the no-load reading when a port is opened
 ENDS_KEPT_N = 256  # number of recent chunks whose ends are kept, for the arrival times of frames that are decoded later
-FRAME_BYTES_MIN_N = 16  # per chip, in any wire format
+FRAME_BYTES_MIN_N = 16  # smallest size of a frame per chip, over all wire formats
 SPACING_MM = 5.0  # spacing of chips on the page if their positions are unknown
 # Largest plausible input of a network, in standard deviations over its training rows. Assumed; the largest observed
 # value is 6 in scene `quick`, and 7 for the boards of scene `lab` with that scene's models.
@@ -55,9 +55,9 @@ UNKNOWN_SDS = 10.0
 
 WAITING = "waiting for data"
 TAKING_NOLOAD = "taking the no-load reading: do not touch, do not move"
-UNKNOWN_SKIN = "unknown skin: the model has not seen such a field change"
+UNKNOWN_SKIN = "unknown skin: the model was not trained on such field changes"
 
-Models = Sequence[Network] | Universal  # without networks, no place or force is estimated
+Models = Sequence[Network] | Universal  # with an empty sequence, no place or force is estimated
 
 
 class Prediction(NamedTuple):

@@ -198,8 +198,8 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
         raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")
 
 
-BLOCK_ROWS_N = 4096  # rows per block, to limit memory: the kernel of a block with 6000 rows takes 200 MB
-_THREADS = ThreadpoolController()  # created once, because finding the libraries takes 3 ms; a limit takes 15 us
+BLOCK_ROWS_N = 4096  # rows per block, to limit memory: the kernel of a block and 6000 training rows takes 200 MB
+_THREADS = ThreadpoolController()  # created once, because finding the libraries takes 3 ms; limiting them takes 15 us
 
 
 def one_thread() -> Any:
@@ -232,7 +232,7 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
 
 
 class _BlockwiseCubicRidge:
-    """Ridge regression on products of inputs, accumulated block by block: all products at once would take 5 GB."""
+    """Ridge regression on products of inputs, block by block: all products of the paper's rows would take 5 GB."""
 
     def __init__(self, alpha: float) -> None:
         self.alpha = alpha

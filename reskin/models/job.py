@@ -48,7 +48,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row, which groups triplets."""
+    """Field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row (triplets are within a skin)."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     target: Float32[np.ndarray, "f t"]

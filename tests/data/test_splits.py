@@ -292,7 +292,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
     ("table", "experiment", "split", "message"),
     [
         (ONE_BOARD, "lobo", Split(), "experiment lobo: boards must be two or more; got 1"),
-        (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* 1 boards; got 3"),
+        (ONE_BOARD, "transfer", TRANSFER, "split.transfer_skins_n must be less than .* in the scene, 1; got 3"),
         (ONE_BOARD, "single_temporal", TEMPORAL, "1 passes of skin s0 are too few .* of 0.2 holds out 0"),
         (ONE_BOARD, "single_random", ALMOST_ALL, "3 readings of skin s0 are too few .* of 0.95 holds out 3"),
         (six_by_three_in_passes(2), "lobo", POOL_OF_2, "passes of held-out skin b0_s0 must be more than .*, 2; got 2"),
@@ -302,7 +302,7 @@ TWO_CAPTURES = replace(ONE_BOARD, capture=np.array(["run2", "run10", "run10"]))
         (ONE_BOARD, "labels", LABELS, "experiment lobo: boards must be two or more; got 1"),
         (
             poked_rows(), "labels", Split(labels_pool_n=10, labels_draws_n=1),
-            "fold labels/b0: split.labels_pool_n must be less than its indentations; got 10",
+            "fold labels/b0: split.labels_pool_n must be less than the number of indentations per skin; got 10",
         ),
         (
             poked_rows(), "labels", Split(labels_pool_n=11, labels_draws_n=1),
