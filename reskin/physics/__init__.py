@@ -1,1 +1,1 @@
-"""Physics of the synthetic skin, in SI units; readings of chips are in uT (`chip`)."""
+"""Physics of the synthetic skin, in SI units; simulated readings (module `chip`) are in uT."""

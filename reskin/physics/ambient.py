@@ -1,7 +1,7 @@
-"""Ambient fields: the earth's, and that of an iron ball. SI units.
+"""Ambient fields: the earth's field and the field of an iron ball. SI units.
 
-The ball is magnetised by a uniform field (one dipole) and by nearby dipoles (image sources). Its effect on these
-sources is neglected.
+A uniform field magnetises the ball like one dipole, and nearby dipoles magnetise it like image sources. The effect of
+the ball on the magnetisation of the nearby sources is neglected.
 """
 
 import numpy as np
@@ -15,17 +15,17 @@ from reskin.physics.magnet import MU0_4PI, Dipoles
 EARTH_SIZE_T = 50 * micro
 EARTH_DIP_DEG = 66.0
 EARTH_T = EARTH_SIZE_T * np.array([np.cos(np.radians(EARTH_DIP_DEG)), 0.0, -np.sin(np.radians(EARTH_DIP_DEG))])
-IRON_MU_R = 1000.0  # soft iron; the moment of a ball differs by 0.3 % from that of infinite permeability
+IRON_MU_R = 1000.0  # soft iron; the moment of a ball is 0.3 % below that of a ball of infinite permeability
 
 
 def random_directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """Draw unit vectors, uniformly over the sphere."""
-    drawn = rng.standard_normal((n, 3))
-    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    """Draw unit vectors that are uniformly distributed over the sphere."""
+    vectors = rng.standard_normal((n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def ball_moment(radius_m: float, b_T: Float[np.ndarray, "3"], mu_r: float = IRON_MU_R) -> Float[np.ndarray, "3"]:
-    """Return the moment of a ball in a uniform field: (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B, in A m^2."""
+    """Return the moment in A m^2 of a ball in a uniform field: (4 pi a^3 / mu0) (mu_r - 1) / (mu_r + 2) B."""
     return 4 * np.pi * radius_m**3 / mu_0 * (mu_r - 1) / (mu_r + 2) * b_T
 
 
@@ -37,7 +37,7 @@ def ball_field(
     radius_m: float,
     mu_r: float = IRON_MU_R,
 ) -> Float[np.ndarray, "o 3"]:
-    """Return the field in T that a ball in the uniform field `b_T` adds at observers outside it."""
+    """Return the field in T that a ball in the uniform field `b_T` adds at observers outside the ball."""
     return magnet.field(centre_m[None], ball_moment(radius_m, b_T, mu_r)[None], observers_m)
 
 
@@ -48,11 +48,11 @@ def ball_images(
     centre_m: Float[np.ndarray, "3"],
     radius_m: float,
 ) -> Float[np.ndarray, "o 3"]:
-    """Return the field in T that a ball of infinite permeability adds, for dipoles (m, A m^2) outside it.
+    """Return the field in T that a ball of infinite permeability adds to the field of dipoles outside it.
 
     As for a conducting, uncharged sphere in electrostatics (Jackson, chapter 2): each dipole has an image dipole and a
-    pole at the inverse point, and an opposite pole at the centre. Close to a skin, a single dipole at the centre would
-    underestimate the field by far.
+    magnetic pole at the inverse point, and an opposite pole at the ball's centre. Close to a skin, a single dipole at
+    the ball's centre would underestimate the field by far. `dipoles` are positions in m and moments in A m^2.
     """
     away_m = dipoles[0] - centre_m
     distance_m = np.linalg.norm(away_m, axis=1, keepdims=True)

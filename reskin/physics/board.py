@@ -1,6 +1,6 @@
-"""The circuit board: design, drawn boards, and the spreads between boards and between skins.
+"""The circuit board: its design, random boards, and the spreads between boards and between skins.
 
-Each board is drawn from its own random generator, seeded by its name: board 7 stays the same when board 8 is added.
+Each board is drawn from its own random generator, seeded by its name. Adding board 8 therefore does not change board 7.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
 class Tiles(Strict):
-    """Several boards side by side under one skin, on a lattice around its centre."""
+    """Several boards under one skin, on a rectangular lattice around the skin's centre."""
 
     columns_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along x
     rows_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along y
@@ -29,7 +29,7 @@ class Tiles(Strict):
 
     @property
     def centres_mm(self) -> list[tuple[float, float]]:
-        """Centres of the boards, row by row."""
+        """Centres of the boards relative to the skin's centre, row by row."""
         x_mm, y_mm = (self.pitch_mm * (np.arange(n) - (n - 1) / 2) for n in (self.columns_n, self.rows_n))
         return [(float(x), float(y)) for y in y_mm for x in x_mm]
 
@@ -37,43 +37,44 @@ class Tiles(Strict):
 class BoardDesign(Strict):
     """Positions of the chips relative to the centre of the board, and the rotation of each chip about z.
 
-    The rotations in the scenes were found from recordings (tests/recordings/test_lab_frames.py), not from a board
-    file. With `tiles`, this is the design of each of several boards; chips are then numbered board by board.
+    The rotations in the scenes were determined from recordings (tests/recordings/test_lab_frames.py), not taken from a
+    board layout file. With `tiles`, several boards have this design, and their chips are numbered board by board.
     """
 
     chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
     chips_turn_deg: tuple[float, ...]
-    gap_mm: Annotated[float, Field(gt=0, le=10)]  # sensing plane below the skin: rigid 1.1, flexible 0.6
+    gap_mm: Annotated[float, Field(gt=0, le=10)]  # sensing plane to skin: 1.1 rigid, 0.6 flexible
     tiles: Tiles | None = None
 
     @model_validator(mode="after")
-    def _each_chip_is_turned(self) -> "BoardDesign":
+    def _check_chips(self) -> "BoardDesign":
         if len(self.chips_xy_mm) != len(self.chips_turn_deg):
-            raise ValueError("chips_turn_deg needs one turn for each of chips_xy_mm")
+            raise ValueError("chips_turn_deg must have one rotation for each chip in chips_xy_mm")
         if len(self.places_mm) > CHIPS_MAX_N:
-            raise ValueError(f"tiles make at most {CHIPS_MAX_N} chips in all, not {len(self.places_mm)}")
+            raise ValueError(f"tiles must have at most {CHIPS_MAX_N} chips in total, not {len(self.places_mm)}")
         return self
 
     @property
     def places_mm(self) -> list[tuple[float, float]]:
-        """Positions of all chips of all boards, relative to the centre of the skin."""
+        """Positions of all boards' chips, relative to the centre of the skin."""
         boards_mm = [(0.0, 0.0)] if self.tiles is None else self.tiles.centres_mm
         return [(x + chip_x, y + chip_y) for x, y in boards_mm for chip_x, chip_y in self.chips_xy_mm]
 
     @property
     def turns_deg(self) -> list[float]:
-        """Rotations of all chips of all boards."""
+        """Rotations of all boards' chips about z."""
         return [*self.chips_turn_deg] * (len(self.places_mm) // len(self.chips_xy_mm))
 
 
 class Spreads(Strict):
     """Standard deviations between boards and between skins.
 
-    Factors are drawn as exp(sd * normal), so that they stay positive; everything else is normal around the design.
+    Gaps, gains, thicknesses and the like are multiplied by exp(sd * normal), so that they stay positive. All other
+    quantities are normally distributed around the design value.
     """
 
     board_gap: Share  # of the gap between skin and chips
-    board_uneven: Share  # of the gap over the outermost chips, because the base tilts along x or y, or bows
+    board_uneven: Share  # of the gap at the outermost chips: the base tilts along x and y, and bows
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
@@ -83,8 +84,8 @@ class Spreads(Strict):
     skin_filler_length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation exp(-r^2 / 2 length^2)
     skin_thickness: Share
     skin_modulus: Share
-    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # lateral offset of the skin on the board, each axis
-    skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # skin about z
+    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # lateral offset of the skin on the board, along each axis
+    skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # rotation of the skin about z
     skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # true depth minus commanded depth
 
 
@@ -102,7 +103,7 @@ class Board:
 
 
 def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -> Board:
-    """Draw the board of this name; tiled boards have the same gap (assumed: one skin holds them down)."""
+    """Draw the board of this name; tiled boards share one gap, as one skin is assumed to hold them down."""
     rng = rng_for(seed, "board", name)
     chips_n = len(design.places_mm)
     gap_mm = design.gap_mm * np.exp(spreads.board_gap * rng.standard_normal())
@@ -122,7 +123,7 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
 
 
 def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # Tilt and bow of the base over its board, 1 at the outermost chip; the skin itself is assumed to be flat.
+    # Tilt and bow of each board's base, scaled to the outermost chip; the skin itself is assumed to be flat.
     places_mm = np.array(design.chips_xy_mm)
     away_mm = np.hypot(*places_mm.T)
     share = places_mm / max(away_mm.max(), 1e-12)

@@ -11,7 +11,7 @@ from scipy.constants import micro
 from reskin.config import Strict
 from reskin.physics.board import Board
 
-GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 5 / 3, 4 / 3, 1.0)  # by GAIN_SEL (data sheet, table 17)
+GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 5 / 3, 4 / 3, 1.0)  # for GAIN_SEL 0 to 7 (data sheet, table 17)
 STEP_AT_GAIN_ONE_uT = (0.150, 0.150, 0.242)  # RES 0; x, y, z
 TEMPERATURE_ZERO_DEGC, TEMPERATURE_ZERO_RAW, TEMPERATURE_STEPS_PER_DEGC = 25.0, 46244, 45.2  # data sheet
 FIELD_MAX_T = 50e-3  # saturation on any axis, at any gain (data sheet)
@@ -28,25 +28,25 @@ class ChipDesign(Strict):
 
 @dataclass(frozen=True)
 class Overruns:
-    """Counts of values out of range: saturated at 50 mT, and beyond int16, which wraps."""
+    """Counts of out-of-range values: fields clipped at 50 mT, and readings that overflow int16 and wrap around."""
 
     clipped_n: int
     wrapped_n: int
 
 
 def steps_uT(gain_sel: int) -> Float[np.ndarray, " 3"]:
-    """Return the field in uT of one count on x, y and z."""
+    """Return the field in uT that corresponds to one count, on x, y and z."""
     return np.array(STEP_AT_GAIN_ONE_uT) * GAINS[gain_sel]
 
 
 def read_field(
     b_T: Float[np.ndarray, "f k 3"], board: Board, *, design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f ch"], Overruns]:
-    """Read the field with the board's chips, each along its own axes; count the values out of range."""
+    """Return the chips' readings of a field, each along the chip's own axes, and counts of out-of-range values."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
-    seen_T = np.einsum("kij,fkj->fki", to_chip, b_T)
-    clipped_n = int(np.count_nonzero(np.abs(seen_T) > FIELD_MAX_T))
-    b_uT = (seen_T.clip(-FIELD_MAX_T, FIELD_MAX_T) + board.offset_T) / micro
+    chip_T = np.einsum("kij,fkj->fki", to_chip, b_T)
+    clipped_n = int(np.count_nonzero(np.abs(chip_T) > FIELD_MAX_T))
+    b_uT = (chip_T.clip(-FIELD_MAX_T, FIELD_MAX_T) + board.offset_T) / micro
     noise_uT = np.array([design.noise_xy_uT, design.noise_xy_uT, design.noise_z_uT])
     b_uT += noise_uT * rng.standard_normal(b_uT.shape)
     step_uT = steps_uT(design.gain_sel)
@@ -59,7 +59,7 @@ def read_field(
 def read_temperature(
     temperature_degC: Float[np.ndarray, "f k"], design: ChipDesign, rng: np.random.Generator
 ) -> Float32[np.ndarray, "f k"]:
-    """Read the chips' temperature, with its noise and its step of 1/45.2 degC."""
+    """Return the chips' temperature readings, with noise and quantised in steps of 1/45.2 degC."""
     noisy_degC = temperature_degC + design.noise_temperature_degC * rng.standard_normal(temperature_degC.shape)
     raw = np.rint(TEMPERATURE_ZERO_RAW + (noisy_degC - TEMPERATURE_ZERO_DEGC) * TEMPERATURE_STEPS_PER_DEGC)
     read_degC = TEMPERATURE_ZERO_DEGC + (raw - TEMPERATURE_ZERO_RAW) / TEMPERATURE_STEPS_PER_DEGC
@@ -72,13 +72,13 @@ CONVERSION_S = 1.84e-3  # MLX90393 at OSR 0, DIG_FILT 2 (data sheet)
 def last_conversions(
     frame_s: Float[np.ndarray, " f"], phase_s: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "f k"], Int[np.ndarray, "f k"]]:
-    """Return for each frame and chip the age of the conversion in s, and the first frame with the same conversion."""
+    """Return for each frame and chip the age of its last conversion in s, and the first frame with that conversion."""
     conversion = np.floor((frame_s[:, None] - phase_s) / CONVERSION_S)
     age_s = frame_s[:, None] - phase_s - conversion * CONVERSION_S
     fresh = np.ones(conversion.shape, bool)
     fresh[1:] = conversion[1:] != conversion[:-1]
-    here = np.arange(len(frame_s))[:, None]
-    return age_s, np.maximum.accumulate(np.where(fresh, here, 0), axis=0)
+    frame_i = np.arange(len(frame_s))[:, None]
+    return age_s, np.maximum.accumulate(np.where(fresh, frame_i, 0), axis=0)
 
 
 def sample_at_conversion(

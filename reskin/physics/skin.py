@@ -1,7 +1,7 @@
-"""A magnetised skin: its design, drawn skins, and the field change and force for indentations. SI units.
+"""A magnetised skin: its design, random skins, and the field change and force for indentations. SI units.
 
-Each skin is drawn from its own random generator, seeded by its name: skin 7 stays the same when skin 8 is added.
-Indentations are true places and commanded depths in the board's frame.
+Each skin is drawn from its own random generator, seeded by its name. Adding skin 8 therefore does not change skin 7.
+An indentation is (x, y, depth) in the board's frame: the true place of the tip, and the commanded depth.
 """
 
 from collections.abc import Iterator
@@ -21,16 +21,17 @@ from reskin.physics.board import Board, Spreads
 from reskin.physics.magnet import DEFAULT_QUADRATURE, SKIN_SIDES_M, Dipoles, Quadrature, change_of_field, place_nodes
 from reskin.seeds import rng_for
 
-FILLER_WAVES_N = 64  # plane waves of the local variation of the filler
+FILLER_WAVES_N = 64  # number of plane waves that make up the local variation of the filler
 
 
 class SkinDesign(Strict):
-    """Section `skin`: what all skins of a scene have in common, and the tip that presses them."""
+    """Section `skin`: the design that all skins of a scene share, and the tip that presses them."""
 
     polarity: magnet.Polarity
-    flipped: bool  # opposite sign of the magnetisation, as for a checkerboard skin rotated by 90 degrees
+    flipped: bool  # reverse the magnetisation, as rotating a checkerboard skin by 90 degrees does
     base: layer.Base
-    hold: slide.HoldDesign | None  # for a finite skin that slides rigidly; None: infinite, with the force of `layer`
+    # For a finite skin that slides rigidly. None: an infinite layer that does not slide, with the force of `layer`.
+    hold: slide.HoldDesign | None
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # phi Br: volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of saturation_T
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
@@ -38,9 +39,9 @@ class SkinDesign(Strict):
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
 
     @model_validator(mode="after")
-    def _only_what_slides_is_held(self) -> "SkinDesign":
+    def _check_hold(self) -> "SkinDesign":
         if self.hold is not None and self.base == "bonded":
-            raise ValueError("hold must be null for a bonded skin; it needs a skin that slides (base: slipping)")
+            raise ValueError("hold must be null for a bonded skin; it applies only to base: slipping")
         return self
 
 
@@ -56,7 +57,7 @@ class Skin:
     thickness_m: float
     modulus_Pa: float
     tip_radius_m: float
-    depth_zero_m: float  # added to a commanded depth
+    depth_zero_m: float  # true depth minus commanded depth
     base: layer.Base
     hold: slide.Hold | None = None
 
@@ -72,9 +73,9 @@ def draw_skin(
     rule: Quadrature = DEFAULT_QUADRATURE,
     sides_m: tuple[float, float] = SKIN_SIDES_M,
 ) -> Skin:
-    """Draw the skin of this name, as it sits on its board; any quadrature rule discretises the same skin.
+    """Draw the skin of this name on its board; the quadrature rule changes its discretisation, not the skin.
 
-    A skin with other side lengths is magnetised by an array of magnets that covers it.
+    The magnetising array has as many magnets as are needed to cover a skin with the given side lengths.
     """
     rng = rng_for(seed, "skin", name)
     amplitude, thickness, modulus = np.exp(
@@ -111,16 +112,16 @@ def draw_skin(
 def changes_of_field(
     board: Board, skin: Skin, indentations_m: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
-    """Return the no-load field at the chips in T, and its change for each indentation (x, y, depth).
+    """Return the no-load field at the chips in T, and the field change for each indentation (x, y, depth).
 
-    Without contact (true depth of 0 or less) the change is exactly zero.
+    Without contact (true depth of 0 or less), the field change is exactly zero.
 
     Raises
     ------
     ParamsError
-        If an indentation is off the skin or too deep.
+        If an indentation is outside the skin or too deep.
     """
-    # Chip by chip, to bound memory: a large skin over many chips has millions of pairs.
+    # One chip at a time, to bound memory: a large skin over many chips has millions of pairs of node and chip.
     rest_T = np.concatenate([magnet.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
     changes_T = np.zeros((len(indentations_m), *board.chips_m.shape))
     for indentation_i, before, after in moved_dipoles(skin, indentations_m):
@@ -131,14 +132,14 @@ def changes_of_field(
 def moved_dipoles(
     skin: Skin, indentations_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[tuple[int, Dipoles, Dipoles]]:
-    """Yield for each indentation in contact its index, and the dipoles within reach at rest and displaced.
+    """Yield for each indentation in contact its index and the dipoles that it moves, at rest and displaced.
 
-    `slid` is the share of the rigid motion that takes place in each press (default: all of it). The caller may displace
-    the dipoles further before `change_of_field`.
+    `slid` is the fraction of the rigid motion that takes place in each press (default: 1). The caller may displace the
+    dipoles further before it calls `change_of_field`.
     """
     true_m = indentations_m + np.array([0.0, 0.0, skin.depth_zero_m])
     _check_on_skin(true_m, skin)
-    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # includes NaN depths, which `tabulate` refuses
+    contacts = np.flatnonzero(~(true_m[:, 2] <= 0))  # includes NaN depths, for which `tabulate` raises an error
     if not contacts.size:
         return
     rest = deformation.group_by_height(skin.nodes_m, skin.moments_A_m2, skin.thickness_m)
@@ -155,10 +156,10 @@ def moved_dipoles(
 
 
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
-    """Return the rigid motion of the skin under presses (x, y, true depth), as far as the tip's friction allows.
+    """Return the rigid motion of the skin under presses (x, y, true depth), limited by the tip's friction.
 
-    The displacement towards the centre depends on the depth but not on the modulus; the limit by friction depends on
-    the force in N.
+    The displacement towards the skin's centre depends on the depth but not on the modulus. The friction limit depends
+    on the force in N.
     """
     places_m = true_m[:, :2] - skin.seat_m
     relative_m2 = slide.force_at(
@@ -177,33 +178,34 @@ def count_beyond_verified(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
 
 def forces(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return the normal force on the tip in N at commanded depths, positive in compression."""
-    of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
+    layer_of_skin = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
     true_m = depth_m + skin.depth_zero_m
     if skin.hold is not None:
-        return slide.force_at(true_m, **of)
-    return layer.force(true_m, **of, base=skin.base)
+        return slide.force_at(true_m, **layer_of_skin)
+    return layer.force(true_m, **layer_of_skin, base=skin.base)
 
 
 def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the shear modulus of the layer under the tip at commanded depths: E / 3 (incompressible) x stiffening."""
+    """Return the shear modulus in Pa under the tip at commanded depths: E / 3 (incompressible) times the stiffening."""
     if skin.hold is None:
         return np.full(len(depth_m), skin.modulus_Pa / 3)
     return skin.modulus_Pa / 3 * slide.stiffening(depth_m + skin.depth_zero_m, skin.thickness_m)
 
 
 def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
-    # The layer of the model is infinite: beyond the skin's edge, the tip would press on material that does not exist.
+    # The modelled layer is infinite, so a press beyond the skin's edge would give a plausible but wrong result.
     half_m = np.array(skin.sides_m) / 2
-    off = ~(np.abs(indentations_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
-    if off.any():
-        x_mm, y_mm = indentations_m[np.argmax(off), :2] / milli
+    outside = ~(np.abs(indentations_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
+    if outside.any():
+        x_mm, y_mm = indentations_m[np.argmax(outside), :2] / milli
         rule = "on the skin, within {:.4g} and {:.4g} mm of its centre along x and y".format(*half_m / milli)
         remedy = "Poke elsewhere, or lower skin_seat_mm."
         raise ParamsError(f"skin {skin.name}", "poke", rule, f"({x_mm:.3g}, {y_mm:.3g}) mm", remedy)
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:
-    # A smooth random factor as a sum of plane waves. It does not depend on the nodes: finer nodes sample the same skin.
+    # A smooth random factor: the exponential of a sum of plane waves. It does not depend on the nodes, so that a finer
+    # quadrature samples the same skin.
     waves = rng.standard_normal((FILLER_WAVES_N, 2)) / (spreads.skin_filler_length_mm * milli)
     phases = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     uneven = np.sqrt(2 / FILLER_WAVES_N) * np.cos(xy_m @ waves.T + phases).sum(axis=1)

@@ -211,7 +211,7 @@ def test_invalid_counts_are_refused(of):
 
 
 def test_wear_without_remaining_stiffness_is_refused():
-    with pytest.raises(ParamsError, match="stiffness left"):
+    with pytest.raises(ParamsError, match="remaining force"):
         softening(np.array([10_000]), settling=0.99, ageing=0.1)
 
 

@@ -125,7 +125,7 @@ def test_single_tile_is_the_board():
 
 
 def test_too_many_chips_are_refused():
-    with pytest.raises(ParamsError, match="tiles make at most 64 chips in all, not 65"):
+    with pytest.raises(ParamsError, match="tiles must have at most 64 chips in total, not 65"):
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
 
@@ -143,7 +143,7 @@ def test_gaps_stay_positive_and_tilt_and_bow_need_one_board():
 
 
 def test_chip_without_rotation_is_refused():
-    with pytest.raises(ParamsError, match="chips_turn_deg needs one turn"):
+    with pytest.raises(ParamsError, match="chips_turn_deg must have one rotation"):
         design(chips_turn_deg=[0.0])
 
 
