@@ -1,9 +1,10 @@
-"""Finite deformation of the skin under a tip: material followed in small steps, and tables of the result. SI units.
+"""Finite deformation of the skin under a tip, computed in small steps and tabulated. SI units.
 
-The linear solution of `layer` is valid for small depths only. Here the tip sinks in small steps (12 to 24 over the
-usual depths). In each step, the pressure change that keeps the deformed surface on the sphere displaces all material.
-The result is axisymmetric and, in units of the thickness, depends only on R/h. A few tables over R/h therefore serve
-skins of any thickness, and an indentation only interpolates them.
+The linear solution of `layer` is valid for small depths only. Here the tip sinks in small steps (12 to 24 for the usual
+depths). Each step solves for the pressure change that keeps the deformed surface on the spherical tip, and displaces
+the material by the linear solution for this pressure. The result is axisymmetric and, in units of the thickness,
+depends only on R/h (tip radius over thickness). A few tables for different R/h therefore cover skins of any thickness,
+and simulating an indentation only needs to interpolate between them.
 """
 
 from dataclasses import asdict, dataclass
@@ -25,18 +26,18 @@ from reskin.physics.magnet import Dipoles
 
 # In units of `depth_scale`: 0.05 mm in a skin of 2 mm. Halving it changes dB by 0.3 % (slipping) and 0.6 % (bonded).
 STEP = 0.025
-# Depths of the steps, which do not depend on the requested depths. The first step is divided, because there the contact
-# radius grows as the square root of the depth.
+# Depths of the steps, in units of `depth_scale`; they do not depend on the requested depths. The first step is divided
+# in three, because the contact radius grows as the square root of the depth.
 LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
-RIM_MAX = 1.2  # of the thickness; above the surface, the waves grow as exp(kz)
-MARKERS_N = 48  # on the surface, denser towards the axis
-PRESSURES_N = 6  # with 4 or 8, the markers move by less than 0.03 mm at 1.2 mm
-DAMPING = 1e-3
+RIM_MAX = 1.2  # largest height of the rim, in thicknesses; above the surface, the waves grow as exp(kz)
+MARKERS_N = 48  # number of markers on the surface; they are denser towards the axis
+PRESSURES_N = 6  # number of basis pressures; 4 or 8 change the markers by less than 0.03 mm at a depth of 1.2 mm
+DAMPING = 1e-3  # of the least squares for the pressure, relative to the largest singular value
 
 
 @dataclass(frozen=True)
 class Material:
-    """Current positions of material points, and the deformation gradient F, whose entries not listed are zero."""
+    """Current positions of material points, and the deformation gradient F; all other entries of F are zero."""
 
     r_m: Float[np.ndarray, " s"]
     z_m: Float[np.ndarray, " s"]
@@ -47,10 +48,10 @@ class Material:
 def follow(
     r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], depths_m: Float[np.ndarray, " d"], press: IndentedLayer
 ) -> list[Material]:
-    """Follow material points from rest through increasing depths; one `Material` for each depth.
+    """Follow material points from rest through increasing depths; return one `Material` per depth.
 
-    Markers on the surface are followed too. With a pressure that fits the surface at rest, the deformed surface would
-    be 0.3 mm off the tip at 1.2 mm. Therefore each step solves for the pressure that moves the markers onto the sphere.
+    Markers on the surface are followed too, and each step solves for the pressure that moves them onto the sphere. If
+    instead the pressure fitted the surface at rest, the deformed surface would be 0.3 mm off the tip at 1.2 mm.
     """
     path = [with_markers(r_m, z_m, press)]
     for depth_m in map(float, depths_m[1:]):
@@ -59,12 +60,12 @@ def follow(
 
 
 def depth_scale(size: float) -> float:
-    """Return the greatest depth in thicknesses, a smooth function below the lesser of 1 and `size`, which is R/h."""
+    """Return the greatest depth in thicknesses for R/h = `size`: a smooth function below both 1 and `size`."""
     return size / (1 + size**4) ** 0.25
 
 
 def depth_steps(depths_m: tuple[float, ...], press: IndentedLayer) -> Float[np.ndarray, " d"]:
-    """List the depths of the steps: 0, those of `LADDER` that are less than the deepest one, and all requested ones."""
+    """List the depths of the steps: all requested depths, and those of `LADDER` below the largest requested one."""
     ladder_m = press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m) * LADDER
     return np.unique(np.append(ladder_m[ladder_m < max(depths_m)], depths_m))
 
@@ -75,18 +76,18 @@ def undeformed(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Ma
 
 
 def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: IndentedLayer) -> Material:
-    """Return material at rest, with surface markers first; the markers extend to the widest possible contact."""
+    """Return material at rest, preceded by surface markers, which extend to the widest possible contact."""
     widest = press.contact(press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m))
     r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKERS_N) ** 2, r_m)
     return undeformed(r_m, np.append(np.full(MARKERS_N, press.thickness_m), z_m))
 
 
 def pressure_change(material: Material, depth_m: float, press: IndentedLayer) -> Waves:
-    """Solve for the pressure change that moves the markers (first in `material`) to a greater depth.
+    """Solve for the pressure change that moves the markers (first in `material`) onto the tip at a greater depth.
 
-    The pressure is a weighted sum of the pressures of spheres with smaller contacts. The weights move all markers
-    inside the contact from their current positions to the tip, by least squares. Damping is needed because waves
-    shorter than the depth do not reach the markers.
+    The pressure is a weighted sum of pressures of the same sphere with smaller contacts. The weights are the damped
+    least-squares solution that moves all markers inside the contact from their current positions to the tip. Damping is
+    needed because waves shorter than the depth do not reach the markers.
     """
     contact = press.contact(depth_m)
     inside = np.flatnonzero(material.r_m[:MARKERS_N] < contact.radius_m)
@@ -107,9 +108,9 @@ def pressure_change(material: Material, depth_m: float, press: IndentedLayer) ->
 
 
 def displace(material: Material, change: Waves, depth_m: float, press: IndentedLayer) -> Material:
-    """Displace material by a pressure change, with the midpoint rule; F follows from the chain rule at the midpoint.
+    """Displace material by a pressure change (midpoint rule), and update F by the chain rule at the midpoint.
 
-    `depth_m` is the depth after the change, for the error message.
+    `depth_m`, the depth after the change, is only used in an error message.
     """
     first = displacement(material.r_m, material.z_m, change)
     half_r_m, half_z_m = material.r_m + first.r_m / 2, material.z_m + first.z_m / 2
@@ -129,36 +130,37 @@ def _gradient(u: Displacement) -> Float[np.ndarray, "s 2 2"]:
 
 
 def rotation_angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
-    """Return the angle, from z towards r, of the rotation R in F = R U."""
+    """Return the angle (from z towards r) of the rotation R in the polar decomposition F = R U."""
     return np.arctan2(f[:, 0, 1] - f[:, 1, 0], f[:, 0, 0] + f[:, 1, 1])
 
 
-# In thicknesses beyond the contact. On a bonded base, material farther away does not move (with a reach of 4 from the
-# axis, the error of dB is up to 17 %). On a sliding base, it moves outward as a whole, apart from waves that decay as
-# exp(-pi r / h).
+# Radius of the tables beyond the contact, in thicknesses. Farther away, the material on a bonded base does not move
+# (with tables that end at 4 thicknesses from the axis, the error of dB is up to 17 %). On a slipping base, it moves
+# outward rigidly, apart from waves that decay as exp(-pi r / h).
 REACH = 5.0
 SIZE_STEP = 0.2  # step of ln(R/h) between tables; the interpolation error of dB is below 0.3 % (test_skin)
-STENCIL_N = 4  # cubic interpolation, between tables and between depths
-DET_F_ERROR_MAX = 0.1
-COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which the flow is computed, relative to the reach
-FINE_R = np.linspace(0, 1, 512)  # radii at which it is tabulated, fine enough for linear interpolation
-PACKAGE = Path(__file__).parent  # tables are cached in this package, whose sources determine them
+STENCIL_N = 4  # number of points of the cubic interpolation, both between tables and between depths
+DET_F_ERROR_MAX = 0.1  # largest relative error of the volume
+COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which the displacement is computed, relative to the reach
+FINE_R = np.linspace(0, 1, 512)  # radii at which it is tabulated; fine enough for linear interpolation
+PACKAGE = Path(__file__).parent  # cached tables are stored in this package and depend on its source files
 
 
 @dataclass(frozen=True)
 class DeformationMap:
-    """Displacement of material by depth, height and radius (in equal steps), in units of the thickness."""
+    """Table of the displacement of material by depth, height and radius (in equal steps of radius)."""
 
     thickness_m: float
     reach_m: float
-    depth_m: Float[np.ndarray, " d"]  # from 0 on
-    moved: Float[np.ndarray, "d l i 3"]  # outward, up, and tan(angle / 2), where the angle is from z towards r
+    depth_m: Float[np.ndarray, " d"]  # starts with 0
+    # Displacement outward and up, in thicknesses, and tan(angle / 2) of the rotation from z towards r.
+    moved: Float[np.ndarray, "d l i 3"]
     base: layer.Base
 
 
 @dataclass(frozen=True)
 class RestingDipoles:
-    """Dipoles at rest, and for each the index of its height among the few `heights` (in thicknesses)."""
+    """Dipoles at rest; `height_i` is the index of a dipole's height in `heights` (in thicknesses)."""
 
     nodes_m: Float[np.ndarray, "s 3"]
     moments_A_m2: Float[np.ndarray, "s 3"]
@@ -178,8 +180,8 @@ class MovedDipoles:
 def group_by_height(
     nodes_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], thickness_m: float
 ) -> RestingDipoles:
-    """Group a skin's nodes by height; a quadrature rule has few heights, and the map is tabulated for each."""
-    # Rounded, so that skins of any thickness have the same heights for a rule.
+    """Group a skin's nodes by height; a quadrature rule has few heights, and the map has a table for each."""
+    # Rounded, so that a quadrature rule gives the same heights for skins of any thickness.
     heights, height_i = np.unique(np.round(nodes_m[:, 2] / thickness_m, 12), return_inverse=True)
     return RestingDipoles(
         np.asfortranarray(nodes_m), np.asfortranarray(moments_A_m2), height_i, tuple(heights.tolist())
@@ -187,7 +189,7 @@ def group_by_height(
 
 
 def reach(size: float, base: layer.Base) -> float:
-    """Return the distance from the axis, in thicknesses, to which a tip of R/h = `size` deforms material."""
+    """Return the distance from the axis, in thicknesses, up to which a tip of R/h = `size` deforms the material."""
     depth = layer.VERIFIED_DEPTH * depth_scale(size)
     return REACH + IndentedLayer(1.0, size, base).contact(depth).radius_m
 
@@ -197,8 +199,8 @@ def tabulate(
 ) -> DeformationMap:
     """Tabulate the map down to the first depth of `LADDER` that is at least `deepest_m`.
 
-    Interpolates between tables that are `SIZE_STEP` apart in ln(R/h). The map at a depth does not depend on the deepest
-    depth.
+    It is interpolated between tables in steps of `SIZE_STEP` of ln(R/h). The map at a given depth does not depend on
+    `deepest_m`.
 
     Parameters
     ----------
@@ -213,7 +215,7 @@ def tabulate(
     size = tip_radius_m / thickness_m
     depth_m = thickness_m * depth_scale(size) * LADDER
     if not 0 < deepest_m <= depth_m[-1]:
-        rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the deepest that can be computed"
+        rule = f"above 0 mm and at most {1e3 * depth_m[-1]:.3g} mm, the greatest depth that can be computed"
         raise ParamsError("poke", "deepest depth", rule, f"{1e3 * deepest_m:.3g} mm", "Poke less deep.")
     rungs_n = 1 + max(int(np.searchsorted(depth_m, deepest_m)), STENCIL_N - 1)
     return _tabulate(thickness_m, tip_radius_m, rungs_n, heights, base)
@@ -227,25 +229,25 @@ def _tabulate(
     depth_m = thickness_m * depth_scale(size) * LADDER[:rungs_n]
     at = np.log(size) / SIZE_STEP
     tables_i = int(np.floor(at)) - 1 + np.arange(STENCIL_N)
-    share = _lagrange(tables_i.astype(float), at)
+    weights = _lagrange(tables_i.astype(float), at)
     parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
-    coarse = sum(weight * part for weight, part in zip(share, parts, strict=True))
-    # Contiguous, because otherwise each indentation would copy its part.
+    coarse = sum(weight * part for weight, part in zip(weights, parts, strict=True))
+    # Contiguous, because otherwise each indentation would copy the part that it uses.
     moved = np.ascontiguousarray(CubicSpline(COARSE_R, coarse, axis=2)(FINE_R))
-    # Material on the base keeps its height and, if bonded, its place; it may rotate.
+    # Material on the base stays on it and, if bonded, does not move sideways; it may rotate.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
     return DeformationMap(thickness_m, thickness_m * reach(size, base), depth_m, moved, base)
 
 
 def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
-    """Interpolate the map at one depth: exact at tabulated depths, cubic in the square root of the depth between them.
+    """Interpolate the map between tabulated depths by cubic polynomials in the square root of the depth.
 
-    In terms of this root, the tip's depth is its square, and the displacement of a far point nearly its cube. Below the
-    first tabulated depth (about 10 um on a skin of 2 mm), the map is proportional to the cube, like the force of a
+    The square root is used because the displacement of a far point is almost proportional to its cube. Below the first
+    tabulated depth (about 10 um on a skin of 2 mm), the map is exactly proportional to the cube, like the force of a
     light touch.
     """
     if not -np.inf < depth_m <= table.depth_m[-1]:
-        rule = f"finite and at most {1e3 * table.depth_m[-1]:.4g} mm, the deepest that is tabulated"
+        rule = f"finite and at most {1e3 * table.depth_m[-1]:.4g} mm, the greatest tabulated depth"
         raise ParamsError("poke", "depth", rule, f"{1e3 * depth_m:.4g} mm", "Tabulate deeper.")
     if depth_m <= 0:
         return table.moved[0]
@@ -253,24 +255,24 @@ def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"
         return table.moved[1] * (depth_m / table.depth_m[1]) ** 1.5
     first = max(int(np.searchsorted(table.depth_m, depth_m)) + 1, STENCIL_N) - STENCIL_N
     near = slice(first, first + STENCIL_N)
-    share = _lagrange(np.sqrt(table.depth_m[near]), np.sqrt(depth_m))
-    return np.dot(share[None], table.moved[near].reshape(STENCIL_N, -1)).reshape(table.moved.shape[1:])
+    weights = _lagrange(np.sqrt(table.depth_m[near]), np.sqrt(depth_m))
+    return np.dot(weights[None], table.moved[near].reshape(STENCIL_N, -1)).reshape(table.moved.shape[1:])
 
 
 def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Float[np.ndarray, "3"]) -> MovedDipoles:
-    """Move and rotate the dipoles within reach of an indentation (x, y, depth); on a sliding base, all dipoles.
+    """Move and rotate the dipoles within reach of an indentation (x, y, depth); on a slipping base, all dipoles.
 
-    Moments rotate with the material: R m, not F m, because magnetisation is independent of stretch (Danas & Reis 2024).
+    A moment m becomes R m, not F m, because the magnetisation does not depend on stretch (Danas & Reis 2024).
     """
-    found = np.empty(0, np.intp), np.empty((6, 0)), np.empty((6, 0))
-    here = at_depth(table, float(indentation_m[2]))
+    result = np.empty(0, np.intp), np.empty((6, 0)), np.empty((6, 0))
+    moved = at_depth(table, float(indentation_m[2]))
     if indentation_m[2] > 0:
-        # Beyond the reach, the volume of the layer is conserved, so r^2 grows by the same amount everywhere.
-        edge_m = table.reach_m + table.thickness_m * here[:, -1, 0].mean()
+        # Beyond the reach, r^2 grows by the same amount everywhere, because the layer conserves its volume.
+        edge_m = table.reach_m + table.thickness_m * moved[:, -1, 0].mean()
         grown_m2 = float(edge_m**2 - table.reach_m**2) if table.base == "slipping" else 0.0
         tip = np.append(indentation_m[:2], (table.reach_m, table.thickness_m, grown_m2))
-        found = _move(rest.nodes_m.T, rest.moments_A_m2.T, rest.height_i, here, tip)
-    i, before, after = found
+        result = _move(rest.nodes_m.T, rest.moments_A_m2.T, rest.height_i, moved, tip)
+    i, before, after = result
     return MovedDipoles(i, (before[:3].T, before[3:].T), (after[:3].T, after[3:].T))
 
 
@@ -278,19 +280,20 @@ def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Flo
 def _displaced(
     table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
 ) -> Float[np.ndarray, "d l p 3"]:
-    """Load the table of one R/h, or compute it and cache it on disk: outward, up, tan(angle / 2)."""
+    """Load the table (outward, up, tan(angle / 2)) of one R/h from the cache, or compute and cache it."""
     name = f"flow {table_i} {heights} {base}"
-    known = io.load_cached_array(PACKAGE, name)
-    if known is None or len(known) < rungs_n:
-        known = _follow_ladder(table_i, heights, rungs_n, base)
-        io.save_cached_array(PACKAGE, name, known)
-    return known[:rungs_n]
+    table = io.load_cached_array(PACKAGE, name)
+    if table is None or len(table) < rungs_n:
+        table = _follow_ladder(table_i, heights, rungs_n, base)
+        io.save_cached_array(PACKAGE, name, table)
+    return table[:rungs_n]
 
 
 def _follow_ladder(
     table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
 ) -> Float[np.ndarray, "d l p 3"]:
-    # Each depth starts from the one before, so that a deeper indentation only extends the ladder. In thicknesses.
+    # Lengths are in thicknesses. Each step starts from the step before, so that a table for deeper indentations only
+    # has more steps.
     size = _size(table_i)
     at = rest = undeformed(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
     parts = np.zeros((rungs_n, 3, len(rest.r_m)))
@@ -306,7 +309,7 @@ def _follow_ladder(
 
 @lru_cache(maxsize=1024)
 def _pressure_change(table_i: int, rung_i: int, base: layer.Base) -> Waves:
-    # From one depth to the next; the same for material at all heights.
+    # The pressure change of one step, which is the same for material at all heights.
     size = _size(table_i)
     depth = depth_scale(size) * float(LADDER[rung_i])
     return pressure_change(_markers(table_i, rung_i - 1, base), depth, IndentedLayer(1.0, size, base))
@@ -314,9 +317,9 @@ def _pressure_change(table_i: int, rung_i: int, base: layer.Base) -> Waves:
 
 @lru_cache(maxsize=1024)
 def _markers(table_i: int, rung_i: int, base: layer.Base) -> Material:
-    press, none = IndentedLayer(1.0, _size(table_i), base), np.empty(0)
+    press, empty = IndentedLayer(1.0, _size(table_i), base), np.empty(0)
     if rung_i == 0:
-        return with_markers(none, none, press)
+        return with_markers(empty, empty, press)
     depth = depth_scale(press.tip_radius_m) * float(LADDER[rung_i])
     return displace(_markers(table_i, rung_i - 1, base), _pressure_change(table_i, rung_i, base), depth, press)
 
@@ -326,13 +329,13 @@ def _size(table_i: int) -> float:
 
 
 def _lagrange(nodes: Float[np.ndarray, " p"], at: float) -> Float[np.ndarray, " p"]:
-    """Return the weights of Lagrange interpolation at one place."""
-    known, share = nodes.tolist(), np.ones(len(nodes))
-    for j, node in enumerate(known):
-        for i, other in enumerate(known):
+    """Return the weights of the nodes for Lagrange interpolation at `at`."""
+    positions, weights = nodes.tolist(), np.ones(len(nodes))
+    for j, node in enumerate(positions):
+        for i, other in enumerate(positions):
             if i != j:
-                share[j] *= (at - other) / (node - other)
-    return share
+                weights[j] *= (at - other) / (node - other)
+    return weights
 
 
 @njit(cache=True, error_model="numpy")
@@ -350,7 +353,7 @@ def _move(nodes, moments, height_i, table, tip):
         s = i[m]
         dx, dy = nodes[0, s] - x, nodes[1, s] - y
         r = sqrt(dx * dx + dy * dy)
-        # On the axis, nothing moves sideways or rotates, so no direction is needed.
+        # Material on the axis neither moves sideways nor rotates, so it needs no direction.
         over_r = 1 / r if r > 0 else 0.0
         cos, sin = dx * over_r, dy * over_r
         outward, up, tan = sqrt(r * r + grown_m2) - r, 0.0, 0.0
@@ -360,10 +363,10 @@ def _move(nodes, moments, height_i, table, tip):
             near, far, share = table[height_i[s], low], table[height_i[s], low + 1], at - low
             outward = thickness_m * (near[0] + share * (far[0] - near[0]))
             up = thickness_m * (near[1] + share * (far[1] - near[1]))
-            tan = near[2] + share * (far[2] - near[2])  # of half the angle
+            tan = near[2] + share * (far[2] - near[2])  # tangent of half the angle
         mx, my, mz = moments[0, s], moments[1, s], moments[2, s]
         radial = cos * mx + sin * my
-        sine = 2 * tan / (1 + tan * tan)  # 1 - cosine is tan of the half times it
+        sine = 2 * tan / (1 + tan * tan)  # 1 - cosine = tan * sine
         change = sine * (mz - tan * radial)
         before[0, m], before[1, m], before[2, m] = nodes[0, s], nodes[1, s], nodes[2, s]
         before[3, m], before[4, m], before[5, m] = mx, my, mz

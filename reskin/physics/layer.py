@@ -1,8 +1,9 @@
 """An incompressible elastic layer under a spherical tip: contact, force and linear displacements. SI units.
 
-The layer is bonded to a rigid base or slips on it. Fields are Hankel integrals over waves J0(kr) of the pressure; kh
-and kz are the wave number times the thickness and the height, primes are derivatives with respect to kz. For a bonded
-base, W = a (sinh z' - z' cosh z') + b z' sinh z' and U = -W'/k, z' = kz.
+The layer is bonded to a rigid base or slips on it. Displacements are Hankel integrals over waves J0(kr) of the
+pressure. kh and kz are the wave number times the thickness and times the height. Primes on functions are derivatives
+with respect to kz. For a bonded base, the vertical displacement is W = a (sinh z' - z' cosh z') + b z' sinh z' and the
+radial one U = -W'/k, with z' = kz.
 """
 
 from dataclasses import dataclass
@@ -21,8 +22,8 @@ from reskin.errors import ParamsError
 
 Base = Literal["bonded", "slipping"]
 
-VERIFIED_DEPTH = 0.6  # of the thickness: Long et al. 2011 compared with finite elements up to this depth
-CURVE_N = 48  # contact radii of the force curve
+VERIFIED_DEPTH = 0.6  # of the thickness: Long et al. 2011 verified their solution by finite elements up to this depth
+CURVE_N = 48  # number of contact radii on the force curve
 
 
 def _gauss(top: float, points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
@@ -30,14 +31,14 @@ def _gauss(top: float, points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np
     return top * (x + 1) / 2, top * w / 2
 
 
-CONTACT_X, CONTACT_W = _gauss(1.0, 48)  # over the radius of the contact
+CONTACT_X, CONTACT_W = _gauss(1.0, 48)  # in units of the contact radius
 KERNEL_KH, KERNEL_W = _gauss(24.0, 160)  # 1 - compliance falls as exp(-2 kh)
-WAVES_KH, WAVES_W = _gauss(40.0, 240)  # the shortest wave of the field is 0.3 mm long in a skin of 2 mm
+WAVES_KH, WAVES_W = _gauss(40.0, 240)  # the shortest wavelength is 0.3 mm in a skin of 2 mm
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact pressure, as weights of its Hankel transform: p^(k) / 2G = sum of weights * cos(k x)."""
+    """Contact pressure p, given by weights of its Hankel transform: p^(k) / 2G = sum_i weights_i cos(k x_i)."""
 
     radius_m: float
     depth_m: float
@@ -47,7 +48,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Waves:
-    """A pressure as waves J0(k r): wave numbers, and the amplitude p^(k) dk / 2G of each."""
+    """A pressure as a sum of waves J0(k r): the wave numbers k, and the amplitude p^(k) dk / 2G of each wave."""
 
     k_per_m: Float[np.ndarray, " w"]
     amplitude_m: Float[np.ndarray, " w"]
@@ -57,7 +58,7 @@ class Waves:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement (outward, up) and its gradient: `r_z` is the derivative of the outward part along z."""
+    """Displacement (outward, up) and its gradient; `r_z` is the derivative of the outward component along z."""
 
     r_m: Float[np.ndarray, " s"]
     z_m: Float[np.ndarray, " s"]
@@ -74,7 +75,7 @@ def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1), A = kh, with numerator and denominator divided by exp(2A) / 2 to avoid
     overflow.
     """
-    double = np.minimum(2 * kh, 1e3)  # the compliance is 1 there, and squares stay finite
+    double = np.minimum(2 * kh, 1e3)  # above this limit, the compliance is 1; the limit keeps squares finite
     fade = np.exp(-double)
     s = double**2
     series = 2 * fade * double * s / 6 * (1 + s / 20 * (1 + s / 42 * (1 + s / 72 * (1 + s / 110))))
@@ -86,7 +87,7 @@ def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     """Return the surface compliance of a slipping layer to a pressure wave, relative to that of a half-space.
 
     (cosh 2A - 1) / (sinh 2A + 2A), A = kh (Johnson 1985, 5.8), with numerator and denominator divided by exp(2A) / 2 to
-    avoid overflow; A / 2 for long waves.
+    avoid overflow; for long waves, its limit A / 2.
     """
     double = np.minimum(2 * kh, 1e3)
     fade = np.exp(-double)
@@ -96,16 +97,16 @@ def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
 
 
 def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
-    """Solve for pressure and depth of a contact of this radius, by a Fredholm equation (Lebedev & Ufliand 1958).
+    """Solve a Fredholm equation for pressure and depth of a contact of this radius (Lebedev & Ufliand 1958).
 
-    p^(k) = integral of chi(x) cos(kx) makes the pressure vanish outside the contact. chi - K chi =
-    2/pi (depth - x artanh(x/R)) puts the surface on the sphere. The depth follows from chi(radius) = 0: the pressure is
-    finite at the edge.
+    With p^(k) = integral of chi(x) cos(kx) dx, the pressure vanishes outside the contact. The equation
+    chi - K chi = 2/pi (depth - x artanh(x/R)) makes the surface follow the sphere. The depth is determined by
+    chi(radius) = 0, because the pressure is finite at the edge of the contact.
     """
     x_m, weights_m = radius_m * CONTACT_X, radius_m * CONTACT_W
-    at_m = np.append(x_m, radius_m)
-    kernel = _kernel(at_m, x_m, thickness_m, base) * weights_m
-    sources = np.stack([np.ones_like(at_m), at_m * np.arctanh(at_m / tip_radius_m)], axis=1)
+    points_m = np.append(x_m, radius_m)
+    kernel = _kernel(points_m, x_m, thickness_m, base) * weights_m
+    sources = np.stack([np.ones_like(points_m), points_m * np.arctanh(points_m / tip_radius_m)], axis=1)
     inside = np.linalg.solve(np.eye(len(x_m)) - kernel[:-1], sources[:-1])
     flat, round_ = sources[-1] + kernel[-1] @ inside
     depth_m = round_ / flat
@@ -116,19 +117,20 @@ def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: floa
 def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
     """Solve for the contact at a depth above 0."""
 
-    def miss_m(radius_m: float) -> float:
-        here = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
-        return here.depth_m - depth_m
+    def depth_error_m(radius_m: float) -> float:
+        contact = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
+        return contact.depth_m - depth_m
 
-    # A thick layer has a^2 = R d; a thin layer, whose material can only flow sideways, has a^2 = 4 R d.
+    # Bounds of the contact radius a: a^2 = R d for a thick layer, and 4 R d for a thin one, whose material can only
+    # flow sideways.
     top_m = min(2.1 * np.sqrt(tip_radius_m * depth_m), 0.999 * tip_radius_m)
-    radius_m = float(brentq(miss_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
+    radius_m = float(brentq(depth_error_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
     return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
 
 
 @dataclass(frozen=True)
 class IndentedLayer:
-    """A layer, how its base is held, and the spherical tip that presses it."""
+    """A layer, its boundary condition at the base, and the spherical tip that presses it."""
 
     thickness_m: float
     tip_radius_m: float
@@ -140,7 +142,7 @@ class IndentedLayer:
 
 
 def beyond_verified(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Bool[np.ndarray, " n"]:
-    """Flag the depths beyond the range of the published solutions."""
+    """Return which depths are beyond the range in which the published solution was verified."""
     return depth_m >= VERIFIED_DEPTH * thickness_m
 
 
@@ -154,12 +156,12 @@ def force(
 ) -> Float[np.ndarray, " n"]:
     """Return the normal force of a linear elastic layer on the tip in N; 0 without contact (depth of 0 or less).
 
-    The simulated skin presses back with `slide.force_at`, which multiplies this force by the stiffening of the layer.
+    The force of a simulated skin that slides is `slide.force_at`: this force times the stiffening of the layer.
 
     Raises
     ------
     ParamsError
-        If layer, tip or modulus is impossible, or if the depth reaches the lesser of thickness and tip radius.
+        If a property of layer or tip is impossible, or if a depth reaches the smaller of thickness and tip radius.
     """
     check_layer(depth_m, thickness_m, tip_radius_m)
     if not (np.isfinite(modulus_Pa) and modulus_Pa >= 0):
@@ -169,66 +171,69 @@ def force(
 
 
 def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius_m: float) -> None:
-    """Raise `ParamsError` for an impossible layer or tip, or a depth beyond the layer or the tip's radius."""
+    """Raise `ParamsError` for an impossible layer or tip, or a depth that reaches the thickness or the tip's radius."""
     for what, size_m in (("thickness", thickness_m), ("tip radius", tip_radius_m)):
         if not 0 < size_m < np.inf:
             raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit.")
     limit_m = min(thickness_m, tip_radius_m)
     if not (np.isfinite(depth_m) & (depth_m < limit_m)).all():
-        rule = f"finite and below {1e3 * limit_m:.3g} mm, the lesser of thickness and tip radius"
+        rule = f"finite and below {1e3 * limit_m:.3g} mm, the smaller of thickness and tip radius"
         raise ParamsError("poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Poke less deep.")
 
 
 def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
-    """Decompose the contact pressure into waves; a cos^2 window over the shorter half avoids ringing."""
+    """Decompose the contact pressure into waves; a cos^2 window on the upper half of wave numbers avoids ringing."""
     window = np.cos(np.pi * np.maximum(WAVES_KH / WAVES_KH[-1] - 0.5, 0)) ** 2
     pressure_m2 = np.cos(np.outer(WAVES_KH / thickness_m, contact.x_m)) @ contact.weights_m2
     return Waves(WAVES_KH / thickness_m, pressure_m2 * window * WAVES_W / thickness_m, thickness_m, base)
 
 
 def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], of: Waves) -> Displacement:
-    """Sum the waves at (r, z): u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0."""
+    """Sum the displacements due to waves of pressure: u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0."""
     top = float(np.max(r_m, initial=0.0) * of.k_per_m[-1])
     table = _bessel_table(1 << max(8, int(np.ceil(top)).bit_length()))
-    waves = np.stack([of.k_per_m, of.thickness_m * of.k_per_m, of.amplitude_m])
-    out_m, hoop, up_m, squeeze, r_z, z_r = _sum_waves(r_m, z_m, waves, of.base == "slipping", table)
+    rows = np.stack([of.k_per_m, of.thickness_m * of.k_per_m, of.amplitude_m])
+    out_m, hoop, up_m, squeeze, r_z, z_r = _sum_waves(r_m, z_m, rows, of.base == "slipping", table)
     return Displacement(r_m=out_m, z_m=up_m, r_r=squeeze - hoop, r_z=r_z, z_r=z_r, z_z=-squeeze, hoop=hoop)
 
 
 def depth_profile(
     kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"], base: Base = "bonded"
 ) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
-    """Return g = k W 2G / p^ at height z and its first two derivatives in kz; g(kh) is the surface compliance."""
-    of_all, of_one = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
-    found = [[of_one(z, h, of_all(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
-    g, slope, bend = np.array(found).transpose(2, 0, 1)
+    """Return g = k W 2G / p^ at height z and its first two derivatives with respect to kz.
+
+    g(kh) is the surface compliance.
+    """
+    factors_of, wave = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
+    profiles = [[wave(z, h, factors_of(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
+    g, slope, bend = np.array(profiles).transpose(2, 0, 1)
     return g, slope, bend
 
 
 @lru_cache(maxsize=64)
 def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
-    # F / (E d^1.5) over sqrt(d) is smooth. At 0, where the contact is small compared with the layer, it is Hertz's
-    # 16/9 sqrt(R).
+    # F / (E d^1.5) is a smooth function of sqrt(d). At d = 0, where the contact is small compared with the layer, it
+    # has Hertz's value 16/9 sqrt(R).
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
     widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]
     contacts = [contact_of_radius(a, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base) for a in radii_m]
-    root = np.sqrt([0.0] + [one.depth_m for one in contacts])
-    share = [4 * np.pi / 3 * one.weights_m2.sum() / one.depth_m**1.5 for one in contacts]
-    return CubicSpline(root, [16 / 9 * np.sqrt(tip_radius_m), *share])
+    root = np.sqrt([0.0] + [contact.depth_m for contact in contacts])
+    ratio = [4 * np.pi / 3 * contact.weights_m2.sum() / contact.depth_m**1.5 for contact in contacts]
+    return CubicSpline(root, [16 / 9 * np.sqrt(tip_radius_m), *ratio])
 
 
 def _kernel(
-    at_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float, base: Base
+    points_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float, base: Base
 ) -> Float[np.ndarray, "p q"]:
-    # 2/pi times the integral of (1 - compliance) cos(k at) cos(k x) dk.
-    surface = bonded_compliance if base == "bonded" else slipping_compliance
-    missing = KERNEL_W / thickness_m * (1 - surface(KERNEL_KH))
+    # 2/pi times the integral over k of (1 - compliance) cos(k point) cos(k x).
+    compliance = bonded_compliance if base == "bonded" else slipping_compliance
+    missing = KERNEL_W / thickness_m * (1 - compliance(KERNEL_KH))
     k_per_m = KERNEL_KH / thickness_m
-    return 2 / np.pi * np.cos(np.outer(at_m, k_per_m)) * missing @ np.cos(np.outer(k_per_m, x_m))
+    return 2 / np.pi * np.cos(np.outer(points_m, k_per_m)) * missing @ np.cos(np.outer(k_per_m, x_m))
 
 
-BESSEL_STEP = 1 / 256  # between tabulated Bessel functions
+BESSEL_STEP = 1 / 256  # step of the argument in the table of Bessel functions
 
 
 @njit(cache=True, error_model="numpy")
@@ -242,7 +247,7 @@ def _bonded_factors(kh):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _bonded_wave(kz, kh, of):
+def _bonded_wave(kz, kh, factors):
     """Return g of one wave at height z of a bonded layer, and its first two derivatives with respect to kz.
 
     g = [cosh A (sinh z' + t cosh z') - A cosh t - A z' sinh t] / (cosh^2 A + A^2), A = kh, z' = kz, t = A - z'.
@@ -251,7 +256,7 @@ def _bonded_wave(kz, kh, of):
     t = kh - kz
     top, fade = exp(-t), exp(-kz)
     low, high = fade * fade, top * top
-    near, far = of[0] * top, of[1] * fade
+    near, far = factors[0] * top, factors[1] * fade
     g = near * (1 + t - (1 - t) * low) - far * (1 + kz + (1 - kz) * high)
     slope = near * t * (1 - low) + far * kz * (1 + high)
     bend = near * (t * (1 + low) - (1 - low)) + far * (1 + high - kz * (1 - high))
@@ -268,14 +273,14 @@ def _slipping_factors(kh):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _slipping_wave(kz, kh, of):
+def _slipping_wave(kz, kh, factors):
     """Return g of one wave at height z of a slipping layer, and its first two derivatives with respect to kz.
 
-    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A): the odd solution, because both W and
-    the shear W'' + W vanish at the base. Numerator and denominator are multiplied by 4 exp(-2A), so that no exponent is
-    positive inside the layer.
+    g = [(sinh A + A cosh A) sinh z' - z' sinh A cosh z'] / (sinh A cosh A + A). This is the odd solution in z', because
+    both W and the shear W'' + W vanish at the base. Numerator and denominator are multiplied by 4 exp(-2A), so that no
+    exponent is positive inside the layer.
     """
-    size, first, second = of
+    size, first, second = factors
     top, low = exp(kz - kh), exp(-kh - kz)
     odd, even = (top - low) / size, (top + low) / size
     g = first * odd - kz * second * even
@@ -299,13 +304,13 @@ def _between(table, low, share):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_waves(r_m, z_m, waves, slipping, table):
-    """Sum waves [k, kh, amplitude; w] at places [s]; return rows u_r, hoop, u_z, squeeze, du_r/dz, du_z/dr."""
+    """Sum waves (rows k, kh, amplitude) at places [s]; return rows u_r, hoop, u_z, -du_z/dz, du_r/dz, du_z/dr."""
     sums = np.zeros((6, len(r_m)))
     for w in range(waves.shape[1]):
         k, kh, amplitude = waves[0, w], waves[1, w], waves[2, w]
-        steep, of = amplitude * k, _slipping_factors(kh) if slipping else _bonded_factors(kh)
+        steep, of_kh = amplitude * k, _slipping_factors(kh) if slipping else _bonded_factors(kh)
         for s in range(len(r_m)):
-            g, slope, bend = _slipping_wave(k * z_m[s], kh, of) if slipping else _bonded_wave(k * z_m[s], kh, of)
+            g, slope, bend = _slipping_wave(k * z_m[s], kh, of_kh) if slipping else _bonded_wave(k * z_m[s], kh, of_kh)
             at = k * r_m[s] / BESSEL_STEP
             low = int(at)
             j0_, j1_ = _between(table, low, at - low)
@@ -317,13 +322,13 @@ def _sum_waves(r_m, z_m, waves, slipping, table):
             sums[5, s] += steep * g * j1_
     for s in range(len(r_m)):
         if r_m[s] > 0:
-            sums[1, s] = sums[0, s] / r_m[s]  # on the axis, the limit above
+            sums[1, s] = sums[0, s] / r_m[s]  # on the axis, `sums[1]` already has the limit for r = 0
     return sums
 
 
 @lru_cache(maxsize=4)
 def _bessel_table(top: int) -> Float[np.ndarray, "x 3"]:
-    """Tabulate J0, J1 and J1' = J0 - J1 / x from 0 to `top`, `BESSEL_STEP` apart."""
+    """Tabulate J0, J1 and J1' = J0 - J1 / x from 0 to `top`, in steps of `BESSEL_STEP`."""
     x = BESSEL_STEP * np.arange(round(top / BESSEL_STEP) + 2)
     with np.errstate(invalid="ignore"):
         slope = np.where(x > 0, j0(x) - j1(x) / x, 0.5)

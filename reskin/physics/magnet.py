@@ -16,20 +16,21 @@ from reskin.errors import ParamsError
 
 CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
 CUBES_N = (4, 4)  # along x and y, for the authors' skin of 20 x 20 mm
-ARRAY_BELOW_M = 0.50e-3  # from the skin's base down to the lower cubes' faces, authors' CAD
-ARRAY_ABOVE_M = 0.25e-3  # from the skin's top up to the upper cubes' faces, authors' CAD
+ARRAY_BELOW_M = 0.50e-3  # gap between the skin's base and the lower cubes, from the authors' CAD
+ARRAY_ABOVE_M = 0.25e-3  # gap between the skin's top and the upper cubes, from the authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
 
-Polarity = Literal["checkerboard", "same"]  # the paper does not specify it; upper and lower cubes attract in both
+# Not specified in the paper. With both, each upper cube attracts the lower cube that it faces.
+Polarity = Literal["checkerboard", "same"]
 
 
 def cuboid_field(
     observers_m: Float[np.ndarray, "o 3"], polarization_T: float, *, sides_m: tuple[float, float, float]
 ) -> Float[np.ndarray, "o 3"]:
-    """Return the field in T of a cuboid around the origin that is magnetised along z.
+    """Return the field in T of a cuboid that is centred at the origin and magnetised along z.
 
-    Two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus J inside. On the lines
-    through the edges the logarithms are infinite; avoid them.
+    The field is that of two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus J
+    inside the cuboid. It is infinite on the lines through the edges, where no observer may be.
     """
     half_m = np.array(sides_m) / 2
     b_T = np.zeros_like(observers_m)
@@ -44,18 +45,18 @@ def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
     """Return the contribution of one corner of a cuboid to its field, times 4 pi / J."""
     x, y, z = from_m.T
     xx, yy, zz = x * x, y * y, z * z
-    # asinh(y / hypot(x, z)) is log(y + r) minus a term common to both ends, and is accurate also for y < 0.
+    # asinh(y / hypot(x, z)) is log(y + r) minus a term that cancels between both ends; it is accurate also for y < 0.
     along_x, along_y = -np.arcsinh(y / np.sqrt(xx + zz)), -np.arcsinh(x / np.sqrt(yy + zz))
     return np.stack([along_x, along_y, np.arctan(x * y / (z * np.sqrt(xx + yy + zz)))], axis=1)
 
 
 def cubes_along(side_m: float) -> int:
-    """Return the number of magnet cubes that cover a side of a skin: four for the authors' skin, assumed for others."""
+    """Return the number of magnet cubes that cover a side of a skin: 4 for the authors' skin (assumed for others)."""
     return ceil(side_m / CUBE_SIDE_M - 1e-9)
 
 
 def seams_m(side_m: float) -> tuple[float, ...]:
-    """Return the positions along a side where two cubes touch, which are kinks of the magnetisation."""
+    """Return the positions along a side where two cubes touch; the magnetisation has kinks there."""
     n = cubes_along(side_m)
     return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
 
@@ -63,7 +64,7 @@ def seams_m(side_m: float) -> tuple[float, ...]:
 def array_field(
     nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity, *, cubes_n: tuple[int, int] = CUBES_N
 ) -> Float[np.ndarray, "s 3"]:
-    """Return the field in T inside the skin of the magnetising array: `cubes_n` cubes below it and as many above.
+    """Return the magnetising array's field in T inside the skin; `cubes_n` cubes are below it, and as many above.
 
     Adjacent cubes share corners, so each corner is computed once, weighted by the sum of its cubes' signs.
     """
@@ -71,7 +72,7 @@ def array_field(
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
         raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
     signs = np.ones(cubes_n) if polarity == "same" else (-1.0) ** np.add.outer(*map(np.arange, cubes_n))
-    # The right corner of a cube has sign +, the left corner -; likewise along y and z.
+    # Along x, y and z, the upper corner of a cube has sign + and the lower corner sign -.
     weights = -np.diff(-np.diff(np.pad(signs, 1), axis=0), axis=1)
     below_m, above_m = -ARRAY_BELOW_M, thickness_m + ARRAY_ABOVE_M
     faces_m = {below_m: 1, below_m - CUBE_SIDE_M: -1, above_m + CUBE_SIDE_M: 1, above_m: -1}
@@ -86,7 +87,7 @@ def array_field(
 def magnetise(b_T: Float[np.ndarray, "s 3"], *, saturation_T: float, half_field_T: float) -> Float[np.ndarray, "s 3"]:
     """Return the remanent magnetisation J of the powder: phi Br u^3 / (1 + u^3) along B, u = |B| / B_half."""
     u = np.linalg.norm(b_T, axis=1, keepdims=True) / half_field_T
-    # u^2 / half_field_T is u^3 / |B|, finite where the field vanishes (seam crossings).
+    # u^2 / half_field_T equals u^3 / |B|, but is finite where the field vanishes (at crossings of seams).
     return saturation_T * b_T * u**2 / half_field_T / (1 + u**3)
 
 
@@ -97,11 +98,11 @@ def moments(j_T: Float[np.ndarray, "s 3"], volumes_m3: Float[np.ndarray, " s"]) 
 
 SKIN_SIDE_M = 20e-3  # authors' CAD
 SKIN_SIDES_M = (SKIN_SIDE_M, SKIN_SIDE_M)
-SEAMS_M = seams_m(SKIN_SIDE_M)  # of the 4x4 array of 0.25 in cubes that magnetises the authors' skin
+SEAMS_M = seams_m(SKIN_SIDE_M)  # for the authors' skin, which is magnetised by 4 x 4 cubes
 
 
 class QuadratureSettings(Strict):
-    """Section `quadrature` of a board: the nearer the chips, the finer it must be (experiment runtime)."""
+    """Section `quadrature` of a board; chips closer to the skin need a finer quadrature (experiment runtime)."""
 
     cell_mm: Annotated[float, Field(gt=0, le=20)]
     layers_n: Annotated[int, Field(ge=1, le=100)]
@@ -119,13 +120,13 @@ class Quadrature:
     layers_n: int
 
 
-# 42 x 42 x 6 nodes; dB is within 2 % of that with cells of half the width (test_skin).
+# 42 x 42 x 6 nodes; halving the cell width changes dB by less than 2 % (test_skin).
 DEFAULT_QUADRATURE = Quadrature(cell_m=0.5e-3, layers_n=6)
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Quadrature nodes of a skin at rest; x and y from its centre, z from the base (0) to the top."""
+    """Quadrature nodes of a skin at rest; x and y are relative to its centre, z to its base."""
 
     nodes_m: Float[np.ndarray, "s 3"]
     volumes_m3: Float[np.ndarray, " s"]
@@ -134,7 +135,7 @@ class Nodes:
 def place_nodes(
     thickness_m: float, rule: Quadrature = DEFAULT_QUADRATURE, *, sides_m: tuple[float, float] = SKIN_SIDES_M
 ) -> Nodes:
-    """Place nodes: midpoints of cells that end at seams and edges, times Gauss nodes in z."""
+    """Place nodes: in x and y at the midpoints of cells that end at seams and edges, in z at Gauss nodes."""
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
         raise ParamsError("quadrature", "thickness, cell and layers", "above 0", got, "Correct the design.")
@@ -168,7 +169,7 @@ def field_of_each(
     positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
 ) -> Float[np.ndarray, "o s 3"]:
     """Return the field in T of each dipole at each observer: mu0/4pi (3 (m.r) r / r^5 - m / r^3)."""
-    # The axis of three comes first, so that every product runs over long contiguous rows.
+    # The axis of x, y, z comes first, so that every product runs over long contiguous rows.
     separation = observers_m.T[:, :, None] - positions_m.T[:, None, :]
     moment = moments_A_m2.T[:, None, :]
     r2 = (separation * separation).sum(axis=0)
@@ -182,8 +183,8 @@ def field_of_each(
 def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
     """Return the field change in T due to dipoles (positions in m, moments in A m^2) that move and rotate.
 
-    K(x) m' - K(X) m is summed dipole by dipole, because the difference of the two total fields would lose digits.
-    Columns that are contiguous in memory (Fortran order, as from `deformation.move_dipoles`) are not copied.
+    The field changes of single dipoles are summed, because the difference of the two total fields would lose digits.
+    Arrays in Fortran order (as from `deformation.move_dipoles`) are not copied.
     """
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
@@ -192,8 +193,8 @@ def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray
     return change_T
 
 
-# The loop over nodes has no sums, so it is vectorised without fastmath; dipoles that do not move contribute exactly 0.
-# With this error_model, a division by zero gives infinity, as in NumPy. The caller checks for it, not the loop.
+# The loop over nodes accumulates nothing, so it is vectorised without fastmath. Dipoles that do not move contribute
+# exactly 0. With this error_model, a division by zero gives infinity, as in NumPy; the caller checks for that.
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
@@ -219,7 +220,7 @@ def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
     return total
 
 
-# reassoc allows several partial sums in parallel; infinities and NaN are kept.
+# `reassoc` allows several partial sums in parallel and keeps infinities and NaN.
 @njit(cache=True, fastmath={"reassoc"})
 @no_type_check
 def _total(parts):

@@ -24,9 +24,9 @@ class Friction(Strict):
 
 @dataclass(frozen=True)
 class DragForce:
-    """Tangential force at each place of a path; the rest position of the material under the tip is path - elastic."""
+    """Tangential force at each place of a path; `path - elastic` is the rest position of the material under the tip."""
 
-    force_N: Float[np.ndarray, "t 2"]  # on the skin, so along the tip's motion
+    force_N: Float[np.ndarray, "t 2"]  # on the skin, so it points along the tip's motion
     elastic_m: Float[np.ndarray, "t 2"]
     sliding: Bool[np.ndarray, " t"]
 
@@ -38,28 +38,29 @@ def drag_force(
     stiffness_N_per_m: Float[np.ndarray, "t 2 2"] | Float[np.ndarray, " t"] | float,
     friction: float,
 ) -> DragForce:
-    """Return the friction force along the path of a tip that first touches at `path_m[0]`.
+    """Return the friction force along the path of a tip that touches down at `path_m[0]`.
 
-    Return mapping (Simo & Hughes 1998): an elastic trial step, whose force is scaled back radially to Coulomb's disc
-    |Q| <= mu F by slip. A step sticks or slides only if both its ends are in contact; otherwise the spring is released,
-    because the place where the tip lifted or touched is unknown.
+    Return mapping (Simo & Hughes 1998): each step is first assumed to be elastic. If its force exceeds Coulomb's limit
+    |Q| <= mu F, the tip slips and the force is scaled down to the limit. The tip sticks or slides in a step only if
+    both ends of the step are in contact. Otherwise the force is zero, because the place where the tip lifted off or
+    touched down is unknown.
 
     Parameters
     ----------
     path_m : places of the tip.
-    normal_N : normal force at each place; 0 is no contact.
-    stiffness_N_per_m : tangential stiffness: a number, one per place, or symmetric matrices for anisotropic skins.
+    normal_N : normal force at each place; 0 means no contact.
+    stiffness_N_per_m : tangential stiffness: one number, one number per place, or one symmetric matrix per place.
     friction : coefficient mu.
     """
     stiffness = np.asarray(stiffness_N_per_m, dtype=float)
     if stiffness.ndim < 3:
         stiffness = np.where(np.eye(2, dtype=bool), np.broadcast_to(stiffness, normal_N.shape)[:, None, None], 0.0)
     _check_drag(path_m, normal_N, stiffness, friction)
-    limit_N, touching = friction * normal_N, normal_N > 0
+    limit_N, in_contact = friction * normal_N, normal_N > 0
     force_N, elastic_m = np.zeros(path_m.shape), np.zeros(path_m.shape)
     sliding = np.zeros(len(path_m), dtype=bool)
     for now in range(1, len(path_m)):
-        if not (touching[now] and touching[now - 1]):
+        if not (in_contact[now] and in_contact[now - 1]):
             continue
         trial_m = elastic_m[now - 1] + path_m[now] - path_m[now - 1]
         trial_N = np.hypot(*(stiffness[now] @ trial_m))
@@ -86,18 +87,18 @@ def _check_drag(
         raise ParamsError("drag", "friction", "0 or more and finite", f"{friction}", "Check the scene.")
 
 
-REACH = 5.0  # in thicknesses beyond the contact, as in `deformation`: material farther away does not move
-WIDEST = 3.0  # largest contact radius in thicknesses; `layer.WAVES_KH` does not sample the waves of larger contacts
-RIM_MAX = 1.2  # of the thickness, as in `deformation`; a rim above the thickness moves like the surface
-STEP = 0.75  # largest half curl per step: on the nominal skin, one step suffices to 0.6 mm with mu 0.8
-STEEPEST = 1.5  # largest half curl that was compared with finer steps: mu 0.8 at 1.2 mm
+REACH = 5.0  # thicknesses beyond the contact, as in `deformation`; material farther away does not move
+WIDEST = 3.0  # largest contact radius in thicknesses; `layer.WAVES_KH` is too coarse for larger contacts
+RIM_MAX = 1.2  # largest height of the rim in thicknesses, as in `deformation`; nodes above 1 move like the surface
+STEP = 0.75  # largest half curl per step; on the nominal skin with mu 0.8, one step suffices for depths to 0.6 mm
+STEEPEST = 1.5  # largest half curl for which the step size was verified (mu 0.8 at a depth of 1.2 mm)
 TABLE_R_N, TABLE_Z_N = 512, 80  # fine enough for linear interpolation
-DEPTH_STEP_M = 10e-6  # between tabulated depths; stiffness changes by 1 % per step, dB by 0.1 uT
+DEPTH_STEP_M = 10e-6  # between tabulated depths; per step, the stiffness changes by 1 % and dB by 0.1 uT
 
 
 @dataclass(frozen=True)
 class Traction:
-    """An axisymmetric tangential traction, as weights of its transform: q^(k) / Q = sum of weights * cos(k x)."""
+    """An axisymmetric traction q, given by weights of its transform: q^(k) / Q = sum_i weights_i cos(k x_i)."""
 
     radius_m: float
     x_m: Float[np.ndarray, " q"]
@@ -106,10 +107,10 @@ class Traction:
 
 @dataclass(frozen=True)
 class WaveResponse:
-    """Response of the layer to a wave of tangential traction T as a function of kz; primes are derivatives in kz.
+    """Response of the layer to a wave of tangential traction T, by kz; primes are derivatives with respect to kz.
 
-    In the plane of the wave, the displacement in units of T / 2Gk is w' along the wave and -i w upwards; across the
-    wave, it is v in units of T / Gk.
+    For the component of T along the wave, the displacement in units of T / 2Gk is w' along the wave and -i w upwards.
+    For the component across the wave, the displacement in units of T / Gk is v across the wave.
     """
 
     w: Float[np.ndarray, "z k"]
@@ -121,10 +122,10 @@ class WaveResponse:
 
 @dataclass(frozen=True)
 class ShearMap:
-    """Displacement and half curl at (r, z) for a force Q along x, divided by Q / G; equal steps in r and in z.
+    """Displacement and half curl for a force Q along x, divided by Q / G, on a grid with equal steps in r and in z.
 
-    Parts A, B, C in 1/m: displacement A + B cos 2f, B sin 2f, C cos f along x, y, z at the angle f from x.
-    Parts D, E, S in 1/m^2: half curl -E sin 2f, D + E cos 2f, S sin f.
+    At the angle f from x, the components along x, y and z are: displacement A + B cos 2f, B sin 2f, C cos f; half curl
+    -E sin 2f, D + E cos 2f, S sin f. `parts` are A, B, C in 1/m and D, E, S in 1/m^2.
     """
 
     r_m: Float[np.ndarray, " i"]
@@ -136,26 +137,26 @@ class ShearMap:
 
 @dataclass(frozen=True)
 class ShearDisplacement:
-    """Displacement of each node, and half of its curl, which is the rotation vector for small rotations."""
+    """Displacement of each node, and half the curl of the displacement: the rotation vector for small rotations."""
 
     displacement_m: Float[np.ndarray, "s 3"]
     half_curl: Float[np.ndarray, "s 3"]
 
 
 def slip_traction(contact: layer.Contact) -> Traction:
-    """Return the traction of a sliding tip: Coulomb's q = mu p, which has the shape of the pressure.
+    """Return the traction of a sliding tip: Coulomb's q = mu p, which is distributed like the pressure.
 
-    It is used for a whole drag, which slides except for its first millimetre or two. Its k_t is below that of
-    `stick_traction` by 19 to 20 % on the nominal skin at 0.2 to 1.2 mm, and by 1/6 on a thick layer.
+    It is used for the whole of a drag, because the tip slides except for the first one or two millimetres. Its k_t is
+    below that of `stick_traction` by 19 to 20 % on the nominal skin at 0.2 to 1.2 mm, and by 1/6 on a thick layer.
     """
     return Traction(contact.radius_m, contact.x_m, contact.weights_m2 / contact.weights_m2.sum())
 
 
 def stick_traction(radius_m: float, thickness_m: float) -> Traction:
-    """Return the traction of a sticking tip: the axisymmetric traction that moves the contact rigidly, apart from B.
+    """Return the traction of a sticking tip: axisymmetric, and moving the contact rigidly except for the B term.
 
-    chi - K chi = 1 (see `layer.contact_of_radius`). For a thick layer chi is constant, which is Mindlin's traction
-    (a^2 - r^2)^(-1/2).
+    It solves chi - K chi = 1 (see `layer.contact_of_radius`). For a thick layer, chi is constant, which gives Mindlin's
+    traction (a^2 - r^2)^(-1/2). For the B term, see `ShearMap`.
     """
     x_m, weights_m = radius_m * layer.CONTACT_X, radius_m * layer.CONTACT_W
     kernel = _kernel(x_m, thickness_m) * weights_m
@@ -164,21 +165,21 @@ def stick_traction(radius_m: float, thickness_m: float) -> Traction:
 
 
 def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
-    """Return k_t / G: the force divided by the mean displacement along it, weighted with the traction, as for work.
+    """Return k_t / G: the force divided by the traction-weighted mean displacement along the force, divided by G.
 
-    By Parseval's theorem it is 8 pi / integral of q^2 (w' + 2v) dk at the surface; the part for a half-space, with 3
-    for the bracket, is in closed form.
+    By Parseval's theorem, it is 8 pi / integral of q^2 (w' + 2v) dk at the surface. For a half-space, w' + 2v = 3; this
+    part of the integral has a closed form, and the kernel describes the effect of the base.
     """
     chi = traction.weights / (traction.radius_m * layer.CONTACT_W)
-    held = _kernel(traction.x_m, thickness_m) @ traction.weights
-    return float(16 / 3 / (traction.weights @ (chi - held)))
+    base_effect = _kernel(traction.x_m, thickness_m) @ traction.weights
+    return float(16 / 3 / (traction.weights @ (chi - base_effect)))
 
 
 @lru_cache(maxsize=32)
 def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
-    """Tabulate the shear under a tip that slides at this depth, out to the reach at the deepest verified depth.
+    """Tabulate the shear under a tip that slides at this depth, for radii up to `deformation.reach`.
 
-    `base` affects only the contact. Sideways the base is always fixed; otherwise no force could act on the layer.
+    `base` affects only the contact. The base is always fixed sideways; otherwise no force could shear the layer.
     """
     layer.check_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
@@ -191,10 +192,10 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
 def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
     """Interpolate the map linearly between tabulated depths, so that it is continuous in the depth.
 
-    Below the first tabulated depth (`DEPTH_STEP_M`), where the force is close to zero, it is the map of that depth.
+    Below the first tabulated depth (`DEPTH_STEP_M`), where the force is close to zero, the map of that depth is used.
     """
-    at = max(depth_m / DEPTH_STEP_M, 1.0)
-    first, share = int(at), at - int(at)
+    steps = max(depth_m / DEPTH_STEP_M, 1.0)
+    first, share = int(steps), steps - int(steps)
     low, high = (
         tabulate_depth(DEPTH_STEP_M * i, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
         for i in (first, first + 1)
@@ -209,7 +210,7 @@ def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: l
 
 
 def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = None) -> ShearMap:
-    """Tabulate the shear due to a traction, by default to `REACH` thicknesses beyond the contact."""
+    """Tabulate the shear due to a traction, by default up to `REACH` thicknesses beyond the contact."""
     if not 0 < traction.radius_m <= WIDEST * thickness_m < np.inf:
         rule, got = f"above 0 m and at most {WIDEST} thicknesses", f"{traction.radius_m} m on {thickness_m} m"
         raise ParamsError("drag", "contact radius", rule, got, "Press less deep.")
@@ -218,9 +219,9 @@ def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = Non
     r_m = np.linspace(0, reach_m, TABLE_R_N)
     z_m = np.linspace(0, thickness_m, TABLE_Z_N)
     parts = evaluate_map(traction, r_m, z_m, thickness_m=thickness_m)
-    parts[:, 0, :3] = 0.0  # the base is fixed, but the material on it shears and therefore rotates
+    parts[:, 0, :3] = 0.0  # no displacement at the base, but its material shears and therefore rotates
     d, e, s = np.moveaxis(parts[..., 3:], 2, 0)
-    # Values at f = 0 and 90 degrees; in between it is smaller.
+    # The largest half curl is at f = 0 or 90 degrees.
     steepest_per_m2 = max(np.abs(d + e).max(), np.hypot(d - e, s).max())
     return ShearMap(r_m, z_m, parts, tangential_stiffness_m(traction, thickness_m), float(steepest_per_m2))
 
@@ -228,26 +229,26 @@ def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = Non
 def evaluate_map(
     traction: Traction, r_m: Float[np.ndarray, " i"], z_m: Float[np.ndarray, " j"], *, thickness_m: float
 ) -> Float[np.ndarray, "i j 6"]:
-    """Return the parts of `ShearMap` on a grid: Hankel integrals with J0, J2, J1, as matrix products.
+    """Return the parts of `ShearMap` on a grid: Hankel integrals with J0, J1 and J2, computed as matrix products.
 
-    A traction q along x has the components q cos f along a wave of direction f and -q sin f across it; the integrals
-    over f are Bessel functions.
+    For a wave with direction f, a traction q along x has the components q cos f along the wave and -q sin f across it.
+    The integrals over f give Bessel functions.
     """
     k_per_m = layer.WAVES_KH / thickness_m
     window = np.cos(np.pi * np.maximum(layer.WAVES_KH / layer.WAVES_KH[-1] - 0.5, 0)) ** 2  # avoids ringing
     waves = np.cos(np.outer(k_per_m, traction.x_m)) @ traction.weights * window
-    of = waves * layer.WAVES_W / thickness_m / (8 * np.pi)
-    at = wave_response(np.outer(z_m, k_per_m), layer.WAVES_KH)
+    amplitude = waves * layer.WAVES_W / thickness_m / (8 * np.pi)
+    response = wave_response(np.outer(z_m, k_per_m), layer.WAVES_KH)
     kr = np.outer(r_m, k_per_m)
     bessel0, bessel1 = j0(kr), j1(kr)
     bessel2 = np.where(kr > 0, 2 * bessel1 / np.where(kr > 0, kr, 1.0) - bessel0, 0.0)
     products = (
-        (bessel0, of * (2 * at.v + at.w_slope)),
-        (bessel2, of * (2 * at.v - at.w_slope)),
-        (bessel1, of * 2 * at.w),
-        (bessel0, of * k_per_m * (2 * at.v_slope + at.w_spin) / 2),
-        (bessel2, of * k_per_m * (2 * at.v_slope - at.w_spin) / 2),
-        (bessel1, of * k_per_m * 2 * at.v),
+        (bessel0, amplitude * (2 * response.v + response.w_slope)),
+        (bessel2, amplitude * (2 * response.v - response.w_slope)),
+        (bessel1, amplitude * 2 * response.w),
+        (bessel0, amplitude * k_per_m * (2 * response.v_slope + response.w_spin) / 2),
+        (bessel2, amplitude * k_per_m * (2 * response.v_slope - response.w_spin) / 2),
+        (bessel1, amplitude * k_per_m * 2 * response.v),
     )
     return np.stack([bessel @ profile.T for bessel, profile in products], axis=2)
 
@@ -255,9 +256,9 @@ def evaluate_map(
 def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> WaveResponse:
     """Return the response of the layer, fixed at its base, to a wave of tangential traction on top.
 
-    w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z': the W of
-    `layer` with W''' = 3 W' at the top. Numerators and denominators are divided by exp(2A) / 4, so that no exponent is
-    positive inside the layer.
+    w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z'. Here
+    w is the W of `layer` with W''' = 3 W' at the top. Numerators and denominators are divided by exp(2A) / 4, so that no
+    exponent is positive inside the layer.
     """
     t = kh - kz
     top, low, high = np.exp(-t), np.exp(-2 * kz), np.exp(-2 * t)
@@ -281,10 +282,10 @@ def shear_displacement(
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
 ) -> ShearDisplacement:
-    """Return the linear displacement and half curl due to a force around `centre_m`; the modulus is Young's, 3 G."""
+    """Return the linear displacement and half curl due to a force at `centre_m`; `modulus_Pa` is Young's, 3 G."""
     lowest_m, highest_m = places_m[:, 2].min(initial=0.0), places_m[:, 2].max(initial=0.0)
     if not (0 <= lowest_m and highest_m <= RIM_MAX * of.z_m[-1]):
-        rule, got = f"0 to {RIM_MAX} of the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
+        rule, got = f"0 to {RIM_MAX} times the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
         raise ParamsError("drag", "height of nodes", rule, got, "Press less deep.")
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     return ShearDisplacement(*_at_places(of.parts, (of.r_m[1], of.z_m[1]), places_m, centre_m, shear_m2))
@@ -298,35 +299,37 @@ def shear_in_steps(
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
 ) -> ShearDisplacement:
-    """Return the finite shear of nodes that `deformation` has moved, in midpoint steps.
+    """Return the finite shear of nodes that `deformation` has moved, computed in midpoint steps.
 
-    `centre_m` is the rest position of the material under the tip, where `deformation` is centred too: the tip's place
-    minus Q / k_t (`DragForce.elastic_m`). With mu 0.8, dB differs from that with 24 steps by up to 1.2 % down to 0.8 mm
-    and 3 % at 1.2 mm; with a single `shear_displacement` of the nodes at rest, by 13 to 90 %.
+    `centre_m` is the rest position of the material under the tip: the tip's place minus Q / k_t
+    (`DragForce.elastic_m`). The displacement by `deformation` must have the same centre. With mu 0.8, dB differs from
+    the result of 24 steps by up to 1.2 % for depths to 0.8 mm and by 3 % at 1.2 mm. With a single `shear_displacement`
+    of the nodes at rest, it would differ by 13 to 90 %.
     """
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     steepest = of.steepest_per_m2 * float(np.hypot(*shear_m2))
     if not steepest <= STEEPEST:
-        rule, remedy = f"at most {STEEPEST} anywhere", "Drag with less friction, or less far before it slips."
+        rule, remedy = f"at most {STEEPEST} everywhere", "Drag with less friction, or less far before it slips."
         raise ParamsError("drag", "half of the curl", rule, f"{steepest:.3g}", remedy)
     steps_n = max(1, int(np.ceil(steepest / STEP)))
     part_N, ahead_m = force_N / steps_n, shear_m2 / of.stiffness_m / steps_n
     moved_m, half_curl = np.zeros_like(places_m), np.zeros_like(places_m)
     for step_i in range(steps_n):
-        at_m, there_m = places_m + moved_m, centre_m + step_i * ahead_m
-        first = shear_displacement(of, at_m, there_m, force_N=part_N, modulus_Pa=modulus_Pa)
-        half_m = at_m + first.displacement_m / 2
-        middle = shear_displacement(of, half_m, there_m + ahead_m / 2, force_N=part_N, modulus_Pa=modulus_Pa)
+        nodes_m, step_centre_m = places_m + moved_m, centre_m + step_i * ahead_m
+        first = shear_displacement(of, nodes_m, step_centre_m, force_N=part_N, modulus_Pa=modulus_Pa)
+        half_m = nodes_m + first.displacement_m / 2
+        middle_m = step_centre_m + ahead_m / 2
+        middle = shear_displacement(of, half_m, middle_m, force_N=part_N, modulus_Pa=modulus_Pa)
         moved_m += middle.displacement_m
-        half_curl += middle.half_curl  # additive in simple shear, like F
+        half_curl += middle.half_curl  # in simple shear, half curls add up like displacement gradients
     return ShearDisplacement(moved_m, half_curl)
 
 
 def rotation_from_curl(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 3"]]:
-    """Return angle and axis of R in F = R U: the arc tangent of the half curl, exact in plane strain."""
+    """Return angle and axis of R in F = R U; the angle is the arc tangent of the half curl (exact in plane strain)."""
     size = np.sqrt((half_curl**2).sum(axis=1))
     axis = half_curl / np.where(size > 0, size, 1.0)[:, None]
-    axis[size == 0] = (1.0, 0.0, 0.0)  # without rotation, any axis will do
+    axis[size == 0] = (1.0, 0.0, 0.0)  # without rotation, the axis has no effect
     return np.arctan(size), axis
 
 
@@ -339,7 +342,7 @@ def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[n
 @njit(cache=True, fastmath=False)
 @no_type_check
 def _at_places(parts, steps, places, centre, force):
-    # Bilinear interpolation of the parts, then combined for the direction of the force.
+    # Interpolate the parts bilinearly, then combine them for the direction of the force.
     r_n, z_n, _ = parts.shape
     moved, half_curl = np.zeros_like(places), np.zeros_like(places)
     at, (fx, fy) = np.empty(6), force
@@ -348,7 +351,7 @@ def _at_places(parts, steps, places, centre, force):
         r = sqrt(x * x + y * y)
         at_r, at_z = r / steps[0], min(places[i, 2] / steps[1], z_n - 1.0)
         if at_r >= r_n - 1:
-            continue  # out of reach
+            continue  # beyond the table, nothing moves
         j, k = int(at_r), min(int(at_z), z_n - 2)
         share_r, share_z = at_r - j, at_z - k
         for p in range(6):
@@ -356,7 +359,7 @@ def _at_places(parts, steps, places, centre, force):
             far = parts[j + 1, k, p] + share_z * (parts[j + 1, k + 1, p] - parts[j + 1, k, p])
             at[p] = near + share_r * (far - near)
         a, b, c, d, e, s = at
-        # On the axis, the parts that depend on the direction are zero, so any direction will do.
+        # On the axis, the parts that depend on the direction are zero, so the direction has no effect.
         cos, sin = (x / r, y / r) if r > 0 else (1.0, 0.0)
         along, across = fx * cos + fy * sin, fx * sin - fy * cos
         twice_x, twice_y = 2 * along * cos - fx, 2 * along * sin - fy
@@ -366,9 +369,9 @@ def _at_places(parts, steps, places, centre, force):
 
 
 def _kernel(x_m: Float[np.ndarray, " q"], thickness_m: float) -> Float[np.ndarray, "q q"]:
-    # 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk: the effect of the base, relative to the 3 of
-    # a half-space.
-    at = wave_response(layer.KERNEL_KH[None], layer.KERNEL_KH)
-    missing = layer.KERNEL_W / thickness_m * (1 - (at.w_slope[0] + 2 * at.v[0]) / 3)
+    # 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk: the effect of the base. For a half-space,
+    # w' + 2v = 3, so the kernel is 0.
+    response = wave_response(layer.KERNEL_KH[None], layer.KERNEL_KH)
+    missing = layer.KERNEL_W / thickness_m * (1 - (response.w_slope[0] + 2 * response.v[0]) / 3)
     waves = np.cos(np.outer(x_m, layer.KERNEL_KH / thickness_m))
     return 2 / np.pi * (waves * missing) @ waves.T
