@@ -257,8 +257,8 @@ def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> 
     """Return the response of the layer, fixed at its base, to a wave of tangential traction on top.
 
     w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z'. Here
-    w is the W of `layer` with W''' = 3 W' at the top. Numerators and denominators are divided by exp(2A) / 4, so that no
-    exponent is positive inside the layer.
+    w is the W of `layer` with W''' = 3 W' at the top. Numerators and denominators are divided by exp(2A) / 4, so that
+    no exponent is positive inside the layer.
     """
     t = kh - kz
     top, low, high = np.exp(-t), np.exp(-2 * kz), np.exp(-2 * t)

@@ -1,1 +1,1 @@
-"""Simulated captures: files as of a recorded capture, from a protocol, a rig and the physics of a skin."""
+"""Simulated captures, in the file formats of recorded ones, from a protocol, a rig and the physics of a skin."""

@@ -1,6 +1,6 @@
-"""Simulated captures: a skin is pressed by a protocol, and the result written in the formats of a recorded capture.
+"""Simulated captures: a protocol presses a skin, and the result is encoded in the formats of a recorded capture.
 
-Only `source: simulated` in its header distinguishes such a capture from a recorded one.
+Only `source: simulated` in the header distinguishes such a capture from a recorded one.
 """
 
 from dataclasses import dataclass
@@ -37,30 +37,30 @@ from reskin.simulation.rig import (
 from reskin.simulation.settings import MAIN, SimulationSettings
 
 WIRE: Wire = "binary"
-# Each part has its own random generator, so that a further term does not change the other draws.
+# Each part has its own random generator, so that an additional term does not change the other parts.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 
 
 @dataclass(frozen=True)
 class SimulatedCapture:
-    """A capture before it is encoded: frames in order of time, arrivals, probe log, clock marks."""
+    """A capture before it is encoded: frames in order of time, their arrivals, probe log and clock marks."""
 
     name: str
     board: str
     skin: str
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
-    arrived_frames_n: Int64[np.ndarray, " c"]  # cumulative number of frames; the first row is 0, at the start
+    arrived_frames_n: Int64[np.ndarray, " c"]  # cumulative number of frames; starts with 0
     arrived_s: Float64[np.ndarray, " c"]  # on the stream's clock
     probe: ProbeLog
-    marks: tuple[tuple[float, float], ...]  # (stream_s, probe_s) of the same events
+    marks: tuple[tuple[float, float], ...]  # times of the same events on both clocks: (stream_s, probe_s)
     protocol: str  # description
     overruns: dict[str, int]  # counts of values out of range, by kind
     card_rate_hz: float | None  # frame rate on an SD card; None if frames come through a port
 
 
 def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str, str]]:
-    """List the names (board, skin) of a protocol's captures; more boards or skins do not change those of the others."""
+    """List (board, skin) of each of a protocol's captures; adding boards or skins does not change earlier names."""
     kind, skins_n = settings.boards[settings.protocols[protocol].boards], settings.protocols[protocol].skins_n
     boards = [f"{kind.letter}{board_i}" for board_i in range(kind.boards_n)]
     skins = [(board, f"{board}_s{skin_i}") for skin_i in range(kind.skins_per_board_n) for board in boards]
@@ -70,7 +70,7 @@ def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str
 def simulate_capture(
     settings: SimulationSettings, protocol: str, *, board: str, skin: str, seed: int
 ) -> SimulatedCapture:
-    """Draw the board and the skin of these names, press the skin by the protocol, and record it."""
+    """Draw the board and the skin of these names, and simulate the protocol's capture of them."""
     presses, chip, spreads = settings.protocols[protocol], settings.chip, settings.spreads
     rig, terms = rig_for(settings.rig, presses), settings.terms.only(presses.terms)
     kind = settings.boards[presses.boards]
@@ -112,7 +112,7 @@ def simulate_capture(
 
 
 def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[Header, dict[str, bytes]]:
-    """Encode a capture as the files of a native capture or of an SD card; the header has no hashes of files yet."""
+    """Encode a capture as the files of a native or SD-card capture; the header does not have the files' hashes yet."""
     on_card = capture.card_rate_hz is not None
     frames_n, chips_n = capture.temperature_degC.shape
     xy_uT, _, z_uT = steps_uT(settings.chip.gain_sel).tolist()
@@ -140,7 +140,7 @@ def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[H
 
 
 def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the tip's positions in the board's frame in m; for a commanded load, the skin determines the depth."""
+    """Return the tip's positions in m in the board's frame; the depth of a commanded load depends on the skin."""
     tip_m = (actual_positions(plan, rig, rng) - (*plan.centre_mm, 0)) * milli
     if plan.weight_N is not None:
         tip_m[:, :, 2] = depths_under_load(skin, plan.weight_N)
@@ -148,7 +148,7 @@ def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[
 
 
 def _force_readings(response: Response, rig: Rig, rng: np.random.Generator) -> tuple[Float32[np.ndarray, "n d 3"], int]:
-    """Return the force readings in N, the no-load dwell of each indentation first, and how many were clipped."""
+    """Return force readings in N, with each indentation's no-load dwell before its stops, and how many were clipped."""
     force_N = np.concatenate([np.zeros((len(response.force_N), 1, 3)), response.force_N], axis=1)
     read_N, past_range_n = read_force(force_N.reshape(-1, 3), noise_N=rig.force_noise_N, rng=rng)
     return read_N.reshape(force_N.shape), past_range_n

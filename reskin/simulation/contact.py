@@ -1,6 +1,6 @@
 """Response of a skin to a tip: fields at the chips and forces at every stop of a protocol.
 
-Terms of physics that a protocol does not name are not computed (experiment neglected_effects reports the error).
+Terms of physics that a protocol does not name are neglected; experiment neglected_effects reports the resulting error.
 """
 
 from collections.abc import Collection
@@ -49,16 +49,18 @@ class Terms(Strict):
     temperature: Temperature | None = None
 
     def named(self) -> set[str]:
+        """Return the names of the terms that have settings."""
         return {name for name in type(self).model_fields if getattr(self, name) is not None}
 
     def only(self, names: Collection[str]) -> "Terms":
+        """Return a copy with only the named terms."""
         return Terms(**{name: getattr(self, name) for name in names})
 
 
 class TangentialResponse(NamedTuple):
-    """Response to a dragged or tilted tip at every stop.
+    """Response to a dragged or tilted tip at each stop.
 
-    force_N: tangential force. change_T: dB due to pressing and dragging. slide_m: translation of the whole skin.
+    force_N: tangential force. change_T: dB due to pressing and dragging together. slide_m: translation of the skin.
     """
 
     force_N: Float[np.ndarray, "n p 2"]
@@ -68,12 +70,12 @@ class TangentialResponse(NamedTuple):
 
 @dataclass(frozen=True)
 class Response:
-    """Fields at the chips in tesla and forces on the skin in newtons; axes n indentations, p stops, k chips."""
+    """Fields at the chips and forces on the skin; the axes are n indentations, p stops and k chips."""
 
-    rest_T: Float[np.ndarray, "n k 3"]  # before each indentation
+    rest_T: Float[np.ndarray, "n k 3"]  # no-load field before each indentation
     change_T: Float[np.ndarray, "n p k 3"]
     force_N: Float[np.ndarray, "n p 3"]
-    beyond_verified_n: int  # number of stops deeper than the published solutions
+    beyond_verified_n: int  # number of stops deeper than the range of the published solutions
 
 
 def simulate_response(
@@ -85,10 +87,10 @@ def simulate_response(
     terms: Terms,
     rng: np.random.Generator,
 ) -> Response:
-    """Simulate the response of a fresh skin at every stop (x, y, depth in the board's frame).
+    """Simulate the response of a new skin at each stop (x, y, depth in the board's frame).
 
-    `tilt` is the slope of the stylus, x and y over z. Without the term friction there is no tangential force, so that a
-    dragged or tilted tip only presses.
+    `tilt` is the slope of the stylus, dx/dz and dy/dz. Without the term friction, there is no tangential force: a
+    dragged or tilted tip has the effect of a press.
     """
     n, stops_n, _ = tip_m.shape
     flat_m = tip_m.reshape(-1, 3)
@@ -105,9 +107,9 @@ def simulate_response(
     if terms.ageing is not None:
         contacts_n, ageing = np.arange(n), terms.ageing
         force_N *= softening(contacts_n, settling=ageing.settling, ageing=ageing.ageing)[:, None, None]
-        left = 1 - fading(contacts_n, per_decade=ageing.fading_per_decade)
+        relative_rest = 1 - fading(contacts_n, per_decade=ageing.fading_per_decade)
         walk_T = baseline_walk(contacts_n, rest_T.size, step_T=ageing.wandering_uT * micro, rng=rng)
-        every_rest_T = left[:, None, None] * rest_T + walk_T.reshape(-1, *rest_T.shape)
+        every_rest_T = relative_rest[:, None, None] * rest_T + walk_T.reshape(-1, *rest_T.shape)
     if terms.relaxation is not None:
         force_N *= relaxed_share(terms.relaxation)
     if terms.memory is not None:
@@ -121,12 +123,12 @@ def simulate_response(
 def drag_tip(
     board: Board, skin: Skin, tip_m: Float[np.ndarray, "n p 3"], *, tilt: Float[np.ndarray, "n 2"], how: Friction
 ) -> TangentialResponse:
-    """Move a dragged or tilted tip through the stops of every indentation, with Coulomb friction.
+    """Move a dragged or tilted tip through the stops of each indentation, with Coulomb friction.
 
-    The tangential force shears the layer under the tip, and slides the whole skin if springs hold its base
+    The tangential force shears the layer under the tip. It also slides the whole skin if springs hold its base
     (`Skin.hold`); otherwise the base is assumed to be fixed sideways. One friction limit applies to pressing and
-    dragging together. It is assumed that the drag uses its share first and the press gets the rest, so that a slipping
-    tip has released the skin from its displacement by the press.
+    dragging together. The drag is assumed to use as much of it as it needs, and the displacement due to the press is
+    scaled by what remains. Under a slipping tip, nothing remains, and the skin loses its displacement due to the press.
     """
     if skin.hold is not None:
         skin = replace(skin, hold=replace(skin.hold, friction=how.coefficient))
@@ -147,15 +149,15 @@ def _drag_once(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
     )
     force_N = _clip(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
-    # Pressing and dragging are centred at the rest position of the material under the tip.
-    slid_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
-    elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + slid_m
+    # Displacements due to pressing and dragging are centred at the rest position of the material under the tip.
+    drag_slide_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
+    elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + drag_slide_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
-    dragged_slide = slide.rigid_motion(tip_m[:, :2] - skin.seat_m, slid_m, skin.sides_m)
+    dragged_slide = slide.rigid_motion(tip_m[:, :2] - skin.seat_m, drag_slide_m, skin.sides_m)
     limit_N = coefficient * normal_N
-    left = 1 - np.minimum(np.hypot(*force_N.T) / np.where(limit_N > 0, limit_N, 1.0), 1.0)
+    press_share = 1 - np.minimum(np.hypot(*force_N.T) / np.where(limit_N > 0, limit_N, 1.0), 1.0)
     change_T = np.zeros((len(tip_m), *board.chips_m.shape))
-    for stop_i, before, after in moved_dipoles(skin, centre_m, left):
+    for stop_i, before, after in moved_dipoles(skin, centre_m, press_share):
         if force_N[stop_i].any():
             shear_map = _shear_map(skin, centre_m[stop_i, 2])
             after = _apply_shear(shear_map, after, centre_m[stop_i, :2], force_N[stop_i], 3 * shear_Pa[stop_i])
@@ -164,7 +166,7 @@ def _drag_once(
     slide_m = np.zeros((len(tip_m), 2))
     if skin.hold is not None:
         true_m = centre_m + np.array([0.0, 0.0, skin.depth_zero_m])
-        slide_m = dragged_slide.move_m + press_motion(skin, skin.hold, true_m).scaled(left).move_m
+        slide_m = dragged_slide.move_m + press_motion(skin, skin.hold, true_m).scaled(press_share).move_m
     return TangentialResponse(force_N, change_T, slide_m)
 
 
@@ -190,7 +192,7 @@ def _shear_map(skin: Skin, depth_m: float) -> shear.ShearMap:
 
 def _clip(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
     size_N = np.hypot(*force_N.T)
-    with np.errstate(over="ignore"):  # for a force far below its limit
+    with np.errstate(over="ignore"):  # if the force is far below its limit
         return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from reskin.config import read_yaml
 
 NOMINAL = Path(__file__).with_name("nominal.yaml")
-SHARED = ("skin", "rig", "chip", "spreads", "terms")  # sections that every simulation takes from `nominal.yaml`
+SHARED = ("skin", "rig", "chip", "spreads", "terms")  # sections that all simulations take from `nominal.yaml`
 
 
 def nominal(section: str, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Protocols of simulated captures: the places and depths of the tip, in order of time."""
+"""Protocols of simulated captures: places and depths of the tip in order of time."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -13,14 +13,14 @@ from reskin.data.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, points_mm, prot
 from reskin.errors import ParamsError
 from reskin.physics.skin import Skin, forces
 
-LIFTED_MM = -1.0  # depth of a stop above the skin, which has no contact and is not in the robot's log
-DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load: 1e-8 N on a skin of 10 N/mm
-DEEPEST_SHARE = 0.999  # of the lesser of thickness and tip radius, which is the limit of the force model
+LIFTED_MM = -1.0  # depth of a stop above the skin, without contact; such stops are not in the robot's log
+DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load; it is 1e-8 N on a skin of 10 N/mm
+DEEPEST_SHARE = 0.999  # of the smaller of thickness and tip radius, which is the limit of the force model
 
 
 @dataclass(frozen=True)
 class Stops:
-    """Positions of the tip at each stop in mm, axes n indentations and p stops."""
+    """Positions of the tip at each stop in mm; the axes are n indentations and p stops."""
 
     x_mm: Float64[np.ndarray, "n p"]
     y_mm: Float64[np.ndarray, "n p"]
@@ -37,10 +37,10 @@ Sides_mm = tuple[float, float]
 
 @dataclass(frozen=True)
 class Plan:
-    """Stops in order of time: a place and a depth at which readings are taken; an indentation has p stops.
+    """Stops in order of time: places and depths at which readings are taken. Each of n indentations has p stops.
 
-    A negative depth is a stop above the skin; if a load is commanded, the depth is NaN. `tilt` is the slope of the
-    stylus, x and y over z. `centre_mm` is the label of the skin's centre.
+    A negative depth means a stop above the skin; depths are NaN if a load is commanded. `tilt` is the slope of the
+    stylus, dx/dz and dy/dz. `centre_mm` is the place of the skin's centre, in the coordinates of the labels.
     """
 
     pass_i: Int32[np.ndarray, " n"]
@@ -50,7 +50,7 @@ class Plan:
     tilt: Float64[np.ndarray, "n 2"]
     description: str
     labelled: bool = True  # whether places, depths and forces are recorded
-    weight_N: Float64[np.ndarray, "n p"] | None = None
+    weight_N: Float64[np.ndarray, "n p"] | None = None  # commanded loads
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM)
 
     def __len__(self) -> int:
@@ -61,29 +61,30 @@ class ProtocolSettings(Strict):
     """Settings common to all protocols."""
 
     boards: str  # kind of board, a key of section `boards` of the scene
-    skins_n: Count  # number of skins: the first skin of each board, then the second of each board, ...
+    skins_n: Count  # skins are taken in this order: the first skin of each board, then the second of each board, ...
     terms: tuple[
         Literal["ageing", "friction", "memory", "relaxation", "temperature"], ...
     ]  # terms of physics that are simulated
-    rate_hz: Rate_hz | None = None  # default: the rate of the rig; more chips take longer
+    rate_hz: Rate_hz | None = None  # default: the rate of the rig; boards with more chips need a lower rate
 
 
 class _RandomDepth(ProtocolSettings):
     depth_mm: tuple[Depth_mm, Depth_mm]  # uniform between these limits
 
     @model_validator(mode="after")
-    def _depths_rise(self) -> "_RandomDepth":
+    def _check_depths(self) -> "_RandomDepth":
         if not self.depth_mm[0] <= self.depth_mm[1]:
             raise ValueError(f"depth_mm must list the smaller depth first, not {self.depth_mm}")
         return self
 
 
 class _OnlyTemperature(ProtocolSettings):
-    # Ageing and relaxation would change the force between stops, which is not modelled; nothing moves sideways.
+    # Other terms are not possible: ageing and relaxation would change the force between stops, which is not modelled,
+    # and the tip does not move sideways.
     terms: tuple[Literal["temperature"], ...]
 
     @model_validator(mode="after")
-    def _ranges_rise(self) -> "_OnlyTemperature":
+    def _check_ranges(self) -> "_OnlyTemperature":
         for name, value in self:
             if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
                 raise ValueError(f"{name} must list the smaller value first, not {value}")
@@ -91,14 +92,14 @@ class _OnlyTemperature(ProtocolSettings):
 
 
 class Grid(ProtocolSettings):
-    """The paper's grid: 65 places, depth by depth, pass by pass (section 3)."""
+    """The paper's grid of 65 places: all places at one depth, then at the next, in several passes (section 3)."""
 
     kind: Literal["grid"]
     passes_n: Count
     depths_mm: Depths_mm
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Press every place at every depth, in every pass."""
+        """Press each place at each depth in each pass."""
         pokes = protocol(self.depths_mm, self.passes_n)
         stops = Stops(pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None])
         return _upright_plan(
@@ -107,7 +108,7 @@ class Grid(ProtocolSettings):
 
 
 class Drag(ProtocolSettings):
-    """Drag lines every 2 mm, along x and along y, over the whole grid (section 4, shear)."""
+    """Lines along x and along y, 2 mm apart, dragged over the whole grid (section 4, shear)."""
 
     kind: Literal["drag"]
     passes_n: Count
@@ -115,20 +116,20 @@ class Drag(ProtocolSettings):
     step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Drag along every row, then along every column, each line opposite in direction to the line before."""
+        """Drag along each row, then along each column; the direction alternates from line to line."""
         stops_n = round(2 * CENTRE_MM / self.step_mm) + 1
         along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
-        there = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
+        alternating_mm = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
         across_mm = np.repeat(PITCH_MM * np.arange(SIDE_POINTS_N)[:, None], stops_n, axis=1)
         lines_n, depths_n = 2 * SIDE_POINTS_N, len(self.depths_mm)
-        x_mm = np.tile(np.concatenate([there, across_mm]), (depths_n, 1))
-        y_mm = np.tile(np.concatenate([across_mm, there]), (depths_n, 1))
-        # Every second pass is reversed; otherwise the place of the tip would determine the direction of its force.
-        turned = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
+        x_mm = np.tile(np.concatenate([alternating_mm, across_mm]), (depths_n, 1))
+        y_mm = np.tile(np.concatenate([across_mm, alternating_mm]), (depths_n, 1))
+        # Every second pass is reversed, so that the place of the tip does not determine the direction of the force.
+        directions = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
         depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
         stops = Stops(
-            np.concatenate([x_mm[:, way] for way in turned]),
-            np.concatenate([y_mm[:, way] for way in turned]),
+            np.concatenate([x_mm[:, direction] for direction in directions]),
+            np.concatenate([y_mm[:, direction] for direction in directions]),
             np.repeat(depth_mm[:, None], stops_n, axis=1),
         )
         description = f"drag lines every {PITCH_MM:g} mm, {depths_n} depths, {self.passes_n} passes, "
@@ -138,7 +139,7 @@ class Drag(ProtocolSettings):
 
 
 class Hand(_RandomDepth):
-    """Indentations by hand along lines, of which only the order is known, not place, depth or force (section 5.2)."""
+    """Manual indentations along lines; only their order is known, not their places, depths or forces (section 5.2)."""
 
     kind: Literal["hand"]
     lines_n: Count
@@ -165,14 +166,14 @@ class Hand(_RandomDepth):
 
 
 class Scatter(_RandomDepth):
-    """Indentations anywhere on the skin, uniform (section 6, arm sleeve); labels in mm from the skin's corner."""
+    """Indentations uniformly distributed over the skin (section 6, arm sleeve); labels are in mm from its corner."""
 
     kind: Literal["scatter"]
     pokes_n: Count
-    margin_mm: Annotated[float, Field(ge=0)]  # to every edge
+    margin_mm: Annotated[float, Field(ge=0)]  # least distance to the edges
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw places and depths, uniform within the margin."""
+        """Draw uniformly distributed places and depths; places keep the margin to the edges."""
         if not 2 * self.margin_mm < min(skin_mm):
             rule = f"less than half of the skin's shorter side, {min(skin_mm) / 2:g} mm"
             raise ParamsError("protocol scatter", "margin_mm", rule, self.margin_mm, "Lower it.")
@@ -186,32 +187,32 @@ class Scatter(_RandomDepth):
 
 
 class Load(_OnlyTemperature):
-    """A glass on the skin's centre, filled step by step (section 6); its foot is modelled as the rig's round tip."""
+    """A glass at the skin's centre that is filled step by step (section 6); its foot is modelled as the rig's tip."""
 
     kind: Literal["load"]
-    # Number of fillings; a direction is fitted on half of them, and tested on the other half.
+    # Number of fillings; a direction is fitted to half of them and tested on the other half.
     passes_n: Annotated[int, Field(ge=2, le=100_000)]
     force_max_N: Annotated[float, Field(gt=0, le=100)]
     step_N: Annotated[float, Field(gt=0, le=100)]
 
     @model_validator(mode="after")
-    def _steps_fill_it(self) -> "Load":
+    def _check_steps(self) -> "Load":
         steps = self.force_max_N / self.step_N
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
-            raise ValueError(f"force_max_N must be a whole number of step_N, not {steps:.4g}")
+            raise ValueError(f"force_max_N must be a multiple of step_N, not {steps:.4g} times step_N")
         return self
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Fill the glass once in each pass; the depths follow from the skin."""
+        """Fill the glass once per pass; the depths will be computed from the skin."""
         weight_N = np.tile(load_steps_N(self.force_max_N, self.step_N), (self.passes_n, 1))
-        middle_mm = np.full(weight_N.shape, CENTRE_MM)
-        stops = Stops(middle_mm, middle_mm, np.full(weight_N.shape, np.nan))
+        centre_mm = np.full(weight_N.shape, CENTRE_MM)
+        stops = Stops(centre_mm, centre_mm, np.full(weight_N.shape, np.nan))
         description = f"{self.passes_n} fillings of a glass, to {self.force_max_N:g} N by {self.step_N:g} N"
         return _upright_plan(stops, description, np.arange(self.passes_n, dtype=np.int32), weight_N=weight_N)
 
 
 class Press(_OnlyTemperature):
-    """Half-sine presses at grid places, with its own rate; each frame is a stop (section 7, dynamic data)."""
+    """Half-sine presses at grid places, read continuously: each frame is a stop (section 7, dynamic data)."""
 
     kind: Literal["press"]
     presses_n: Count
@@ -220,7 +221,7 @@ class Press(_OnlyTemperature):
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw places, durations (log-uniform) and depths; after a short press the tip stays lifted."""
+        """Draw places, durations (log-uniform) and depths; the tip stays lifted until the longest press would end."""
         least_s, most_s = self.duration_s
         long_s = np.exp(rng.uniform(np.log(least_s), np.log(most_s), size=self.presses_n))
         long_n = np.maximum(np.round(long_s * self.rate_hz).astype(np.int64), 1)
@@ -234,7 +235,7 @@ class Press(_OnlyTemperature):
 
 
 class Walk(_OnlyTemperature):
-    """Footfalls of a shoe or touches of a glove, in one log without labels (section 6: dog shoe, glove)."""
+    """Footfalls of a shoe or touches of a glove, recorded as one walk (section 6: dog shoe, glove)."""
 
     kind: Literal["walk"]
     steps_n: Count
@@ -245,7 +246,7 @@ class Walk(_OnlyTemperature):
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw one walk as one indentation of many stops: a footfall, a swing above the skin, and so on."""
+        """Draw a walk as one indentation of many stops, in which footfalls alternate with swings above the skin."""
         stance_n, swing_n = (
             np.maximum(np.round(rng.uniform(*range_s, size=self.steps_n) * self.rate_hz).astype(np.int64), 1)
             for range_s in (self.stance_s, self.swing_s)
@@ -272,7 +273,7 @@ def _upright_plan(
     weight_N: Float64[np.ndarray, "n p"] | None = None,
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM),
 ) -> Plan:
-    """Make a plan with an upright tip, in a single pass if `pass_i` is not given."""
+    """Create a plan with an upright tip; without `pass_i`, it is a single pass."""
     n = len(stops.depth_mm)
     passes = np.zeros(n, np.int32) if pass_i is None else pass_i
     return Plan(
@@ -282,12 +283,12 @@ def _upright_plan(
 
 
 def load_steps_N(force_max_N: float, step_N: float) -> Float64[np.ndarray, " p"]:
-    """List the loads of one filling: 0, a step, two steps, ... the maximum."""
+    """List the loads of one filling, from 0 to the maximum in equal steps."""
     return step_N * np.arange(round(force_max_N / step_N) + 1)
 
 
 def depths_under_load(skin: Skin, load_N: Float[np.ndarray, "n p"]) -> Float64[np.ndarray, "n p"]:
-    """Solve for the commanded depth in m under each load; without load, the tip just touches the skin.
+    """Solve for the commanded depth in m under each load; at a load of 0, the tip just touches the skin.
 
     Raises
     ------
@@ -313,7 +314,7 @@ def _depth_under_load(skin: Skin, load_N: float) -> float:
 
 
 def half_sine(frames_n: int, peak_mm: float) -> Float64[np.ndarray, " p"]:
-    """Return the depth at the middle of each frame of a half-sine press."""
+    """Return the depth of a half-sine press at the middle of each frame."""
     return peak_mm * np.sin(np.pi * (np.arange(frames_n) + 0.5) / frames_n)
 
 

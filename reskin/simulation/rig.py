@@ -1,4 +1,4 @@
-"""The simulated rig: robot, force sensor, chips, port and clocks. It makes frames and a probe log from fields."""
+"""The simulated rig: robot, force sensor, chips, port and clocks, which turn fields into frames and a probe log."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -21,26 +21,26 @@ Spread = Annotated[float, Field(ge=0, le=1)]
 
 
 class Rig(Strict):
-    """Section `rig`: frames, repeatability of the robot, noise of the force sensor, clocks and port."""
+    """Section `rig`: numbers of frames, repeatability of the robot, noise of the force sensor, port and clocks."""
 
     noload_frames_n: FrameCount
-    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames on the way down, and as many on the way up
-    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames at rest before each dwell
+    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # on the way down, and the same number on the way up
+    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # with the tip at rest, before each dwell
     readings_n: FrameCount
     rate_hz: Rate_hz
-    robot_place_sd_mm: Spread  # each axis
+    robot_place_sd_mm: Spread  # along each axis
     robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
     place_offset_sd_mm: Spread  # true place minus label, the same for all skins of a board
     force_noise_N: Annotated[float, Field(ge=0, le=10)]
     chunk_frames_max_n: FrameCount
-    arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean delay of a chunk, exponential
-    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]  # sd of the probe's clock minus the stream's
+    arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean of the exponentially distributed delay of a chunk
+    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]  # sd of (probe's clock - stream's clock)
     probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Frames of one indentation, axis t: the stop of each frame, and the share of the stop's field change."""
+    """Frames of one indentation, axis t: the stop of each frame, and the fraction of its field change in the frame."""
 
     stop_i: Int64[np.ndarray, " t"]
     share: Float64[np.ndarray, " t"]
@@ -52,7 +52,10 @@ class Timeline:
 
 
 def rig_for(rig: Rig, protocol: Protocol) -> Rig:
-    """Adapt the rig to a protocol: rate; one frame per stop for presses and walks; no robot and one clock for walks."""
+    """Adapt the rig to a protocol.
+
+    A protocol may have its own rate. Presses and walks have one frame per stop; walks have no robot and a single clock.
+    """
     changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
     if isinstance(protocol, Press | Walk):
         changes |= {"moving_frames_n": 0, "settling_frames_n": 0, "readings_n": 1}
@@ -70,7 +73,7 @@ def rig_for(rig: Rig, protocol: Protocol) -> Rig:
 
 
 def timeline(rig: Rig, stops_n: int) -> Timeline:
-    """Arrange the frames of an indentation: settle, no-load dwell, down, settle and read at every stop, up."""
+    """Arrange the frames of an indentation: settle, no-load dwell, down, settle and dwell at each stop, up."""
     ramp = np.arange(1, rig.moving_frames_n + 1) / (rig.moving_frames_n + 1)
     lifted_n, dwell_n = rig.settling_frames_n + rig.noload_frames_n, rig.settling_frames_n + rig.readings_n
     share = np.concatenate([np.zeros(lifted_n), ramp, np.ones(stops_n * dwell_n), ramp[::-1]])
@@ -81,9 +84,9 @@ def timeline(rig: Rig, stops_n: int) -> Timeline:
 
 
 def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the true positions of the tip (x, y, depth in mm), with the same error for all stops of an indentation.
+    """Return the true positions of the tip (x, y, depth in mm); all stops of an indentation have the same error.
 
-    Without a robot there are no commanded places, so the plan has the true positions.
+    Without a robot, there are no commanded positions: the plan consists of true positions.
     """
     planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
     if not plan.labelled:
@@ -95,7 +98,7 @@ def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[
 def draw_arrivals(
     frame_s: Float64[np.ndarray, " f"], rig: Rig, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
-    """Draw the arrivals of frames at the port, in chunks: cumulative number of frames, and time in s."""
+    """Draw when chunks of frames arrive at the port: cumulative numbers of frames, and times in s."""
     frames_n = len(frame_s)
     sizes = rng.integers(1, rig.chunk_frames_max_n + 1, size=frames_n)
     ends = np.cumsum(sizes)
@@ -105,13 +108,13 @@ def draw_arrivals(
 
 
 def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw offset in s and rate of the probe's clock relative to the stream's."""
+    """Draw the offset in s and the rate of the probe's clock relative to the stream's clock."""
     offset_s, error = rng.standard_normal(2) * (rig.probe_clock_offset_s, rig.probe_clock_rate_error)
     return float(offset_s), float(1 + error)
 
 
 def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
-    """Build the log of robot and force sensor: the no-load dwell of each indentation, then its stops (d = 1 + p).
+    """Build the log of robot and force sensor: for each indentation, the no-load dwell, then its p stops (d = 1 + p).
 
     A dwell lasts from half a frame before its first frame to half a frame after its last. Stops above the skin are not
     logged.
@@ -146,10 +149,10 @@ FORCE_RANGE_N = (25.0, 25.0, 35.0)  # +- on x, y and z: ATI Nano17, calibration 
 def read_force(
     force_N: Float[np.ndarray, "n 3"], *, noise_N: float, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "n 3"], int]:
-    """Read forces on the tip with noise of sd `noise_N`; return the readings, and how many values were clipped."""
-    felt_N = force_N + noise_N * rng.standard_normal(force_N.shape)
-    read_N = felt_N.clip(-np.array(FORCE_RANGE_N), FORCE_RANGE_N)
-    return read_N.astype(np.float32), int(np.count_nonzero(read_N != felt_N))
+    """Return force readings with noise of sd `noise_N`, and how many values were clipped to the sensor's range."""
+    noisy_N = force_N + noise_N * rng.standard_normal(force_N.shape)
+    read_N = noisy_N.clip(-np.array(FORCE_RANGE_N), FORCE_RANGE_N)
+    return read_N.astype(np.float32), int(np.count_nonzero(read_N != noisy_N))
 
 
 BLOCK_INDENTATIONS_N = 1000
@@ -157,7 +160,7 @@ BLOCK_INDENTATIONS_N = 1000
 
 @dataclass(frozen=True)
 class SimulatedFrames:
-    """Readings in order of time, and how many values were out of the chips' range."""
+    """Readings in order of time, and how many values were outside the chips' range."""
 
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
@@ -167,7 +170,7 @@ class SimulatedFrames:
 
 @dataclass(frozen=True)
 class Readout:
-    """Readout of a board during one capture; each chip has its own conversion phase and temperature sensitivity."""
+    """How a board is read in one capture; each chip has its own conversion phase and temperature sensitivity."""
 
     board: Board
     design: ChipDesign
@@ -180,7 +183,7 @@ class Readout:
 def start_readout(
     board: Board, design: ChipDesign, *, rate_hz: float, temperature: Temperature | None, rng: np.random.Generator
 ) -> Readout:
-    """Draw each chip's conversion phase and temperature sensitivity."""
+    """Draw each chip's conversion phase and temperature sensitivity for one capture."""
     chips_n = len(board.chips_m)
     phase_s = chip.CONVERSION_S * rng.random(chips_n)
     sd = 0.0 if temperature is None else temperature.chip_sensitivity_per_K
@@ -195,17 +198,17 @@ def read_frames(
     noise: np.random.Generator,
     warmth_noise: np.random.Generator,
 ) -> SimulatedFrames:
-    """Read every frame of every indentation, in blocks; the result does not depend on the block size."""
+    """Read all frames of all indentations, in blocks; the result does not depend on the block size."""
     frame_s = (1 + np.arange(len(response.rest_T) * len(timeline))) / readout.rate_hz
     age_s, source_i = chip.last_conversions(frame_s, readout.phase_s)
     b_uT, temperature_degC, overruns = [], [], []
     for first_i in range(0, len(response.rest_T), BLOCK_INDENTATIONS_N):
-        seen_T, chips_degC = _field_at(response, timeline, readout, age_s, first_i)
-        block_uT, overrun = read_field(seen_T, readout.board, design=readout.design, rng=noise)
+        chip_T, chip_degC = _field_at(response, timeline, readout, age_s, first_i)
+        block_uT, overrun = read_field(chip_T, readout.board, design=readout.design, rng=noise)
         b_uT.append(block_uT)
         overruns.append(overrun)
-        temperature_degC.append(read_temperature(chips_degC, readout.design, warmth_noise))
-    # Two frames with the same conversion have the same reading, including its noise.
+        temperature_degC.append(read_temperature(chip_degC, readout.design, warmth_noise))
+    # Frames that contain the same conversion have the same reading, including its noise.
     chip_i = np.arange(len(readout.phase_s))
     repeated_uT = np.concatenate(b_uT).reshape(len(frame_s), -1, 3)[source_i, chip_i].reshape(len(frame_s), -1)
     return SimulatedFrames(
@@ -219,7 +222,7 @@ def read_frames(
 def _field_at(
     response: Response, timeline: Timeline, readout: Readout, age_s: Float[np.ndarray, "f k"], first_i: int
 ) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
-    # The first frames of a block may have conversions from the previous indentation.
+    # The first frames of a block may contain conversions from the previous indentation.
     lead_n = len(timeline) if first_i else 0
     block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
     b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]
@@ -231,5 +234,5 @@ def _field_at(
         warm_degC += rise_K
         gain = aging.relative_remanence(rise_K)[:, None] * (1 + rise_K[:, None] * readout.sensitivity_per_K)  # [f k]
         b_T *= gain[:, :, None]
-    seen_T = chip.sample_at_conversion(b_T, age_s[start : start + frames_n], readout.rate_hz)
-    return seen_T[lead_n:], np.repeat(warm_degC[lead_n:, None], len(readout.phase_s), axis=1)
+    chip_T = chip.sample_at_conversion(b_T, age_s[start : start + frames_n], readout.rate_hz)
+    return chip_T[lead_n:], np.repeat(warm_degC[lead_n:, None], len(readout.phase_s), axis=1)

@@ -22,7 +22,7 @@ Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class BoardKind(Strict):
-    """Boards of one kind, each with its own skins; their names start with the letter."""
+    """Boards of one kind, each with its own skins; names of boards and skins start with the letter."""
 
     letter: Annotated[str, Field(pattern="^[a-z]$")]
     boards_n: Count
@@ -69,7 +69,7 @@ class SimulationSettings(Strict):
                     f"protocol {name}: skins_n {skins_n} is more than the {have_n} skins of {protocol.boards} boards"
                 )
         if len({kind.letter for kind in self.boards.values()}) < len(self.boards):
-            raise ValueError("kinds of boards need different letters")
+            raise ValueError("each kind of board must have its own letter")
         return self
 
     @model_validator(mode="after")
@@ -80,7 +80,7 @@ class SimulationSettings(Strict):
 
     @property
     def main(self) -> Grid:
-        """The protocol whose captures the folds are drawn from."""
+        """The protocol whose captures are split into folds."""
         main = self.protocols[MAIN]
         assert isinstance(main, Grid), "checked above"
         return main
@@ -91,7 +91,7 @@ class SimulationSettings(Strict):
 
 
 def parse_simulation(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> SimulationSettings:
-    """Parse section `simulate` of a scene, with the shared sections skin, rig, chip, spreads and the terms in use."""
+    """Parse section `simulate` of a scene, with the shared sections, of which `terms` is reduced to those in use."""
     protocols = section.get("protocols")
     named = {
         term

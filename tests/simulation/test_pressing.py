@@ -163,7 +163,7 @@ def test_force_controlled_presses_refuse_relaxation_and_wear():
         with_protocol("press", PRESS | {"terms": ["relaxation"]})
     with pytest.raises(ParamsError, match="duration_s must list the smaller value first"):
         with_protocol("press", PRESS | {"duration_s": (1.0, 0.05)})
-    with pytest.raises(ParamsError, match="whole number of step_N"):
+    with pytest.raises(ParamsError, match="multiple of step_N"):
         with_protocol("glass", GLASS | {"step_N": 0.3})
 
 
