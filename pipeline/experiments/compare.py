@@ -32,7 +32,7 @@ from reskin.physics.skin import SkinDesign
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 from reskin.universal.law import SEVEN, START, TEN, AlignedPresses, Law, Setup, beyond_n, fit, nominal_uT, simulate_uT
-from reskin.universal.presses import RecordedPresses, cosines, explained, growth, lengths_uT, memory, pool
+from reskin.universal.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, memory, pool
 
 ARROWS_N = 4  # places that the figure shows
 WALK_uT = 0.5  # random-walk step of the simulated no-load field from poke to poke, assumed
@@ -145,7 +145,7 @@ def _drawn(seen: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> di
         "places_mm": seen.place_mm[chosen].round(2).tolist(),
         "arrows_uT": {name: of[chosen].round(1).tolist() for name, of in fields.items()},
         "force_N": seen.recorded.force_N.round(3).tolist(),
-        "length_uT": {name: lengths_uT(of).round(1).tolist() for name, of in fields.items()},
+        "length_uT": {name: magnitudes_uT(of).round(1).tolist() for name, of in fields.items()},
     }
 
 
@@ -216,7 +216,7 @@ def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"
     """Return |dB| in uT of presses with the forces `CURVE_N`, as the median over some places."""
     places_mm = np.unique(place_mm.round(2), axis=0)[::EVERY]
     at_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
-    length_uT = lengths_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
+    length_uT = magnitudes_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
     return np.median(length_uT, axis=0)
 
 

@@ -423,7 +423,7 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
         return chart(fit_unlabelled(frame.field(board.pool_uT), frame.field(board.rest_uT)[0], setup), setup)
 
     def residual(fitted: Chart, board: Board) -> Float[np.ndarray, " b"]:
-        return search(fitted, frame.field(board.tested_uT)).left
+        return search(fitted, frame.field(board.tested_uT)).residual
 
     charts = {board: fit_board(own) for board, own in boards.items()}
     found = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}

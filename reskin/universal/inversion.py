@@ -1,8 +1,8 @@
-"""Physics inversion, a reference method: fit a law to one skin alone, then search the best place for each reading.
+"""Physics inversion, a reference method: fit a law to one skin, then search for the place and force of each reading.
 
-The law is fitted by least squares to the no-load field and to presses at unknown places, from nominal parameters. The
-residual of a search is large on a skin that the law does not describe. Places are in the board's frame, fields along
-its axes.
+The law is fitted by least squares to the no-load field and to presses at unknown places, starting from nominal
+parameters. If the law does not describe a skin, the residuals of the search are large. Places are in the board's frame,
+and fields are along its axes.
 """
 
 from dataclasses import dataclass
@@ -14,21 +14,21 @@ from scipy.optimize import least_squares
 from reskin.universal.law import PRIOR, STEP, Law, OFFSET_uT, Setup, at_rest_uT, inside, simulate_uT, with_parameters
 from reskin.universal.map import FORCES_N, NOMINAL, lattice_mm
 
-# Stiffness and offset of the labels stay nominal: fields without known forces and places do not determine them.
+# Modulus and label offset keep their nominal values, because unlabelled presses do not determine them.
 PARAMETERS = ("seat_x_mm", "seat_y_mm", "rotation_deg", "gap_mm", "amplitude", "away_um_mm", "give_x_um", "give_y_um")
-LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin is above its chips
-PRIOR_WEIGHT = 0.5  # assumed; the weight in `law.fit` was chosen on recorded boards
-ROUNDS_N = 3  # rounds of searching places with a law, then fitting parameters and places together
+LEAST = {"gap_mm": 0.3, "amplitude": 0.05}  # the skin must be above its chips and be magnetised
+PRIOR_WEIGHT = 0.5  # assumed; the weight in `law.fit` was chosen on recorded boards instead
+ROUNDS_N = 3  # each round searches places with the current law, then fits parameters and places together
 EVALUATIONS_MAX_N = 8  # evaluations of all derivatives per round
-STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of finite differences in place and log force
-REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # bounds of places and forces
-CELL = 1.0  # maximum distance between the nearest point and the result of a search, in steps of the lattice
-BLOCK_N = 500  # readings searched at once, to bound memory
+STEP_MM, STEP_LOG_N = 0.05, 0.03  # steps of the finite differences in place and log force
+REACH_MM, REACH_N = 9.0, (0.2, 14.0)  # bounds of |x|, |y| and of the force
+CELL = 1.0  # maximum distance of a search's result from the nearest lattice point, in steps of the lattice
+BLOCK_N = 500  # number of readings per block, to bound memory
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Fields of a law on a lattice of places and forces, and their slopes per step of the lattice."""
+    """Field changes of a law on a lattice of places and forces, and their slopes per step of the lattice."""
 
     place_mm: Float[np.ndarray, "h 2"]
     log_N: Float[np.ndarray, " h"]
@@ -38,48 +38,51 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Found:
-    """Results of a search: places, forces, and residuals |dB - simulated| / |dB|."""
+class SearchResult:
+    """Places and forces that were found, and residuals |dB - simulated| / |dB|."""
 
     place_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
-    left: Float[np.ndarray, " n"]
+    residual: Float[np.ndarray, " n"]
 
 
 def chart(law: Law, setup: Setup) -> Chart:
-    """Simulate a law at every place and force of the lattice: about 2,900 presses in a second."""
+    """Simulate a law at all places and forces of the lattice (about 2,900 presses in one second)."""
     axis_mm, log_N = lattice_mm(), np.log(FORCES_N)
-    at = np.stack(np.meshgrid(axis_mm, axis_mm, log_N, indexing="ij"), axis=-1)
-    flat = at.reshape(-1, 3)
-    field_uT = simulate_uT(law, setup, flat[:, :2], np.exp(flat[:, 2])).reshape(*at.shape[:3], -1)
+    points = np.stack(np.meshgrid(axis_mm, axis_mm, log_N, indexing="ij"), axis=-1)
+    flat = points.reshape(-1, 3)
+    field_uT = simulate_uT(law, setup, flat[:, :2], np.exp(flat[:, 2])).reshape(*points.shape[:3], -1)
     slope_uT = np.stack(np.gradient(field_uT, axis=(0, 1, 2)), axis=-1).reshape(len(flat), -1, 3)
-    pressed = inside(flat[:, :2])
+    on_skin = inside(flat[:, :2])
     step = np.array([axis_mm[1] - axis_mm[0], axis_mm[1] - axis_mm[0], log_N[1] - log_N[0]])
-    return Chart(flat[pressed, :2], flat[pressed, 2], step, field_uT.reshape(len(flat), -1)[pressed], slope_uT[pressed])
+    return Chart(flat[on_skin, :2], flat[on_skin, 2], step, field_uT.reshape(len(flat), -1)[on_skin], slope_uT[on_skin])
 
 
-def search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
-    """Search a chart for each reading: its nearest point, then one Gauss-Newton step."""
+def search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
+    """Search a chart for each reading: take the point with the nearest field, then one Gauss-Newton step."""
     blocks = [_search(known, db_uT[i : i + BLOCK_N]) for i in range(0, max(len(db_uT), 1), BLOCK_N)]
-    return Found(*(np.concatenate([getattr(one, name) for one in blocks]) for name in Found.__annotations__))
+    names = SearchResult.__annotations__
+    return SearchResult(*(np.concatenate([getattr(block, name) for block in blocks]) for name in names))
 
 
-def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> Found:
-    far_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T  # without |dB|^2, which is constant
-    at = far_uT2.argmin(axis=1)
-    off_uT, slope_uT = db_uT - known.field_uT[at], known.slope_uT[at]
+def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
+    # Squared distances minus |dB|^2, which is the same for all points.
+    distance_uT2 = (known.field_uT**2).sum(axis=1) - 2 * db_uT @ known.field_uT.T
+    nearest = distance_uT2.argmin(axis=1)
+    off_uT, slope_uT = db_uT - known.field_uT[nearest], known.slope_uT[nearest]
     square = slope_uT.transpose(0, 2, 1) @ slope_uT
-    held = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # for coordinates without effect
-    steps = np.linalg.solve(square + held, np.einsum("nci,nc->ni", slope_uT, off_uT)[..., None])[..., 0]
+    damping = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # for coordinates without effect
+    steps = np.linalg.solve(square + damping, np.einsum("nci,nc->ni", slope_uT, off_uT)[..., None])[..., 0]
     steps = np.clip(steps, -CELL, CELL)
-    left_uT = off_uT - np.einsum("nci,ni->nc", slope_uT, steps)
+    residual_uT = off_uT - np.einsum("nci,ni->nc", slope_uT, steps)
     moved = steps * known.step
-    left = np.linalg.norm(left_uT, axis=1) / np.linalg.norm(db_uT, axis=1)
-    return Found(known.place_mm[at] + moved[:, :2], np.exp(known.log_N[at] + moved[:, 2]), left)
+    residual = np.linalg.norm(residual_uT, axis=1) / np.linalg.norm(db_uT, axis=1)
+    force_N = np.exp(known.log_N[nearest] + moved[:, 2])
+    return SearchResult(known.place_mm[nearest] + moved[:, :2], force_N, residual)
 
 
 def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, " ch"], setup: Setup) -> Law:
-    """Fit a law to unlabelled presses and the no-load field, from nominal parameters: about 6 s for 65 presses."""
+    """Fit a law to unlabelled presses and the no-load field, from nominal parameters (6 s for 65 presses)."""
     law = NOMINAL
     for _ in range(ROUNDS_N):
         law = _JointFit(law, setup, db_uT, rest_uT).solve(search(chart(law, setup), db_uT))
@@ -88,14 +91,14 @@ def fit_unlabelled(db_uT: Float[np.ndarray, "n ch"], rest_uT: Float[np.ndarray, 
 
 @dataclass(frozen=True)
 class _JointFit:
-    """Least squares over the law's parameters, then x, y and log F of each press; weights as in `law.fit`."""
+    """Least squares over the law's parameters and x, y and log F of each press, in this order."""
 
     law: Law
     setup: Setup
     db_uT: Float[np.ndarray, "n ch"]
     rest_uT: Float[np.ndarray, " ch"]
 
-    def solve(self, found: Found) -> Law:
+    def solve(self, found: SearchResult) -> Law:
         n = len(self.db_uT)
         low = [*(LEAST.get(name, -np.inf) for name in PARAMETERS), *[-REACH_MM, -REACH_MM, np.log(REACH_N[0])] * n]
         high = [*[np.inf] * len(PARAMETERS), *[REACH_MM, REACH_MM, np.log(REACH_N[1])] * n]
@@ -111,13 +114,14 @@ class _JointFit:
         parameters, at = values[: len(PARAMETERS)], values[len(PARAMETERS) :].reshape(-1, 3)
         law = with_parameters(self.law, PARAMETERS, parameters)
         simulated_uT = simulate_uT(law, self.setup, at[:, :2], np.exp(at[:, 2])).reshape(self.db_uT.shape)
-        each = (simulated_uT - self.db_uT) / np.linalg.norm(self.db_uT, axis=1, keepdims=True)
+        changes = (simulated_uT - self.db_uT) / np.linalg.norm(self.db_uT, axis=1, keepdims=True)
         rest = (at_rest_uT(law, self.setup).ravel() - self.rest_uT) / OFFSET_uT
-        held = PRIOR_WEIGHT * (parameters - _values(NOMINAL)) / _values(PRIOR)
-        return np.concatenate([each.ravel(), rest, held])
+        priors = PRIOR_WEIGHT * (parameters - _values(NOMINAL)) / _values(PRIOR)
+        return np.concatenate([changes.ravel(), rest, priors])
 
     def slopes(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "r p"]:
-        # A press's coordinates affect only its own rows, so three simulations of all presses give all these columns.
+        # The coordinates of a press affect only the rows of this press. Three simulations of all presses therefore give
+        # the columns of all coordinates.
         n, channels_n = self.db_uT.shape
         first, parameters_n = self.residuals(values), len(PARAMETERS)
         columns = np.zeros((len(first), len(values)))

@@ -1,6 +1,6 @@
-"""The law of a skin: ten parameters and a rotation that determine the field change for any place and force.
+"""The law of a skin: eleven fitted parameters that determine the field change for any place and force.
 
-Also fits the law to the presses of one board. Units: uT, mm, N.
+This module also fits the law to the presses of one board. Units: uT, mm, N.
 """
 
 from dataclasses import asdict, dataclass
@@ -16,55 +16,54 @@ from scipy.spatial.transform import Rotation
 from reskin.physics import deformation, layer, magnet, slide
 from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import SkinDesign
-from reskin.universal.presses import RecordedPresses, lengths_uT
+from reskin.universal.presses import RecordedPresses, magnitudes_uT
 
-MARGIN_MM = 0.4  # margin around the outermost places of the paper's grid
-HALF_MM, CORNER_MM = 8.0, 12.0  # largest |x| or |y|, and largest |x| + |y|, of that grid
+MARGIN_MM = 0.4  # width of the margin around the paper's grid
+HALF_MM, CORNER_MM = 8.0, 12.0  # largest |x| or |y| and largest |x| + |y| of the paper's grid
 
 
 def inside(place_mm: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
-    """Return which places are within the octagon of the paper's grid, with a margin around it."""
+    """Return which places are within the octagon of the paper's grid, including a margin around it."""
     x_mm, y_mm = np.abs(place_mm).T
     return (np.maximum(x_mm, y_mm) <= HALF_MM + MARGIN_MM) & (x_mm + y_mm <= CORNER_MM + 1.5 * MARGIN_MM)
 
 
-RULE = Quadrature(
-    cell_m=0.8e-3, layers_n=5
-)  # as in scene quick: the cheapest with an error below 2 % of dB (`runtime`)
+# Same as in scene `quick`: the cheapest rule whose error is below 2 % of dB (measured by experiment `runtime`).
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)
 
 
 @dataclass(frozen=True)
 class Law:
-    """Parameters of one skin on its board: the first seven may differ between boards, the others belong to the rig."""
+    """Parameters of one skin on its board; the first seven may differ between boards, the others belong to the rig."""
 
     seat_x_mm: float  # the skin's centre relative to the board's centre
     seat_y_mm: float
     rotation_deg: float  # rotation of the skin about z
-    gap_mm: float  # fitted distance from the chips to the skin, which trades off against the amplitude
+    gap_mm: float  # distance from the chips to the skin; a fit determines only a combination of gap and amplitude well
     amplitude: float  # magnetisation relative to nominal
-    label_x_mm: float  # from the label to the tip, along the board's axes
+    label_x_mm: float  # true place of the tip minus its label, along the board's axes
     label_y_mm: float
     modulus_MPa: float
     away_um_mm: float
     give_x_um: float
     give_y_um: float
-    # Not fitted.
-    lets_go_N: float = 8.0  # force at which the slide towards the centre ends; chosen on both boards of scene lab
-    grip_N_mm: float = 8.75  # springs of 7 N/mm over a friction of 0.8 (nominal.yaml: skin.hold)
-    tilt_x_deg: float = 0.0  # tilt of the skin over the board
+    # The following parameters are not fitted.
+    lets_go_N: float = 8.0  # force at which the slide towards the centre vanishes; chosen on both boards of scene lab
+    grip_N_mm: float = 8.75  # springs of 7 N/mm divided by a friction of 0.8 (nominal.yaml: skin.hold)
+    tilt_x_deg: float = 0.0  # tilt of the skin relative to the board
     tilt_y_deg: float = 0.0
     label_rotation_deg: float = 0.0  # rotation of the labels' axes about the board's centre
 
 
 @dataclass(frozen=True)
 class Setup:
-    """What all laws of a scene share: the designed skin, the chips under it, and the tip."""
+    """What all laws of a scene share: the nominal skin design, the chips' positions, and the tip."""
 
     design: SkinDesign
     chips_mm: Float[np.ndarray, "k 2"]
     gap_mm: float
     skin_mm: tuple[float, float]
-    skin_flipped: bool  # all fields have the opposite sign, as for a checkerboard skin rotated by 90 degrees
+    skin_flipped: bool  # reverse the sign of all fields, as rotating a checkerboard skin by 90 degrees does
     tip_radius_mm: float
     rule: Quadrature = RULE
 
@@ -89,7 +88,7 @@ class Setup:
         )
 
     def table(self, tip_radius_mm: float) -> deformation.DeformationMap:
-        """Tabulate the sliding flow under a tip, to the greatest depth for which forces are computed."""
+        """Tabulate the deformation of a slipping skin to the greatest depth for which forces are computed."""
         deepest_m = slide.DEEPEST * self.thickness_m
         heights = self.rest.heights
         return deformation.tabulate(
@@ -97,7 +96,7 @@ class Setup:
         )
 
     def chips_under(self, law: Law) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "3 3"]]:
-        """Return the chips' positions in the skin's frame, in m, and the rotation from the skin to the board."""
+        """Return the chips' positions in m in the skin's frame, and the rotation matrix from skin to board."""
         angles_deg = [law.rotation_deg, law.tilt_y_deg, law.tilt_x_deg]
         turn = Rotation.from_euler("zyx", angles_deg, degrees=True).as_matrix()
         seat_mm = (law.seat_x_mm, law.seat_y_mm)
@@ -106,7 +105,7 @@ class Setup:
 
 
 def at_rest_uT(law: Law, setup: Setup, rest: deformation.RestingDipoles | None = None) -> Float[np.ndarray, "k 3"]:
-    """Return the field of the untouched skin at the chips, in the board's axes; `rest` as in `simulate_uT`."""
+    """Return the field of the untouched skin at the chips, in the board's axes (`rest`: see `simulate_uT`)."""
     chips_m, turn = setup.chips_under(law)
     rest = rest or setup.rest
     field_T = magnet.field(rest.nodes_m, rest.moments_A_m2, chips_m)
@@ -120,9 +119,9 @@ def simulate_uT(
     force_N: Float[np.ndarray, " n"],
     rest: deformation.RestingDipoles | None = None,
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes at the chips, in the board's axes, for presses at labelled places of the board.
+    """Return the field changes at the chips, in the board's axes, for presses with these labels.
 
-    `rest` replaces the setup's dipoles, at the same nodes, for a skin with uneven filler.
+    `rest` replaces the setup's dipoles (at the same nodes), for example for a skin with uneven filler.
     """
     chips_m, turn = setup.chips_under(law)
     offset_mm = (law.label_x_mm - law.seat_x_mm, law.label_y_mm - law.seat_y_mm)
@@ -130,8 +129,8 @@ def simulate_uT(
     places_m = (place_mm @ labels.T + offset_mm) @ turn[:2, :2] * milli
     depths_m = slide.depth_at(force_N, **_layer(law, setup))
     give_m, away = (law.give_x_um * micro, law.give_y_um * micro), law.away_um_mm * micro / milli
-    taken_m = slide.press_displacement_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
-    whole = slide.rigid_motion(places_m, taken_m, setup.sides_m)
+    displacement_m = slide.press_displacement_m(places_m, force_N / law.lets_go_N, give_m=give_m, away=away)
+    whole = slide.rigid_motion(places_m, displacement_m, setup.sides_m)
     slides = slide.limit_by_friction(whole, force_N, law.grip_N_mm * kilo)
     table = setup.table(setup.tip_radius_mm)
     change_T = _changes_T(rest or setup.rest, table, chips_m, places_m, depths_m, slides)
@@ -141,7 +140,7 @@ def simulate_uT(
 def nominal_uT(
     setup: Setup, place_mm: Float[np.ndarray, "n 2"], force_N: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n k 3"]:
-    """Return the field changes for the nominal skin: nothing is fitted, no slide, force from the elastic layer."""
+    """Return the field changes of the nominal skin: nothing is fitted, no sliding, and the force of `layer`."""
     depths_m = np.interp(force_N, *_nominal_curve(setup))
     chips_m = np.column_stack([setup.chips_mm, np.full(len(setup.chips_mm), -setup.gap_mm)]) * milli
     still = slide.RigidMotion(np.zeros(place_mm.shape), np.zeros(len(place_mm)))
@@ -150,10 +149,10 @@ def nominal_uT(
 
 
 def beyond_n(law: Law | None, setup: Setup, force_N: Float[np.ndarray, " n"]) -> int:
-    """Count presses with a force beyond the range of a law, or of the nominal skin if no law is given."""
+    """Count presses with a force beyond the range of a law, or of the nominal skin if `law` is None."""
     if law is None:
-        known_N, _ = _nominal_curve(setup)
-        return int((force_N > known_N[-1]).sum())
+        curve_N, _ = _nominal_curve(setup)
+        return int((force_N > curve_N[-1]).sum())
     return slide.count_clipped(force_N, **_layer(law, setup))
 
 
@@ -167,11 +166,11 @@ def _layer(law: Law, setup: Setup) -> dict[str, float]:
 def _nominal_curve(setup: Setup) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """Return forces on the nominal skin and their depths, to the greatest depth for which fields are tabulated."""
     curve_m = np.linspace(0, slide.DEEPEST * setup.thickness_m, slide.CURVE_N)
-    known_N = layer.force(
+    curve_N = layer.force(
         curve_m, thickness_m=setup.thickness_m, tip_radius_m=setup.design.tip_radius_mm * milli,
         modulus_Pa=setup.design.modulus_kPa * kilo, base="slipping",
     )  # fmt: skip
-    return known_N, curve_m
+    return curve_N, curve_m
 
 
 def _changes_T(
@@ -192,23 +191,24 @@ def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, 
     return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))
 
 
-# Start of a fit and mean of its priors; standard deviations of the priors; step sizes. Assumed.
+# Of a fit: start and means of the priors; standard deviations of the priors; scales of the parameters. Assumed.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
 PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
 OF_BOARD = ("seat_x_mm", "seat_y_mm", "gap_mm", "amplitude", "label_x_mm", "label_y_mm")
 TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
-SEVEN = (*OF_BOARD, "rotation_deg")  # parameters that may differ between boards; the others come from another board
-PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with twice this weight, one of four fits explains only 0.796
-GROWTH_WEIGHT = 10.0  # weight of the errors of log|dB| by group minus their mean, that is, of the growth with force
-OFFSET_uT = 200.0  # standard deviation of the no-load field by a chip's offset (spreads.chip_offset_uT)
-# Evaluations of all derivatives. The fits of scene lab take 5; a tenth of ftol changes the cosine by 0.0001.
+SEVEN = (*OF_BOARD, "rotation_deg")  # may differ between boards; fitted with the other parameters of another board
+PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with 0.5, one of four fits explains only 79.6 % of dB
+# Weight of the growth with force: of the mean error of log|dB| in each group, minus the mean over groups.
+GROWTH_WEIGHT = 10.0
+OFFSET_uT = 200.0  # standard deviation of the no-load field due to chips' offsets (spreads.chip_offset_uT)
+# Evaluations of all derivatives. The fits of scene lab need 5; reducing ftol tenfold changes the cosine by 0.0001.
 EVALUATIONS_MAX_N = 10
 
 
 @dataclass(frozen=True)
 class AlignedPresses:
-    """Presses of a board, with fields and places in the board's axes."""
+    """Presses on a board, with fields and places in the board's axes."""
 
     recorded: RecordedPresses
     place_mm: Float[np.ndarray, "n 2"]
@@ -217,35 +217,36 @@ class AlignedPresses:
 
 
 def fit(presses: AlignedPresses, setup: Setup, names: tuple[str, ...], start: Law = START) -> Law:
-    """Fit the named parameters by least squares; the others stay as in `start`."""
-    length_uT = lengths_uT(presses.db_uT)
+    """Fit the named parameters by least squares; the others keep their values in `start`."""
+    magnitude_uT = magnitudes_uT(presses.db_uT)
     counts = np.bincount(presses.recorded.group_i)
     centre, prior, step = (np.array([getattr(law, name) for name in names]) for law in (START, PRIOR, STEP))
 
     def residuals(values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
         law = with_parameters(start, names, values)
         simulated_uT = simulate_uT(law, setup, presses.place_mm, presses.recorded.force_N)
-        each = (simulated_uT - presses.db_uT) / length_uT[:, None, None]
-        ratio = np.log(lengths_uT(simulated_uT) / length_uT)
+        changes = (simulated_uT - presses.db_uT) / magnitude_uT[:, None, None]
+        ratio = np.log(magnitudes_uT(simulated_uT) / magnitude_uT)
         by_group = np.bincount(presses.recorded.group_i, ratio) / counts
         rest = (at_rest_uT(law, setup) - presses.rest_uT) / OFFSET_uT
-        held = PRIOR_WEIGHT * (values - centre) / prior
-        return np.concatenate([each.ravel(), rest.ravel(), held, GROWTH_WEIGHT * (by_group - by_group.mean())])
+        priors = PRIOR_WEIGHT * (values - centre) / prior
+        return np.concatenate([changes.ravel(), rest.ravel(), priors, GROWTH_WEIGHT * (by_group - by_group.mean())])
 
     first = np.array([getattr(start, name) for name in names])
-    # Fields have kinks at the steps of the flow's table, which would disturb smaller finite differences.
-    found = least_squares(
+    # Fields have kinks at the tabulated depths, which would disturb smaller finite differences.
+    result = least_squares(
         residuals, first, x_scale=step, diff_step=1e-3, ftol=1e-3, max_nfev=EVALUATIONS_MAX_N, bounds=_limits(names)
     )
-    return with_parameters(start, names, found.x)
+    return with_parameters(start, names, result.x)
 
 
 def _limits(names: tuple[str, ...]) -> tuple[list[float], list[float]]:
-    # The skin is above its chips and is elastic.
+    # The skin must be above its chips, be magnetised, and have some stiffness.
     least = {"gap_mm": 0.3, "amplitude": 0.05, "modulus_MPa": 0.01}
     return [least.get(name, -np.inf) for name in names], [np.inf] * len(names)
 
 
+# Positions and rotations of the chips on the paper's board.
 CHIPS_MM = ((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0))
 TURNS_DEG = (0.0, 180.0, 270.0, 90.0, 0.0)
 

@@ -34,15 +34,15 @@ def test_search_recovers_places_and_forces():
         found.place_mm, PLACE_MM, atol=0.2
     )  # a quarter of the pitch, after a single step with the slopes of the lattice
     np.testing.assert_allclose(np.log(found.force_N), np.log(FORCE_N), atol=0.2)
-    assert found.left.max() < 0.1
+    assert found.residual.max() < 0.1
 
 
 def test_residuals_are_zero_on_the_lattice_only():
     known = chart(TRUE, CHEAP)
     found = search(known, known.field_uT)
     np.testing.assert_allclose(found.place_mm, known.place_mm, atol=1e-9)
-    np.testing.assert_allclose(found.left, 0.0, atol=1e-9)
-    assert np.median(search(known, -fields_uT()).left) > 0.5
+    np.testing.assert_allclose(found.residual, 0.0, atol=1e-9)
+    assert np.median(search(known, -fields_uT()).residual) > 0.5
 
 
 def test_slopes_equal_differences():
@@ -60,7 +60,7 @@ def test_unlabelled_presses_determine_parameters(monkeypatch):
     monkeypatch.setattr(inversion, "ROUNDS_N", 1)
     rest_uT, presses_uT = at_rest_uT(TRUE, CHEAP).ravel(), fields_uT()[::2]
     found = fit_unlabelled(presses_uT, rest_uT, CHEAP)
-    left = [np.median(search(chart(law, CHEAP), presses_uT).left) for law in (NOMINAL, found)]
+    left = [np.median(search(chart(law, CHEAP), presses_uT).residual) for law in (NOMINAL, found)]
     assert left[1] < 0.3 * left[0]
     for name, near in {"seat_x_mm": 0.15, "seat_y_mm": 0.15, "give_x_um": 15.0}.items():
         assert abs(asdict(found)[name] - asdict(TRUE)[name]) < near
