@@ -1,4 +1,4 @@
-"""Calibration data of one skin: checks and file format; likelihood powers and their cross-validation."""
+"""Calibration data of one skin (checks and file format), and likelihood powers with their cross-validation."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,17 +15,17 @@ from reskin.universal.map import Estimate, NOISE_uT
 from reskin.universal.network import FULL_SET_N
 
 CHANNELS_N = 15  # five chips with three axes each
-FIELD_MAX_uT = 1e6  # 20 times the range of a chip, so no press exceeds it; its square fits single precision
-BEYOND = 2.0  # a label whose force is outside the model's range by more than this factor has another unit
+FIELD_MAX_uT = 1e6  # 20 times the range of a chip, so no reading exceeds it; its square fits single precision
+RANGE_FACTOR = 2.0  # a label's force outside the model's range by this factor or more probably has a wrong unit
 CHANNELS_RULE = f"This model needs {CHANNELS_N} numbers per reading: Bx, By, Bz of each of five chips."
-LABELS_MAX_N = 2000  # memory grows with the square of the number, time even faster
+LABELS_MAX_N = 2000  # memory grows with the square of the number of labels, and time even faster
 
 
 def check_shape(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
-    """Return one or several readings as rows; raise SchemaError if they have another number of channels."""
+    """Return one or several readings as rows; raise SchemaError for a wrong number of channels."""
     try:
         rows_uT = np.atleast_2d(np.asarray(b_uT, float))
-    except (TypeError, ValueError):  # words, or rows of different lengths
+    except (TypeError, ValueError):  # text, or rows of different lengths
         got = " ".join(repr(b_uT).split())[:60]
         raise SchemaError(f"b_uT: {got} is not an array of numbers. {CHANNELS_RULE}") from None
     if rows_uT.ndim != 2 or rows_uT.shape[1] != CHANNELS_N:
@@ -38,7 +38,7 @@ def check_readings(b_uT: Float[np.ndarray, "..."]) -> Float[np.ndarray, "f ch"]:
     """Return calibration readings as rows; raise SchemaError for values that are not finite or out of range."""
     rows_uT = check_shape(b_uT)
     _need("fields", "calibration readings", "finite numbers of uT", rows_uT, np.isfinite(rows_uT))
-    rule = f"at most {FIELD_MAX_uT:,.0f} uT in size"
+    rule = f"at most {FIELD_MAX_uT:,.0f} uT in magnitude"
     _need("fields", "calibration readings", rule, rows_uT, np.abs(rows_uT) <= FIELD_MAX_uT)
     return rows_uT
 
@@ -57,11 +57,11 @@ def check_labels(
     got = f"places {places_mm.shape}, forces {forces_N.shape}, readings ({rows_n}, {CHANNELS_N})"
     if places_mm.shape != (rows_n, 2) or forces_N.shape != (rows_n,):
         raise SchemaError(
-            f"labels: each press needs x and y, a force and a reading; got {got}. Give arrays [m, 2], [m] and [m, "
-            f"{CHANNELS_N}]."
+            f"labels: each press needs x and y, a force and a reading; got {got}. Pass arrays of shapes "
+            f"[m, 2], [m] and [m, {CHANNELS_N}]."
         )
     if rows_n > LABELS_MAX_N:
-        raise SchemaError(f"labels: {rows_n} are too many, at most {LABELS_MAX_N} can be used. Use some of them.")
+        raise SchemaError(f"labels: {rows_n} are too many, at most {LABELS_MAX_N} can be used. Select some of them.")
     least_mm, most_mm = reach_mm
     on_skin = (places_mm >= least_mm) & (places_mm <= most_mm)
     _need("labels", "places", f"on the skin, {least_mm.tolist()} to {most_mm.tolist()} mm", places_mm, on_skin)
@@ -71,29 +71,29 @@ def check_labels(
 
 
 def check_range(force_N: Float[np.ndarray, " m"], range_N: Float[np.ndarray, " q"]) -> None:
-    """Raise SchemaError on forces of labels that are half the model's smallest force or less, or twice its largest."""
+    """Raise SchemaError for labels' forces that are outside the model's range by a factor of 2 or more."""
     least_N, most_N = float(range_N.min()), float(range_N.max())
-    inside = (force_N > least_N / BEYOND) & (force_N < BEYOND * most_N)
+    inside = (force_N > least_N / RANGE_FACTOR) & (force_N < RANGE_FACTOR * most_N)
     if not inside.all():
         got = f"{force_N[~inside][0]:.6g} N"
         rule = f"about {least_N:.3g} to {most_N:.3g} N, the model's range"
-        raise SchemaError("labels", "forces", rule, got, "Are they in newtons? Convert them, or leave the press out.")
+        raise SchemaError("labels", "forces", rule, got, "Are they in newtons? Convert them, or omit the press.")
 
 
 def check_presses(db_uT: Float[np.ndarray, "m ch"]) -> Float[np.ndarray, "m ch"]:
-    """Return changes of field by presses; raise SchemaError if all are within the noise, as fields in mT are."""
+    """Return field changes of presses; raise SchemaError if all are below the noise, as they would be in mT."""
     strongest_uT = float(np.linalg.norm(db_uT.reshape(len(db_uT), -1, 3), axis=2).max(initial=0.0))
     if len(db_uT) and strongest_uT < NOISE_uT:
         rule = f"{NOISE_uT:g} uT or more at some chip"
         remedy = "Are the fields in uT? Convert mT or G, or press the skin."
-        raise SchemaError("presses", "changes of field", rule, f"{strongest_uT:.3g} uT at most", remedy)
+        raise SchemaError("presses", "field changes", rule, f"{strongest_uT:.3g} uT at most", remedy)
     return db_uT
 
 
-def _need(where: str, what: str, rule: str, got: np.ndarray, holds: Bool[np.ndarray, "..."]) -> None:
-    if not holds.all():
-        wrong = np.argwhere(~holds)[0]
-        raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Leave it out.")
+def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndarray, "..."]) -> None:
+    if not valid.all():
+        wrong = np.argwhere(~valid)[0]
+        raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
 
 
 FORMAT = "reskin-skin-1"
@@ -104,13 +104,13 @@ SHAPES: Mapping[str, tuple[int, ...]] = {  # shapes of the arrays, without the f
     "labelled_N": (),
     "labelled_uT": (CHANNELS_N,),
 }
-FILE_BYTES_MAX_N = 2**20  # three times the size of a full set of presses and LABELS_MAX_N labels
-REMEDY = "Give a file that `save` wrote."
+FILE_BYTES_MAX_N = 2**20  # three times the size of a file with a full set of presses and LABELS_MAX_N labels
+REMEDY = "Use a file that `save` wrote."
 
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Presses at known places (relative to the board's centre) with known forces, and their field changes."""
+    """Presses with known places (relative to the board's centre) and forces, and their field changes."""
 
     place_mm: Float[np.ndarray, "m 2"]
     force_N: Float[np.ndarray, " m"]
@@ -136,8 +136,8 @@ def no_labels() -> LabelledPresses:
 class CalibrationData:
     """All calibration data of one skin, along the board's axes.
 
-    rest_uT: no-load field. presses_uT: field changes for presses at unknown places, at most a full set. even_uT: the
-    same for presses that are evenly spread over the skin. labels: presses at known places.
+    rest_uT: no-load field. presses_uT: field changes of presses at unknown places, at most `FULL_SET_N`. even_uT: field
+    changes of presses that are evenly spread over the skin. labels: presses at known places.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
@@ -154,12 +154,12 @@ def write_calibration(data: CalibrationData, file: Path) -> None:
 
 
 def is_calibration(file: Path) -> bool:
-    """Return whether `write_calibration` wrote a file; raise SchemaError for a small file that is damaged."""
+    """Return whether a file is one of `write_calibration`; raise SchemaError if a file of such a size is damaged."""
     return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") == FORMAT
 
 
 def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
-    """Read calibration data; raise SchemaError for places outside `reach_mm`, which is relative to the centre."""
+    """Read calibration data; raise SchemaError for places outside `reach_mm` (relative to the board's centre)."""
     if file.is_file() and (bytes_n := file.stat().st_size) > FILE_BYTES_MAX_N:
         raise SchemaError(
             f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
@@ -184,43 +184,43 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
 
 
 FOLDS_N = 5  # folds of the cross-validation over labels
-PRIOR_N = 40.0  # prior weight of a variance inflation of 1, in numbers of coordinates (docs/learning.md)
-NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| for a standard normal z
+PRIOR_N = 40.0  # weight of the prior (an inflation of 1), as a number of coordinates (docs/learning.md)
+NORMAL_MEAN = math.sqrt(2 / math.pi)  # mean of |z| of a standard normal z
 
-HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]  # estimates for each power, and true places in mm
+HeldOut = tuple[Sequence[Estimate], Float[np.ndarray, "_ 2"]]  # estimates with each power, and true places in mm
 
 
 @dataclass(frozen=True)
 class LikelihoodPowers:
-    """Likelihood powers for a misfit of 1, measured on simulated skins, by numbers of unlabelled presses and labels.
+    """Table of likelihood powers by numbers of unlabelled presses and labels, determined on simulated skins.
 
-    anywhere: by number of presses at unknown places, then by number of labels. even: by number of labels, for presses
-    that are evenly spread over the skin. Powers are interpolated between numbers of labels; for a number of presses,
-    the next smaller number in the table is used.
+    The powers are those for a misfit of 1. anywhere: by number of presses at unknown places, then by number of labels.
+    even: by number of labels, for presses that are evenly spread over the skin. Powers are interpolated between numbers
+    of labels. For the number of presses, the largest tabulated number that does not exceed it is used.
     """
 
     anywhere: Mapping[int, Mapping[int, float]]
     even: Mapping[int, float]
 
-    def of(self, presses_n: int, labels_n: int, *, even: bool) -> float:
+    def power_for(self, presses_n: int, labels_n: int, *, even: bool) -> float:
         """Return the power for these numbers of presses and labels."""
-        known = self.even if even else self.anywhere[max(n for n in self.anywhere if n <= presses_n)]
-        known_n = sorted(known)
-        return float(np.exp(np.interp(labels_n, known_n, np.log([known[n] for n in known_n]))))
+        powers = self.even if even else self.anywhere[max(n for n in self.anywhere if n <= presses_n)]
+        tabulated_n = sorted(powers)
+        return float(np.exp(np.interp(labels_n, tabulated_n, np.log([powers[n] for n in tabulated_n]))))
 
     def are_enough(self, presses_n: int) -> bool:
-        """Return whether this number of presses is enough for their misfit to be used."""
+        """Return whether the misfit of this number of presses is used."""
         return any(0 < n <= presses_n for n in self.anywhere)
 
     def to_card(self) -> dict[str, dict[str, Any]]:
-        """Return the entry of the model's card."""
-        anywhere = {str(presses_n): _named(of) for presses_n, of in self.anywhere.items()}
+        """Return the powers as an entry of the model's card."""
+        anywhere = {str(presses_n): _named(powers) for presses_n, powers in self.anywhere.items()}
         return {"anywhere": anywhere, "even": _named(self.even)}
 
     @classmethod
     def from_card(cls, card: Mapping[str, Mapping[str, Any]]) -> "LikelihoodPowers":
         """Read the entry of a model's card."""
-        anywhere = {int(presses_n): _numbered(of) for presses_n, of in card["anywhere"].items()}
+        anywhere = {int(presses_n): _numbered(powers) for presses_n, powers in card["anywhere"].items()}
         return cls(anywhere, _numbered(card["even"]))
 
 
@@ -233,30 +233,33 @@ def _numbered(powers: Mapping[str, float]) -> dict[int, float]:
 
 
 def lower_by_misfit(power: float, misfit: float) -> float:
-    """Lower a power by the misfit of unlabelled presses; at most 1."""
+    """Divide a power by the misfit of unlabelled presses; the result is at most 1."""
     return min(1.0, power / misfit)
 
 
 def lower_by_residuals(power: float, inflation: float) -> float:
-    """Lower a power by the variance inflation of held-out labels; at most 1."""
+    """Divide a power by the variance inflation of held-out labels; the result is at most 1."""
     return min(1.0, power / inflation)
 
 
 def folds_of_labels(labels_n: int) -> list[tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " l"]]]:
-    """Split labels for cross-validation, every fifth in the same fold; return indices kept and indices held out."""
+    """Split labels into folds for cross-validation (label i is in fold i mod 5); return kept and held-out indices."""
     fold = np.arange(labels_n) % FOLDS_N
     return [(np.flatnonzero(fold != i), np.flatnonzero(fold == i)) for i in range(min(FOLDS_N, labels_n))]
 
 
 def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
     """Return for each power the factor by which squared errors of held-out labels exceed the estimated variances."""
-    found = []
+    inflations = []
     for i in range(powers_n):
         off = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
-        found.append(variance_inflation(np.concatenate([np.zeros((0, 2)), *off])))
-    return found
+        inflations.append(variance_inflation(np.concatenate([np.zeros((0, 2)), *off])))
+    return inflations
 
 
 def variance_inflation(off: Float[np.ndarray, "m 2"]) -> float:
-    """Return the factor from the mean absolute error in standard deviations, so that outliers are not squared."""
+    """Return the variance inflation for errors in standard deviations.
+
+    It is the square of the mean absolute error, relative to that of a normal distribution: outliers are not squared.
+    """
     return ((PRIOR_N + float(off.sum()) / NORMAL_MEAN) / (PRIOR_N + off.size)) ** 2

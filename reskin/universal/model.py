@@ -293,7 +293,7 @@ class Universal:
         """
         if self._power is None:  # cross-validation takes long, so it runs once for each set of data, when needed
             data = self._data
-            tabulated = self.powers.of(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
+            tabulated = self.powers.power_for(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
             power = lower_by_misfit(tabulated, self.misfit)
             if len(data.labels):
                 power = lower_by_residuals(power, *self.variance_inflations([power]))

@@ -1,6 +1,7 @@
-"""The network of the universal model, evaluated in NumPy: a set encoder, whose code of the skin conditions a regressor.
+"""The network of the universal model, evaluated in NumPy.
 
-`reskin.universal.training` trains its weights with PyTorch.
+A set encoder computes a code of the skin, which conditions a regressor. `reskin.universal.training` trains the weights
+with PyTorch.
 """
 
 import math
@@ -15,15 +16,15 @@ from numba import njit
 Weights = Mapping[str, np.ndarray]
 
 LAYERS_N = 3
-DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # scale inputs to about 1: dB/|dB|, log|dB|, field at rest
-LENGTH_MIN_uT = 1.0  # smaller field changes have no direction
-PLACE_MM, LOG_N = 8.0, 3.0  # scales of the output
-LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviation of scaled outputs
-FULL_SET_N = 65  # maximum number of unlabelled presses in training
+DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # scale the inputs dB/|dB|, log|dB| and no-load field to about 1
+LENGTH_MIN_uT = 1.0  # least |dB| by which dB is divided, so that tiny changes have no direction
+PLACE_MM, LOG_N = 8.0, 3.0  # scales of the outputs: place in mm, log force
+LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviations of scaled outputs
+FULL_SET_N = 65  # maximum number of unlabelled presses for conditioning, in training and use
 
 
 class Layers(NamedTuple):
-    """Weights and biases of a network that is conditioned on a skin."""
+    """Weights and biases of a network after it is conditioned on a skin."""
 
     weight: tuple[Float32[np.ndarray, "_ _"], ...]
     bias: tuple[Float32[np.ndarray, " _"], ...]
@@ -31,7 +32,7 @@ class Layers(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkEstimate:
-    """Networks' estimates for readings: places and logarithms of forces, with standard deviations."""
+    """Estimates of places and log forces for readings, with standard deviations."""
 
     place_mm: Float[np.ndarray, "n 2"]
     sd_mm: Float[np.ndarray, "n 2"]
@@ -40,33 +41,33 @@ class NetworkEstimate:
 
 
 def condition(weights: Weights, rest_uT: Float[np.ndarray, " ch"], presses_uT: Float[np.ndarray, "c ch"]) -> Layers:
-    """Condition a network on a skin's no-load field and on unlabelled presses, of which there may be none."""
+    """Condition a network on a skin's no-load field and on unlabelled presses (possibly none)."""
     rest = (rest_uT / REST_uT).astype(np.float32)
     code, reading_n = _encode(weights, rest, presses_uT), len(rest) + 1
-    each_weight, each_bias = [], []
+    layer_weights, layer_biases = [], []
     for i in range(LAYERS_N):
         weight, bias = _linear(weights, f"layer{i}")
         film, film_bias = _linear(weights, f"film{i}")
         gain, shift = np.split(film @ code + film_bias, 2)
         if i == 0:
             weight, bias = weight[:, :reading_n], bias + weight[:, reading_n:] @ rest
-        each_weight.append(np.ascontiguousarray((weight * (1 + gain)[:, None]).T))
-        each_bias.append(bias * (1 + gain) + shift)
+        layer_weights.append(np.ascontiguousarray((weight * (1 + gain)[:, None]).T))
+        layer_biases.append(bias * (1 + gain) + shift)
     weight, bias = _linear(weights, "answer")
-    return Layers((*each_weight, np.ascontiguousarray(weight.T)), (*each_bias, bias))
+    return Layers((*layer_weights, np.ascontiguousarray(weight.T)), (*layer_biases, bias))
 
 
 def evaluate(networks: Sequence[Layers], db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
-    """Estimate places and forces: the mean over networks, whose spread adds to the standard deviations."""
-    found = np.empty((len(networks), len(db_uT), 6))
-    for layers, of_one in zip(networks, found, strict=True):
-        _forward(db_uT, *layers, of_one)
+    """Estimate places and forces as means over networks; the spread of the networks adds to the standard deviations."""
+    outputs = np.empty((len(networks), len(db_uT), 6))
+    for layers, output in zip(networks, outputs, strict=True):
+        _forward(db_uT, *layers, output)
     if len(networks) == 1:
-        of_all = found[0]
+        combined = outputs[0]
     else:
-        var = (found[..., 3:] ** 2).mean(axis=0) + found[..., :3].var(axis=0)
-        of_all = np.concatenate([found[..., :3].mean(axis=0), np.sqrt(var)], axis=1)
-    return NetworkEstimate(of_all[:, :2], of_all[:, 3:5], of_all[:, 2], of_all[:, 5])
+        var = (outputs[..., 3:] ** 2).mean(axis=0) + outputs[..., :3].var(axis=0)
+        combined = np.concatenate([outputs[..., :3].mean(axis=0), np.sqrt(var)], axis=1)
+    return NetworkEstimate(combined[:, :2], combined[:, 3:5], combined[:, 2], combined[:, 5])
 
 
 def predict(
@@ -80,7 +81,7 @@ def predict(
 
 
 def shift_places(layers: Layers, by_mm: Float[np.ndarray, "2"]) -> Layers:
-    """Shift all places that a network estimates, by changing its last bias (in single precision)."""
+    """Shift all places that a network predicts, by changing its last bias (in single precision)."""
     *biases, last = layers.bias
     by = np.zeros_like(last)
     by[:2] = by_mm / PLACE_MM
@@ -88,12 +89,12 @@ def shift_places(layers: Layers, by_mm: Float[np.ndarray, "2"]) -> Layers:
 
 
 def to_tensors(networks: Sequence[Weights]) -> dict[str, np.ndarray]:
-    """Name the weights of several networks for a file."""
+    """Return the weights of several networks as named arrays for a file."""
     return {f"{i}.{name}": value for i, weights in enumerate(networks) for name, value in weights.items()}
 
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> list[Weights]:
-    """Return the networks of a file, in their order."""
+    """Return the networks' weights, in order, from the arrays of a file."""
     networks: dict[int, dict[str, np.ndarray]] = {}
     for key, value in tensors.items():
         i, _, name = key.partition(".")
@@ -135,20 +136,20 @@ def _fill_inputs(db_uT, values):
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
-def _forward(db_uT, weight, bias, found):
+def _forward(db_uT, weight, bias, output):
     for r in range(len(db_uT)):
         values = np.empty(db_uT.shape[1] + 1, np.float32)
         _fill_inputs(db_uT[r], values)
         for layer in range(len(weight)):
-            given, values = values, bias[layer].copy()
-            for i in range(len(given)):
-                if layer == 0 or not given[i] <= 0:  # NaN must propagate
+            previous, values = values, bias[layer].copy()
+            for i in range(len(previous)):
+                if layer == 0 or not previous[i] <= 0:  # ReLU that propagates NaN
                     for o in range(len(values)):
-                        values[o] += given[i] * weight[layer][i, o]
+                        values[o] += previous[i] * weight[layer][i, o]
         for i in range(3):
             scale = LOG_N if i == 2 else PLACE_MM
-            found[r, i] = scale * values[i]
-            found[r, 3 + i] = scale * math.exp(min(max(values[3 + i], LOG_SD[0]), LOG_SD[1]))
+            output[r, i] = scale * values[i]
+            output[r, 3 + i] = scale * math.exp(min(max(values[3 + i], LOG_SD[0]), LOG_SD[1]))
 
 
-SET_WIDTH, CODE_WIDTH, WIDTH = 160, 64, 192
+SET_WIDTH, CODE_WIDTH, WIDTH = 160, 64, 192  # units in the encoder's layers, in the code, in the regressor's layers

@@ -1,6 +1,6 @@
-"""Train the networks of the universal model on simulated skins and, if given, on recorded boards.
+"""Train the networks of the universal model on simulated skins and, if available, on recorded boards.
 
-Every step draws some skins and, for each, an error of the law and the number of presses for conditioning.
+Each training step draws some skins and, for each skin, an error of the law and a number of presses for conditioning.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
 
 
 class Network(nn.Module):
-    """Set encoder and regressor in PyTorch, with weights named as by `draw_weights`."""
+    """Set encoder and regressor in PyTorch; the weights have the names of `draw_weights`."""
 
     def __init__(self, weights: Weights) -> None:
         super().__init__()
@@ -51,18 +51,18 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b c ch"], rest_uT: Float[torch.Tensor, "b ch"],
         kept: Float[torch.Tensor, "b c"],
     ) -> Float[torch.Tensor, "b 64"]:  # fmt: skip
-        """Return the code of each skin from its kept presses (`kept` is 1 or 0); without any, the pooled value is 0."""
-        each = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
-        each = torch.relu(self._linear("set2", each)) * kept[..., None]
+        """Return the code of each skin from those presses for which `kept` is 1; without any, the pooled value is 0."""
+        features = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
+        features = torch.relu(self._linear("set2", features)) * kept[..., None]
         kept_n = kept.sum(1, keepdim=True)
-        pooled = each.sum(1) / kept_n.clamp_min(1)
+        pooled = features.sum(1) / kept_n.clamp_min(1)
         return torch.relu(self._linear("code", torch.cat([pooled, kept_n / FULL_SET_N], 1)))
 
     def forward(
         self, db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"],
         code: Float[torch.Tensor, "b 64"],
     ) -> tuple[Float[torch.Tensor, "b n 3"], Float[torch.Tensor, "b n 3"]]:  # fmt: skip
-        """Return scaled x, y, log F, and the log standard deviation of each."""
+        """Return scaled x, y and log F, and their log standard deviations."""
         values = inputs(db_uT, rest_uT)
         for i in range(LAYERS_N):
             gain, shift = self._linear(f"film{i}", code)[:, None].chunk(2, -1)
@@ -75,9 +75,9 @@ class Network(nn.Module):
 
 
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
-    """Return direction and log length of each field change, and the skin's no-load field, scaled to about 1.
+    """Return direction and log magnitude of each field change, and the skin's no-load field, scaled to about 1.
 
-    Computed in NumPy, as `torch.log` differs between processors; gradients do not reach the readings.
+    NumPy is used because `torch.log` differs between processors. No gradients with respect to readings are needed.
     """
     db, rest = db_uT.numpy(), rest_uT.numpy() / np.float32(REST_uT)
     length_uT = np.maximum(np.linalg.norm(db, axis=-1, keepdims=True), np.float32(LENGTH_MIN_uT))
@@ -87,7 +87,7 @@ def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b
 
 
 def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Draw initial weights as PyTorch does for linear layers (uniform within 1/sqrt(fan in)); FiLM starts near zero."""
+    """Draw initial weights uniformly within 1/sqrt(fan in), as PyTorch does; FiLM weights are close to zero."""
     inputs_n = 2 * channels_n + 1
     shapes = {"set1": (SET_WIDTH, inputs_n), "set2": (SET_WIDTH, SET_WIDTH), "code": (CODE_WIDTH, SET_WIDTH + 1)}
     shapes |= {f"layer{i}": (WIDTH, WIDTH if i else inputs_n) for i in range(LAYERS_N)}
@@ -103,16 +103,16 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
     return weights
 
 
-SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # all skins; recorded skins among them, if boards are known
+SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # total number; those of recorded boards, if there are any
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
-NO_PRESSES = 0.25  # share of skins without presses for conditioning; the others have 1 to 65
+NO_PRESSES_SHARE = 0.25  # fraction of skins without presses for conditioning; the others have 1 to 65
 NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading, by axis
-RESIDUAL_SCALE_MAX = 2.0  # the residual of known boards is multiplied by a factor between 0 and this
-# Ranges of the law's relative rms error: with known boards, without, and for variations of the recorded boards.
+RESIDUAL_SCALE_MAX = 2.0  # the residual from recorded boards is multiplied by a random factor from 0 to this
+# Ranges of the law's relative rms error: for skins simulated with and without known boards, and for recorded boards.
 ERROR_OF_RIG, ERROR_OF_NOMINAL, ERROR_OF_RECORDED = (0.1, 0.4), (0.1, 0.5), (0.15, 0.15)
-ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # length scales of these errors; number of cosines
-NOMINAL_NAME = "nominal"  # name of the prior without a known board
+ERROR_MM, ERROR_LOG_N, ERROR_WAVES_N = (2.5, 5.0), 1.2, 48  # length scales in place and log F; number of cosines
+NOMINAL_NAME = "nominal"  # name of the prior that uses no recorded board
 
 
 class TrainingSettings(Strict):
@@ -125,7 +125,7 @@ class TrainingSettings(Strict):
 
 @dataclass(frozen=True)
 class RecordedBoard:
-    """Readings of a known board, the same number for each press, in the board's frame and axes."""
+    """Readings of a recorded board in its frame and axes, the same number for each press."""
 
     db_uT: Float32[np.ndarray, "m r ch"]
     rest_uT: Float32[np.ndarray, " ch"]
@@ -137,8 +137,9 @@ class RecordedBoard:
 class SkinPrior:
     """Distribution of the skins that networks are trained on.
 
-    Skins are simulated around a central law. If boards of the rig are known, `recorded` has these boards and `residual`
-    the law's errors on them. follows_law: whether skins follow the law exactly, as those of a simulated scene do.
+    Skins are simulated with parameters around those of a central law. If boards of the rig were recorded, `recorded`
+    has their readings and `residual` the law's errors on them. follows_law: whether skins follow the law exactly, as in
+    a simulated scene.
     """
 
     name: str
@@ -152,9 +153,10 @@ class SkinPrior:
 
 @dataclass(frozen=True)
 class Batch:
-    """Skins of one step.
+    """Skins of one training step.
 
-    The network is conditioned on the `kept` ones of the first `PLACES_N` presses, and trained on the other presses.
+    The network is conditioned on those of the first `PLACES_N` presses for which `kept` is 1, and trained to predict
+    `target` for all later presses.
     """
 
     db_uT: Float32[np.ndarray, "b m ch"]
@@ -164,7 +166,7 @@ class Batch:
 
 
 def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> list[dict[str, np.ndarray]]:
-    """Draw skins, train networks on them one by one, and return the networks' weights."""
+    """Draw skins, train networks on them one after the other, and return the networks' weights."""
     rng = rng_for(seed, "universal", prior.name, "skins")
     skins = draw_population(prior.centre, prior.spreads, prior.setup, settings.skins_n, rng)
     names = ("universal", prior.name, "network")
@@ -172,8 +174,8 @@ def train_networks(prior: SkinPrior, settings: TrainingSettings, seed: int) -> l
 
 
 def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Train one network; return its weights."""
-    torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
+    """Train one network and return its weights."""
+    torch.set_num_threads(1)  # with several threads, the order of summation would vary
     network = Network(draw_weights(skins.rest_uT.shape[1], rng))
     optimizer = torch.optim.AdamW(network.parameters(), RATE_MAX, weight_decay=WEIGHT_DECAY, fused=True)
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, RATE_MAX, total_steps=steps_n, pct_start=WARM_UP)
@@ -189,15 +191,15 @@ def train(skins: Population, prior: SkinPrior, steps_n: int, rng: np.random.Gene
 
 
 def loss_of(network: Network, batch: Batch) -> torch.Tensor:
-    """Return the loss: Huber loss of the estimates plus the Gaussian negative log likelihood."""
+    """Return the loss of a batch: Huber loss of the means plus Gaussian negative log likelihood."""
     db_uT, rest_uT = torch.from_numpy(batch.db_uT), torch.from_numpy(batch.rest_uT)
     target, kept = torch.from_numpy(batch.target), torch.from_numpy(batch.kept)
     set_n = kept.shape[1]
     mean, log_sd = network(db_uT[:, set_n:], rest_uT, network.encode(db_uT[:, :set_n], rest_uT, kept))
     error = HUBER_WEIGHT * huber_loss(mean, target, delta=HUBER_DELTA)
-    # Errors affect standard deviations, but not the reverse: with the likelihood alone, hard presses are not learned.
-    off = (mean - target).detach()
-    return error + SD_WEIGHT * (log_sd + 0.5 * off**2 * exp(-2 * log_sd)).mean()
+    # The likelihood trains only the standard deviations. If it also trained the means, hard presses would be ignored.
+    deviation = (mean - target).detach()
+    return error + SD_WEIGHT * (log_sd + 0.5 * deviation**2 * exp(-2 * log_sd)).mean()
 
 
 class Batches:
@@ -237,7 +239,7 @@ class Batches:
 
 
 def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw one reading for each of 130 presses of a known board; with fewer presses, some repeat."""
+    """Draw one reading for each of 130 presses of a recorded board; if it has fewer presses, some repeat."""
     press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
     reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
     return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
@@ -245,7 +247,7 @@ def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.nd
 
 def draw_kept(n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n c"]:
     """Draw which presses of each skin the network is conditioned on: none for some skins, 1 to 65 for the others."""
-    kept_n = np.where(rng.random(n) < NO_PRESSES, 0, rng.integers(1, PLACES_N + 1, n))
+    kept_n = np.where(rng.random(n) < NO_PRESSES_SHARE, 0, rng.integers(1, PLACES_N + 1, n))
     rank = rng.random((n, PLACES_N)).argsort(axis=1).argsort(axis=1)
     return (rank < kept_n[:, None]).astype(np.float32)
 
@@ -257,28 +259,28 @@ def add_error(
     size: tuple[float, float],
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "b m ch"]:
-    """Add an error of the law that is smooth over place and log F.
+    """Add a random error of the law that is smooth in place and log F.
 
-    Half of it is proportional to |dB| at the chip, half to |dB| over all chips. size: bounds of its relative rms, which
-    is drawn for each skin.
+    Half of the error is proportional to |dB| at the chip, and half to |dB| over all chips. size: bounds of the relative
+    rms error, which is drawn for each skin.
     """
     skins_n, _, channels_n = db_uT.shape
-    part = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)
+    rms = rng.uniform(*size, (skins_n, 1, 1)).astype(np.float32)
     wave = rng.standard_normal((skins_n, 3, ERROR_WAVES_N), np.float32)
     wave[:, :2] /= rng.uniform(*ERROR_MM, (skins_n, 1, 1))
     wave[:, 2] /= ERROR_LOG_N
     at = np.concatenate([place_mm, log_N[..., None]], axis=-1)
     phase = rng.uniform(0, 2 * np.pi, (skins_n, 1, ERROR_WAVES_N)).astype(np.float32)
     amplitude = rng.standard_normal((skins_n, ERROR_WAVES_N, channels_n), np.float32)
-    unit = np.cos(at @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # a variance of 1
+    unit = np.cos(at @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # its variance is 1
     chips = db_uT.reshape(*db_uT.shape[:2], -1, len(NOISE_uT))
     of_chip = np.repeat(np.linalg.norm(chips, axis=-1), len(NOISE_uT), axis=-1) / np.sqrt(np.float32(len(NOISE_uT)))
     of_all = np.linalg.norm(db_uT, axis=-1, keepdims=True) / np.sqrt(np.float32(channels_n))
-    return db_uT + part * unit * 0.5 * (of_chip + of_all)
+    return db_uT + rms * unit * 0.5 * (of_chip + of_all)
 
 
 def residual_uT(skins: Population, residual: Residual) -> Float32[np.ndarray, "s m ch"]:
-    """Return the expected errors of the law for every press of a population, in uT."""
+    """Return the law's expected error in uT for each press of a population."""
     added = np.empty_like(skins.db_uT)
     for i in range(len(skins)):
         relative: Float[np.ndarray, "m ch"] = residual.at(skins.place_mm[i], np.log(skins.force_N[i]))

@@ -107,7 +107,7 @@ def test_presses_within_the_noise_are_refused_and_change_nothing(random_pokes):
     estimator.set_noload(noload_uT)
     before = estimator(db_uT.astype(np.float32)).target
     for calibrate in (estimator.adapt, lambda weak_uT: estimator.label(b_uT[:, :2], weak_uT, np.arange(len(b_uT)) < 3)):
-        with pytest.raises(SchemaError, match="changes of field must be 4.5 uT or more at some chip"):
+        with pytest.raises(SchemaError, match="field changes must be 4.5 uT or more at some chip"):
             calibrate(1e-3 * db_uT)
     estimator.set_noload(noload_uT)
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, before)

@@ -46,7 +46,7 @@ def test_shipped_model_estimates_as_the_tested_variant(model, labels_n):
     b_uT, _ = calibrate(model, skins, 0, (65, labels_n), even=True, seed=0)
     prior = PriorModel(new_map(model.tables), model.networks)
     calibration, tested = calibrate_to_simulated(prior, skins, 0, seed=0)
-    power = model.powers.of(65, labels_n, even=True)
+    power = model.powers.power_for(65, labels_n, even=True)
     powers = lower_by_labels(calibration, labels_n, [calibration.nominal_powers(Powers(power, power))])
     ((_, expected),) = estimate(calibration.with_labels(labels_n), tested.db_uT, powers)
     found = model.estimate(b_uT)
@@ -64,9 +64,9 @@ def test_larger_misfit_lowers_the_power(model, presses_n):
         misfits.append(model.misfit)
         powers.append(model.power)
         calibrate(model, skins_of(model, 1, error), 0, (5, 0), even=False, seed=0)
-        assert (model.misfit, model.power) == (1.0, model.powers.of(0, 0, even=False))
+        assert (model.misfit, model.power) == (1.0, model.powers.power_for(0, 0, even=False))
     assert misfits[1] > 3 * misfits[0]
-    assert powers == pytest.approx([min(1, model.powers.of(presses_n, 0, even=False) / of) for of in misfits])
+    assert powers == pytest.approx([min(1, model.powers.power_for(presses_n, 0, even=False) / of) for of in misfits])
 
 
 def test_powers_are_calibrated_for_all_presses_and_labels(model, monkeypatch):

@@ -64,7 +64,7 @@ def test_powers_are_at_most_one():
 
 def test_powers_are_interpolated_between_label_counts():
     powers = LikelihoodPowers({0: {0: 0.9, 10: 0.9}, 12: {0: 0.8, 10: 0.2}}, {0: 0.3})
-    assert [powers.of(12, n, even=False) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
-    assert [powers.of(n, 0, even=False) for n in (0, 11, 12, 65)] == pytest.approx([0.9, 0.9, 0.8, 0.8])
+    assert [powers.power_for(12, n, even=False) for n in (0, 5, 10, 99)] == pytest.approx([0.8, 0.4, 0.2, 0.2])
+    assert [powers.power_for(n, 0, even=False) for n in (0, 11, 12, 65)] == pytest.approx([0.9, 0.9, 0.8, 0.8])
     assert [powers.are_enough(n) for n in (0, 11, 12, 65)] == [False, False, True, True]
-    assert powers.of(65, 7, even=True) == pytest.approx(0.3)
+    assert powers.power_for(65, 7, even=True) == pytest.approx(0.3)

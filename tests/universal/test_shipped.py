@@ -168,7 +168,7 @@ def test_surprising_labels_raise_uncertainty_and_labels_are_replaced(skin):
     np.testing.assert_allclose(skin.skin.mean, number)
     assert skin.power == pytest.approx(fits)
     skin.zero(rest_uT)
-    assert skin.power == pytest.approx(skin.powers.of(0, 0, even=False))
+    assert skin.power == pytest.approx(skin.powers.power_for(0, 0, even=False))
 
 
 def test_order_of_data_and_queries_does_not_matter(skin):
@@ -280,7 +280,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
     for changed, rule in [
         ({"pokes_uT": one_uT * np.nan}, "must be finite numbers of uT; got nan"),
         ({"rest_uT": one_uT[0] * np.inf}, "must be finite numbers of uT; got inf"),
-        ({"pokes_uT": one_uT * 1e7}, "must be at most 1,000,000 uT in size; got 1"),
+        ({"pokes_uT": one_uT * 1e7}, "must be at most 1,000,000 uT in magnitude; got 1"),
         ({"pokes_uT": np.ones((66, CHANNELS_N))}, "arrays must be"),
         ({"even_uT": np.ones((66, CHANNELS_N))}, "arrays must be"),
         ({"even_uT": one_uT[:, :12]}, "arrays must be"),
