@@ -10,9 +10,9 @@ from reskin.universal import population
 from reskin.universal.law import at_rest_uT, inside, simulate_uT
 from reskin.universal.map import NOMINAL, NOMINAL_SPREADS
 from reskin.universal.population import (
+    DEFAULT_FORCES,
     LEAST,
     PLACES_N,
-    PLAIN,
     draw_gains,
     draw_law,
     draw_places,
@@ -34,7 +34,9 @@ def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     assert not np.allclose(two.rest_uT[0], two.rest_uT[1])
     second = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, slice(1, 2), rng_for(0, "skins"))
     np.testing.assert_array_equal(second.db_uT[0], two.db_uT[1])
-    weighed = draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(PLAIN, weight_N=5.0))
+    weighed = draw_population(
+        NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(DEFAULT_FORCES, weight_N=5.0)
+    )
     np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)  # a weight press does not change the others
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 
@@ -48,7 +50,7 @@ def test_parameters_have_the_given_spreads_and_bounds():
     for name, least in LEAST.items():
         assert min(getattr(law, name) for law in laws) >= least
     gap_mm, log = np.array([law.gap_mm for law in laws]), np.log([law.amplitude for law in laws])
-    assert np.polyfit(gap_mm, log, 1)[0] == pytest.approx(population.STRONGER_PER_MM, abs=0.15)
+    assert np.polyfit(gap_mm, log, 1)[0] == pytest.approx(population.LOG_AMPLITUDE_PER_MM, abs=0.15)
 
 
 def test_presses_cover_the_grid_and_stay_on_the_skin():
