@@ -1,8 +1,8 @@
-"""Compiled loops of the map: likelihoods of hypotheses given readings, and means over hypotheses.
+"""Compiled loops of the map: likelihoods of hypotheses given readings, and means over the hypotheses.
 
-A hypothesis is a place and a force; the force index varies fastest. Its Gaussian is stored as the inverse root W of the
-covariance and W times the mean m, so that chi^2 = |W d - W m|^2 for a reading d. Likelihoods are in single precision:
-the error of chi^2 is below 0.01 for hypotheses under which a reading is likely.
+A hypothesis is a pair of a place and a force; the force index varies fastest. The Gaussian of a hypothesis, with mean m
+and covariance C, is stored as W and W m, where W'W is the inverse of C. For a reading d, chi^2 = |W d - W m|^2.
+Likelihoods are in single precision. The error of chi^2 is below 0.01 for hypotheses under which a reading is likely.
 """
 
 import math
@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Int64
 from numba import njit
 
-LANES_N = 64  # Gaussians per block, axis `l`, for vector instructions
+LANES_N = 64  # Gaussians per block (axis `l`), for vector instructions
 
 
 @dataclass(frozen=True)
 class LinearMeans:
-    """Means of Gaussians that are linear in some parameters, in blocks; copies of the last Gaussian fill its block."""
+    """Means of Gaussians, linear in some parameters, in blocks; copies of the last Gaussian fill the last block."""
 
     mean: Float32[np.ndarray, "k ch l"]
     slope: Float32[np.ndarray, "k ch t l"]
@@ -26,7 +26,10 @@ class LinearMeans:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """Whitened Gaussians: for each channel, W m and the row of W up to it; log determinants of covariances."""
+    """Whitened Gaussians, and the log determinants of their covariances.
+
+    row: for each channel, W m, then the row of W up to the diagonal (W is lower triangular).
+    """
 
     row: Float32[np.ndarray, "f h"]
     log_det: Float32[np.ndarray, " h"]
@@ -34,7 +37,7 @@ class Gaussians:
     def evaluate(
         self, read: Float32[np.ndarray, "n ch"]
     ) -> tuple[Float32[np.ndarray, "n h"], Float32[np.ndarray, "n h"]]:
-        """Return chi^2 of readings, and their deviance: chi^2 plus the log determinant."""
+        """Return chi^2 of readings under each Gaussian, and the deviance: chi^2 plus the log determinant."""
         chi2 = np.zeros((len(read), len(self.log_det)), np.float32)
         _chi2(self.row, read, chi2)
         return chi2, chi2 + self.log_det
@@ -43,8 +46,8 @@ class Gaussians:
 def in_blocks(mean: Float32[np.ndarray, "h ch"], slope: Float32[np.ndarray, "h ch t"]) -> LinearMeans:
     """Arrange Gaussians in blocks."""
     blocks_n = -(-len(mean) // LANES_N)
-    of_lane = np.minimum(np.arange(blocks_n * LANES_N), len(mean) - 1).reshape(blocks_n, LANES_N)
-    return LinearMeans(*(np.ascontiguousarray(np.moveaxis(part[of_lane], 1, -1)) for part in (mean, slope)))
+    gaussian_i = np.minimum(np.arange(blocks_n * LANES_N), len(mean) - 1).reshape(blocks_n, LANES_N)
+    return LinearMeans(*(np.ascontiguousarray(np.moveaxis(part[gaussian_i], 1, -1)) for part in (mean, slope)))
 
 
 def whiten(
@@ -52,10 +55,10 @@ def whiten(
     residual: Float32[np.ndarray, "h ch"], share: Float32[np.ndarray, " h"], error_cov: Float32[np.ndarray, "ch ch"],
     noise_var: float,
 ) -> Gaussians:  # fmt: skip
-    """Whiten Gaussians whose parameters have a mean and the lower root C of a covariance.
+    """Whiten Gaussians, given the parameters as their mean and the lower Cholesky factor L of their covariance.
 
-    With M = mean + slope parameters, a Gaussian has the mean M + |M| residual and the covariance (slope C)(slope C)' +
-    |M|^2 share error_cov + noise_var 1.
+    With M = mean + slope @ parameters, a Gaussian has the mean M + |M| residual and the covariance
+    (slope L)(slope L)' + |M|^2 share error_cov + noise_var 1.
     """
     channels_n = len(error_cov)
     row = np.empty((channels_n * (channels_n + 3) // 2 + 1, len(share)), np.float32)
@@ -125,7 +128,7 @@ def _spread(slope, root, s):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _cov(s, var, error_cov, noise_var, a):
-    # The lower triangle of s s' + var error_cov + noise_var 1.
+    # Compute the lower triangle of s s' + var error_cov + noise_var 1.
     for i in range(len(a)):
         for j in range(i + 1):
             noise = noise_var if i == j else np.float32(0)
@@ -154,7 +157,7 @@ def _root(a, log_det):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _inverse(a, b):
-    # The inverse of the factor L in `a`, also lower triangular.
+    # Compute the inverse of the Cholesky factor in `a`; it is lower triangular, too.
     for j in range(len(a)):
         b[j, j] = a[j, j]
         for i in range(j + 1, len(a)):
@@ -167,13 +170,13 @@ def _inverse(a, b):
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _write(b, m, log_det, row):
-    f, n, aimed = 0, row.shape[1], np.empty(LANES_N, np.float32)
+    f, n, white_mean = 0, row.shape[1], np.empty(LANES_N, np.float32)
     for i in range(len(b)):
-        _clear(aimed)
+        _clear(white_mean)
         for j in range(i + 1):
-            _add(aimed, b[i, j], m[j])
+            _add(white_mean, b[i, j], m[j])
             row[f + 1 + j] = b[i, j, :n]
-        row[f] = aimed[:n]
+        row[f] = white_mean[:n]
         f += i + 2
     row[f] = log_det[:n]
 
@@ -214,10 +217,10 @@ def _clear(value):
         value[lane] = np.float32(0)
 
 
-CELL_SD_MM = 0.2  # least standard deviation of a place, because of its position within a cell of the lattice
-TINY = float(np.finfo(np.float32).tiny)  # least probability of a place in the map
+CELL_SD_MM = 0.2  # least standard deviation of a place: positions within a cell of the lattice are not distinguished
+TINY = float(np.finfo(np.float32).tiny)  # least probability of a place or force in the map
 LEAST = math.log(TINY)
-FARTHEST = 200.0  # log likelihoods are raised to at least the largest one minus this
+FARTHEST = 200.0  # log likelihoods further below the largest one than this are raised to this distance
 
 
 class Lattice(NamedTuple):
@@ -234,9 +237,9 @@ Moments = tuple[np.ndarray, np.ndarray, np.ndarray]  # x and y [n 2], their stan
 def means(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, power: float
 ) -> Moments:
-    """Return means over all hypotheses, weighted by a power of their likelihoods.
+    """Return moments over all hypotheses, weighted by a power of their likelihoods.
 
-    deviance: -2 log likelihood, up to a constant. best: the most likely hypothesis of each reading.
+    deviance: -2 log likelihood, up to a constant. best: index of the most likely hypothesis for each reading.
     """
     found = np.empty((len(deviance), 5))
     _means(deviance, best, tuple(lattice), 0.5 * power, found)
@@ -247,9 +250,9 @@ def products(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
     map_power: float, power: float,
 ) -> Moments:  # fmt: skip
-    """Return moments of the map's probabilities times normal distributions, for places and forces separately.
+    """Return moments of the map's marginal probabilities of places and of forces, each times normal distributions.
 
-    map_power: power of the map's likelihoods. power: power of the product, for standard deviations only.
+    map_power: power of the map's likelihoods. power: power of the product; it affects standard deviations only.
     """
     found = np.empty((len(deviance), 5))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), found)
@@ -309,7 +312,7 @@ def _likelihoods(deviance, least, half_power, likely):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _margins(likely, of_place, of_force):
-    # Logarithms of the probabilities of places, and of forces.
+    # Compute the log marginal probabilities of places and of forces.
     forces_n, sum_ = len(of_force), 0.0
     for q in range(forces_n):
         of_force[q] = 0.0
@@ -328,7 +331,7 @@ def _margins(likely, of_place, of_force):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _moments(log, place_mm, about_mm, power, likely):
-    # Moments of a power of the probabilities: means of x and y, mean squares about a place; `likely` is working memory.
+    # Weighted by a power of the probabilities: means of x and y, mean squares about a place. `likely` is a work array.
     most, sum_, x, y, xx, yy = _most(log), 0.0, 0.0, 0.0, 0.0, 0.0
     for p in range(len(log)):
         likely[p] = _exp(power * (log[p] - most))
@@ -364,8 +367,8 @@ def _most(values):
 @njit(inline="always")
 @no_type_check
 def _exp(x):
-    # Exponential of x <= 0; relative error 1e-9 down to -100, 5e-7 at -200. The Taylor series of x / 512, squared nine
-    # times: the library's exp is not vectorised.
+    # Exponential of x <= 0: Taylor series for x / 512, squared nine times, because the library's exp is not vectorised.
+    # The relative error is 1e-9 down to -100, and 5e-7 at -200.
     p = (-FARTHEST if x < -FARTHEST else x) * (1 / 512)
     y = p * (1 / 24 + p * (1 / 120 + p * (1 / 720 + p * (1 / 5040 + p * (1 / 40320)))))
     y = 1.0 + p * (1.0 + p * (1 / 2 + p * (1 / 6 + y)))

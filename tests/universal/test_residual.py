@@ -29,8 +29,8 @@ def test_order_of_boards_does_not_matter():
     one = fit_residual([APART_MM, APART_MM + 1], [FORCE_N, 2 * FORCE_N], [ERRORS, ERRORS**2])
     other = fit_residual([APART_MM + 1, APART_MM], [2 * FORCE_N, FORCE_N], [ERRORS**2, ERRORS])
     np.testing.assert_allclose(one.at(APART_MM, np.zeros(3)), other.at(APART_MM, np.zeros(3)), rtol=1e-9)
-    np.testing.assert_allclose(one.share, other.share)
-    assert np.trace(one.share) == pytest.approx(1)
+    np.testing.assert_allclose(one.channel_cov, other.channel_cov)
+    assert np.trace(one.channel_cov) == pytest.approx(1)
 
 
 def test_kernel_is_squared_exponential():
