@@ -1,10 +1,12 @@
-"""The universal model: estimates places and forces on a skin without training.
+"""The universal model: estimates places and forces on a new skin without training on that skin.
 
-`PriorModel` is a map and networks made from simulated skins. Calibration conditions both on the data of one skin:
-`PressCalibration` on its no-load field and on presses at unknown places, `CalibratedModel` on labelled presses too.
-These work in the board's frame and axes, for any board. `Universal` is the model that comes with the project, for the
-paper's board with five chips, oriented as on the recorded boards. Its readings are along the chips' axes; its places
-are in the frame of the labels, with the board's centre at (8, 8) mm.
+`PriorModel` consists of a map and networks that were computed from simulated skins. Calibration conditions both on the
+data of one skin: `PressCalibration` on its no-load field and on presses at unknown places, `CalibratedModel` also on
+labelled presses. These three classes use the board's frame and axes, and work for any board.
+
+`Universal` is the model that comes with the project. It is for the paper's board with five chips, oriented as on the
+recorded boards. It takes readings along the chips' axes, and its places are in the frame of the labels, in which the
+board's centre is at (8, 8) mm.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -56,26 +58,26 @@ from reskin.universal.map import (
 )
 from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weights, shift_places
 
-# Power of the map's likelihoods when they are combined with the networks'. Below 1, because the errors of channels are
-# correlated; not fitted to any board.
+# Power of the map's likelihoods when they are combined with the networks' estimates. It is below 1, because the errors
+# of channels are correlated, and is not fitted to any board.
 MAP_POWER = 0.6
-SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of a network's estimates
-FADES_PER_LABEL = 0.15  # how fast the centring of the networks' places fades, as labels determine the centre better
-OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the constant error of the networks' places; sd of single errors about it
-MISFIT_MAX = 4.0  # assumed, chi^2 per channel; about 1 for skins like those that the model was trained on
-BLOCK_N = 200  # readings evaluated at once, to bound memory
+SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
+FADES_PER_LABEL = 0.15  # each label weakens the centring of the networks' places, because labels determine it better
+OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of single errors about it
+MISFIT_MAX = 4.0  # chi^2 per channel, assumed; skins like those in training have about 1
+BLOCK_N = 200  # readings per block, to bound memory
 
-FILE = Path(__file__).with_name("universal.safetensors")  # the card has the same name, .json
+FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT = "reskin-universal-3"
-REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # range of places, relative to the centre
-CHOICE_EVERY_N = 3  # every third place of the lattice is a candidate for the next press
+REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # least and largest x and y, relative to the centre
+CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next press
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Readings evaluated by map and networks, from which estimates for any likelihood power can be computed.
+    """Readings evaluated by map and networks; estimates with any likelihood power are computed from it.
 
-    The power affects standard deviations, and in `by_map` also places and forces.
+    The power affects standard deviations and, in `by_map`, also places and forces.
     """
 
     evaluator: MapEvaluator
@@ -85,33 +87,32 @@ class Evaluation:
     __repr__ = one_line
 
     def by_map(self, power: float) -> Estimate:
-        """Estimate by the map alone, as means over its hypotheses."""
+        """Estimate with the map alone, as means over its hypotheses."""
         return self.evaluator.mean(self.likelihoods, power)
 
     def by_network(self, power: float) -> Estimate:
-        """Estimate by the networks alone; they have no misfit (NaN)."""
-        nothing = np.full(len(self.network.log_N), np.nan)
-        of = self.network
-        return Estimate(of.place_mm, of.sd_mm / np.sqrt(power), np.exp(of.log_N), nothing)
+        """Estimate with the networks alone; their misfit is NaN."""
+        own = self.network
+        return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), np.full(len(own.log_N), np.nan))
 
     def combined(self, power: float) -> Estimate:
-        """Multiply the map's probabilities of places and of forces with the networks' normal distributions.
+        """Multiply the map's marginal probabilities of places and forces by the networks' normal distributions.
 
-        Both use the same field, so their errors are correlated. Therefore the standard deviations are those of a power
-        of the product.
+        The errors of both are correlated, because both use the same field changes. Therefore the standard deviations
+        are computed from a power of the product.
         """
         normals = np.empty((len(self.network.log_N), 6))
         normals[:, :2], normals[:, 4] = self.network.place_mm, self.network.log_N
         np.maximum(self.network.sd_mm, SD_MIN_MM, out=normals[:, 2:4])
         np.maximum(self.network.sd_log_N, SD_MIN_LOG_N, out=normals[:, 5])
-        of = self.likelihoods
-        moments = products(of.deviance, of.best, self.evaluator.lattice, normals, MAP_POWER, power)
-        return Estimate(*moments, of.misfit())
+        likelihoods = self.likelihoods
+        moments = products(likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power)
+        return Estimate(*moments, likelihoods.misfit())
 
 
 @dataclass(frozen=True)
 class CalibratedModel:
-    """Map and networks, calibrated to one skin. `offsets_mm` are added to the networks' places, in this order."""
+    """Map and networks, calibrated to one skin; `offsets_mm` are added to the networks' places one after the other."""
 
     skin: SkinMap
     networks: Sequence[Layers]
@@ -120,18 +121,18 @@ class CalibratedModel:
     __repr__ = one_line
 
     def with_offsets_in_biases(self) -> "CalibratedModel":
-        """Return the same model with the offsets added to the networks' last biases: faster, in single precision."""
-        by_mm = sum(self.offsets_mm, np.zeros(2))
-        return CalibratedModel(self.skin, [shift_places(layers, by_mm) for layers in self.networks], ())
+        """Return the model with its offsets added to the networks' last biases: faster, but in single precision."""
+        offset_mm = sum(self.offsets_mm, np.zeros(2))
+        return CalibratedModel(self.skin, [shift_places(layers, offset_mm) for layers in self.networks], ())
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Estimate places and forces by map and networks, once for each likelihood power."""
+        """Estimate places and forces with map and networks, once for each likelihood power."""
         return self.estimate_by(lambda evaluation: [evaluation.combined(power) for power in powers], db_uT)
 
     def estimate_by(
         self, method: Callable[[Evaluation], Sequence[Estimate]], db_uT: Float[np.ndarray, "n ch"]
     ) -> list[Estimate]:
-        """Estimate places and forces by one or several methods, block by block."""
+        """Estimate places and forces block by block; `method` returns one or several estimates for a block."""
         starts = range(0, max(len(db_uT), 1), BLOCK_N)
         by_block = [method(self.evaluate(db_uT[i : i + BLOCK_N])) for i in starts]
         return [concatenate(parts) for parts in zip(*by_block, strict=True)]
@@ -142,11 +143,11 @@ class CalibratedModel:
         return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT))
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
-        """Estimate by the networks alone."""
-        found = network.evaluate(self.networks, db_uT)
+        """Estimate with the networks alone."""
+        estimate = network.evaluate(self.networks, db_uT)
         for offset_mm in self.offsets_mm:
-            found = replace(found, place_mm=found.place_mm + offset_mm)
-        return found
+            estimate = replace(estimate, place_mm=estimate.place_mm + offset_mm)
+        return estimate
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,7 @@ class PressCalibration:
 
     @cached_property
     def even_mm(self) -> Float[np.ndarray, "e 2"]:
-        """The networks' places of the presses that are evenly spread over the skin."""
+        """Places that the networks estimate for the evenly spread presses."""
         return network.evaluate(self.layers, self.data.even_uT).place_mm
 
     def with_labels(self, labels: LabelledPresses) -> CalibratedModel:
@@ -186,13 +187,13 @@ class PriorModel:
     __repr__ = one_line
 
     def calibrate(self, data: CalibrationData) -> PressCalibration:
-        """Calibrate to a skin; labels of the data are not used (see `PressCalibration.with_labels`)."""
+        """Calibrate to a skin's no-load field and unlabelled presses (labels: `PressCalibration.with_labels`)."""
         noload_map = condition_on_noload(self.skin, data.rest_uT)
         return PressCalibration(condition_on_unlabelled(noload_map, data), self.networks, data)
 
 
 def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinMap:
-    """Condition a map on presses at unknown places, then on those that are evenly spread over the skin."""
+    """Condition a map on presses at unknown places, then on the evenly spread ones."""
     skin = noload_map
     if len(data.presses_uT):
         skin = condition_on_presses(skin, data.presses_uT)
@@ -204,11 +205,11 @@ def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinM
 def network_offsets_mm(
     even_mm: Float[np.ndarray, "e 2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return two corrections of the networks' places, to be added in this order.
+    """Return two corrections to add to the networks' places.
 
-    The first moves the mean of presses that are evenly spread over the skin (`even_mm`) to the centre; it fades with
-    the number of labels. The second is the mean error of labelled presses, estimated at `estimated_mm`, with a Gaussian
-    prior of zero mean.
+    The first moves the mean of the evenly spread presses (`even_mm`) towards the centre, by less the more labels there
+    are. The second is the mean error that then remains for labelled presses, which the networks estimate at
+    `estimated_mm`; it is shrunk by a Gaussian prior with mean zero.
     """
     centre_mm = -even_mm.mean(axis=0) / (1 + FADES_PER_LABEL * len(place_mm)) if len(even_mm) else np.zeros(2)
     off_mm = place_mm - (estimated_mm + centre_mm)
@@ -219,15 +220,15 @@ def network_offsets_mm(
 class Universal:
     """The model for the paper's board that comes with the project; it can be calibrated during use.
 
-    Call `zero` with readings without contact first, then `see` with presses at unknown places and `label` with presses
-    at known ones, in any order and as often as wanted; `predict` at any time after `zero`. These three change the model
-    in place and return it. Fields are in uT along the chips' axes.
+    First call `zero` with readings without contact. Then call `see` with presses at unknown places and `label` with
+    presses at known places, in any order and any number of times. Each of these three methods changes the model in
+    place and returns it. `predict` works at any time after `zero`. Fields are in uT along the chips' axes.
 
     Parameters
     ----------
     tables : the map's prior
     networks : weights of the networks
-    powers : likelihood powers by number of presses and labels
+    powers : likelihood powers by numbers of presses and labels
     """
 
     tables: Tables
@@ -235,7 +236,7 @@ class Universal:
     powers: LikelihoodPowers
 
     def __post_init__(self) -> None:
-        """Start from nominal skins."""
+        """Start without any calibration data."""
         self._noload_uT: np.ndarray | None = None
         self._prior_map = new_map(self.tables)
         self._noload_map: SkinMap
@@ -255,43 +256,43 @@ class Universal:
 
     @property
     def card(self) -> dict[str, Any]:
-        """The model's JSON card: how it was made, and what it must not be used for."""
+        """The model's JSON card: how it was trained, and what it must not be used for."""
         return io.read_json(FILE.with_suffix(".json"))
 
     @property
     def skin(self) -> SkinMap:
-        """The map, conditioned on all data of the skin."""
+        """The map, conditioned on all calibration data."""
         return self._model.skin
 
     @property
     def noload_uT(self) -> Float[np.ndarray, " ch"]:
-        """The no-load field that is subtracted, along the chips' axes; raise SchemaError before `zero`."""
+        """The baseline (no-load field that is subtracted) along the chips' axes; raises SchemaError before `zero`."""
         if self._noload_uT is None:
             raise SchemaError("the model has no no-load reading: call zero(...) with readings without contact first.")
         return self._noload_uT
 
     @property
     def zeroed(self) -> bool:
-        """Whether there is a no-load field."""
+        """Whether `zero` has been called (or a calibration loaded)."""
         return self._noload_uT is not None
 
     @property
     def presses_n(self) -> int:
-        """Number of presses that it is calibrated to, labelled or not."""
+        """Number of presses that the model is calibrated to, labelled or not."""
         return len(self._data.presses_uT) + len(self._data.labels)
 
     @property
     def misfit(self) -> float:
-        """Median chi^2 per channel of unlabelled presses: about 1 for skins as in the prior; 1 for too few presses."""
+        """Median chi^2 per channel of unlabelled presses: about 1 for skins as in training; 1 if there are too few."""
         return float(np.median(self._misfits)) if self.powers.are_enough(len(self._misfits)) else 1.0
 
     @property
     def power(self) -> float:
         """Power of the combined likelihood, from the misfit of unlabelled presses and cross-validated labels.
 
-        With 1, map and networks are trusted fully; a smaller power gives larger standard deviations.
+        With a power of 1, map and networks are trusted fully; a smaller power gives larger standard deviations.
         """
-        if self._power is None:  # cross-validation takes long, so it runs once for each set of data, when needed
+        if self._power is None:  # cross-validation is slow, so it runs only when needed, and once per data set
             data = self._data
             tabulated = self.powers.power_for(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
             power = lower_by_misfit(tabulated, self.misfit)
@@ -303,26 +304,27 @@ class Universal:
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and condition the map on it.
 
-        Earlier presses are discarded, unless `keep` is set: use this for the same skin after drift. The model is
-        changed in place and returned.
+        Earlier presses are discarded, unless `keep` is set, as it should be for the same skin after drift. The model
+        is changed in place and returned.
 
         Raises
         ------
-        SchemaError : there is no reading, or one is not finite, out of range or from another board
+        SchemaError : there is no reading, or a reading is not finite, out of range or from another board
         """
         noload_uT = check_readings(b_uT)
         if not len(noload_uT):
-            raise SchemaError("zero: no readings without contact. Read the board before a touch.")
+            raise SchemaError("zero: there are no readings without contact. Read the board before a contact.")
         self._noload_uT = noload_uT.mean(axis=0)
         rest_uT = to_board(self._noload_uT[None])[0]
         data = replace(self._data, rest_uT=rest_uT) if keep else CalibrationData(rest_uT)
         return self._restart(condition_on_noload(self._prior_map, rest_uT), data)
 
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
-        """Calibrate to presses at unknown places, one reading each: dozens all over the skin, in one or several calls.
+        """Calibrate to presses at unknown places, given as one reading per press.
 
-        The first set is used in several rounds, later sets in one. Set `even` if these and all earlier presses are
-        evenly spread over the skin (a grid, each place once), so that their mean place is the skin's centre.
+        Use dozens of presses all over the skin, in one or several calls. The first set is used in several rounds of
+        estimation, later sets in one. Set `even` if these and all earlier presses together are evenly spread over the
+        skin (for example a grid with one press per place), so that their mean place is the skin's centre.
         """
         db_uT, data = check_presses(self._change(check_readings(b_uT))), self._data
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
@@ -347,8 +349,9 @@ class Universal:
 
         Raises
         ------
-        SchemaError : no no-load reading, no change of field above the noise, a place off the skin, a force of 0 N or
-            less, or outside the model's range by a factor of 2, too many labels; the model is unchanged
+        SchemaError : `zero` was not called; no field change exceeds the noise; a place is outside the skin; a force is
+            not above 0 N, or outside the model's range by a factor of 2; there are too many labels. The model is then
+            unchanged.
         """
         readings_uT = check_readings(b_uT)
         places_mm, forces_N = check_labels(
@@ -362,18 +365,18 @@ class Universal:
                 np.concatenate([before.place_mm, labels.place_mm]), np.concatenate([before.force_N, labels.force_N]),
                 np.concatenate([before.db_uT, labels.db_uT]),
             )  # fmt: skip
-            check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # together they may be too many
+            check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # all labels together may be too many
         data, press_map = replace(self._data, labels=labels), self._calibration.skin
-        if len(before):  # condition on unlabelled presses again, so that the order of calls does not matter
+        if len(before):  # start again from the unlabelled presses, so that the order of calls does not matter
             press_map = condition_on_unlabelled(self._noload_map, data)
         return self._set(press_map, data)
 
     def next_place(self, force_N: float = 2.0) -> Float[np.ndarray, "2"]:
-        """Return the place, in mm, where a labelled press of about this force would be most informative.
+        """Return the place in mm where a labelled press with about this force would be most informative.
 
         Raises
         ------
-        SchemaError : a force that is not finite or not above 0 N
+        SchemaError : the force is not finite or not above 0 N
         """
         if not (np.isfinite(force_N) and force_N > 0):
             raise SchemaError("next_place", "the force", "finite and above 0 N", force_N, "Try: 2.0")
@@ -383,17 +386,20 @@ class Universal:
 
     def predict(self, b_uT: Float[np.ndarray, "*f ch"]) -> Float[np.ndarray, "f 3"]:
         """Predict x_mm, y_mm and the normal force in N for readings in contact."""
-        found = self.estimate(b_uT)
-        return np.column_stack([found.place_mm, found.force_N])
+        estimate = self.estimate(b_uT)
+        return np.column_stack([estimate.place_mm, estimate.force_N])
 
     def estimate(self, b_uT: Float[np.ndarray, "*f ch"]) -> Estimate:
-        """Estimate places with standard deviations, forces and misfits; far above 1, the skin is unlike the prior."""
+        """Estimate places with standard deviations, forces and misfits.
+
+        Misfits far above 1 mean that the skin is unlike those that the model was trained on.
+        """
         return self.estimates(b_uT, [self.power])[0]
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Return `estimate` for several likelihood powers; only the standard deviations differ."""
-        found = self._model.estimate(self._change(b_uT), powers)
-        return [replace(one, place_mm=one.place_mm + CENTRE_MM) for one in found]
+        """Return the result of `estimate` for each likelihood power; only the standard deviations differ."""
+        estimates = self._model.estimate(self._change(b_uT), powers)
+        return [replace(estimate, place_mm=estimate.place_mm + CENTRE_MM) for estimate in estimates]
 
     def variance_inflations(self, powers: Sequence[float]) -> list[float]:
         """Estimate the variance inflation for each likelihood power by cross-validation over the labelled presses."""
@@ -404,19 +410,19 @@ class Universal:
         return variance_inflations(len(powers), folds)
 
     def save(self, file: Path | str) -> None:
-        """Write the calibration data of this skin, for `load_universal(file)`; raise SchemaError before `zero`."""
+        """Write this skin's calibration data to a file for `load_universal(file)`; raise SchemaError before `zero`."""
         if self._noload_uT is None:
             raise SchemaError("save: the model has no no-load reading. First call zero.")
         write_calibration(self._data, Path(file))
 
     def remember(self, file: Path | str) -> "Universal":
-        """Replace all data of the skin by the data in a file of `save`; afterwards, call `zero(b_uT, keep=True)`."""
+        """Replace all calibration data by those in a file from `save`; afterwards, call `zero(b_uT, keep=True)`."""
         data = read_calibration(Path(file), REACH_MM)
         self._noload_uT = to_chips(data.rest_uT[None])[0]
         return self._restart(condition_on_noload(self._prior_map, data.rest_uT), data)
 
     def __call__(self, db_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f 3"]:
-        """Predict from field changes, as a trained network does."""
+        """Predict x_mm, y_mm and force_N from field changes, with the interface of a trained network."""
         return self.predict(check_shape(db_uT) + self.noload_uT).astype(np.float32)
 
     @property
@@ -428,16 +434,16 @@ class Universal:
         return to_board(check_shape(b_uT) - self.noload_uT)
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Calibrate to all data, starting from a map that is conditioned on the no-load field alone."""
+        """Calibrate to all data, given the map that is conditioned on the no-load field only."""
         self._noload_map = noload_map
         self._misfits = np.full(len(data.presses_uT), np.nan)
         return self._set(condition_on_unlabelled(noload_map, data), data)
 
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Use a map that is conditioned on the unlabelled presses of the data, and condition it on the labels."""
-        new = np.isnan(self._misfits)
-        if new.any():  # the misfit of a press is that of the first map that was conditioned on it
-            self._misfits[new] = press_map.evaluator.evaluate(data.presses_uT[new]).misfit()
+        """Set the map that is conditioned on the unlabelled presses, and condition it on the labels."""
+        missing = np.isnan(self._misfits)
+        if missing.any():  # a press keeps the misfit that it has in the first map conditioned on it
+            self._misfits[missing] = press_map.evaluator.evaluate(data.presses_uT[missing]).misfit()
         self._calibration = PressCalibration(press_map, self.networks, data)
         self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
         self._power = None
@@ -445,7 +451,7 @@ class Universal:
 
 
 def load_universal(calibration: Path | str | None = None, *, file: Path = FILE) -> Universal:
-    """Load the model that comes with the project, calibrated to a skin if a file that `save` wrote is given."""
+    """Load the model that comes with the project, calibrated to a skin if `calibration` is a file from `save`."""
     model = Universal(*_read_parts(file))
     return model if calibration is None else model.remember(calibration)
 
@@ -456,21 +462,21 @@ def _read_parts(file: Path) -> tuple[Tables, Sequence[Weights], LikelihoodPowers
     card = io.read_json(card_file)
     form = card.get("format") if isinstance(card, dict) else None
     if form != FORMAT:
-        remedy = "Use the files of this version, or make them again: python -m pipeline.training.shipping"
+        remedy = "Use the files of this version, or regenerate them: python -m pipeline.training.shipping"
         raise SchemaError(card_file, "format", FORMAT, form, remedy)
     parts, _ = io.read_tensors(file, digest_needed=True)
-    of_map = {one.name: parts.pop(one.name).astype(float) for one in fields(Tables) if one.name != "names"}
-    tables = Tables(names=tuple(card["spreads"]), **of_map)
+    map_arrays = {field.name: parts.pop(field.name).astype(float) for field in fields(Tables) if field.name != "names"}
+    tables = Tables(names=tuple(card["spreads"]), **map_arrays)
     return tables, network.from_tensors(parts), LikelihoodPowers.from_card(card["sureness"])
 
 
 def write(
     tables: Tables, networks: Sequence[Weights], powers: LikelihoodPowers, about: Mapping[str, Any], file: Path = FILE
 ) -> None:
-    """Write the map's prior (in single precision), the networks, and a card: origin, powers and spreads."""
-    parts = [one.name for one in fields(tables) if one.name != "names"]
-    of_map = {name: getattr(tables, name).astype(np.float32) for name in parts}
-    io.write_tensors(file, of_map | network.to_tensors(networks), {})
+    """Write the map's prior (in single precision), the networks, and the card (`about`, powers and spreads)."""
+    names = [field.name for field in fields(tables) if field.name != "names"]
+    map_arrays = {name: getattr(tables, name).astype(np.float32) for name in names}
+    io.write_tensors(file, map_arrays | network.to_tensors(networks), {})
     spreads = dict(zip(tables.names, tables.spreads.tolist(), strict=True))
     card = {"format": FORMAT, **about, "sureness": powers.to_card(), "spreads": spreads}
     io.write_json(file.with_suffix(".json"), card)
