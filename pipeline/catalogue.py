@@ -1,4 +1,4 @@
-"""The experiments that exist: the stage that runs each, and what each needs of a scene."""
+"""Catalogue of experiments: the stage that runs each experiment, and what the experiment requires of a scene."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -12,18 +12,19 @@ Kind = Literal["models", "curve", "analysis", "study", "report"]
 
 
 class Experiment(Strict):
-    """An experiment that scenes can run, and what it needs of a scene.
+    """An experiment that scenes can run, and what it requires of a scene.
 
-    kind: what its stage writes: `models` with cards; points of a `curve`; the results of an `analysis` (numbers, data
-    of its figures, losses of its captures); those of a `study` (numbers alone); or nothing, if it is part of the
-    `report`. Analyses and studies are modules of `pipeline.experiments`.
-    stage: the stage that runs it. key: the name of its results in numbers.json; an experiment that is renamed keeps it.
-    needs: experiments that the scene must run too.
-    protocol: the simulated protocol whose captures it reads; None: the main protocol.
-    folds: the keys of section `split` that its folds are drawn with; None: it has no folds of its own.
-    settings: whether the scene has a section of settings for it, with the stage's name.
-    recorded: whether a recorded scene may run it. alone: whether a scene may run only this experiment, because it
-    needs neither folds nor places in mm.
+    kind: what its stage writes. `models`: networks with cards. `curve`: the points of a curve. `analysis`: numbers,
+    figure data and capture losses. `study`: numbers only. `report`: nothing, because the report stage computes it.
+    Each analysis or study is a module of `pipeline.experiments`.
+    stage: the stage that runs it.
+    key: the name of its results in numbers.json; it stays the same if the experiment is renamed.
+    needs: other experiments that the scene must also run.
+    protocol: the simulated protocol whose captures it reads; None for the main protocol.
+    folds: the keys of section `split` that determine its folds; None if it has no folds of its own.
+    settings: whether the scene's file has a section for it, named after its stage.
+    recorded: whether a scene with recorded captures may run it.
+    alone: whether it may be the only experiment of a scene, because it needs neither folds nor places in mm.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Experiment(Strict):
 
 
 class ExperimentFile(Strict):
-    """`pipeline/experiments/<name>.yaml`: what it needs, its section of the report page, its rows of the checklist."""
+    """Content of `pipeline/experiments/<name>.yaml`: the experiment, its report section and its checklist rows."""
 
     experiment: dict[str, Any]  # fields of `Experiment`
     section: dict[str, Any] | None = None
@@ -48,12 +49,12 @@ class ExperimentFile(Strict):
 
 @cache
 def experiment_files() -> Mapping[str, ExperimentFile]:
-    """Read the YAML files of all experiments, by name."""
+    """Read the YAML files of all experiments; return their contents by experiment name."""
     return {file.stem: parse(ExperimentFile, read_yaml(file), str(file)) for file in sorted(FOLDER.glob("*.yaml"))}
 
 
 def read_experiments() -> list[Experiment]:
-    """Read what the experiments of `pipeline/experiments` need."""
+    """Read the catalogue entries of the experiments in `pipeline/experiments`."""
     return [
         parse(Experiment, {"name": name, "stage": name, "key": name} | file.experiment, f"{FOLDER / name}.yaml")
         for name, file in experiment_files().items()

@@ -20,20 +20,20 @@ from reskin.recordings import ReaderLayout
 if TYPE_CHECKING:
     from pipeline.scenes import Plan
 
-ROOT = Path()  # of the checkout
+ROOT = Path()  # the checkout, which is the working directory
 
 app = typer.Typer()
 scenes = typer.Typer(no_args_is_help=True, help="Choose which scenes `dvc repro` runs.")
 app.add_typer(scenes, name="scenes", rich_help_panel=PIPELINE)
 
 Layout = Literal["capture", "serial-binary", "serial-text", ReaderLayout]
-LAYOUT = "Its format: table for a CSV of your own, capture for a folder of `record`; the others: data/README.md."
+LAYOUT = "Format: table for your own CSV, capture for a folder written by `record`; for the others, see data/README.md."
 Board = Annotated[str, Option(help="Name of the circuit board.")]
 Marks = Annotated[
     list[str] | None,
     Option(
-        help="Layouts capture, serial-*: STREAM_S,PROBE_S, the time of one event in s on the stream's clock and on the "
-        "robot's; may be repeated."
+        help="Layouts capture, serial-*: STREAM_S,PROBE_S, the times of the same event in s, on the stream's clock and "
+        "on the robot's clock; may be repeated."
     ),
 ]
 
@@ -70,7 +70,7 @@ def add(
     mark: Marks = None,
     rows_late: Annotated[
         int | None,
-        Option(help="Layout ini: by how many rows the fields come after the labels. Default: detected.", min=0, max=5),
+        Option(help="Layout ini: rows by which the fields lag behind the labels. Default: detected.", min=0, max=5),
     ] = None,
     force_axis: Annotated[
         Literal["x", "y", "z"] | None, Option(help="Layout eflesh: direction of the force gauge. Default: z.")
@@ -96,26 +96,28 @@ def add(
         },
     )  # fmt: skip
     names, marks = preparing.CaptureNames(board, skin, name), preparing.parse_marks(mark or [])
-    running = read_plan(ROOT / PLAN).scenes
+    planned = read_plan(ROOT / PLAN).scenes
     with plan.scene_copy(ROOT, scene, like), preparing.suggesting_layout(recording, layout):
         if layout == "capture":
             prepared = preparing.native(recording, names, probe, marks)
         elif layout == "serial-binary" or layout == "serial-text":
-            usual: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
-            what = preparing.Dump(wire or usual, chips_n or 5, 400.0 if rate_hz is None else rate_hz, probe, marks)
-            prepared = preparing.dump(recording, names, what)
+            default_wire: Wire = "binary" if layout == "serial-binary" else "text-xyzt"
+            dump_options = preparing.Dump(
+                wire or default_wire, chips_n or 5, 400.0 if rate_hz is None else rate_hz, probe, marks
+            )
+            prepared = preparing.dump(recording, names, dump_options)
         else:
             options = {"force_axis": str(force_axis or "z")} if layout == "eflesh" else {}
             options |= {"rows_late": str(rows_late)} if layout == "ini" and rows_late is not None else {}
             prepared = preparing.foreign(recording, layout, names, options)
         header = adding.add(ROOT, scene, prepared, allow_copy=allow_copy)
     typer.echo(f"added {scene}/{header.capture} (board {board}, skin {skin}); next: dvc repro report@{scene}")
-    if scene not in running:
-        typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(running) or 'none'})")
+    if scene not in planned:
+        typer.echo(f"added scene {scene} to {PLAN} (already there: {', '.join(planned) or 'none'})")
 
 
 def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) -> None:
-    """Raise for an option that is given although only other layouts use it; `options` has values and layouts."""
+    """Raise if an option is given that the layout does not use; `options`: values, and the layouts that use them."""
     for option, (value, layouts) in options.items():
         if value not in (None, []) and layout not in layouts:
             used = " and ".join(sorted(layouts))
@@ -128,7 +130,7 @@ def fetch(
     origin: Annotated[
         str | None, Option("--from", help="Take the files from this git mirror or folder instead of the origin.")
     ] = None,
-    yes: Annotated[bool, Option("--yes", help="Agree, without being asked, to use data that has no licence.")] = False,
+    yes: Annotated[bool, Option("--yes", help="Do not ask before using data that has no licence.")] = False,
 ) -> None:
     """Fetch public recordings, verify them, and add them to their scene."""
     from pipeline.manage import fetch as fetching
@@ -161,7 +163,7 @@ def merge() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write to MLflow the training runs and reports that it lacks, after it was deleted or could not be reached."""
+    """Write missing training runs and reports to MLflow, for example after it was deleted or unreachable."""
     from pipeline.scenes import read_scene
     from pipeline.stages.report import read_curves
     from pipeline.tracking import publish as write
@@ -196,7 +198,7 @@ def verify_reports(
         list[str] | None, Argument(metavar="[SCENE]...", help="Default: all scenes that `dvc repro` runs.")
     ] = None,
     against: Annotated[
-        Path | None, Option(help="Do not run: compare the reports of an earlier rerun in this folder with the commit.")
+        Path | None, Option(help="Do not rerun: compare the commit with an earlier rerun's reports in this folder.")
     ] = None,
 ) -> None:
     """Rerun scenes in a fresh clone of the last commit; exit status 1 if any value of their reports differs."""
@@ -207,7 +209,7 @@ def verify_reports(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def check_cache() -> None:
-    """Verify the files in DVC's cache and move damaged ones aside; `dvc repro` then makes them again."""
+    """Verify the files in DVC's cache and move damaged ones aside; `dvc repro` then regenerates them."""
     from pipeline.manage import cache
 
     sys.exit(cache.check(ROOT, typer.echo))
@@ -215,7 +217,7 @@ def check_cache() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def readme(
-    check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if they are out of date.")] = False,
+    check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if a part is out of date.")] = False,
 ) -> None:
     """Write the generated parts of README.md and docs from the results in reports/."""
     from pipeline.report.readme import fill_pages
@@ -232,9 +234,9 @@ def list_scenes() -> None:
     """List all scenes; a star marks those that `dvc repro` runs."""
     from pipeline import plan
 
-    running = checked_plan().scenes
+    planned = checked_plan().scenes
     for name in plan.scene_names(ROOT):
-        typer.echo(f"{'*' if name in running else ' '} {name}")
+        typer.echo(f"{'*' if name in planned else ' '} {name}")
 
 
 @scenes.command()
@@ -256,16 +258,16 @@ def tidy() -> None:
 
     stale = tidying.tidy(ROOT, checked_plan())
     for stage, paths in stale.items():
-        typer.echo(f"removed {stage}: {', '.join(map(str, paths)) or 'no file of its own'}")
+        typer.echo(f"removed {stage}: {', '.join(map(str, paths)) or 'no files, because other stages use them'}")
     if not stale:
         typer.echo("nothing to remove")
 
 
 @scenes.command()
 def check() -> None:
-    """Check the scenes that run, params.yaml, and that pipeline/plan.yaml, the list of what runs, is up to date."""
+    """Check the planned scenes and params.yaml, and that pipeline/plan.yaml is up to date."""
     typer.echo(f"{PLAN} is up to date; scenes: {', '.join(checked_plan().scenes) or 'none'}")
 
 
-# Help shows the groups of commands in the order of their first commands.
-app.registered_commands.sort(key=lambda one: one.rich_help_panel == MAINTENANCE)
+# Help shows the groups of commands in the order of their first commands; maintenance comes last.
+app.registered_commands.sort(key=lambda command: command.rich_help_panel == MAINTENANCE)

@@ -1,8 +1,8 @@
-"""Run calls on a Dask cluster: a `concurrent.futures` executor for the address of a scheduler.
+"""A `concurrent.futures` executor that runs calls on the workers of a Dask scheduler.
 
 Workers must see the checkout under the same path (on the same machine, or on a shared file system), because results are
-files in it. Results are the same bits as those of a local run: a worker with other code, libraries or variables, or
-with more than one thread, is refused before work begins, or at its first call if it joins later.
+files in it. Results are bit-identical to those of a local run: a worker with different code, libraries or environment
+variables, or with more than one thread, is rejected before work begins, or at its first call if it joins later.
 """
 
 import os
@@ -22,8 +22,8 @@ from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
-CONNECT_MAX_s, WORKERS_MAX_s = 20.0, 60.0  # a worker that starts at the same time imports for seconds
-HOW = "docs/cluster.md says how workers are started."
+CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # a worker that starts at the same time needs seconds for its imports
+HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
 CODE = (".py", ".json", ".safetensors")  # sources and their tables; settings are sent with each call
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
@@ -36,27 +36,27 @@ def _version(library: str) -> str:
         return "none"
 
 
-# Computed at import: a worker that runs while a file is edited continues with the code in its memory.
+# Computed at import: if a file is edited while a worker runs, the worker still uses the code that it imported.
 IMPORTED = {"sources as imported": package_digest(*PACKAGES, suffixes=CODE)} | {
     name: _version(name) for name in LIBRARIES
 }
 
 
 class Cluster(Executor):
-    """Submit calls to a Dask scheduler; each runs in this process's working directory, in one thread of a worker."""
+    """Executor that submits calls to a Dask scheduler; they run in this process's working directory, one per worker."""
 
     def __init__(self, address: str, imports: str) -> None:
         self._own, self._address = describe_process(), address
         self._client = _connect(address)
         try:
             with suppress(TimeoutError):
-                self._client.wait_for_workers(1, timeout=WORKERS_MAX_s)
+                self._client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_s)
             _check_workers(self._client, address)
             self._client.run(import_on_worker, imports)
         except BaseException:
             self._client.close()
             raise
-        self._executor = self._client.get_executor(pure=False)  # calls write files, so none may be skipped
+        self._executor = self._client.get_executor(pure=False)  # every call must run, because calls write files
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run a call on one of the workers."""
@@ -67,7 +67,7 @@ class Cluster(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for submitted calls, or cancel them, and disconnect; the cluster goes on running."""
+        """Wait for submitted calls, or cancel them, and disconnect; the cluster keeps running."""
         self._executor.shutdown(wait=wait and not cancel_futures)
         self._client.close()
 
@@ -88,7 +88,7 @@ def import_on_worker(name: str) -> None:
 
 
 def describe_process() -> dict[str, str]:
-    """Return what determines the bits of a result: versions, sources as imported, and environment variables."""
+    """Return everything that determines the bits of a result: versions, imported sources, environment variables."""
     from reskin.numerics import DEVICE_VARIABLE, device
 
     return {
@@ -108,20 +108,20 @@ def _connect(address: str) -> Any:
         remedy = "Try: pip install -c constraints.txt -e '.[dask]'"
         raise ParamsError(f"RESKIN_EXECUTOR: package distributed is not installed. {remedy}") from None
     try:
-        return Client(address, timeout=CONNECT_MAX_s, set_as_default=False)
+        return Client(address, timeout=CONNECT_TIMEOUT_s, set_as_default=False)
     except (OSError, ValueError) as error:
-        what = f"the scheduler at {address} did not answer within {CONNECT_MAX_s:g} s ({str(error)[:80]})"
-        raise ParamsError(f"RESKIN_EXECUTOR: {what}. {HOW}") from None
+        what = f"the scheduler at {address} did not answer within {CONNECT_TIMEOUT_s:g} s ({str(error)[:80]})"
+        raise ParamsError(f"RESKIN_EXECUTOR: {what}. {HELP}") from None
 
 
 def _check_workers(client: Any, address: str) -> None:
-    """Raise if there is no worker, or if a worker would compute other bits than this process."""
+    """Raise if there is no worker, or if the results of a worker could differ from this process's."""
     workers: Mapping[str, Any] = client.scheduler_info(n_workers=-1)["workers"]
     if not workers:
-        raise ParamsError(f"RESKIN_EXECUTOR: the scheduler at {address} has no workers. {HOW}")
+        raise ParamsError(f"RESKIN_EXECUTOR: the scheduler at {address} has no workers. {HELP}")
     for name, worker in workers.items():
         if worker["nthreads"] != 1:
-            raise ParamsError("RESKIN_EXECUTOR", f"threads of worker {name}", "1", worker["nthreads"], HOW)
+            raise ParamsError("RESKIN_EXECUTOR", f"threads of worker {name}", "1", worker["nthreads"], HELP)
     own = describe_process()
     for name, theirs in client.run(describe_process).items():
         _compare(own, theirs, name)
@@ -131,14 +131,14 @@ def _compare(own: Mapping[str, str], theirs: Mapping[str, str], name: str) -> No
     for what, value in own.items():
         got = theirs.get(what, "nothing")  # missing if the worker imported an older version of this module
         if got != value:
-            raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Restart it. {HOW}")
+            raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Restart it. {HELP}")
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
-    """Copy the result or error of a Dask future to ours; raise the same error for a dead worker as locally."""
+    """Copy the outcome of a Dask future to `future`; a dead worker becomes `BrokenExecutor`, as in a local run."""
     from distributed import KilledWorker
 
-    if submitted.cancelled():  # by Dask, when it loses the scheduler; nobody waits for calls that we cancel
+    if submitted.cancelled():  # by Dask, because it lost the scheduler; no code waits for calls that we cancel
         remedy = "Finished training runs are cached: start the scheduler again, then repeat the command."
         future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))
         return

@@ -14,16 +14,16 @@ from reskin.board.faults import find_lsb
 from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
-FORCES_N = (0.5, 1.0, 2.0, 3.0)  # at which changes of field are compared
+FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which changes of field are compared
 NEAR = 0.2  # relative tolerance of these forces
-ENOUGH_N = 20  # fewest readings from which a number is computed
+ENOUGH_N = 20  # minimum number of readings for a statistic
 LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
-STEP_READINGS_N = 2000  # readings from which the chips' steps are found
+STEP_READINGS_N = 2000  # number of readings used to find the chips' resolution
 PRESSED_N = 0.5  # below this force, a weak chip shows mostly its noise
 
 
 def describe(readings: Readings) -> dict[str, float]:
-    """Describe one capture; quantities for which it has too few readings are absent."""
+    """Describe one capture; quantities with too few readings are omitted."""
     # A row with a force but no place is not a contact; a row with neither is an unlabelled contact.
     touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
     change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
@@ -45,14 +45,14 @@ def without_rest(described: Mapping[str, float]) -> dict[str, float]:
 
 
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
-    """Return the mean, sd, least and most value over skins of every quantity.
+    """Summarise every quantity over skins: mean, standard deviation, minimum and maximum.
 
     described: pairs of a skin and the description of one capture. The captures of a skin are averaged first.
     """
     rows = pd.DataFrame([numbers for _, numbers in described])
     skins = rows.groupby([skin for skin, _ in described], sort=False).mean()
     weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
-    if {weak, strong} <= set(skins):  # of skins, as each capture of a skin may have one force only
+    if {weak, strong} <= set(skins):  # computed per skin, because one capture may contain only one of these forces
         skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
     found = summarise(skins)
     return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
@@ -68,10 +68,10 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
 
 
 def _wander(readings: Readings) -> dict[str, float]:
-    """Return the rms difference of the field at rest between contacts separated by each lag, over channels and pairs.
+    """Return the rms difference between the fields at rest of two contacts, for each number of contacts between them.
 
-    The difference due to a random walk grows as the square root of the lag. The difference due to what a contact leaves
-    behind has its full size at lag 1, and repeats with the scan.
+    The difference due to a random walk grows as the square root of this lag. The difference due to the after-effects of
+    contacts has its full size at lag 1, and repeats with the scan.
     """
     _, first_i = np.unique(rank(readings.indentation), return_index=True)
     rest_uT = readings.noload_uT[first_i].astype(np.float64)
@@ -83,14 +83,15 @@ def _wander(readings: Readings) -> dict[str, float]:
 
 
 def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
-    # Nothing moves during one stop of an indentation, so deviations from the stop's mean are noise. Pooled over stops.
+    # Nothing moves during one stop of an indentation, so deviations from the stop's mean are noise.
+    # Its variance is pooled over all stops.
     stops = [part[touched] for part in (readings.indentation, readings.x_mm, readings.y_mm)]
     by_stop = pd.DataFrame(readings.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
-    freedom_n = int(touched.sum()) - by_stop.ngroups
-    if freedom_n < ENOUGH_N:
+    dof_n = int(touched.sum()) - by_stop.ngroups
+    if dof_n < ENOUGH_N:
         return {}
     left_uT = readings.b_uT[touched] - by_stop.transform("mean").to_numpy()
-    sd_uT = np.sqrt((left_uT**2).sum(axis=0) / freedom_n).reshape(-1, AXES_PER_CHIP_N)
+    sd_uT = np.sqrt((left_uT**2).sum(axis=0) / dof_n).reshape(-1, AXES_PER_CHIP_N)
     return {"noise_xy_uT": float(np.median(sd_uT[:, :2])), "noise_z_uT": float(np.median(sd_uT[:, 2]))}
 
 
@@ -103,7 +104,7 @@ def _steps(readings: Readings) -> dict[str, float]:
 def _rate(readings: Readings) -> dict[str, float]:
     """Return the rate of readings within one stop, if the capture has a clock."""
     between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
-    known_s = between_s[between_s > 0]  # leaves out NaN (no clock)
+    known_s = between_s[between_s > 0]  # also drops NaN (no clock)
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
 
 

@@ -1,7 +1,7 @@
-"""Executors: run calls in processes, in this process or on a cluster, as RESKIN_EXECUTOR says.
+"""Executors that run calls in worker processes, in this process or on a cluster; RESKIN_EXECUTOR selects one.
 
-This is an environment variable rather than a setting, because the hash of a training run must not depend on where it
-runs.
+RESKIN_EXECUTOR is an environment variable rather than a setting, because the hash of a training run must not depend on
+where it runs.
 """
 
 import multiprocessing
@@ -31,18 +31,18 @@ def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
 
         return Cluster(address, imports)
     workers_n = _workers_n(DEFAULT if tasks_n > 1 else HERE)
-    return ProcessPoolExecutor(workers_n, _context(imports), _end_with_parent) if workers_n else Here()
+    return ProcessPoolExecutor(workers_n, _context(imports), _end_with_parent) if workers_n else InProcessExecutor()
 
 
 def prepare_workers(imports: str) -> None:
-    """Start the process that workers are forked from, which imports a module while this process reads its data."""
+    """Start the fork server early, so that it imports a module while this process reads its data."""
     if not _scheduler_address() and _workers_n(DEFAULT):
         _context(imports)
         forkserver.ensure_running()
 
 
 def _workers_n(default: str) -> int:
-    """Return the number of processes of RESKIN_EXECUTOR; 0 means `here`."""
+    """Return the number of worker processes that RESKIN_EXECUTOR sets; 0 means `here`."""
     name = os.environ.get(VARIABLE, default)
     if name == HERE:
         return 0
@@ -68,12 +68,12 @@ def _context(imports: str) -> ForkServerContext:
 
 
 def end_workers() -> None:
-    """Stop the process that forks workers, so that their CPU time counts as that of this process's children."""
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # it would end only after this process
+    """Stop the fork server, so that the CPU time of workers counts as that of this process's children."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # otherwise it ends only after this process
 
 
-class Here(Executor):
-    """Run each call at once in this process: for a debugger, and for work shorter than a worker's imports."""
+class InProcessExecutor(Executor):
+    """Run each call immediately in this process, for debugging and for work that is shorter than a worker's imports."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Call a function, and return a finished future with its result or error."""
@@ -86,12 +86,12 @@ class Here(Executor):
 
 
 def _end_with_parent() -> None:
-    """End a worker when its stage is killed; otherwise it would keep running beside the next attempt."""
+    """Make a worker exit when its stage is killed; otherwise it would still run when the stage is started again."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
-    def wait() -> None:
+    def exit_with_parent() -> None:
         parent.join()
         os._exit(1)
 
-    threading.Thread(target=wait, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()

@@ -20,17 +20,17 @@ HEADER = """\
 # Which scenes run, and the items that each stage of dvc.yaml iterates over. Generated from pipeline/scenes and
 # data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
 """
-MANY_N = 30  # captures of a recorded scene; if there are more, one stage reads all (docs/growth.md)
-NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the probe; their experiment reads the raw capture
+MANY_N = 30  # if a recorded scene has more captures, one stage reads all of them (docs/growth.md)
+NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the probe; their experiments read raw captures
 
 
 def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
     """Derive the plan: the experiments of each scene, its recorded captures, and the items of every stage.
 
     Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures, one
-    for each protocol of a scene, and `ingest` over recorded captures. An experiment that has a protocol of its own in
-    simulated scenes, and that recorded scenes may run too (`drift`), iterates over scenes, each with its folder of
-    captures.
+    for each protocol of a scene, and `ingest` over recorded captures. An experiment that has its own protocol in
+    simulated scenes, but may also run in recorded scenes (`drift`), iterates over scenes and the folder of captures of
+    each scene.
     """
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
@@ -85,7 +85,7 @@ def scene_names(root: Path) -> list[str]:
     return sorted(file.stem for file in (root / SCENES).glob("*.yaml"))
 
 
-def scene_file(root: Path, name: str, *, remedy: str = "To make one: docs/add-a-scene.md.") -> Path:
+def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/add-a-scene.md.") -> Path:
     """Return the file of a scene; raise `ParamsError` if there is none."""
     known = scene_names(root)
     if name not in known:
@@ -96,7 +96,7 @@ def scene_file(root: Path, name: str, *, remedy: str = "To make one: docs/add-a-
 
 @contextmanager
 def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
-    """Write scene `name` as a copy of scene `like`, and remove it if the block fails; without `like`, do nothing.
+    """Create scene `name` as a copy of scene `like`, and delete it if the block fails; without `like`, do nothing.
 
     Comments are copied, except those above the first setting, which describe the other scene.
     """
@@ -108,7 +108,7 @@ def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
     original = scene_file(root, like)
     target = original.with_name(f"{name}.yaml")
     if target.exists():
-        remedy = "Leave out --like to add to it."
+        remedy = "Omit --like to add the recording to it."
         raise ParamsError(f"--like {like}: scene {name} exists already. {remedy}")
     lines = original.read_text(encoding="utf-8").splitlines(keepends=True)
     first_i = next(i for i, line in enumerate(lines) if not line.startswith("#"))
@@ -144,7 +144,7 @@ def _keep_outputs(root: Path) -> None:
     from dvc.exceptions import DvcException  # imported late: it takes a second
     from dvc.repo import Repo
 
-    with suppress(DvcException), Repo(str(root)) as repo:  # a DVC that cannot start deletes nothing
+    with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start, it deletes nothing either
         repo.state.links.clear()
 
 

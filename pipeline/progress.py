@@ -1,4 +1,4 @@
-"""Report the place of the running stage in `dvc repro`, such as `stage 5 of 39`."""
+"""Report the position of the running stage in `dvc repro`, such as `stage 5 of 39`."""
 
 import hashlib
 import os
@@ -12,8 +12,8 @@ VARIABLE = "DVC_STAGE"  # set by DVC for the command of a stage, such as `simula
 ORDER = Path(".reskin/order.json")
 
 
-def announce() -> str | None:
-    """Return the place of this stage among all stages; None if DVC does not run it."""
+def stage_position() -> str | None:
+    """Return the position of this stage among all stages; None if DVC does not run it."""
     stage = os.environ.get(VARIABLE, "").rpartition(":")[2]  # with several files, DVC puts `dvc.yaml:` before it
     if not stage:
         return None
@@ -21,7 +21,7 @@ def announce() -> str | None:
         order = stages_in_order()
         return f"stage {order.index(stage) + 1} of {len(order)}" if stage in order else None
     except Exception as error:  # a stage must not fail because of this line
-        return f"its place among all stages is unknown ({type(error).__name__} {error})"
+        return f"its position among all stages is unknown ({type(error).__name__} {error})"
 
 
 def stages_in_order() -> list[str]:
@@ -29,11 +29,11 @@ def stages_in_order() -> list[str]:
 
     The list is computed by DVC, and cached until `dvc.yaml` or the plan changes.
     """
-    made_of = hashlib.sha256(Path(FLOW).read_bytes() + Path(PLAN).read_bytes()).hexdigest()
+    inputs_sha256 = hashlib.sha256(Path(FLOW).read_bytes() + Path(PLAN).read_bytes()).hexdigest()
     file = home() / ORDER
     cached = io.read_json(file) if file.exists() else {}
-    if cached.get("made_of") != made_of:
-        cached = {"made_of": made_of, "stages": _ask_dvc()}
+    if cached.get("made_of") != inputs_sha256:
+        cached = {"made_of": inputs_sha256, "stages": _ask_dvc()}
         io.write_json(file, cached)
     return list(cached["stages"])
 

@@ -14,9 +14,9 @@ from reskin import io
 from reskin.code import ROOT, files_of, normalised
 from reskin.numerics import departures
 
-EXPERIMENTS = (".dvc", "tmp", "exps")  # folder of the copies of a checkout that DVC makes for experiments, and deletes
+EXPERIMENTS = (".dvc", "tmp", "exps")  # folder of DVC's temporary copies of a checkout, for `dvc exp`
 PACKAGES = (ROOT / "pipeline", ROOT / "reskin")
-NO_CODE = ("plan.yaml", "scenes")  # settings in the folders of the code
+NO_CODE = ("plan.yaml", "scenes")  # settings, although they are in the folders of the code
 COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # times of training and prediction on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
@@ -25,7 +25,7 @@ INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd"
 
 
 def home() -> Path:
-    """Return the checkout with the caches: the working directory, or the one around it if it is a copy by DVC."""
+    """Return the checkout that has the caches: the working directory, or its original if `dvc exp` made a copy."""
     here = Path.cwd()
     around = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
     return around[-1] if around else Path()
@@ -79,10 +79,10 @@ def machine() -> str:
 def processor_name(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
     """Return the processor's model, its instruction sets, and the settings that differ from those of `numerics`.
 
-    cpuinfo: content of Linux's /proc/cpuinfo. otherwise: name of a processor whose model is not there.
+    cpuinfo: content of Linux's /proc/cpuinfo. otherwise: the name to use if that has no model name.
     """
     lines = [line.partition(":") for line in cpuinfo.splitlines()]
-    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # the first processor's
+    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # of the first processor
     flags = set(values.get("flags", values.get("features", "")).split())
     model = values.get("model name") or otherwise or "unknown processor"
     plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())
@@ -108,7 +108,7 @@ def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float
     waited_s: how long the stage waited for them.
     """
     before = _read_trainings(folder, stage)
-    reused = {key for key, (_, again) in trained.items() if again} - set(before["computed_s"])
+    reused = {key for key, (_, was_reused) in trained.items() if was_reused} - set(before["computed_s"])
     io.write_json(
         _trainings_file(folder, stage),
         {
@@ -133,12 +133,12 @@ def record_cost(folder: Path, stage: str, seconds: float) -> None:
         folder / f"{stage}.json",
         {
             "seconds": round(seconds, 2),
-            # Parallel training runs take less time than their sum. The waiting time beyond what they took in this run
-            # counts here, such as imports of workers.
+            # The stage waits less than the sum of the times of training runs if these run in parallel. If it waits
+            # longer than this sum, the difference counts here, for example the workers' imports.
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,
             "reused_n": len(trained["reused"]),
-            "cpu_s": round(sum(usage.ru_utime + usage.ru_stime for usage in usages), 2),  # imports too
+            "cpu_s": round(sum(usage.ru_utime + usage.ru_stime for usage in usages), 2),  # includes imports
             "peak_process_memory_MB": round(max(usage.ru_maxrss for usage in usages) * unit / 1e6, 1),
         },
     )
@@ -154,7 +154,8 @@ def read_costs(folder: Path) -> dict[str, dict[str, Any]]:
 def total_cost_s(costs: Iterable[Mapping[str, Any]]) -> float:
     """Return the total cost of stages in seconds; a training run that two stages share counts once.
 
-    Times of training runs are added as if one ran after another; if two run in parallel, less time passes.
+    Times of training runs are added as if they ran one after another; the elapsed time is shorter if they run in
+    parallel.
     """
     stages = list(costs)
     trainings_s = {key: seconds for cost in stages for key, seconds in cost["trainings_s"].items()}

@@ -1,4 +1,4 @@
-"""MLflow's loader of trained networks: `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle is opened.
+"""Load a trained network with `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle file is read.
 
 The model takes changes of field in uT, one row per reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...), and returns
 x_mm, y_mm and force_N.
@@ -22,7 +22,7 @@ class NetworkModel:
         self.network = network
 
     def predict(self, model_input: pd.DataFrame) -> pd.DataFrame:
-        """Predict from changes of field in uT, [f ch]."""
+        """Predict places and forces from changes of field in uT, [f ch]."""
         db_uT: Float[np.ndarray, "f ch"] = np.atleast_2d(np.asarray(model_input, np.float32))
         return pd.DataFrame(self.network(db_uT), columns=list(COLUMNS))
 

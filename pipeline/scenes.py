@@ -1,4 +1,4 @@
-"""Scenes: validation of `pipeline/scenes/*.yaml` and `params.yaml`, and the experiments that each scene runs."""
+"""Validate scenes (`pipeline/scenes/*.yaml`), `params.yaml` and the plan; list the experiments that a scene runs."""
 
 from collections.abc import Iterable, Mapping, Set
 from pathlib import Path
@@ -17,7 +17,7 @@ from reskin.errors import ParamsError, did_you_mean
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Name, Recipe, Schedule
 from reskin.recordings.fault_policy import FaultPolicy
 
-MAIN_PROTOCOL = "grid"  # folds are drawn on its captures
+MAIN_PROTOCOL = "grid"  # protocol of the captures on which folds are drawn
 # The rows of table 2 and their experiments. A scene that runs all of these gets the table before its report.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
@@ -32,7 +32,7 @@ def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
     return list(dict.fromkeys(one.stage for one in EXPERIMENTS.values() if one.name in chosen and one.kind in kinds))
 
 
-SharedRow = dict[str, Any]  # without `steps_n`, which a scene adds
+SharedRow = dict[str, Any]  # a row without `steps_n`, which each scene sets
 SHARED_ROWS: dict[str, type[Schedule]] = {
     "recipes": Recipe,
     "adaptations": AdaptationRecipe,
@@ -41,8 +41,8 @@ SHARED_ROWS: dict[str, type[Schedule]] = {
 Source = Literal["simulated", "recorded"]
 
 
-class OnBoards(Strict, extra="allow"):
-    """The settings of a protocol that the plan needs: its kind, its kind of boards, and its terms of physics."""
+class ProtocolSummary(Strict, extra="allow"):
+    """The settings of a protocol that the plan needs: its kind, its boards, and its physics terms."""
 
     kind: str
     boards: str
@@ -50,14 +50,14 @@ class OnBoards(Strict, extra="allow"):
 
 
 class Simulation(Strict):
-    """Section `simulate`. `pipeline.simulation` checks the rest: only stages that import it depend on the physics."""
+    """What the plan needs of section `simulate`; `pipeline.simulation`, which imports the physics, checks the rest."""
 
     boards: dict[str, dict[str, Any]]
-    protocols: Annotated[dict[str, OnBoards], Field(min_length=1)]
+    protocols: Annotated[dict[str, ProtocolSummary], Field(min_length=1)]
 
 
 class Scene(Strict, extra="allow"):
-    """One named set-up: its captures or how to simulate them, its experiments, and their sections of settings."""
+    """A scene: recorded or simulated captures, the experiments to run on them, and the settings of each experiment."""
 
     source: Source
     seed: Seed
@@ -67,22 +67,22 @@ class Scene(Strict, extra="allow"):
     simulate: Simulation | None = None
 
     @property
-    def rows(self) -> list[Experiment]:
-        """The catalogue's entries of its experiments, in the order of the scene's file."""
+    def entries(self) -> list[Experiment]:
+        """The catalogue entries of the scene's experiments, in the order of its file."""
         return [EXPERIMENTS[name] for name in self.experiments]
 
     @property
     def analyses(self) -> tuple[str, ...]:
-        return tuple(one.name for one in self.rows if one.kind == "analysis")
+        return tuple(one.name for one in self.entries if one.kind == "analysis")
 
     @property
     def studies(self) -> tuple[str, ...]:
-        return tuple(one.name for one in self.rows if one.kind == "study")
+        return tuple(one.name for one in self.entries if one.kind == "study")
 
     @property
     def with_folds(self) -> tuple[str, ...]:
         """The experiments that have folds of their own."""
-        return tuple(one.name for one in self.rows if one.folds is not None)
+        return tuple(one.name for one in self.entries if one.folds is not None)
 
     @property
     def model_stages(self) -> list[str]:
@@ -91,14 +91,14 @@ class Scene(Strict, extra="allow"):
 
     @property
     def curves(self) -> dict[str, str]:
-        """The experiments whose results are points of a curve, and their stages."""
+        """The stage of each experiment whose results are points of a curve."""
         of_curves = (one for one in EXPERIMENTS.values() if one.kind == "curve")
         return {one.name: one.stage for one in of_curves if one.name in self.experiments}
 
     @property
     def protocols(self) -> set[str]:
         """The protocols that a simulated scene needs for its experiments."""
-        return {MAIN_PROTOCOL} | {one.protocol for one in self.rows if one.protocol is not None}
+        return {MAIN_PROTOCOL} | {one.protocol for one in self.entries if one.protocol is not None}
 
     @property
     def described(self) -> str:
@@ -106,23 +106,25 @@ class Scene(Strict, extra="allow"):
         return "recorded" if self.source == "recorded" else MAIN_PROTOCOL
 
     def runs(self, unit: str) -> bool:
-        """Return whether the scene runs a stage (`drift`), or a stage for one protocol (`simulate-wear`)."""
+        """Return whether the scene runs a stage (`drift`), or the part of a stage for a protocol (`simulate-wear`)."""
         stage, _, part = unit.partition("-")
         if stage in {one.stage for one in EXPERIMENTS.values() if one.kind != "report"}:
-            return stage in {one.stage for one in self.rows}
+            return stage in {one.stage for one in self.entries}
         return not part or self.source == "recorded" or part in self.protocols
 
     @model_validator(mode="after")
     def _check_sections(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
             raise ValueError("a scene has a section simulate if and only if its source is simulated")
-        for one in self.rows:
+        for one in self.entries:
             if missing := set(one.needs) - set(self.experiments):
                 raise ValueError(f"experiment {one.name} needs {', '.join(sorted(missing))} in the same scene")
-        split_keys = {key for one in self.rows for key in one.folds or ()}
+        split_keys = {key for one in self.entries for key in one.folds or ()}
         split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()  # adaptation draws pokes from a pool
         wrong = [
-            *_differences("the scene", set(self.model_extra or ()), {one.stage for one in self.rows if one.settings}),
+            *_differences(
+                "the scene", set(self.model_extra or ()), {one.stage for one in self.entries if one.settings}
+            ),
             *_differences("split", self.split.model_fields_set, split_keys),
             *(_differences("simulate.protocols", {*self.simulate.protocols}, self.protocols) if self.simulate else ()),
         ]
@@ -132,12 +134,12 @@ class Scene(Strict, extra="allow"):
 
     @model_validator(mode="after")
     def _check_source(self) -> "Scene":
-        if not self.with_folds and not any(one.alone for one in self.rows):
+        if not self.with_folds and not any(one.alone for one in self.entries):
             sufficient = sorted(one.name for one in EXPERIMENTS.values() if one.folds is not None or one.alone)
             raise ValueError(f"experiments must include at least one of {', '.join(sufficient)}")
-        beyond = sorted(one.name for one in self.rows if not one.recorded)
-        if self.simulate is None and beyond:
-            raise ValueError(f"only a simulated scene can run experiments {', '.join(beyond)}")
+        only_simulated = sorted(one.name for one in self.entries if not one.recorded)
+        if self.simulate is None and only_simulated:
+            raise ValueError(f"only a simulated scene can run experiments {', '.join(only_simulated)}")
         return self
 
 
@@ -148,7 +150,7 @@ def _differences(place: str, have: Set[str], want: Set[str]) -> list[str]:
 
 
 class Shared(Strict):
-    """`params.yaml`: what scenes share, by name."""
+    """Content of `params.yaml`: settings that scenes share, in named rows."""
 
     lost_fraction_max: Annotated[float, Field(ge=0, le=1)]
     faults: FaultPolicy
@@ -159,7 +161,7 @@ class Shared(Strict):
 
 
 class Plan(Strict):
-    """`pipeline/plan.yaml`: experiments of the scenes that run, their recorded captures, the items of each stage."""
+    """Content of `pipeline/plan.yaml`: experiments of the planned scenes, recorded captures, items of each stage."""
 
     scenes: dict[str, tuple[str, ...]]
     captures: dict[str, tuple[str, ...]]
@@ -175,9 +177,9 @@ def read_scene(root: Path, name: str) -> Scene:
 
 
 def check_scene(settings: Settings) -> Scene:
-    """Check a scene, and each section by the model that its stage takes."""
+    """Check a scene, and each section with the settings model of its stage."""
     scene = parse_scene(settings.of_scene, settings.where)
-    for stage in dict.fromkeys(["split", *(one.stage for one in scene.rows if one.kind != "report")]):
+    for stage in dict.fromkeys(["split", *(one.stage for one in scene.entries if one.kind != "report")]):
         if model := section_of(getattr(module_of(stage), stage)):
             settings.section(model, stage)
     if scene.simulate is not None:

@@ -30,7 +30,7 @@ class Seeded(Strict):
 
 
 class SectionWithRows(Strict):
-    """Base of sections that name rows of `params.yaml`, such as a recipe."""
+    """Base class of sections that refer to rows of `params.yaml` by name, such as a recipe."""
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
@@ -41,7 +41,8 @@ class SectionWithRows(Strict):
 class Training(SectionWithRows):
     """Recipes by name, each trained on every fold with `seeds_n` seeds; `paper` is the headline recipe.
 
-    The scene's file gives the name of a shared `recipe`, `steps_n`, and for each variant the values that differ.
+    The scene's file sets `recipe` (the name of a shared recipe), `steps_n`, and for each variant the values that
+    differ.
     """
 
     recipes: dict[Name, Recipe | AugmentedRecipe]
@@ -53,7 +54,7 @@ class Training(SectionWithRows):
 
 
 class SectionWithTraining(SectionWithRows):
-    """Base of sections that contain a subsection `training`."""
+    """Base class of sections that contain a subsection `training`."""
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
@@ -64,8 +65,8 @@ class SectionWithTraining(SectionWithRows):
 class Adaptations(SectionWithRows):
     """Adaptations by name, each with `pokes_n` unlabelled indentations of every held-out skin.
 
-    The scene's file gives the name of a shared `adaptation`, its `base` (a recipe of section train_triplet), `steps_n`
-    and the variants.
+    The scene's file sets `adaptation` (the name of a shared adaptation), `base` (a recipe of section train_triplet),
+    `steps_n` and the variants.
     """
 
     pokes_n: Count
@@ -125,7 +126,7 @@ class Settings:
         return cast(Section, self.parsed[model, name])
 
     def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
-        """Remove a key from a section and return the row of a shared section that it names, such as a recipe.
+        """Remove a key from a section and return the shared row that its value names, such as a recipe.
 
         Raises `ParamsError`, which names `where` and the key, if the key or the row is missing.
         """
@@ -145,13 +146,13 @@ class Settings:
     def captures_in(self, indentations: Path) -> list[str]:
         """Return the names of the captures in a folder of readings.
 
-        Those of a recorded scene come from the registry, so that a file left by a removed capture is not read.
+        For a recorded scene, the names come from the registry, so that a file left by a removed capture is not read.
         """
         return sorted(self.captures) or sorted(file.stem for file in indentations.glob("*.parquet"))
 
 
 def section_of(stage: Callable[..., None]) -> type[Strict] | None:
-    """Return the model of the section that the function of a stage takes as `section`; None if it takes none."""
+    """Return the settings model of a stage function's parameter `section`; None if it has no such parameter."""
     parameter = inspect.signature(stage).parameters.get("section")
     return None if parameter is None else parameter.annotation
 
@@ -184,7 +185,7 @@ def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}
     variants = take(section, "variants", where)
     if "recipes" in section:
-        raise ParamsError(f"{where}: unknown key recipes. Remove it: recipes are made of recipe, steps_n and variants.")
+        raise ParamsError(f"{where}: unknown key recipes. Remove it: recipes result from recipe, steps_n and variants.")
     if not isinstance(variants, dict) or not all(isinstance(own, dict) for own in variants.values()):
         rule = "a mapping of names to the settings that a variant changes, {} for none"
         raise ParamsError(f"{where}.variants", "the variants", rule, variants, "Correct it there.")

@@ -1,4 +1,4 @@
-"""Simulation settings of a scene, checked against what its experiments read."""
+"""Read a scene's simulation settings, and check that its experiments can use them."""
 
 from pipeline.settings import Settings
 from reskin.data.grid import SKIN_MM
@@ -11,7 +11,7 @@ KINDS = {
     "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter", "glass": "load",
     "grip": "load", "press": "press", "log": "walk",
 }  # fmt: skip
-# Compared with the boards of the main protocol, or read by networks of these.
+# Protocols that are compared with the main boards, or whose captures are given to networks trained on these.
 ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "grip", "press", "log")
 ON_OTHER_BOARDS = ("flexible",)
 OF_ONE_SKIN = ("wear", "glass", "press", "log")  # their experiments read one capture
@@ -26,7 +26,7 @@ def simulation_settings(settings: Settings) -> SimulationSettings:
 
 
 def check_protocols(simulation: SimulationSettings, where: str) -> None:
-    """Raise ParamsError, which names `where`, if an experiment cannot read one of the protocols."""
+    """Raise `ParamsError` if an experiment cannot use one of the protocols; the error names `where`."""
     main = simulation.main.boards
     if simulation.main_boards.skin_mm != SKIN_MM:  # studies of the physics assume the authors' skin
         rule = f"skin_mm of the boards of protocol {MAIN} must be {list(SKIN_MM)}"

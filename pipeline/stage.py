@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from pipeline.executors import end_workers
-from pipeline.progress import announce
+from pipeline.progress import stage_position
 from pipeline.provenance import COSTS, clear_cost, record_cost
 from pipeline.settings import read_settings, section_of
 from reskin.errors import ReskinError, explaining
@@ -25,8 +25,8 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
     options = vars(parser.parse_args(arguments))
     scene = options.pop("scene")
-    if place := announce():
-        say(f"{stage}: {place}")
+    if position := stage_position():
+        say(f"{stage}: {position}")
     start_s, costs, unit = time.monotonic(), COSTS / scene, _unit(stage, scene, options)
     try:
         with explaining(stage):
@@ -44,7 +44,7 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
-    """Return the name under which the cost is recorded: the stage, and the capture or protocol if it runs for each."""
+    """Return the name under which the cost is recorded: the stage, and the capture or protocol if it runs per item."""
     if stage == "ingest":
         return f"{stage}-{options['indentations'].stem}"
     if stage in ("simulate", "ingest_simulated"):

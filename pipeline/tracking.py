@@ -1,6 +1,6 @@
-"""Write finished training runs and reports from their files to MLflow, which is possible at any later time.
+"""Write training runs and reports to MLflow, from the files that finished stages wrote.
 
-No result is computed from MLflow, and a server that does not answer delays a stage only briefly.
+No result depends on MLflow. A server that does not respond delays a stage only briefly.
 """
 
 import hashlib
@@ -31,9 +31,9 @@ PARENT = "mlflow.parentRunId"
 LAYOUT = 2  # version of what an MLflow run contains; runs of an older version are written again
 METRICS_MAX_N = 1000  # in one call to MLflow
 TIMEOUT_S = 2.0
-LOCK_TIMEOUT_S = 5.0  # reading by a UI, or writing of a run by another process, takes much less
-PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # limit on all writing; a local server takes 0.1 s per run
-NOT_METRICS = {"provenance", "runtime", "described", "variants"}  # costs, and what other runs have
+LOCK_TIMEOUT_S = 5.0  # UIs and other writers lock the store for a much shorter time
+PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for all writing; a local server takes 0.1 s per run
+NOT_METRICS = {"provenance", "runtime", "described", "variants"}  # costs, and values that other MLflow runs contain
 
 # A point of a sweep or an experiment: the name of its curve, its step (pokes, skins or contacts), and means by name.
 Point = tuple[str, int, Mapping[str, float]]
@@ -91,9 +91,9 @@ def _probe_sqlite(file: str) -> None:
 def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene: str, root: Path) -> dict[str, int]:
     """Write every training run and the report of a scene to MLflow, each once.
 
-    A sweep or an experiment is one MLflow run, its metrics by step: hundreds of child runs would hide the others.
-    Tag `current` marks the runs of the present results. Restored results that were written before are tagged again but
-    not written again.
+    A sweep or an experiment is one MLflow run with metrics by step, because hundreds of child runs would hide others.
+    Tag `current` marks the runs of the current results. Restored results that are already in MLflow are tagged again
+    but not written again.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
     trainings_n = sum(map(len, cards.values()))
     with _client(uri) as client:
         publisher = Publisher(client, scene, root, runs_n=trainings_n)
-        new_n = sum(publisher.write_trainings(stage, of_stage) for stage, of_stage in cards.items())
+        new_n = sum(publisher.write_trainings(stage, stage_cards) for stage, stage_cards in cards.items())
         for stage, points in curves.items():
             publisher.write_curve(stage, points)
         publisher.write_report(reports)
@@ -135,7 +135,7 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
 class Publisher:
     """Writes the MLflow runs of one scene, each once, and remembers the keys of the current ones.
 
-    The tag `run_key` is a digest of a run's content, by which the run is found again.
+    The tag `run_key` is a digest of a run's content, and identifies the run.
     """
 
     def __init__(self, client: Any, scene: str, root: Path, *, runs_n: int) -> None:
@@ -155,7 +155,7 @@ class Publisher:
     def open_run(
         self, stage: str, key: str, *, name: str = "", parent: str = "", tags: Mapping[str, str] = MappingProxyType({})
     ) -> tuple[str, bool]:
-        """Find or create the run with this key; return its id, and whether it is still to be written.
+        """Find or create the run with this key; return its id, and whether its content must still be written.
 
         A run that a killed process left unfinished is replaced.
         """
@@ -176,7 +176,7 @@ class Publisher:
         return str(run.info.run_id), True
 
     def set_tags(self, run: Any, tags: Mapping[str, str]) -> None:
-        """Set those tags of a run whose values differ."""
+        """Set the tags of a run whose values have changed."""
         for name, value in tags.items():
             if run.data.tags.get(name) != value:
                 self.client.set_tag(run.info.run_id, name, value)
@@ -264,7 +264,7 @@ class Publisher:
             if unwritten:
                 self.log(run_id, metrics)
             self.client.set_tag(run_id, "inputs", inputs)
-            self.client.log_artifacts(run_id, str(reports))  # always: text on the page and costs may be new
+            self.client.log_artifacts(run_id, str(reports))  # always: page texts and costs may have changed
             self.client.set_terminated(run_id)
 
     def mark_superseded(self) -> int:
@@ -301,7 +301,7 @@ def _client(uri: str) -> Iterator[Any]:
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     import logging
 
-    # Errors are raised as one sentence, which MLflow's own log of the traceback would hide.
+    # Errors are raised as one sentence. MLflow would also log a traceback, which would hide that sentence.
     levels = {"alembic": "WARNING", "mlflow": "WARNING", "mlflow.store.db.utils": "CRITICAL"}
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
@@ -354,8 +354,8 @@ def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
 
     Other lists, texts, costs and the content of training runs are left out.
     """
-    shown = {name: value for name, value in numbers.items() if name not in NOT_METRICS}
-    return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(shown, "", 0)]
+    published = {name: value for name, value in numbers.items() if name not in NOT_METRICS}
+    return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(published, "", 0)]
 
 
 def _flatten(value: Any, name: str, step: int) -> Iterator[tuple[str, float, int]]:

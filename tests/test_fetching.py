@@ -120,11 +120,11 @@ def test_recordings_are_fetched_and_added_once(root, example):
     assert "next: dvc repro" in output
     before = contents(root)
     output = fetch(root)
-    assert "there already and unchanged" in output
+    assert "already present and unchanged" in output
     assert "small/board1_skin-board1_board1: added already" in output
     assert contents(root) == before
     plan.use(root, [])
-    assert "scene small is switched off; now: reskin scenes use small; dvc repro" in fetch(root)
+    assert "scene small is not in the plan; to run it: reskin scenes use small; dvc repro" in fetch(root)
 
 
 def test_interrupted_add_continues(root, monkeypatch):
@@ -196,7 +196,7 @@ def test_changed_file_is_fetched_again(root, example):
 @pytest.mark.usefixtures("without_adding")
 def test_unlicensed_data_need_consent(root, example):
     write_source(root, source_of(example.files, example.url, example.commit, licence=None))
-    assert_refused(root, "use without a licence was not agreed to. Nothing was fetched.*--yes")
+    assert_refused(root, "the use of files without a licence was not confirmed. Nothing was fetched.*--yes")
     output = fetch(root, consent=True)
     assert "rig: 2 files, 0.0 MB; licence: none (use it here, do not pass it on)" in output
     assert f"home: {example.url}, commit {example.commit}" in output

@@ -28,7 +28,7 @@ def checkout(tmp_path, monkeypatch) -> Path:
 def test_stage_prints_its_position(checkout, monkeypatch, stage, line):
     monkeypatch.setattr(progress, "_ask_dvc", lambda: ORDER)
     monkeypatch.setenv(progress.VARIABLE, stage)
-    assert progress.announce() == line
+    assert progress.stage_position() == line
 
 
 def test_order_is_read_again_when_the_plan_changes(checkout, monkeypatch):
@@ -42,12 +42,12 @@ def test_order_is_read_again_when_the_plan_changes(checkout, monkeypatch):
 def test_unknown_position_is_printed_as_unknown(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv(progress.VARIABLE, "split@tiny")
-    assert "unknown (FileNotFoundError" in progress.announce()
+    assert "unknown (FileNotFoundError" in progress.stage_position()
 
 
 def test_stage_outside_dvc_prints_nothing(monkeypatch):
     monkeypatch.delenv(progress.VARIABLE, raising=False)
-    assert progress.announce() is None
+    assert progress.stage_position() is None
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries

@@ -13,7 +13,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int, Int64, Shaped
 from pydantic import Field
 
-from pipeline.executors import Here
+from pipeline.executors import InProcessExecutor
 from pipeline.experiments.results import read_captures, read_losses, write_results
 from pipeline.report.drawing import COLOURS, drawing, svg
 from pipeline.report.formatting import COLUMNS, scores, show, tabulate
@@ -138,7 +138,7 @@ def predict_by_neighbours(
         for inputs in ("raw", "shape")
     ]  # fmt: skip
     rows = TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin)
-    done = run_classical_jobs(tasks, rows, Here(), lambda line: say(f"{data.scene} sleeve: {line}"))
+    done = run_classical_jobs(tasks, rows, InProcessExecutor(), lambda line: say(f"{data.scene} sleeve: {line}"))
     return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
 
 

@@ -25,14 +25,14 @@ from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
-COMPARED_N = 3  # the places of a new capture are compared with those of so many last captures of the scene
+COMPARED_N = 3  # number of latest captures of the scene whose places are compared with a new capture's
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
-    """Check a prepared recording, write it, track it with DVC, register it, and plan its scene; undo all on failure."""
+    """Check and write a prepared recording, track it with DVC, register it and plan its scene; undo all on failure."""
     require_idle(root)
     header, files = prepared
-    settings = read_scene(root, plan.scene_file(root, scene, remedy="To create it, give --like ini too.").stem)
+    settings = read_scene(root, plan.scene_file(root, scene, remedy="To create it, add --like ini.").stem)
     if settings.source != header.source:
         remedy = "Choose a scene of the same source"
         if header.source == "recorded":
@@ -69,15 +69,17 @@ def remove(root: Path, scene: str, capture: str) -> None:
 
 def _check_free(target: Path, registered: bool) -> None:
     if registered:
-        remedy = "Is it the same recording? Then nothing is left to do. If not, choose another --name."
+        remedy = "Is it the same recording? Then nothing remains to be done. If not, choose another --name."
         raise ParamsError(f"the name {target.name} is taken in this scene. {remedy}")
     if target.exists():
-        remedy = "It is in no scene: `reskin add` was killed there. Delete the folder, or choose another --name."
+        remedy = (
+            "No scene contains it: an earlier `reskin add` was killed. Delete the folder, or choose another --name."
+        )
         raise ParamsError(f"{target}: the folder exists already. {remedy}")
 
 
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
-    """Read a capture as ingestion will; return hashes that a copy shares, whatever its names and layout are."""
+    """Read a whole capture as ingestion does; return hashes that are equal for copies with other names or layouts."""
     _, blocks, account = open_capture(folder, policy)
     rows_n, readings = 0, hashlib.sha256()
     for block in blocks:
@@ -85,7 +87,7 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
         readings.update(block.b_uT.tobytes())
     check_losses(account, limit, folder.name)
     if rows_n == 0:
-        raise CaptureError(f"{folder.name}: no reading is left; counted {dict(account)}. Check its files.")
+        raise CaptureError(f"{folder.name}: no readings are left; counts: {dict(account)}. Check its files.")
     faults = [f"{key.removeprefix('fault_')} {n}" for key, n in account.items() if key.startswith("fault_")]
     if faults:
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
@@ -93,10 +95,10 @@ def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolic
 
 
 def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], policy: FaultPolicy) -> None:
-    """Warn if chips, labels or skin of a capture seem oriented otherwise than its scene's section `compare` says."""
+    """Warn if the orientation of chips, labels or skin seems to differ from section `compare` of the scene."""
     from pipeline.experiments.compare import (
         Compare,
-        find_departure,  # late: the physics takes seconds
+        find_departure,  # imported late: the physics takes seconds
     )
     from reskin.physics.skin import SkinDesign
 
@@ -111,17 +113,17 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
 
 
 def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:
-    """Warn if places seem rotated, mirrored or with x and y exchanged, compared with the scene's other captures."""
-    found = []
+    """Warn if places seem rotated, mirrored, or with x and y swapped, compared with the scene's other captures."""
+    orientations = []
     own = presses_of(open_capture(folder, policy)[1])
     for other in others[-COMPARED_N:]:
         if (folder.parent / other).is_dir():
-            found.append(other_orientation(own, presses_of(open_capture(folder.parent / other, policy)[1])))
-    usual = max(set(found), key=found.count, default=None)
-    if usual is not None:
+            orientations.append(other_orientation(own, presses_of(open_capture(folder.parent / other, policy)[1])))
+    most_common = max(set(orientations), key=orientations.count, default=None)
+    if most_common is not None:
         say(
-            f"warning: capture {folder.name}: its places agree with those of the scene's other captures only {usual}. "
-            "Are columns exchanged, or was the board turned? It was added anyway."
+            f"warning: capture {folder.name}: its places agree with those of the scene's other captures only "
+            f"{most_common}. Are columns swapped, or was the board rotated? It was added anyway."
         )
 
 
@@ -166,7 +168,7 @@ def _track(folder: Path, root: Path) -> None:
 
     try:
         with Repo(str(root)) as repo:
-            repo.scm_context.quiet = True  # else DVC says how to stage files with git
+            repo.scm_context.quiet = True  # otherwise DVC prints how to stage files with git
             repo.add([str(folder)])
     except (DvcException, OSError) as error:
         reason = " ".join(str(error).split())[-300:]

@@ -20,8 +20,8 @@ from reskin.errors import SchemaError
 
 DAMAGED = ".reskin/damaged"  # the folder of objects that were set aside
 FOLDER = ".dir"  # suffix of an object that lists the files of a folder
-OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other files were being written when DVC was killed
-READ_ONLY = 0o444  # as DVC keeps objects
+OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other files are remains of a killed DVC process
+READ_ONLY = 0o444  # the permissions that DVC gives objects
 
 
 class Use(NamedTuple):
@@ -32,7 +32,7 @@ class Use(NamedTuple):
 
 
 def check(root: Path, echo: Callable[[str], None]) -> int:
-    """Compare every object with its name; set damaged ones and their copies aside; return 1 if there is any, else 0."""
+    """Check the MD5 of every object; set damaged ones aside and remove their copies; return 1 if any is damaged."""
     require_idle(root)
     cache = _cache_of(root)
     files = (file for file in sorted(cache.glob("[0-9a-f][0-9a-f]/*")) if OBJECT.fullmatch(file.name))
@@ -40,15 +40,15 @@ def check(root: Path, echo: Callable[[str], None]) -> int:
     damaged = {name: file for name, file in objects.items() if _md5(file) != name.removesuffix(FOLDER)}
     uses = _uses(root, objects) if damaged else {}
     for name, file in damaged.items():
-        cure = _set_aside(root, name, file, uses.get(name, []))
-        echo(f"error: {file} is damaged: its MD5 is not its name. {cure}")
+        outcome = _set_aside(root, name, file, uses.get(name, []))
+        echo(f"error: {file} is damaged: its MD5 is not its name. {outcome}")
     echo(f"DVC's cache: {len(objects)} objects, {len(damaged)} of them damaged")
     return 1 if damaged else 0
 
 
 def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
-    """Move an object away; restore it from an intact output, else remove its copies, so that their stages run again."""
-    changed, aside = _md5(file), root / DAMAGED / name
+    """Move an object away; restore it from an intact output, or remove its copies so that their stages run again."""
+    damaged_md5, aside = _md5(file), root / DAMAGED / name
     outputs = [(use.path, _md5(use.path)) for use in uses if use.path.is_file()]
     aside.parent.mkdir(parents=True, exist_ok=True)
     shutil.move(file, aside)  # not deleted: there may be no other copy of a recording
@@ -58,7 +58,7 @@ def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
                 shutil.copyfile(path, temporary)
                 temporary.chmod(READ_ONLY)
             return f"It was restored from {path}."
-    copies = [path for path, digest in outputs if digest == changed]
+    copies = [path for path, digest in outputs if digest == damaged_md5]
     for path in copies:
         io.remove(path)
     if not uses:
@@ -69,17 +69,17 @@ def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
 
 def _uses(root: Path, objects: Mapping[str, Path]) -> dict[str, list[Use]]:
     """List the outputs that contain each object, by the object's name, including files of folders."""
-    found: dict[str, list[Use]] = defaultdict(list)
+    uses: dict[str, list[Use]] = defaultdict(list)
     for command, path, name in _outputs(root):
-        found[name].append(Use(command, path))
+        uses[name].append(Use(command, path))
         if name.endswith(FOLDER) and name in objects:
             try:
                 listed: list[dict[str, Any]] = io.read_json(objects[name])
             except SchemaError:  # the list is damaged too, and reported as such
                 continue
             for entry in listed:
-                found[entry["md5"]].append(Use(command, path / entry["relpath"]))
-    return found
+                uses[entry["md5"]].append(Use(command, path / entry["relpath"]))
+    return uses
 
 
 def _outputs(root: Path) -> Iterator[tuple[str, Path, str]]:

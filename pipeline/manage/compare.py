@@ -19,8 +19,8 @@ from pipeline import plan
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
-LABEL_N = 3  # a row is named by at most so many of its leading texts and counts
-LISTED_N = 10  # largest differences that are listed
+LABEL_N = 3  # maximum number of leading texts and counts that name a row
+LISTED_N = 10  # number of largest differences to list
 # Verdicts that cells begin with; the first three are from results before 2026-11.
 VERDICT = re.compile(
     r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|not judged \([^)]*\))(?![\w ])"
@@ -28,7 +28,7 @@ VERDICT = re.compile(
 MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance: possible causes of a difference
 EXPECTED = (
     "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
-    "processor with AVX2; a GPU or other versions may differ. If none of these explains it, please report it."
+    "processor with AVX2; a GPU or other versions may differ. If none of these explains a difference, please report it."
 )
 MISSING: Any = object()  # in place of a value that one of the two runs does not have
 
@@ -54,7 +54,7 @@ class Difference:
 
     @property
     def verdicts(self) -> tuple[str, str] | None:
-        """The verdicts that two texts begin with; None if they are equal or one text has none."""
+        """The verdicts that two texts begin with; None if these are equal, or if a text begins with none."""
         old, new = (VERDICT.match(value) if isinstance(value, str) else None for value in (self.committed, self.fresh))
         return (old[1], new[1]) if old and new and old[1] != new[1] else None
 
@@ -132,9 +132,9 @@ def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Label the rows of two lists by their leading values, so that an additional row shifts no other.
+    """Label the rows of two lists by their leading values, so that an additional row does not shift the others.
 
-    If the labels differ and the lists are equally long, rows are paired by position.
+    If the labels differ but the lists are equally long, rows are paired by position.
     """
     before, after = _labels(old), _labels(new)
     if set(before) != set(after) and len(before) == len(after):
@@ -143,7 +143,7 @@ def _label_rows(old: Sequence[Any], new: Sequence[Any]) -> tuple[dict[str, Any],
 
 
 def _labels(rows: Sequence[Any]) -> list[str]:
-    """Label rows by as few leading texts and counts as make them unique; rows that still agree are numbered."""
+    """Label rows by the fewest leading texts and counts that make labels unique; number labels that are still equal."""
     if not all(isinstance(row, Mapping) for row in rows):
         return [str(i) for i in range(len(rows))]
     leading: list[list[str]] = []
@@ -168,7 +168,7 @@ def _labels(rows: Sequence[Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class Report:
-    """The compared parts of a report, numbers.json and the cells of tables, and its location and provenance."""
+    """A report: its location, the compared values (numbers.json and the cells of tables), and its provenance."""
 
     where: str
     numbers: dict[str, Any]
@@ -179,7 +179,8 @@ class Report:
 def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
     """Compare `reports/<scene>` with those of a revision or a folder; return the exit status.
 
-    If a scene cannot be compared, this prints an error and returns its status, so that other scenes are still compared.
+    If a scene cannot be compared, this prints the error and returns its exit status, so that other scenes are still
+    compared.
     """
     try:
         folder = root / "reports" / scene
@@ -195,9 +196,9 @@ def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
 
 
 def read_folder(path: Path, scene: str) -> Report:
-    """Read the report of a scene from `reports/<scene>` itself, a folder around it, or the folder of a file."""
-    around = path if path.is_dir() else path.parent
-    candidates = (around, around / scene, around / "reports" / scene)
+    """Read a scene's report; `path` is `reports/<scene>`, a folder that contains it, or a file in one of these."""
+    start = path if path.is_dir() else path.parent
+    candidates = (start, start / scene, start / "reports" / scene)
     folder = next((one for one in candidates if (one / "numbers.json").is_file()), None)
     if folder is None:
         remedy = "Name reports/<scene> of another checkout."
@@ -274,7 +275,7 @@ def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -
             numbers = {title: str(by_section[section]) for title, by_section in found.items()}
             counts.append({"part": name, "section": section, "equal": str(part.equal[section])} | numbers)
     differing = [one for part in parts.values() for one in part.differing]
-    # Tables repeat the numbers of numbers.json, so theirs are listed only if none of numbers.json differs.
+    # Tables repeat the numbers of numbers.json, so their differences are listed only if none of those numbers differs.
     numeric = next(filter(None, ([one for one in part.differing if one.relative] for part in parts.values())), [])
     largest = [
         {
@@ -293,10 +294,10 @@ def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -
     for rows in (machines, counts, largest, verdicts):
         if rows:
             echo(str(pd.DataFrame(rows).to_markdown(index=False, disable_numparse=True)) + "\n")
-    lone_n = sum(len(part.missing) + len(part.new) for part in parts.values())
+    unpaired_n = sum(len(part.missing) + len(part.new) for part in parts.values())
     echo(
-        f"{scene}: not equal: {len(differing):,} of {values} differ from those {committed.where}; {lone_n:,} in one "
-        f"run only; {len(verdicts)} verdicts changed. {EXPECTED}"
+        f"{scene}: not equal: {len(differing):,} of {values} differ from those {committed.where}; {unpaired_n:,} in "
+        f"one run only; {len(verdicts)} verdicts changed. {EXPECTED}"
     )
     return 1
 

@@ -31,24 +31,24 @@ from reskin.recordings.preparing import CaptureNames, Prepared
 
 SOURCES = "pipeline/fetch.yaml"
 FETCHED = "data/fetched"
-COPIES_N = 4  # of each byte on disk: as fetched, in data/raw, in DVC's cache, and one in reserve
+COPIES_N = 4  # copies of each file on disk: as fetched, in data/raw, in DVC's cache, and one in reserve
 USE_FROM = "--from takes a git mirror, or a folder of the files."
 Say = Callable[[str], None]
 
 
-def _below(path: str) -> str:
+def _check_relative(path: str) -> str:
     if Path(path).is_absolute() or ".." in Path(path).parts:
         raise ValueError("a path below the folder of its source")
     return path
 
 
-Below = Annotated[str, AfterValidator(_below)]
+RelativePath = Annotated[str, AfterValidator(_check_relative)]
 
 
 class File(Strict):
-    """One file: its path in the repository (`at`) and on disk (`path`), and the size and hash of the latter."""
+    """One file: its path in the repository (`at`) and on disk (`path`), and its size and hash on disk."""
 
-    path: Below
+    path: RelativePath
     at: str
     bytes_n: Annotated[int, Field(gt=0)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -57,7 +57,7 @@ class File(Strict):
 class Recording(Strict):
     """A recording in the fetched files, with the options of `reskin add` for it."""
 
-    path: Below
+    path: RelativePath
     layout: ReaderLayout
     board: str
     skin: str
@@ -95,8 +95,8 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
 
     Parameters
     ----------
-    where : git repository or folder to take the files from, instead of the source's home.
-    agree : asks the user a yes-or-no question, about files without a licence.
+    where : git repository or folder from which to take the files, instead of the source's home.
+    agree : function that asks the user a yes-or-no question, here whether to use files without a licence.
     """
     sources = read_sources(root)
     if name is None:
@@ -108,7 +108,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
         raise ParamsError("reskin fetch", "a source", f"one of {', '.join(sources)}", name, f"{SOURCES} lists them.")
     source, folder, running = sources[name], root / FETCHED / name, read_plan(root / PLAN).scenes
     if all(_is_unchanged(folder / file.path, file) for file in source.files):
-        say(f"{folder}: {source.size}, there already and unchanged")
+        say(f"{folder}: {source.size}, already present and unchanged")
     else:
         commit = f"commit {source.commit}" if source.commit else "newest commit (none is pinned; checksums are checked)"
         say(f"{name}: {source.size}; licence: {source.terms}\nhome: {source.home}, {commit}")
@@ -116,7 +116,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
             say(f"taken from: {where}")
         if source.licence is None and not agree("It has no licence. Fetch it, for use here only?"):
             remedy = "Nothing was fetched. Answer y on a terminal, or add --yes."
-            raise ParamsError(f"reskin fetch {name}: use without a licence was not agreed to. {remedy}")
+            raise ParamsError(f"reskin fetch {name}: the use of files without a licence was not confirmed. {remedy}")
         download(source, where or source.home, folder)
         say(f"{folder}: {source.size}, all checksums match")
     if source.scene is None:
@@ -130,7 +130,7 @@ def _is_unchanged(path: Path, file: File) -> bool:
 
 
 def download(source: Source, where: str, folder: Path) -> None:
-    """Read the files of a source, check each, and replace a folder by them; on failure, leave the folder as it was."""
+    """Read and check the files of a source, and replace a folder with them; on failure, leave the folder unchanged."""
     try:
         with io.replacing(folder) as temporary:
             needed, free = COPIES_N * sum(file.bytes_n for file in source.files), shutil.disk_usage(folder.parent).free
@@ -162,7 +162,8 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
     digest = sha256(content).hexdigest()
     if digest != file.sha256:
         rule, got = f"{file.sha256} ({file.bytes_n} bytes)", f"{digest} ({len(content)} bytes)"
-        remedy = f"It is changed, cut or another file of that name; nothing was kept. Run the command again; {USE_FROM}"
+        problem = "The file is changed, truncated, or a different file with that name; nothing was kept."
+        remedy = f"{problem} Run the command again; {USE_FROM}"
         raise CaptureError(name, "sha256", rule, got, remedy)
     return content
 
@@ -206,7 +207,9 @@ def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
 def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Say) -> None:
     running = list(read_plan(root / PLAN).scenes)
     if scene not in running:
-        return say(f"scene {scene} is switched off; now: reskin scenes use {' '.join([*running, scene])}; dvc repro")
+        return say(
+            f"scene {scene} is not in the plan; to run it: reskin scenes use {' '.join([*running, scene])}; dvc repro"
+        )
     if scene not in before:
         say(f"added scene {scene} to {PLAN} (already there: {', '.join(before) or 'none'})")
     say(f"next: dvc repro (runs {', '.join(running)}; to run this scene alone first: reskin scenes use {scene})")
@@ -222,7 +225,7 @@ class Origin:
     read: Callable[[str], bytes]
 
     def find(self, wanted: str) -> str | None:
-        """Return the path that shares most of its last parts with the wanted one; None if no file name is equal."""
+        """Return the path that shares the most trailing parts with `wanted`; None if no file has that name."""
 
         def common_n(path: str) -> int:
             parts = zip(reversed(PurePosixPath(path).parts), reversed(PurePosixPath(wanted).parts), strict=False)
@@ -280,7 +283,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
 
 
 def _git(*arguments: str, repository: Path | None = None) -> bytes:
-    """Run git such that it gives up on a dead connection and never asks for a password."""
+    """Run git; give up on a dead connection, and never ask for a password."""
     command = ["git", "-c", "http.lowSpeedLimit=1000", "-c", "http.lowSpeedTime=60"]
     command += [] if repository is None else ["--git-dir", str(repository)]
     silent = {"GIT_TERMINAL_PROMPT": "0", "GIT_ASKPASS": "true", "GIT_SSH_COMMAND": "ssh -oBatchMode=yes"}

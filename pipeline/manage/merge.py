@@ -44,12 +44,12 @@ def merge(root: Path) -> str:
             write_registry(root, merge_registries(*_registries(root, unmerged[REGISTRY])))
         plan.use(root, _scenes(root, unmerged.get(PLAN)))  # also if only captures changed
         both = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
-    gone = {name for name in unmerged if name.startswith(REPORTS) and "2" not in unmerged[name]}
+    deleted = {name for name in unmerged if name.startswith(REPORTS) and "2" not in unmerged[name]}
     for name in unmerged:
         if name.startswith(REPORTS):
-            command = ["rm", "--quiet"] if name in gone else ["checkout", "--ours"]
+            command = ["rm", "--quiet"] if name in deleted else ["checkout", "--ours"]
             _git(root, *command, "--", name)
-    _git(root, "add", "--all", "--", *(name for name in unmerged if name not in gone), PLAN)
+    _git(root, "add", "--all", "--", *(name for name in unmerged if name not in deleted), PLAN)
     changed = f" {len(both)} stages that both sides ran may run again." if both else ""
     captures_n = sum(map(len, read_registry(root).captures.values()))
     return f"resolved {', '.join(unmerged)}: {captures_n} captures.{changed} Now: git commit, dvc pull, dvc repro"
@@ -70,9 +70,9 @@ def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Regist
 def merge_stages(
     base: Mapping[str, Any], ours: Mapping[str, Any], theirs: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[str]]:
-    """Merge the stages of dvc.lock, each entry from the side that changed it.
+    """Merge the stages of dvc.lock, taking each entry from the side that changed it.
 
-    Of an entry that both sides changed, ours is kept. Returns the merged stages and the names of those entries.
+    If both sides changed an entry, ours is kept. Returns the merged stages, and the names of entries that both changed.
 
     >>> merge_stages({"a": 1, "b": 1}, {"a": 2, "b": 1}, {"a": 3, "b": 3, "c": 3})
     ({'a': 2, 'b': 3, 'c': 3}, ['a'])

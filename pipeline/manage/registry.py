@@ -14,7 +14,7 @@ COMMENT = "# The recorded captures of this checkout, by scene; written by `reski
 
 
 class Entry(Strict):
-    """One recorded capture: its names, and fingerprints by which a copy is found."""
+    """One recorded capture: its names, and fingerprints that identify copies."""
 
     board: str
     skin: str
@@ -59,7 +59,9 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
     for name, other in captures.items():
         if other.skin == entry.skin and other.board != entry.board:
             what, rule = f"the board of skin {entry.skin}", f"{other.board}, as in {name}"
-            remedy = "Give a skin that moves to another board a new name, or folds would train and test on one skin."
+            remedy = (
+                "Give a skin that moves to another board a new name: folds must not train and test on the same skin."
+            )
             raise CaptureError(where, what, rule, entry.board, remedy)
         if other.chips_n != entry.chips_n:
             what = f"{entry.chips_n} chips, but {name} in the same scene has {other.chips_n}"

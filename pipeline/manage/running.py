@@ -7,7 +7,7 @@ from reskin import io
 from reskin.errors import ParamsError, SchemaError
 
 DVC_FILES = Path(".dvc/tmp")
-LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages; the second lists users of files during a stage
+LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages; the second lists the users of files
 
 
 def require_idle(root: Path) -> None:
@@ -24,12 +24,15 @@ def require_idle(root: Path) -> None:
 
 
 def _users(rwlock: Path) -> set[int]:
-    """List the processes in the file that are alive; a killed process leaves its entries there."""
+    """Return the live processes among those in DVC's file; a killed process leaves its entries behind."""
     try:
-        noted = io.read_json(rwlock)
+        content = io.read_json(rwlock)
     except SchemaError:  # no such file yet, or a broken one, which DVC itself refuses
         return set()
-    entries = [*noted.get("write", {}).values(), *(one for users in noted.get("read", {}).values() for one in users)]
+    entries = [
+        *content.get("write", {}).values(),
+        *(user for users in content.get("read", {}).values() for user in users),
+    ]
     return {entry["pid"] for entry in entries if _is_alive(entry["pid"])}
 
 

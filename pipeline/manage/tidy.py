@@ -1,6 +1,6 @@
 """Find and remove the outputs of experiments that a scene no longer runs.
 
-Only scenes in the plan are considered: the outputs of another scene may have taken hours, and it may run again.
+Only scenes in the plan are considered: other scenes may run again later, and their outputs may have taken hours.
 """
 
 from collections.abc import Iterable, Mapping
@@ -21,7 +21,7 @@ LOCK = "dvc.lock"
 def stale_outputs(root: Path, plan: Plan) -> dict[str, list[Path]]:
     """List the stages that ran here and are no longer in the plan, each with the files that only it wrote.
 
-    dvc.lock is committed, and so also lists stages that ran only elsewhere: those have no outputs here.
+    dvc.lock is committed, so it also lists stages that ran only in other clones; these have no outputs here.
     """
     if not (root / LOCK).exists():
         return {}
@@ -65,6 +65,6 @@ def _overlaps(path: Path, others: Iterable[Path]) -> bool:
 
 
 def _scene_of(stage: str, known: Iterable[str]) -> str:
-    """Return the scene of `stage@scene` or `stage@scene-part`: the longest name that fits."""
+    """Return the scene of `stage@scene` or `stage@scene-part`: the longest scene name that matches."""
     key = stage.partition("@")[2]
     return max((name for name in known if f"{key}-".startswith(f"{name}-")), key=len, default="")

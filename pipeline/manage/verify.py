@@ -17,15 +17,16 @@ from pipeline.stage import say
 from reskin import io
 from reskin.errors import SchemaError
 
-VERIFIED = ".reskin/verified"  # reports of the last reruns, to look at, and for `--against` on another machine
-QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as the Makefile does
+VERIFIED = ".reskin/verified"  # reports of the last reruns, for inspection and for `--against` on another machine
+QUIET = {"MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1", "OMP_NUM_THREADS": "1"}  # as in the Makefile
 
 
 def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -> int:
     """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
     for name in names:
         plan.scene_file(root, name)
-    committed = {name: read_revision(root, name, "HEAD") for name in names}  # first: the rerun takes hours
+    # These reports are read first, so that errors are found before the rerun, which takes hours.
+    committed = {name: read_revision(root, name, "HEAD") for name in names}
     if against is None:
         rerun(root, names)
     fresh = {name: read_folder(against or root / VERIFIED / name, name) for name in names}
@@ -35,7 +36,7 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
 def rerun(root: Path, names: Sequence[str]) -> None:
     """Run scenes in a clone of the last commit, and keep their reports."""
     if changed := _git(root, "status", "--porcelain", "--untracked-files=no"):
-        say(f"warning: {len(changed.splitlines())} files differ from the last commit; the last commit runs")
+        say(f"warning: {len(changed.splitlines())} files differ from the last commit; the last commit is run")
     with tempfile.TemporaryDirectory(prefix="reskin-verify-", ignore_cleanup_errors=True) as temporary:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
@@ -44,7 +45,7 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
-            _clear(clone / "reports" / name)  # a scene that does not run must not pass
+            _clear(clone / "reports" / name)  # otherwise a scene that does not run would pass
         # Forced, so that no cache of this machine replaces a stage. Stage publish does not run.
         _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
         for name in names:
@@ -53,7 +54,7 @@ def rerun(root: Path, names: Sequence[str]) -> None:
 
 
 def _clear(reports: Path) -> None:
-    """Remove the reports of a scene; the choice of settings stays, as audits of other scenes read it."""
+    """Remove the reports of a scene, except choice.json, which audits of other scenes read."""
     for path in reports.glob("*"):
         if path.is_dir():
             shutil.rmtree(path)
@@ -76,7 +77,7 @@ def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool =
         try:
             running.wait()
         except BaseException:
-            os.killpg(running.pid, signal.SIGTERM)  # with DVC's stages, which would go on in a deleted folder
+            os.killpg(running.pid, signal.SIGTERM)  # also ends DVC's stages, which would continue in a deleted folder
             raise
     if running.returncode:
         raise SchemaError(

@@ -155,7 +155,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
         **before_touch_numbers(inputs.before_touch),
         "trainings": count_trainings(inputs.cards, inputs.points, analyses),
         "described": inputs.described,
-        **{one.key: experiments[one.key] for one in scene.rows if one.key in experiments},
+        **{one.key: experiments[one.key] for one in scene.entries if one.key in experiments},
         "runtime": runtime,
     }  # fmt: skip
     if scene.source == "simulated":
