@@ -1,18 +1,18 @@
-# make repro   everything from nothing: environment, then `dvc repro` on the scenes of pipeline/plan.yaml
+# make repro   everything from scratch: the environment, then `dvc repro` for the scenes of pipeline/plan.yaml
 # make test    lint, types, layers, tests
 # make test-processors   checks that training gives the same bits on emulated Intel and AMD processors (needs qemu-user)
 # make ui      the MLflow UI on the embedded store
 # make bench   benchmarks at full size (the tests run each at a tiny size)
 # make faults   injects every fault for real (Linux; mounts need root) -> docs/faults.md
 # make time-repro   times `make repro` in a fresh clone (three runs of its stages) -> reports/time.json
-# make constraints   the newest versions that fit together -> constraints.txt; then run make test, and commit
+# make constraints   finds the newest compatible versions -> constraints.txt; then run make test, and commit
 # make licences   lists the licences of all installed packages; fails if one is not compatible
-# make audit   known vulnerabilities of the versions in constraints.txt, from pypi.org
-# make time-install   installs the wheel in an empty environment: seconds, MB, and a page of `reskin live`
+# make audit   lists known vulnerabilities of the versions in constraints.txt, according to pypi.org
+# make time-install   installs the wheel in an empty environment: measures time and size, and opens `reskin live`
 # make team-server FOLDER=... [HOST=0.0.0.0] [PORT=5000]   MLflow on PostgreSQL, until Ctrl-C
-# make teams      tests what a team does, on servers that it starts and stops -> docs/measured/teams.md
+# make teams   tests the workflows of a team, on servers that it starts and stops -> docs/measured/teams.md
 # make cluster-test   runs a sweep on a cluster in network namespaces, as root -> docs/measured/cluster.md, scaling.md
-# make clean   removes what the targets above made, except data and results
+# make clean   removes the files made by the targets above, except data and results
 
 PYTHON ?= python3
 VENV := .venv
@@ -22,7 +22,7 @@ STAMP := $(VENV)/.installed
 export MLFLOW_DISABLE_TELEMETRY = true
 export DO_NOT_TRACK = true
 export DVC_NO_ANALYTICS = 1
-# One thread per process: run times vary less on few cores, and sums have the same order everywhere.
+# One thread per process: run times vary less on few cores, and sums are always computed in the same order.
 export OMP_NUM_THREADS = 1
 # Empty, so that bytecode is written even if the user's environment forbids it. Without bytecode, every stage and every
 # test worker compiles all its modules again.
@@ -44,7 +44,7 @@ repro: $(STAMP)
 	$(BIN)/reskin scenes check
 	$(BIN)/dvc repro
 	@[ -e mlflow.db ] || $(BIN)/reskin publish # DVC skips stage publish if all results equal those in dvc.lock
-	@$(BIN)/reskin compare || true # compares with the committed reports, which your own scenes do not have
+	@$(BIN)/reskin compare || true # compares with the committed reports; your own scenes have none
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
@@ -66,7 +66,7 @@ ui: $(STAMP)
 bench: $(STAMP)
 	RESKIN_BENCHMARKS=full $(BIN)/python -m pytest tests/benchmarks -s -q -p no:xdist
 
-# Kills, full disks, cut files, dead servers: each fault is injected into a copy of a small finished checkout.
+# Kills, full disks, truncated files, dead servers: each fault is injected into a copy of a small finished checkout.
 faults: $(STAMP)
 	$(BIN)/python -m tests.faults
 
@@ -84,13 +84,13 @@ constraints: $(STAMP)
 licences: $(STAMP)
 	$(BIN)/python -m release.licences
 
-# In a separate environment, because the auditing tool is not a dependency of the project.
+# It uses a separate environment, because the auditing tool is not a dependency of the project.
 audit:
 	$(PYTHON) -m venv .audit
 	.audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit
 	.audit/bin/pip-audit --strict --requirement constraints.txt --no-deps --disable-pip # strict: fails if a package cannot be audited
 
-# Extras dask and team, and for the tests an S3-compatible server.
+# Installs the extras dask and team, and an S3-compatible server for the tests.
 $(VENV)/.team: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dask,team]' 'moto[server]'
 	@touch $@

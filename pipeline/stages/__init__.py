@@ -1,7 +1,7 @@
 """The stages of the pipeline: thin functions that read inputs, call the library, and write outputs.
 
-dvc.yaml runs a stage by `python -m pipeline STAGE --scene NAME ...`. The stage of an experiment in
-`pipeline.experiments` is the function in its module that has its name.
+dvc.yaml runs a stage by `python -m pipeline STAGE --scene NAME ...`. An experiment in `pipeline.experiments`
+is a module whose stage is the function with the name of the module.
 """
 
 from importlib import import_module

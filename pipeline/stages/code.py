@@ -1,6 +1,6 @@
 """Stage code: write the digests of all modules that each stage imports to data/code/<stage>.
 
-Every other stage depends on its file there, so that after an edit DVC reruns the stages that import the edited module.
+Every other stage depends on its own file in that folder, so that DVC reruns the stages that import an edited module.
 Comments and docstrings are not part of a digest. `pipeline.report` and the YAML files of experiments, which contain
 captions, are part of the digests only of stages that show results.
 """
@@ -13,18 +13,18 @@ from reskin import io
 from reskin.code import digest, imported
 
 REPORT = "pipeline.report"
-SHOWING = f"{REPORT}.experiments"  # imports the modules of experiments by name
+PRESENTATION = f"{REPORT}.experiments"  # imports the modules of experiments by name
 
 
 def all_stages() -> list[str]:
-    """List all stages but this one."""
+    """List all stages except this one."""
     return list(dict.fromkeys([*MODULES, *experiment_files()]))
 
 
 def digests_of(stage: str) -> dict[str, str]:
-    """Return the digest of each module that decides what a stage writes, by the module's name."""
+    """Return the digests of all modules that affect a stage's outputs, by module name."""
     names = imported(module_name(stage))
-    if SHOWING in names:
+    if PRESENTATION in names:
         return {name: digest(name) for name in imported(module_name(stage), *map(module_name, experiment_files()))}
     computing = [name for name in names if not name.startswith(REPORT)]
     return {name: digest(name, data=not name.startswith(EXPERIMENTS)) for name in computing}
@@ -33,5 +33,5 @@ def digests_of(stage: str) -> dict[str, str]:
 def write_digests(digests: Path) -> None:
     """Write a file for each stage, with one line per module: its digest and its name."""
     for stage in all_stages():
-        lines = [f"{found}  {name}\n" for name, found in digests_of(stage).items()]
+        lines = [f"{module_digest}  {name}\n" for name, module_digest in digests_of(stage).items()]
         io.write_text(digests / stage, "".join(lines))

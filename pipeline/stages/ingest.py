@@ -15,12 +15,12 @@ from reskin.data.splits import Split, draw_folds, render_folds
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.ingest import check_losses, open_capture
 
-CACHE = ".reskin/readings"  # of ingest_many; DVC deletes a stage's outputs before it runs
+CACHE = ".reskin/readings"  # cache of ingest_many, as DVC deletes a stage's outputs before it runs
 NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
 
 def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
-    """Read one recorded capture, check its losses, and write its readings, one row each."""
+    """Read one recorded capture, check its losses, and write its readings, one row per reading."""
     policy = settings.shared_section(FaultPolicy, "faults")
     header, blocks, account = open_capture(raw, policy)
     io.write_readings(indentations, blocks, account)
@@ -42,18 +42,20 @@ def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
 
 
 def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -> None:
-    """Read all captures of a recorded scene that has many: one DVC stage per capture would cost more than reading it.
+    """Read all captures of a recorded scene in one stage.
 
-    Captures that were read before, with the same bytes, code and settings, come from a cache (docs/growth.md).
+    It is used for scenes with many captures, for which one DVC stage per capture would take longer than reading them.
+    Captures that were already read, with the same bytes, code and settings, come from a cache (docs/growth.md).
     """
     cache = home() / CACHE / settings.scene
-    rest_on = repr([settings.shared["faults"], settings.shared["lost_fraction_max"]]).encode() + io.read_bytes(code)
+    policy = [settings.shared["faults"], settings.shared["lost_fraction_max"]]
+    common_inputs = repr(policy).encode() + io.read_bytes(code)
     before = {file.stem.partition("-")[0]: file for file in cache.glob("*-*.parquet")}
     used, read_n = set(), 0
     with io.replacing(indentations) as folder:
         folder.mkdir()
         for name in settings.captures:
-            key = _cache_key(raw / name, rest_on)
+            key = _cache_key(raw / name, common_inputs)
             if key not in before or not _is_whole(before[key]):
                 fresh = cache / f"{key}.parquet"
                 ingest(settings, raw / name, fresh)
@@ -69,17 +71,17 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
 
 
 def _is_whole(cached: Path) -> bool:
-    """Check cached readings against the digest in their name; remove them and warn if they were damaged."""
+    """Check cached readings against the digest in their name; if they are damaged, remove them and warn."""
     if io.sha256(cached) == cached.stem.partition("-")[2]:
         return True
-    say(f"warning: cached readings are damaged and are read again ({cached}: other content than was written)")
+    say(f"warning: cached readings are damaged and are read again ({cached}: content has changed since it was written)")
     io.remove(cached)
     return False
 
 
-def _cache_key(capture: Path, rest_on: bytes) -> str:
-    """Return a digest of what the readings of a capture depend on: its name and bytes, the code, the settings."""
-    digest = hashlib.sha256(rest_on + capture.name.encode())
+def _cache_key(capture: Path, common_inputs: bytes) -> str:
+    """Return a digest of everything that a capture's readings depend on: its name and bytes, the code, the settings."""
+    digest = hashlib.sha256(common_inputs + capture.name.encode())
     for file in sorted(file for file in capture.rglob("*") if file.is_file()):
         digest.update(f"{file.relative_to(capture)} {io.sha256(file)}\n".encode())
     return digest.hexdigest()
@@ -95,16 +97,16 @@ def describe(settings: Settings, indentations: Path, description: Path) -> None:
         for name, account in accounts.items()
         if account.get("baseline_subtracted_rows_n")
     }
-    together = over_skins([(one.skin, described[one.capture]) for one in captures])
+    summary = over_skins([(one.skin, described[one.capture]) for one in captures])
     readings_n = sum(map(len, captures))
     counts = {"captures_n": len(captures), "readings_n": readings_n}
     counts["indentations_n"] = sum(account.get("indentations_n", 0) for account in accounts.values())
-    io.write_json(description, {"counts": counts, "source": captures[0].source, "over_skins": together})
+    io.write_json(description, {"counts": counts, "source": captures[0].source, "over_skins": summary})
     say(f"{settings.scene}: {indentations}: {readings_n} readings of {len(captures)} captures described")
 
 
 def split(settings: Settings, section: Split, indentations: Path, folds: Path) -> None:
-    """Draw the folds of every experiment of the scene that holds rows out."""
+    """Draw the folds of all experiments of the scene that hold rows out."""
     captures = settings.captures_in(indentations)
     if not settings.held_out:
         io.write_json(folds, render_folds(captures, NO_ROWS, []))

@@ -1,4 +1,4 @@
-"""Stages that show results: table2 (early), report (numbers, tables, figures, pages), publish (MLflow)."""
+"""Stages that present results: table2 (early), report (numbers, tables, figures, pages), publish (MLflow)."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
     source, inputs = scene.source, read_inputs(scene, indentations, folds, models, results)
     scores = tidy(inputs.cards, inputs.points)
     numbers = rounded(compute_numbers(settings, scene, inputs, scores))
-    drawn = {EXPERIMENTS[one].key: result["drawn"] for one, result in inputs.analyses.items()}
+    plot_data = {EXPERIMENTS[name].key: result["drawn"] for name, result in inputs.analyses.items()}
     if "choice" in scene.experiments:
         physics = fingerprint(settings.shared)
         record = to_record(numbers["chosen"], inputs.cards, source=source, seed=settings.seed, physics=physics)
@@ -82,7 +82,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
     io.write_json(reports / "provenance.json", of_this_run)
     io.write_json(reports / "scores.json", headline_scores(numbers))
     with make_executor(imports="pipeline.report.experiments") as executor:  # drawing takes most of the time
-        of_experiments = executor.submit(experiment_figures, numbers, drawn, source)
+        of_experiments = executor.submit(experiment_figures, numbers, plot_data, source)
         of_costs = executor.submit(cost_pages, numbers["runtime"], source)
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
@@ -103,7 +103,7 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
 
 @dataclass(frozen=True)
 class Inputs:
-    """What stage report reads: results of training runs and experiments by name, and counts of captures."""
+    """Inputs of stage report: results of training runs and experiments by name, and counts of captures."""
 
     cards: list[dict[str, Any]]
     points: dict[str, Any]
@@ -179,7 +179,7 @@ def publish(settings: Settings, models: Path, results: Path, reports: Path) -> N
     """Write every training run of a scene and its report to MLflow once; warn if the server does not answer."""
     scene, name = planned_scene(settings), settings.scene
     folders = {stage: models / stage for stage in scene.model_stages}
-    experiment = f"{name} (dvc exp)" if is_experiment() else name  # apart from the checkout's own results
+    experiment = f"{name} (dvc exp)" if is_experiment() else name  # kept separate from the checkout's own results
     try:
         counts = write_runs(folders, read_curves(scene, results), reports, scene=experiment, root=home())
         say(f"{experiment}: MLflow runs {counts}")
@@ -204,11 +204,10 @@ def planned_scene(settings: Settings) -> Scene:
     scene = parse_scene(settings.of_scene, settings.where)
     planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
     if list(scene.experiments) != list(planned):
-        differing = ", ".join(sorted(set(scene.experiments) ^ set(planned))) or "another order"
+        in_one_only = ", ".join(sorted(set(scene.experiments) ^ set(planned)))
+        difference = f"{in_one_only} only in one of them" if in_one_only else "their order"
         remedy = f"Try: reskin scenes use {settings.scene}, with the names of the other scenes that run."
-        raise ParamsError(
-            f"{settings.where}: experiments differ from those in {PLAN}: {differing} only in one of them. {remedy}"
-        )
+        raise ParamsError(f"{settings.where}: experiments differ from those in {PLAN}: {difference}. {remedy}")
     return scene
 
 

@@ -14,7 +14,7 @@ from reskin.simulation.settings import SimulationSettings
 
 
 def simulate(settings: Settings, protocol: str, raw: Path) -> None:
-    """Simulate the captures of one protocol, one for each skin."""
+    """Simulate the captures of one protocol, one capture per skin."""
     simulation, seed = simulation_settings(settings), settings.seed
     pairs, skins_n = list_captures(simulation, protocol), simulation.protocols[protocol].skins_n
     if len(pairs) < skins_n:

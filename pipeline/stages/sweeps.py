@@ -1,4 +1,4 @@
-"""Stages of figure 6: adaptation with few and many pokes, and training on few and many skins."""
+"""Stages of paper figure 6: adaptation with different numbers of pokes, and training on different numbers of skins."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +24,10 @@ from reskin.models.recipe import HEADLINE
 
 
 class PokesSweep(Strict):
-    """Section sweep_pokes: numbers of unlabelled indentations (0: no adaptation); the last `boards_n` boards test."""
+    """Section sweep_pokes: numbers of unlabelled indentations; 0 means no adaptation.
+
+    boards_n: how many of the boards are held out; these are the last ones.
+    """
 
     pokes_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     boards_n: Annotated[int, Field(ge=1)]
@@ -80,10 +83,10 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         "multi": settings.section(Training, "train_multi").recipes[HEADLINE],
         "triplet": settings.section(Training, "train_triplet").recipes[adaptation.base],
     }
-    # Most training skins first: networks are trained in stacks, and a stack is cached as a whole. Only in this order do
+    # Folds with most training skins come first: a stack of networks is cached as a whole. Only in this order do
     # the folds with all training skins form the same stacks as in `train_multi`.
     draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
-    # The draw is part of the fold's name, and so of the random generator's: one seed per draw is enough.
+    # One seed per draw is enough, because a fold's name, which determines its random generator, contains the draw.
     jobs = [
         TrainingJob("sensors", HEADLINE, recipe, fold.name, settings.seed, 0, fold.train, fold.test, what=method)
         for method, recipe in recipes.items()

@@ -1,4 +1,4 @@
-"""Stages that train on a scene's folds: networks of one skin and of many skins, adapted networks, classical methods."""
+"""Stages that train on a scene's folds: networks for one skin or for many, adapted networks, classical methods."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +35,7 @@ NO_LABELS = np.zeros(0, np.int64)
 def train_single(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
     """Train on one skin at a time: splits within a skin, and transfer to other skins (paper sections 4 and 5.1).
 
-    Also scores places predicted without the contact's signal, on the folds within one skin.
+    On the folds within one skin, places that are predicted without the contact's signal are also scored.
     """
     preload_training()
     data = read_data(settings, indentations, folds)
@@ -79,7 +79,7 @@ def adapt(
 
 
 class ClassicalMethods(SectionWithRows):
-    """Section train_classical: classical methods, each on at most `rows_max_n` training rows."""
+    """Section train_classical: classical methods, each fitted to at most `rows_max_n` training rows."""
 
     rows_max_n: Annotated[int, Field(ge=1)]
     methods: dict[Name, Classical]

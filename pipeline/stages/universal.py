@@ -1,4 +1,4 @@
-"""Stages that score methods on a held-out board with several numbers of its labels: few_labels, universal."""
+"""Stages that score methods on held-out boards with different numbers of their labels: few_labels, universal."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,11 +28,11 @@ from reskin.universal.training import TrainingSettings
 
 
 def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds: Path, scores: Path) -> None:
-    """Score networks, adapted networks and classical methods with every number of labels on the same rows."""
+    """Score networks, adapted networks and classical methods on the same rows, with every number of labels."""
     data = read_data(settings, indentations, folds)
     study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, section)
-    done: list[few.Done] = []
-    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each starts from earlier networks
+    done: list[few.TrainedEntry] = []
+    for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each uses networks of earlier steps
         pairs = step(study, done)
         trained = train_jobs(data, [job for _, job in pairs], "few_labels")
         done = [*done, *((entry, job, result) for (entry, job), result in zip(pairs, trained, strict=True))]
@@ -65,7 +65,8 @@ def universal(
 ) -> None:
     """Score the universal model on every held-out board, with every number of labels, on the rows of few_labels.
 
-    The map alone and the map with networks are scored, made from the other boards of the rig or from simulated skins.
+    The map alone and the map with networks are scored. Each is built once from the other boards of the rig and once
+    from simulated skins.
     """
     known = read_known_boards(settings, indentations, folds)
     variants = make_variants(known, section)

@@ -1,8 +1,9 @@
-"""Scores of places that 2 nearest neighbours predict without the contact's signal, on the folds within one skin.
+"""Score places that 2 nearest neighbours predict without the contact's signal, on the folds within one skin.
 
-The input is the no-load field alone, or the number of the indentation in its pass. A network may have learnt whatever
-accuracy these reach from the scan rather than from contacts. The hover control predicts the place of a hovering tip
-with models that were trained on contacts. Its accuracy is that of chance, unless the chips sense the tip itself.
+The input is the no-load field alone, or the number of the indentation in its pass. If such a prediction is accurate,
+networks may have learnt the same from the order of the scan rather than from contacts. The hover control predicts the
+place of a hovering tip with models that were trained on contacts. Its accuracy is at chance level, unless the chips
+sense the tip itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,9 +27,9 @@ from reskin.seeds import rng_for
 
 NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
 PLACE = ("accuracy_pct", "mse_xy_mm2")
-LENGTHS = ("hover_uT", "touch_uT")  # median |dB| of rows that hover, and of contacts of about 1 N
-TOUCH_N = (0.8, 1.2)
-BY_TIME = "single_temporal"  # tests passes that are not in training
+MAGNITUDES = ("hover_uT", "touch_uT")  # median |dB| of hovering rows, and of contacts at about 1 N
+TOUCH_N = (0.8, 1.2)  # forces of these contacts
+BY_TIME = "single_temporal"  # experiment that trains on some passes and tests on others
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Scan:
 
 
 def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
-    """Stack what is known before each contact, in the order of the scene's rows."""
+    """Stack the no-load fields and numbers of all contacts, in the order of the scene's rows."""
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
@@ -71,10 +72,10 @@ class Hover:
 
 
 def gather_hover(captures: Sequence[Readings]) -> Hover:
-    """Stack the rows without force between the contacts of a pass, each with the place of the next contact.
+    """Stack the rows without force between the contacts of a pass; the place of each row is that of the next contact.
 
-    A tip that descends on a place in steps first hovers over it. Rows before the first contact of a pass are its
-    no-load reading, and rows after the last contact have no place.
+    A tip that descends in steps first hovers over the place of the contact. Rows before the first contact of a pass
+    are left out because they are its no-load reading, and rows after the last contact because they have no place.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     passes_n: dict[str, int] = {}
@@ -97,9 +98,10 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
 def score_before_contact(
     data: SceneData, indentations: Path, captures: list[str], networks: Mapping[str, Sequence[Network]]
 ) -> pa.Table:
-    """Score places predicted from the no-load field alone, from the number in the pass alone, and of a hovering tip.
+    """Score places predicted from the no-load field alone or from the number in the pass alone, and the hover control.
 
-    networks: by fold, for the hover control in addition to 2 neighbours. Returns one row for each fold and input.
+    networks: trained networks by fold, which the hover control uses in addition to the nearest neighbours. Returns one
+    row per fold and input.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
@@ -114,14 +116,15 @@ def score_before_contact(
     for fold in [fold for fold in data.folds if fold.experiment == BY_TIME]:
         lines += _hover(data, fold, hover, networks.get(fold.name, ()))
     kinds = dict.fromkeys(("question", "fold", "told_by"), pa.string())
-    kinds |= dict.fromkeys((*PLACE, *LENGTHS), pa.float64())
+    kinds |= dict.fromkeys((*PLACE, *MAGNITUDES), pa.float64())
     return pa.Table.from_pylist(lines, schema=pa.schema(kinds))
 
 
 def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network]) -> list[dict[str, Any]]:
-    """Score hovering rows in the tested passes of a fold, by models of contacts."""
-    rows, tested = data.rows, set(zip(data.rows.skin[fold.test], data.rows.pass_i[fold.test].tolist(), strict=True))
-    own = np.array([pair in tested for pair in zip(hover.skin, hover.pass_i.tolist(), strict=True)], bool)
+    """Score models of contacts on the hovering rows in the test passes of a fold."""
+    rows = data.rows
+    test_passes = set(zip(rows.skin[fold.test], rows.pass_i[fold.test].tolist(), strict=True))
+    own = np.array([pair in test_passes for pair in zip(hover.skin, hover.pass_i.tolist(), strict=True)], bool)
     if not own.any():
         return []
     db_uT, place_mm = hover.db_uT[own], hover.place_mm[own]
@@ -130,21 +133,21 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
     predictions = {"hover": [neighbours.predict(db_uT)], "hover_network": [network(db_uT) for network in networks]}
     force_N = rows.target[fold.test, 2]
     touch_uT = np.linalg.norm(rows.db_uT[fold.test][(force_N > TOUCH_N[0]) & (force_N < TOUCH_N[1])], axis=1)
-    lengths = {"hover_uT": float(np.median(np.linalg.norm(db_uT, axis=1))), "touch_uT": float(np.median(touch_uT))}
+    magnitudes = {"hover_uT": float(np.median(np.linalg.norm(db_uT, axis=1))), "touch_uT": float(np.median(touch_uT))}
     true = np.column_stack([place_mm, np.full(len(place_mm), np.nan)])
     lines = []
-    for name, found in predictions.items():
-        scores = [score(true, predicted) for predicted in found]
+    for name, of_models in predictions.items():
+        scores = [score(true, predicted) for predicted in of_models]
         if scores:
             means = {metric: float(np.mean([one[metric] for one in scores])) for metric in PLACE}
-            lines.append({"question": fold.experiment, "fold": fold.name, "told_by": name, **means, **lengths})
+            lines.append({"question": fold.experiment, "fold": fold.name, "told_by": name, **means, **magnitudes})
     return lines
 
 
 def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
 ) -> Mapping[str, float]:
-    rng = rng_for(data.settings.seed, "before-touch")  # neighbours are not random
+    rng = rng_for(data.settings.seed, "before-touch")  # not used by nearest neighbours
     fitted = fit(NEIGHBOURS, inputs[train], data.rows.target[train], rng, weight=None)
-    found = score(data.rows.target[test], fitted.predict(inputs[test]))
-    return {name: found[name] for name in PLACE}
+    scores = score(data.rows.target[test], fitted.predict(inputs[test]))
+    return {name: scores[name] for name in PLACE}

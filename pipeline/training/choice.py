@@ -1,12 +1,12 @@
-"""Choose settings on the boards of a study, from the cards of its models.
+"""Choose settings from the cards of a scene's models, which were trained with each board held out in turn.
 
-The criterion is the mean squared error of places over the boards held out in turn, of networks with the paper's inputs.
-The number of steps is a scene's budget: every candidate is tried with the same budgets, and its errors are averaged
-over them, so that no setting wins by training longer. Settings with a collapsed training run are not chosen. Settings
-of adaptation are chosen together with the triplet weight of the network that they start from, because the triplet term
-by itself only increases the error.
+The criterion is the mean squared error of places on the held-out boards, for networks with the paper's inputs. The
+number of steps is not chosen, because each scene sets it as a budget. Every candidate is tried with the same budgets,
+and its errors are averaged over them, so that no setting wins by training longer. Settings with a collapsed training
+run are not chosen. Settings of adaptation are chosen together with the triplet weight of the network that they start
+from, because the triplet term by itself only increases the error.
 
-The record of a choice has a fingerprint of the simulated skin, which audits compare with that of the current code.
+The record of a choice contains a fingerprint of the simulated skin. Audits compare it with that of the current code.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ VARIED = (
     "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
     "unlabelled_weight",
 )  # fmt: skip
-BUDGET = ("steps_n", "base")  # not settings of the method: a scene's number of steps, the name of a base
+BUDGET = ("steps_n", "base")  # not settings of the method, but a scene's number of steps and the name of a base recipe
 WHERE = "choice of settings"
 
 Card = Mapping[str, Any]
@@ -40,7 +40,7 @@ Cards = Sequence[Card]
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     """Choose settings for every stage: `recipe_name`, `settings`, `by` (the criterion), `candidates` with scores.
 
-    The control of adaptation, which adaptation must beat, is the same network fine-tuned as long without the pokes.
+    The choice for `adapt` also has the error of its control: the same network, fine-tuned as long without the pokes.
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
@@ -78,13 +78,13 @@ def to_record(
 
 
 def settings_of(card: Card) -> dict[str, Any]:
-    """Return the settings of a training run: its recipe, or those of its adaptation."""
+    """Return the settings of a training run: its recipe, or the settings of its adaptation if it has one."""
     settings: dict[str, Any] = card["tuning"]["settings"] if "tuning" in card else card["recipe"]
     return settings
 
 
 def trimmed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out the budget, which is not a setting of the method."""
+    """Return the settings without the budget, which is not a setting of the method."""
     return {name: value for name, value in settings.items() if name not in BUDGET}
 
 
@@ -122,11 +122,11 @@ def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, 
 
 
 def _check_budgets(cards: Cards, stage: str) -> None:
-    tried = {card["recipe_name"]: {_budget(alike) for alike in cards if _key(alike) == _key(card)} for card in cards}
-    every = set().union(*tried.values())
+    tried = {card["recipe_name"]: {_budget(other) for other in cards if _key(other) == _key(card)} for card in cards}
+    all_budgets = set().union(*tried.values())
     for name, budgets in tried.items():
-        if budgets != every:
-            what, got = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(every)}"
+        if budgets != all_budgets:
+            what, got = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(all_budgets)}"
             remedy = "Try every candidate with every number of steps."
             raise ParamsError(f"{WHERE}: {what} differ between candidates: {got}. {remedy}")
 
@@ -141,7 +141,7 @@ def _budget(card: Card) -> tuple[int, int]:
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
-    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # of the first card
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # of the first card of each recipe
     return [
         {
             "recipe_name": name,
@@ -152,7 +152,7 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     ]
 
 
-# --- A fingerprint of the simulation: unchanged as long as equal indentations give equal fields and forces ---
+# --- A fingerprint of the simulation, which is the same as long as equal indentations give equal fields and forces ---
 
 RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as in scene quick
 BOARD = BoardDesign(
@@ -162,11 +162,11 @@ BOARD = BoardDesign(
 )
 PLACES_MM = ((0.0, 0.0), (4.0, -2.0), (-6.0, 4.0), (8.0, 4.0))
 DEPTHS_MM = (0.2, 0.6, 1.2)
-DIGITS = 4  # significant digits: rounding errors are smaller, changes of the physics larger
+DIGITS = 4  # significant digits; rounding errors are smaller, and changes of the physics are larger
 
 
 def fingerprint(sections: Mapping[str, Any]) -> str:
-    """Return a digest of fields and forces of two skins under some indentations, and of the rig and chip settings.
+    """Return a digest of the fields and forces of two skins under fixed indentations, and of the rig and chip settings.
 
     A refactoring keeps the fingerprint; a change of the physics or of a setting changes it.
     """

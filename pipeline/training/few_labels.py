@@ -28,7 +28,7 @@ Labels = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
 class FewLabels(SectionWithRows):
     """Section few_labels: networks, classical methods, and numbers of labelled indentations of the held-out board.
 
-    adapted: recipes that are also adapted with unlabelled indentations; their settings are `adapting`.
+    adapted: recipes that are also adapted with unlabelled indentations. adapting: settings of these adaptations.
     """
 
     labels_n: Labels
@@ -51,7 +51,7 @@ class FewLabels(SectionWithRows):
         }
 
     @model_validator(mode="after")
-    def _adapts_what_it_trains(self) -> "FewLabels":
+    def _check_adapted_recipes(self) -> "FewLabels":
         if unknown := set(self.adapted) - set(self.recipes):
             raise ValueError(f"adapted must name recipes of few_labels, not {sorted(unknown)}")
         return self
@@ -77,10 +77,10 @@ class Entry:
     fold: Fold
 
 
-Done = tuple[Entry, TrainingJob, TrainingResult]
+TrainedEntry = tuple[Entry, TrainingJob, TrainingResult]
 
 
-def network_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
+def network_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
     """List the jobs that train every recipe on every fold."""
     return [
         (
@@ -92,25 +92,25 @@ def network_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, Traini
     ]
 
 
-def adaptation_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
+def adaptation_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
     """List the jobs that adapt the recipes in `adapted` with all indentations of the pool, unlabelled."""
     pairs = []
     for entry, job, trained in done:
         if job.recipe_name in study.settings.adapted:
             lines = grid_lines(study.rows, entry.fold.pool)
-            tuning = Adaptation(_start(trained), study.settings.adapting, lines)
+            tuning = Adaptation(_to_pretrained(trained), study.settings.adapting, lines)
             adapted = Entry(f"{entry.method}, adapted", entry.inputs, 0, entry.fold)
             pairs.append((adapted, replace(job, tuning=tuning, skin=entry.fold.board, what="adapted")))
     return pairs
 
 
-def fine_tuning_jobs(study: Study, done: Sequence[Done]) -> list[tuple[Entry, TrainingJob]]:
+def fine_tuning_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
     """List the jobs that fine-tune every network on every number of labelled indentations."""
     pairs = []
     for entry, job, trained in done:
         for labels_n, row in _labelled_rows(study, entry.fold).items():
             if labels_n:
-                tuning = FineTuning(_start(trained), study.settings.labelling, row)
+                tuning = FineTuning(_to_pretrained(trained), study.settings.labelling, row)
                 labelled = Entry(entry.method, entry.inputs, labels_n, entry.fold)
                 what = f"{job.what}{labels_n}labels"
                 pairs.append((labelled, replace(job, tuning=tuning, skin=entry.fold.board, what=what)))
@@ -132,7 +132,7 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 
 
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
-    """Draw labelled indentations from the pool; each set contains the smaller ones. Return rows by number of labels."""
+    """Draw nested sets of labelled indentations from the pool; return their rows by number of labels."""
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     order = labelling_order(study.rows, fold, study.seed)
     if max(labels_n) > len(order):
@@ -142,5 +142,5 @@ def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, "
     return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}
 
 
-def _start(trained: TrainingResult) -> Pretrained:
+def _to_pretrained(trained: TrainingResult) -> Pretrained:
     return Pretrained(trained.key, trained.weights, trained.scaler)

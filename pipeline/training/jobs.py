@@ -30,7 +30,7 @@ from reskin.models.trained import FORMAT
 from reskin.seeds import rng_for
 
 TRAINING_MODULE = "reskin.models.train"
-CACHE = ".reskin/cells"  # finished training runs; a cache, not an output
+CACHE = ".reskin/cells"  # completed training runs; a cache, not an output
 
 PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe, fold and seed
 
@@ -61,7 +61,7 @@ class AdaptationPokes:
 
 
 class ModelCard(TypedDict):
-    """The JSON card beside a model: how it was trained, what it takes and returns, and its scores."""
+    """The JSON card of a model: its training, inputs, outputs and scores."""
 
     format: str
     scene: str
@@ -126,7 +126,7 @@ def training_data(data: SceneData) -> TrainingData:
 def make_jobs(
     data: SceneData, training: Training, folds: Iterable[Fold], *, experiment: str | None = None
 ) -> list[TrainingJob]:
-    """Make a job for every fold, recipe and seed; it belongs to the fold's experiment unless another is named."""
+    """Make a job for every fold, recipe and seed, for `experiment` or, by default, for the experiment of each fold."""
     return [
         TrainingJob(
             experiment or fold.experiment, name, recipe, fold.name, data.settings.seed, seed_i, fold.train, fold.test
@@ -140,7 +140,7 @@ def make_jobs(
 def adaptation_jobs(
     data: SceneData,
     fold: Fold,
-    named: tuple[str, AdaptationWithBase],
+    named_recipe: tuple[str, AdaptationWithBase],
     pretrained: PretrainedNetworks,
     *,
     experiment: str,
@@ -148,21 +148,21 @@ def adaptation_jobs(
 ) -> Iterator[TrainingJob]:
     """Make the jobs that adapt a fold's networks to each held-out skin with `pokes_n` indentations of its pool."""
     for skin in np.unique(data.rows.skin[fold.test]):
-        for seed_i in select_pretrained(pretrained, named[1].base, fold):
+        for seed_i in select_pretrained(pretrained, named_recipe[1].base, fold):
             lines = pool_lines(data, fold, str(skin), pokes_n=pokes_n, seed_i=seed_i)
             pokes = AdaptationPokes(experiment, str(skin), seed_i, f"{pokes_n}pokes", lines)
-            yield adaptation_job(data, fold, named, pretrained, pokes)
+            yield adaptation_job(data, fold, named_recipe, pretrained, pokes)
 
 
 def adaptation_job(
     data: SceneData,
     fold: Fold,
-    named: tuple[str, AdaptationWithBase],
+    named_recipe: tuple[str, AdaptationWithBase],
     pretrained: PretrainedNetworks,
     pokes: AdaptationPokes,
 ) -> TrainingJob:
     """Make the job that adapts the fold's network of one seed to one skin and tests it on that skin's test rows."""
-    name, settings = named
+    name, settings = named_recipe
     test = fold.test[data.rows.skin[fold.test] == pokes.skin]
     start = select_pretrained(pretrained, settings.base, fold)[pokes.seed_i]
     recipe = data.settings.section(Training, "train_triplet").recipes[settings.base]
@@ -214,8 +214,8 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
             cache=home() / CACHE,
             log=lambda line: say(f"{prefix}: {line}"),
         )
-    took = {result.key: (result.seconds, result.reused) for result in results}
-    record_trainings(COSTS / data.scene, stage, took, time.monotonic() - start_s)
+    times = {result.key: (result.seconds, result.reused) for result in results}
+    record_trainings(COSTS / data.scene, stage, times, time.monotonic() - start_s)
     for job, result in zip(jobs, results, strict=True):
         if result.stopped_step is not None:
             say(f"warning: {prefix}: {job.name} diverged by step {result.stopped_step}; its earlier weights are kept")
@@ -228,7 +228,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> None:
-    """Write models, cards and predictions; write times, which differ between equal runs, outside the outputs."""
+    """Write models, cards and predictions; times are written elsewhere, because they differ between equal runs."""
     code = code_version_of(imported(module_name(stage)))
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
     with io.replacing(models) as folder:
@@ -304,28 +304,28 @@ def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float3
 
 
 def sweep_point(data: SceneData, job: TrainingJob, result: TrainingResult, method: str) -> dict[str, Any]:
-    """Return the scores of a training run as a point on the curve of a sweep, without weights and predictions."""
+    """Return the scores of a training run as a point of a sweep's curve."""
     card: dict[str, Any] = {**scored_card(data, job, result)}
     kept = ("key", "question", "fold", "seed_i", "stopped_step", "scores", "collapsed", "collapsed_before_n")
     return {name: card[name] for name in kept} | {"method": method, "trained_on_skins_n": len(card["train_skins"])}
 
 
 def collapse_record(result: TrainingResult) -> dict[str, Any]:
-    """Return whether training collapsed, and how often earlier attempts with other random draws did."""
+    """Return whether training collapsed, and how many earlier attempts with other random draws collapsed."""
     return {"collapsed": result.collapsed, "collapsed_before_n": result.collapsed_before_n}
 
 
 def write_timings(scene: str, stage: str, jobs: Sequence[_Named], results: Sequence[_Timed]) -> None:
     """Write the seconds that each training run and one prediction took, outside the outputs of stages."""
-    took = [
+    seconds = [
         {"name": job.name, "train_s": result.seconds, "one_reading_s": result.one_reading_s}
         for job, result in zip(jobs, results, strict=True)
     ]
-    io.write_json(SECONDS / scene / f"{stage}.json", took)
+    io.write_json(SECONDS / scene / f"{stage}.json", seconds)
 
 
 def _predictions(jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], rows: Rows) -> pa.Table:
-    """Tabulate the truth and the prediction, one row for each job and test row."""
+    """Tabulate true and predicted values, one row for each job and test row."""
     tables = []
     for job, result in zip(jobs, results, strict=True):
         names = {"question": job.experiment, "recipe": job.recipe_name, "fold": job.fold, "seed_i": job.seed_i}

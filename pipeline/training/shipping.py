@@ -35,8 +35,8 @@ from reskin.universal.network import FULL_SET_N
 from reskin.universal.population import Population
 from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
 
-PRESSES_N = (0, 12, FULL_SET_N)  # unlabelled; `reskin live` asks for a dozen
-WAYS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses, and whether they are evenly spread
+PRESSES_N = (0, 12, FULL_SET_N)  # numbers of unlabelled presses; `reskin live` asks for 12
+PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses, and whether evenly spread
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "name": "universal, simulated alone",
@@ -58,16 +58,16 @@ CARD = {
 
 
 def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int], seed: int) -> LikelihoodPowers:
-    """Choose likelihood powers at a misfit of 1 on simulated skins, by number of unlabelled presses and of labels."""
-    found: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
+    """Choose likelihood powers for a misfit of 1 on simulated skins, by numbers of unlabelled presses and of labels."""
+    by_setting: dict[tuple[int, bool, int], list[Float[np.ndarray, "t 2"]]] = {}
     for name, error in LAW_ERRORS.items():
         skins = draw_prior_skins(prior, CALIBRATION_SKINS_N, seed, name, error)
         for i in range(len(skins)):
-            for presses_n, even in WAYS:
+            for presses_n, even in PRESS_SETS:
                 for n in labels_n if name == AS_TRAINED else [n for n in labels_n if n]:
                     tested = calibrate(model, skins, i, (presses_n, n), even=even, seed=seed)
-                    found.setdefault((presses_n, even, n), []).append(_coverages(model, *tested))
-    best = {key: best_powers(NOMINAL_POWERS, of).combined for key, of in found.items()}
+                    by_setting.setdefault((presses_n, even, n), []).append(_coverages(model, *tested))
+    best = {key: best_powers(NOMINAL_POWERS, of_skins).combined for key, of_skins in by_setting.items()}
     anywhere = {presses_n: {n: best[presses_n, False, n] for n in labels_n} for presses_n in PRESSES_N}
     return LikelihoodPowers(anywhere, {n: best[FULL_SET_N, True, n] for n in labels_n})
 
@@ -75,7 +75,7 @@ def calibrate_powers(model: Universal, prior: SkinPrior, labels_n: Sequence[int]
 def calibrate(
     model: Universal, skins: Population, i: int, counts: tuple[int, int], *, even: bool, seed: int
 ) -> tuple[Float[np.ndarray, "m ch"], Float[np.ndarray, "m 2"]]:
-    """Calibrate a model to a simulated skin with the given numbers (presses, labels) of its pool.
+    """Calibrate a model to a simulated skin with the given counts (presses, labels) from its pool.
 
     Returns readings to test it on, in the chips' axes, and their places in the frame of labels.
     """
@@ -96,14 +96,14 @@ def _coverages(
 ) -> Float[np.ndarray, "t 2"]:
     """Return the coverage of 90 % intervals for each power, in two equal columns, because `best_powers` takes pairs."""
     by_misfit = [lower_by_misfit(power, model.misfit) for power in NOMINAL_POWERS]
-    powers = [lower_by_residuals(*one) for one in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
-    found = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
-    return np.column_stack([found, found])
+    powers = [lower_by_residuals(*pair) for pair in zip(by_misfit, model.variance_inflations(by_misfit), strict=True)]
+    covered = [coverage(estimate, place_mm) for estimate in model.estimates(b_uT, powers)]
+    return np.column_stack([covered, covered])
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the shipped model is made from."""
+    """The inputs of the shipped model."""
 
     prior: SkinPrior
     training: TrainingSettings
@@ -112,7 +112,7 @@ class Inputs:
 
 
 def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
-    """Read the nominal skin, for the paper's board, and the training settings of a scene."""
+    """Read the nominal skin design (mounted on the paper's board) and a scene's training settings."""
     design = parse(SkinDesign, defaults.nominal("skin"), f"{defaults.NOMINAL}: skin")
     setup = Setup(design, np.array(CHIPS_MM), NOMINAL.gap_mm, SKIN_MM, design.flipped, design.tip_radius_mm)
     settings = read_yaml(scene)
@@ -126,7 +126,7 @@ def read_inputs(scene: Path = Path("pipeline/scenes/lab.yaml")) -> Inputs:
 
 
 def make() -> None:
-    """Make the model and overwrite its file and card."""
+    """Make the model, and overwrite its file and its card."""
     inputs = read_inputs()
     times_s = [time.process_time()]
     tables = tabulate(NOMINAL, NOMINAL_SPREADS, inputs.prior.setup)
@@ -136,9 +136,9 @@ def make() -> None:
     model = Universal(tables, networks, NO_POWERS)
     powers = calibrate_powers(model, inputs.prior, inputs.labels_n, inputs.seed)
     times_s.append(time.process_time())
-    took_s = dict(zip(("map", "network", "sureness"), np.diff(times_s).round().tolist(), strict=True))
+    elapsed_s = dict(zip(("map", "network", "sureness"), np.diff(times_s).round().tolist(), strict=True))
     training = inputs.training.model_dump() | {"seed": inputs.seed}
-    write(tables, networks, powers, CARD | {"lessons": training, "made_in_s": took_s})
+    write(tables, networks, powers, CARD | {"lessons": training, "made_in_s": elapsed_s})
 
 
 if __name__ == "__main__":

@@ -28,14 +28,14 @@ from reskin.universal.training import ERROR_OF_NOMINAL, NOISE_uT, SkinPrior, add
 
 EXPERIMENT = "labels"  # its folds are scored
 METHODS = ("universal map, ", "universal, ")  # the map alone; map and networks
-WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}
-REACH = 1.645  # standard deviations to either side of a 90 % interval
+WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # titles of the variants
+REACH = 1.645  # half width of a 90 % interval, in standard deviations
 BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidates, calibrated on other boards
 NOMINAL_POWERS = tuple(
     np.geomspace(0.1, 1.6, 13).tolist()
 )  # candidates at a misfit of 1, calibrated on simulated skins
-ASSUMED_POWER = 0.5  # of the map's estimates if none is calibrated, as if the channels' errors were equal in pairs
-FORCE_MIN_N = float(FORCES_N[0])  # of a labelled press: the map is not tabulated below
+ASSUMED_POWER = 0.5  # of the map's estimates if none is calibrated: as if channels had equal errors in pairs
+FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is not tabulated below
 
 
 class Powers(NamedTuple):
@@ -67,11 +67,11 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class PoolCalibration:
-    """A model calibrated to a board's no-load field and its pool of presses; the first presses may serve as labels."""
+    """A model calibrated to a board's no-load field and its pool of presses, the first of which may serve as labels."""
 
     presses: PressCalibration
     pool: LabelledPresses
-    pool_mm: Float[np.ndarray, "m 2"]  # the pool's places as the networks estimate them
+    pool_mm: Float[np.ndarray, "m 2"]  # places of the pool's presses, estimated by the networks
     misfit: float  # median over the pool
 
     def with_labels(self, labels_n: int) -> CalibratedModel:
@@ -87,7 +87,7 @@ class PoolCalibration:
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
     def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":
-        """Put some of the pool's presses first."""
+        """Return this calibration with the given presses first in the pool."""
         order = np.concatenate([first, np.setdiff1d(np.arange(len(self.pool)), first)])
         pool = self.pool[order]
         # The networks are conditioned again, because the order of the pool changes their sums in the last bits.
@@ -103,19 +103,19 @@ def calibrate(model: PriorModel, rest_uT: Float[np.ndarray, " ch"], pool: Labell
 
 
 def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[Powers]) -> list[Estimates]:
-    """Estimate places and forces for each pair of powers, on which only the standard deviations depend."""
+    """Estimate places and forces for each pair of powers; only the standard deviations depend on the powers."""
 
     def by_powers(evaluation: Evaluation) -> list[Estimate]:
         assumed = evaluation.by_map(ASSUMED_POWER)
         by_map = [with_deviation_of(assumed, evaluation.by_map(power)) for power, _ in powers]
         return [*by_map, *(evaluation.combined(power) for _, power in powers)]
 
-    found = model.estimate_by(by_powers, db_uT)
-    return [Estimates(*pair) for pair in zip(found[: len(powers)], found[len(powers) :], strict=True)]
+    estimates = model.estimate_by(by_powers, db_uT)
+    return [Estimates(*pair) for pair in zip(estimates[: len(powers)], estimates[len(powers) :], strict=True)]
 
 
 def with_deviation_of(estimate: Estimate, other: Estimate) -> Estimate:
-    """Return an estimate whose standard deviations are the rms errors about its places under another estimate."""
+    """Replace the standard deviations of an estimate by its rms errors under the distribution of another one."""
     return replace(estimate, sd_mm=np.hypot(other.sd_mm, other.place_mm - estimate.place_mm))
 
 
@@ -125,9 +125,10 @@ def lower_by_labels(calibration: PoolCalibration, labels_n: int, powers: Sequenc
     combined: list[HeldOut] = []
     for kept, held_out in folds_of_labels(min(labels_n, len(calibration.pool))):
         model = calibration.reordered(kept).with_labels(len(kept))
-        found, true_mm = estimate(model, calibration.pool.db_uT[held_out], powers), calibration.pool.place_mm[held_out]
-        by_map.append(([one.map for one in found], true_mm))
-        combined.append(([one.combined for one in found], true_mm))
+        estimates = estimate(model, calibration.pool.db_uT[held_out], powers)
+        true_mm = calibration.pool.place_mm[held_out]
+        by_map.append(([pair.map for pair in estimates], true_mm))
+        combined.append(([pair.combined for pair in estimates], true_mm))
     inflations = [variance_inflations(len(powers), folds) for folds in (by_map, combined)]
     return [
         Powers(lower_by_residuals(power.map, of_map), lower_by_residuals(power.combined, of_both))
@@ -141,7 +142,7 @@ def score_fold(
     """Score both variants on one fold, by the map alone and with networks, for every number of labels."""
     known, data = benchmark.known, benchmark.known.data
     board = str(data.rows.board[fold.test[0]])
-    if board not in known.presses:  # if a board has several skins, they are named by board and skin
+    if board not in known.presses:  # the keys are boards and skins if a board has several skins
         what = f"boards of one skin each are needed; got {', '.join(known.presses)}"
         raise ParamsError(f"fold {fold.name}: {what}. Remove the experiment from the scene.")
     pool, rest_uT = pool_of(known, fold), known.presses[board].rest_uT.ravel()
@@ -165,7 +166,7 @@ def score_fold(
 
 
 def coverage(estimate: Estimate, place_mm: Float[np.ndarray, "n 2"]) -> float:
-    """Return the share of coordinates that are inside their 90 % intervals."""
+    """Return the fraction of coordinates that are inside their 90 % intervals."""
     return float((np.abs(estimate.place_mm - place_mm) <= REACH * estimate.sd_mm).mean())
 
 
@@ -173,8 +174,8 @@ def coverages(
     calibration: PoolCalibration, tested: LabelledPresses, labels_n: int, powers: Sequence[Powers]
 ) -> Float[np.ndarray, "t 2"]:
     """Return the coverage of 90 % intervals for each pair of powers, for the map alone and with networks."""
-    found = estimate(calibration.with_labels(labels_n), tested.db_uT, powers)
-    return np.array([[coverage(one, tested.place_mm) for one in pair] for pair in found])
+    estimates = estimate(calibration.with_labels(labels_n), tested.db_uT, powers)
+    return np.array([[coverage(each, tested.place_mm) for each in pair] for pair in estimates])
 
 
 def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate: Estimate) -> dict[str, Any]:
@@ -203,23 +204,25 @@ def pool_of(known: KnownBoards, fold: Fold) -> LabelledPresses:
     return LabelledPresses(known.frame.place(target[:, :2]), target[:, 2], known.frame.field(db_uT))
 
 
-CALIBRATION_SKINS_N = 24  # simulated skins per kind of error of the law, for the powers of the nominal variant
+CALIBRATION_SKINS_N = (
+    24  # number of simulated skins for each of LAW_ERRORS, to calibrate the powers of the nominal variant
+)
 
-Coverages = Float[np.ndarray, "t 2"]  # by power; for the map alone, and with networks
+Coverages = Float[np.ndarray, "t 2"]  # rows: powers; columns: the map alone, the map with networks
 LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns changes of field with errors of the law
 
 
-def law_error(times: float = 1.0) -> LawError:
-    """Return a function that adds errors of the law, `times` as large as in training."""
+def law_error(scale: float = 1.0) -> LawError:
+    """Return a function that adds errors of the law, scaled relative to those in training."""
     least, most = ERROR_OF_NOMINAL
 
     def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
-        return add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), (times * least, times * most), rng)
+        return add_error(skins.db_uT, skins.place_mm, np.log(skins.force_N), (scale * least, scale * most), rng)
 
     return add
 
 
-AS_TRAINED = "further"  # the names of errors are part of seeds
+AS_TRAINED = "further"  # the names of errors select random streams
 LAW_ERRORS = {AS_TRAINED: law_error(), "further, missed twice": law_error(2.0)}
 
 
@@ -236,26 +239,26 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 
 
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
-    """Choose powers at a misfit of 1, by number of labels, on simulated skins.
+    """Choose powers for a misfit of 1 on simulated skins, by number of labels.
 
     The powers used for a board are these, divided by its misfit (Birge's ratio) and by the variance inflation of its
-    labels. The law's errors on the simulated skins are as large as in training. With labels, skins with errors twice as
-    large are added, because the residuals of labels should show the size of the errors.
+    labels. The law's errors on the simulated skins are as large as in training. If there are labels, skins with errors
+    twice as large are added, because the residuals at the labels reveal the size of the errors.
     """
-    found: dict[int, list[Coverages]] = {n: [] for n in labels_n}
+    by_labels_n: dict[int, list[Coverages]] = {n: [] for n in labels_n}
     for name, error in LAW_ERRORS.items():
         skins = draw_prior_skins(nominal.prior, CALIBRATION_SKINS_N, seed, name, error)
         calibrated = [calibrate_to_simulated(nominal.model, skins, i, seed) for i in range(len(skins))]
         for n in labels_n:
             if n or name == AS_TRAINED:
-                found[n] += [_simulated_coverages(*one, n) for one in calibrated]
-    return {n: best_powers(NOMINAL_POWERS, found[n]) for n in labels_n}
+                by_labels_n[n] += [_simulated_coverages(*skin, n) for skin in calibrated]
+    return {n: best_powers(NOMINAL_POWERS, by_labels_n[n]) for n in labels_n}
 
 
-def best_powers(candidates: Sequence[float], found: Sequence[Coverages]) -> Powers:
+def best_powers(candidates: Sequence[float], of_skins: Sequence[Coverages]) -> Powers:
     """Choose the powers whose 90 % intervals have a coverage closest to 90 %, averaged over skins."""
-    of_map, combined = np.abs(np.mean(found, axis=0) - 0.9).argmin(axis=0)
-    return Powers(candidates[of_map], candidates[combined])
+    map_i, combined_i = np.abs(np.mean(of_skins, axis=0) - 0.9).argmin(axis=0)
+    return Powers(candidates[map_i], candidates[combined_i])
 
 
 def draw_prior_skins(prior: SkinPrior, skins_n: int, seed: int, name: str, error: LawError) -> Population:
@@ -289,7 +292,7 @@ def _simulated_coverages(calibration: PoolCalibration, tested: LabelledPresses, 
 
 
 def _board_coverages(benchmark: Benchmark, board: str, labels_n: Sequence[int]) -> dict[int, Coverages]:
-    """Return the coverages of the nominal variant on a board: a third of its presses is the pool, the others test."""
+    """Compute coverages of the nominal variant on a board; a third of its presses is the pool, the rest is tested."""
     own = benchmark.known.presses[board]
     order = rng_for(benchmark.known.data.settings.seed, "universal", board).permutation(len(own.recorded))
     db_uT = own.db_uT.reshape(len(order), -1)

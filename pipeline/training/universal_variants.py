@@ -1,4 +1,4 @@
-"""The universal model before calibration to a held-out board: train it or read it.
+"""Train or read the universal model before it is calibrated to a held-out board.
 
 There are two variants: `rig` is made from the recorded boards that are not held out, `nominal` from simulated skins
 alone.
@@ -32,13 +32,17 @@ from reskin.universal.model import PriorModel
 from reskin.universal.network import Weights, from_tensors, to_tensors
 from reskin.universal.training import NOMINAL_NAME, RecordedBoard, SkinPrior, TrainingSettings, train_networks
 
-READINGS_N = 100  # of each press of a recorded board, for training
+READINGS_N = 100  # number of readings per press of a recorded board, for training
 FORMAT = "reskin-universal-1"
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame of boards relative to their labels: the chips' axes, and the labels' middle and direction of y."""
+    """The relation of a board's frame to the axes of its chips and to its labels.
+
+    turn: for each chip, the rotation from its axes to the board's. middle_mm: the board's centre in label coordinates.
+    mirrored: whether y of the labels points opposite to y of the board.
+    """
 
     turn: Float[np.ndarray, "k 3 3"]
     middle_mm: tuple[float, float]
@@ -70,7 +74,7 @@ class KnownBoards:
 
 @dataclass(frozen=True)
 class Variant:
-    """The model before calibration to a board, and the skins that it was made from."""
+    """The model before calibration to a board, and the prior of the skins that it was made from."""
 
     prior: SkinPrior
     model: PriorModel
@@ -119,7 +123,7 @@ def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
 
 
 def prior_without(known: KnownBoards, laws: Mapping[str, Law], board: str) -> SkinPrior:
-    """Return the prior that is made from all boards but one: their laws, the laws' errors, and their readings."""
+    """Return the prior made from all boards except one: from their laws, the laws' errors, and their readings."""
     others = {other: own for other, own in known.presses.items() if other != board}
     rows, frame = known.data.rows, known.frame
     recorded = [recorded_board(rows, frame, other, own.rest_uT.ravel()) for other, own in others.items()]
@@ -133,8 +137,8 @@ def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], 
     for board, own in presses.items():
         simulated_uT = simulate_uT(laws[board], setup, own.place_mm, own.recorded.force_N)
         simulated_uT = simulated_uT.reshape(len(simulated_uT), -1)
-        off_uT = own.db_uT.reshape(simulated_uT.shape) - simulated_uT
-        errors.append(off_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
+        error_uT = own.db_uT.reshape(simulated_uT.shape) - simulated_uT
+        errors.append(error_uT / np.linalg.norm(simulated_uT, axis=1, keepdims=True))
     boards = list(presses.values())
     return fit_residual([own.place_mm for own in boards], [own.recorded.force_N for own in boards], errors)
 
@@ -170,7 +174,7 @@ def _file_name(name: str) -> str:
 
 
 def card_of(variant: Variant, settings: TrainingSettings, seed: int) -> dict[str, object]:
-    """Describe networks: the skins they were trained on, and what they are not for."""
+    """Describe networks: the skins that they were trained on, and for what they are not suitable."""
     prior = variant.prior
     return {
         "format": FORMAT, "method": f"universal, {prior.name}", "seed": seed,

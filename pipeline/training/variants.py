@@ -26,8 +26,8 @@ from reskin.models.recipe import AdaptationWithBase
 from reskin.numerics import device
 
 FORCE = 2  # column
-BEFORE, AFTER, CONTROL = "before", "after", "control"  # the control trains as long but without the skin's pokes
-Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # of true and predicted x_mm, y_mm, F_N
+BEFORE, AFTER, CONTROL = "before", "after", "control"  # the control is trained as long, without the skin's pokes
+Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # takes true and predicted x_mm, y_mm, F_N
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def predict_before(
 def adapt_and_predict(
     data: SceneData, jobs: Sequence[tuple[str, TrainingJob]], stage: str
 ) -> tuple[list[VariantPrediction], dict[str, int]]:
-    """Run (variant, job) pairs; return predictions for the test rows, and the counts of collapsed training runs."""
+    """Run (variant, job) pairs; return predictions for the test rows, and counts of collapsed training runs."""
     adapted = [job for _, job in jobs]
     trained = train_jobs(data, adapted, stage)
     write_timings(data.scene, stage, adapted, trained)
@@ -74,15 +74,15 @@ def adapt_and_predict(
 def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
     """Compute the bias of the predicted force in newtons and in percent of the mean force."""
     true_N = true[:, FORCE].astype(float)
-    over_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
-    return {"bias_f_N": over_N, "bias_f_pct": 100 * over_N / float(true_N.mean())}
+    bias_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
+    return {"bias_f_N": bias_N, "bias_f_pct": 100 * bias_N / float(true_N.mean())}
 
 
 def summarise_variants(predictions: Sequence[VariantPrediction], metric: Metric = score) -> dict[str, dict[str, Any]]:
     """Summarise every metric over boards, for each variant.
 
-    The value of a board is the mean over its skins, and that of a skin the mean over its seeds. `sd_seeds` is the
-    standard deviation over the networks of one skin, averaged over skins.
+    The value of a board is the mean over its skins, and the value of a skin is the mean over its seeds. `sd_seeds` is
+    the standard deviation over the networks of one skin, averaged over skins.
     """
     variants = _tidy(predictions, metric).groupby("method", sort=False)
     return {
@@ -102,18 +102,19 @@ def force_biases(predictions: Sequence[VariantPrediction]) -> dict[str, dict[str
 
 
 def compare_variants(predictions: Sequence[VariantPrediction], of: str, over: str) -> dict[str, Any]:
-    """Summarise the difference `of` minus `over` of two variants, skin by skin, over boards and `by_board`.
+    """Summarise over boards the difference of two variants, `of` minus `over`, on the same skins.
 
-    `sd_seeds` is that of the differences, because networks with equal seeds start from the same weights.
+    `by_board` has each board's value. `sd_seeds` is computed from differences between networks with equal seeds, which
+    start from the same weights.
     """
     rows = _tidy(predictions, score)
     sides = [statistics.select(rows, method=variant) for variant in (of, over)]
     compared = statistics.paired(*sides)
     network = ["board", "skin", "seed"]
     metrics = [name for name in METRICS if name in rows]
-    each = sides[0].set_index(network)[metrics] - sides[1].set_index(network)[metrics]
+    by_network = sides[0].set_index(network)[metrics] - sides[1].set_index(network)[metrics]
     by_board = compared.pop("by_board")
-    return statistics.add_seed_sd(compared, each, "board", "skin") | {"by_board": by_board}
+    return statistics.add_seed_sd(compared, by_network, "board", "skin") | {"by_board": by_board}
 
 
 def _tidy(predictions: Sequence[VariantPrediction], metric: Metric) -> pd.DataFrame:

@@ -86,9 +86,9 @@ def initial_result(job: TrainingJob) -> TrainingResult:
     )
 
 
-def networks_of(at: few.Study) -> list[few.Done]:
+def networks_of(at: few.Study) -> list[few.TrainedEntry]:
     """Return all networks of the study, step by step as in the stage."""
-    done: list[few.Done] = []
+    done: list[few.TrainedEntry] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
         done = [*done, *((entry, job, initial_result(job)) for entry, job in step(at, done))]
     return done
@@ -101,7 +101,7 @@ ADAPTED = [job for _, job, _ in NETWORKS if isinstance(job.tuning, Adaptation)]
 LABELLED = [(entry, job) for entry, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
 
 
-def all_tried(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
+def all_tried(at: few.Study, networks: list[few.TrainedEntry]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
     return [*((entry, job) for entry, job, _ in networks), *few.classical_jobs(at)]
 
 
@@ -129,7 +129,7 @@ def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
     return one.few_labels if isinstance(one, ClassicalJob) else one.tuning.row
 
 
-def with_labels(at: few.Study, networks: list[few.Done]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
+def with_labels(at: few.Study, networks: list[few.TrainedEntry]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
     return [(entry, one) for entry, one in all_tried(at, networks) if entry.labels_n]
 
 
@@ -222,7 +222,7 @@ def test_only_listed_networks_are_adapted():
     assert few.adaptation_jobs(study(adapted=[]), networks_of_no_labels(study(adapted=[]))) == []
 
 
-def networks_of_no_labels(at: few.Study) -> list[few.Done]:
+def networks_of_no_labels(at: few.Study) -> list[few.TrainedEntry]:
     return [(entry, job, initial_result(job)) for entry, job in few.network_jobs(at, [])]
 
 
