@@ -46,7 +46,7 @@ class Cluster(Executor):
     """Executor that submits calls to a Dask scheduler; they run in this process's working directory, one per worker."""
 
     def __init__(self, address: str, imports: str) -> None:
-        self._own, self._address = describe_process(), address
+        self._expected, self._address = describe_process(), address
         self._client = _connect(address)
         try:
             with suppress(TimeoutError):
@@ -62,7 +62,7 @@ class Cluster(Executor):
         """Run a call on one of the workers."""
         future: Future[Any] = Future()
         future.set_running_or_notify_cancel()
-        submitted = self._executor.submit(run_on_worker, os.getcwd(), self._own, partial(fn, *args, **kwargs))
+        submitted = self._executor.submit(run_on_worker, os.getcwd(), self._expected, partial(fn, *args, **kwargs))
         submitted.add_done_callback(partial(_copy_outcome, future, self._address))
         return future
 
@@ -72,12 +72,12 @@ class Cluster(Executor):
         self._client.close()
 
 
-def run_on_worker(folder: str, own: Mapping[str, str], call: Callable[[], Any]) -> Any:
+def run_on_worker(folder: str, expected: Mapping[str, str], call: Callable[[], Any]) -> Any:
     """Run a call on a worker, in the folder of the checkout, because the paths of stages are relative to it.
 
     The worker is checked again, because it may have joined after `_check_workers`.
     """
-    _compare(own, describe_process(), f"process {os.getpid()}")
+    _compare(expected, describe_process(), f"process {os.getpid()}")
     os.chdir(folder)  # a worker has one thread
     return call()
 
@@ -122,13 +122,13 @@ def _check_workers(client: Any, address: str) -> None:
     for name, worker in workers.items():
         if worker["nthreads"] != 1:
             raise ParamsError("RESKIN_EXECUTOR", f"threads of worker {name}", "1", worker["nthreads"], HELP)
-    own = describe_process()
+    expected = describe_process()
     for name, theirs in client.run(describe_process).items():
-        _compare(own, theirs, name)
+        _compare(expected, theirs, name)
 
 
-def _compare(own: Mapping[str, str], theirs: Mapping[str, str], name: str) -> None:
-    for what, value in own.items():
+def _compare(expected: Mapping[str, str], theirs: Mapping[str, str], name: str) -> None:
+    for what, value in expected.items():
         got = theirs.get(what, "nothing")  # missing if the worker imported an older version of this module
         if got != value:
             raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Restart it. {HELP}")

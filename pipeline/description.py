@@ -54,9 +54,9 @@ def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str
     weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
     if {weak, strong} <= set(skins):  # computed per skin, because one capture may contain only one of these forces
         skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
-    found = summarise(skins)
+    summary = summarise(skins)
     return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
-            for name, stat in found.items()}  # fmt: skip
+            for name, stat in summary.items()}  # fmt: skip
 
 
 def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
@@ -117,16 +117,16 @@ def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
 
 def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
     size_uT = np.linalg.norm(change_uT, axis=1)
-    found = {}
-    for at_N in FORCES_N:
-        near = np.abs(force_N - at_N) <= NEAR * at_N
+    numbers = {}
+    for level_N in FORCES_N:
+        near = np.abs(force_N - level_N) <= NEAR * level_N
         if near.sum() >= ENOUGH_N:
-            found[f"change_at_{at_N:g}_N_uT"] = float(np.median(size_uT[near]))
+            numbers[f"change_at_{level_N:g}_N_uT"] = float(np.median(size_uT[near]))
     chips_uT = np.linalg.norm(
         change_uT.reshape(len(change_uT), change_uT.shape[1] // AXES_PER_CHIP_N, AXES_PER_CHIP_N), axis=2
     )
     pressed = ~(force_N < PRESSED_N)
     if pressed.sum() >= ENOUGH_N and chips_uT.shape[1] > 1:
         ratio = chips_uT[pressed].min(axis=1) / chips_uT[pressed].max(axis=1)
-        found["weakest_over_strongest_chip"] = float(np.median(ratio))
-    return found
+        numbers["weakest_over_strongest_chip"] = float(np.median(ratio))
+    return numbers

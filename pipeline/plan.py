@@ -59,10 +59,11 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
     }  # fmt: skip
     for stage in (*stages(EXPERIMENTS, "models", "curve", "study"), *ANALYSES):
         items[stage] = [name for name, scene in scenes.items() if scene.runs(stage)]
-    for one in EXPERIMENTS.values():
-        if one.protocol is not None and one.recorded:
-            items[one.stage] = {
-                name: _folder(name, one.protocol) if scenes[name].simulate else name for name in items[one.stage]
+    for experiment in EXPERIMENTS.values():
+        if experiment.protocol is not None and experiment.recorded:
+            items[experiment.stage] = {
+                name: _folder(name, experiment.protocol) if scenes[name].simulate else name
+                for name in items[experiment.stage]
             }
     items["table2"] = [name for name, scene in scenes.items() if {*TABLE_2.values()} <= {*scene.experiments}]
     items |= {"report": list(scenes), "publish": list(scenes)}

@@ -72,8 +72,8 @@ def machine() -> str:
     """Describe the machine: processor and instruction sets, cores that this process may use, Python."""
     cores_n = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     cpuinfo = CPUINFO.read_text(encoding="utf-8", errors="replace") if CPUINFO.exists() else ""
-    named = processor_name(cpuinfo, os.environ, otherwise=platform.processor())
-    return f"cpu {platform.machine()} {named}, {cores_n} cores, Python {platform.python_version()}"
+    processor = processor_name(cpuinfo, os.environ, otherwise=platform.processor())
+    return f"cpu {platform.machine()} {processor}, {cores_n} cores, Python {platform.python_version()}"
 
 
 def processor_name(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
@@ -173,7 +173,7 @@ def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
 
 def _git(*words: str) -> str:
     try:
-        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+        completed = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
     except OSError:
         return ""  # no git on this machine: the version is reported as unknown
-    return done.stdout.strip() if done.returncode == 0 else ""
+    return completed.stdout.strip() if completed.returncode == 0 else ""

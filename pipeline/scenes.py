@@ -21,15 +21,21 @@ MAIN_PROTOCOL = "grid"  # protocol of the captures on which folds are drawn
 # The rows of table 2 and their experiments. A scene that runs all of these gets the table before its report.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
-EXPERIMENTS: Mapping[str, Experiment] = {one.name: one for one in (*LEARNING, *read_experiments())}
-ANALYSES = tuple(one.name for one in EXPERIMENTS.values() if one.kind == "analysis")
-SECTIONS = {one.stage for one in EXPERIMENTS.values() if one.settings}
+EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in (*LEARNING, *read_experiments())}
+ANALYSES = tuple(experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "analysis")
+SECTIONS = {experiment.stage for experiment in EXPERIMENTS.values() if experiment.settings}
 
 
 def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
     """Return the stages that run the named experiments of the given kinds, each once and in a fixed order."""
     chosen = set(names)
-    return list(dict.fromkeys(one.stage for one in EXPERIMENTS.values() if one.name in chosen and one.kind in kinds))
+    return list(
+        dict.fromkeys(
+            experiment.stage
+            for experiment in EXPERIMENTS.values()
+            if experiment.name in chosen and experiment.kind in kinds
+        )
+    )
 
 
 SharedRow = dict[str, Any]  # a row without `steps_n`, which each scene sets
@@ -73,16 +79,16 @@ class Scene(Strict, extra="allow"):
 
     @property
     def analyses(self) -> tuple[str, ...]:
-        return tuple(one.name for one in self.entries if one.kind == "analysis")
+        return tuple(experiment.name for experiment in self.entries if experiment.kind == "analysis")
 
     @property
     def studies(self) -> tuple[str, ...]:
-        return tuple(one.name for one in self.entries if one.kind == "study")
+        return tuple(experiment.name for experiment in self.entries if experiment.kind == "study")
 
     @property
     def with_folds(self) -> tuple[str, ...]:
         """The experiments that have folds of their own."""
-        return tuple(one.name for one in self.entries if one.folds is not None)
+        return tuple(experiment.name for experiment in self.entries if experiment.folds is not None)
 
     @property
     def model_stages(self) -> list[str]:
@@ -92,13 +98,13 @@ class Scene(Strict, extra="allow"):
     @property
     def curves(self) -> dict[str, str]:
         """The stage of each experiment whose results are points of a curve."""
-        of_curves = (one for one in EXPERIMENTS.values() if one.kind == "curve")
-        return {one.name: one.stage for one in of_curves if one.name in self.experiments}
+        of_curves = (experiment for experiment in EXPERIMENTS.values() if experiment.kind == "curve")
+        return {experiment.name: experiment.stage for experiment in of_curves if experiment.name in self.experiments}
 
     @property
     def protocols(self) -> set[str]:
         """The protocols that a simulated scene needs for its experiments."""
-        return {MAIN_PROTOCOL} | {one.protocol for one in self.entries if one.protocol is not None}
+        return {MAIN_PROTOCOL} | {experiment.protocol for experiment in self.entries if experiment.protocol is not None}
 
     @property
     def described(self) -> str:
@@ -108,22 +114,24 @@ class Scene(Strict, extra="allow"):
     def runs(self, unit: str) -> bool:
         """Return whether the scene runs a stage (`drift`), or the part of a stage for a protocol (`simulate-wear`)."""
         stage, _, part = unit.partition("-")
-        if stage in {one.stage for one in EXPERIMENTS.values() if one.kind != "report"}:
-            return stage in {one.stage for one in self.entries}
+        if stage in {experiment.stage for experiment in EXPERIMENTS.values() if experiment.kind != "report"}:
+            return stage in {experiment.stage for experiment in self.entries}
         return not part or self.source == "recorded" or part in self.protocols
 
     @model_validator(mode="after")
     def _check_sections(self) -> "Scene":
         if (self.simulate is not None) != (self.source == "simulated"):
             raise ValueError("a scene has a section simulate if and only if its source is simulated")
-        for one in self.entries:
-            if missing := set(one.needs) - set(self.experiments):
-                raise ValueError(f"experiment {one.name} needs {', '.join(sorted(missing))} in the same scene")
-        split_keys = {key for one in self.entries for key in one.folds or ()}
+        for experiment in self.entries:
+            if missing := set(experiment.needs) - set(self.experiments):
+                raise ValueError(f"experiment {experiment.name} needs {', '.join(sorted(missing))} in the same scene")
+        split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
         split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()  # adaptation draws pokes from a pool
         wrong = [
             *_differences(
-                "the scene", set(self.model_extra or ()), {one.stage for one in self.entries if one.settings}
+                "the scene",
+                set(self.model_extra or ()),
+                {experiment.stage for experiment in self.entries if experiment.settings},
             ),
             *_differences("split", self.split.model_fields_set, split_keys),
             *(_differences("simulate.protocols", {*self.simulate.protocols}, self.protocols) if self.simulate else ()),
@@ -134,10 +142,14 @@ class Scene(Strict, extra="allow"):
 
     @model_validator(mode="after")
     def _check_source(self) -> "Scene":
-        if not self.with_folds and not any(one.alone for one in self.entries):
-            sufficient = sorted(one.name for one in EXPERIMENTS.values() if one.folds is not None or one.alone)
+        if not self.with_folds and not any(experiment.alone for experiment in self.entries):
+            sufficient = sorted(
+                experiment.name
+                for experiment in EXPERIMENTS.values()
+                if experiment.folds is not None or experiment.alone
+            )
             raise ValueError(f"experiments must include at least one of {', '.join(sufficient)}")
-        only_simulated = sorted(one.name for one in self.entries if not one.recorded)
+        only_simulated = sorted(experiment.name for experiment in self.entries if not experiment.recorded)
         if self.simulate is None and only_simulated:
             raise ValueError(f"only a simulated scene can run experiments {', '.join(only_simulated)}")
         return self
@@ -179,7 +191,9 @@ def read_scene(root: Path, name: str) -> Scene:
 def check_scene(settings: Settings) -> Scene:
     """Check a scene, and each section with the settings model of its stage."""
     scene = parse_scene(settings.of_scene, settings.where)
-    for stage in dict.fromkeys(["split", *(one.stage for one in scene.entries if one.kind != "report")]):
+    for stage in dict.fromkeys(
+        ["split", *(experiment.stage for experiment in scene.entries if experiment.kind != "report")]
+    ):
         if model := section_of(getattr(module_of(stage), stage)):
             settings.section(model, stage)
     if scene.simulate is not None:
@@ -193,9 +207,9 @@ def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
     """Check a scene's experiments and that it has the sections they need, but not the content of the sections."""
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
-            found, guess = repr(value)[:80], did_you_mean(name, sorted(known))
+            got, guess = repr(value)[:80], did_you_mean(name, sorted(known))
             raise ParamsError(
-                f"{where}: {name} is not a known parameter (its value: {found}). Correct or remove it there.{guess}"
+                f"{where}: {name} is not a known parameter (its value: {got}). Correct or remove it there.{guess}"
             )
         if name in SECTIONS and not isinstance(value, dict):
             raise ParamsError(where, name, "a valid dictionary", repr(value)[:80], "Correct it there.")

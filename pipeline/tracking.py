@@ -149,8 +149,8 @@ class Publisher:
     def find(self, stage: str, **tags: str) -> Any:
         """Find a stage's newest run with these tags; None if there is none."""
         query = " and ".join(f"tags.{name} = '{value}'" for name, value in {"stage": stage, **tags}.items())
-        found = self.client.search_runs([self.experiment_id], query, max_results=1)
-        return found[0] if found else None
+        runs = self.client.search_runs([self.experiment_id], query, max_results=1)
+        return runs[0] if runs else None
 
     def open_run(
         self, stage: str, key: str, *, name: str = "", parent: str = "", tags: Mapping[str, str] = MappingProxyType({})
@@ -164,13 +164,13 @@ class Publisher:
                 f"MLflow took longer than {self.limit_s:.0f} s. Results are kept; `reskin publish` sends the rest."
             )
         self.current.add(key)
-        found = self.find(stage, run_key=key)
+        existing = self.find(stage, run_key=key)
         current = {"current": "true"} | ({PARENT: parent} if parent else {})
-        if found and found.info.status == "FINISHED":
-            self.set_tags(found, current)
-            return str(found.info.run_id), False
-        if found:
-            self.client.delete_run(found.info.run_id)
+        if existing and existing.info.status == "FINISHED":
+            self.set_tags(existing, current)
+            return str(existing.info.run_id), False
+        if existing:
+            self.client.delete_run(existing.info.run_id)
         all_tags = {"run_key": key, "stage": stage, "scene": self.scene, "kind": "stage", **current, **tags}
         run = self.client.create_run(self.experiment_id, tags=all_tags, run_name=name or stage)
         return str(run.info.run_id), True
@@ -247,18 +247,18 @@ class Publisher:
         (`dvc checkout` does not restore reports), the report that was written with them is the current one.
         """
         inputs = _digest(sorted(self.current))
-        before = self.find("report", inputs=inputs)
-        found = key = None
+        earlier = self.find("report", inputs=inputs)
+        existing = key = None
         metrics: list[tuple[str, float, int]] = []
         if (reports / "numbers.json").exists():
             metrics = metrics_of(io.read_json(reports / "numbers.json"))
             files = [file for part in ("figures", "tables") for file in sorted((reports / part).glob("*"))]
             key = _digest([*metrics, *((file.name, io.sha256(file), 0) for file in files)])
-            found = self.find("report", run_key=key)
-        other_inputs = found is not None and found.data.tags.get("inputs") != inputs
-        if before is not None and (key is None or other_inputs):
-            self.set_tags(before, {"current": "true"})
-            self.current.add(before.data.tags["run_key"])
+            existing = self.find("report", run_key=key)
+        other_inputs = existing is not None and existing.data.tags.get("inputs") != inputs
+        if earlier is not None and (key is None or other_inputs):
+            self.set_tags(earlier, {"current": "true"})
+            self.current.add(earlier.data.tags["run_key"])
         elif key is not None:
             run_id, unwritten = self.open_run("report", key)
             if unwritten:
@@ -320,9 +320,9 @@ def _client(uri: str) -> Iterator[Any]:
 
 def _experiment(client: Any, scene: str, root: Path) -> str:
     """Find or create the experiment of a scene; return its id."""
-    found = client.get_experiment_by_name(scene)
-    if found is not None:
-        return str(found.experiment_id)
+    existing = client.get_experiment_by_name(scene)
+    if existing is not None:
+        return str(existing.experiment_id)
     location = None if server_uri() else (root / ARTIFACTS / scene).resolve().as_uri()
     # The kind makes the UI show training runs, not chats.
     kind = {"mlflow.experimentKind": "custom_model_development"}

@@ -81,17 +81,17 @@ class Comparison:
 
 def compare(committed: Mapping[str, Any], fresh: Mapping[str, Any]) -> Comparison:
     """Compare the nested numbers, booleans and texts of a fresh run with the committed ones."""
-    done = Comparison(Counter(), [], [], [])
+    comparison = Comparison(Counter(), [], [], [])
     for name, old, new in _pairs(committed, fresh, ""):
         if new is MISSING:
-            done.missing.append(name)
+            comparison.missing.append(name)
         elif old is MISSING:
-            done.new.append(name)
+            comparison.new.append(name)
         elif _equal(old, new):
-            done.equal[section_of(name)] += 1
+            comparison.equal[section_of(name)] += 1
         else:
-            done.differing.append(Difference(name, old, new))
-    return done
+            comparison.differing.append(Difference(name, old, new))
+    return comparison
 
 
 def _equal(old: Leaf, new: Leaf) -> bool:
@@ -199,7 +199,7 @@ def read_folder(path: Path, scene: str) -> Report:
     """Read a scene's report; `path` is `reports/<scene>`, a folder that contains it, or a file in one of these."""
     start = path if path.is_dir() else path.parent
     candidates = (start, start / scene, start / "reports" / scene)
-    folder = next((one for one in candidates if (one / "numbers.json").is_file()), None)
+    folder = next((candidate for candidate in candidates if (candidate / "numbers.json").is_file()), None)
     if folder is None:
         remedy = "Name reports/<scene> of another checkout."
         raise SchemaError(f"{path}: no {scene}/numbers.json there. {remedy}")
@@ -222,8 +222,8 @@ def read_revision(root: Path, scene: str, revision: str) -> Report:
 
 def _git(root: Path, *arguments: str) -> str:
     """Run git in the checkout and return its output; empty if it fails."""
-    done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
-    return "" if done.returncode else done.stdout
+    completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
+    return "" if completed.returncode else completed.stdout
 
 
 def _parse(where: str, texts: Mapping[str, str]) -> Report:
@@ -266,30 +266,33 @@ def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -
     ]
     counts = []
     for name, part in parts.items():
-        found = {
-            "differ": Counter(section_of(one.name) for one in part.differing),
+        by_kind = {
+            "differ": Counter(section_of(difference.name) for difference in part.differing),
             "only committed": Counter(map(section_of, part.missing)),
             "only fresh": Counter(map(section_of, part.new)),
         }
-        for section in dict.fromkeys(chain.from_iterable(found.values())):
-            numbers = {title: str(by_section[section]) for title, by_section in found.items()}
+        for section in dict.fromkeys(chain.from_iterable(by_kind.values())):
+            numbers = {title: str(by_section[section]) for title, by_section in by_kind.items()}
             counts.append({"part": name, "section": section, "equal": str(part.equal[section])} | numbers)
-    differing = [one for part in parts.values() for one in part.differing]
+    differing = [difference for part in parts.values() for difference in part.differing]
     # Tables repeat the numbers of numbers.json, so their differences are listed only if none of those numbers differs.
-    numeric = next(filter(None, ([one for one in part.differing if one.relative] for part in parts.values())), [])
+    numeric = next(
+        filter(None, ([difference for difference in part.differing if difference.relative] for part in parts.values())),
+        [],
+    )
     largest = [
         {
-            "largest differences": one.name,
-            "committed": _show(one.committed),
-            "fresh": _show(one.fresh),
-            "relative, %": f"{100 * (one.relative or 0.0):.3g}",
+            "largest differences": difference.name,
+            "committed": _show(difference.committed),
+            "fresh": _show(difference.fresh),
+            "relative, %": f"{100 * (difference.relative or 0.0):.3g}",
         }
-        for one in sorted(numeric, key=lambda one: -(one.relative or 0.0))[:LISTED_N]
+        for difference in sorted(numeric, key=lambda difference: -(difference.relative or 0.0))[:LISTED_N]
     ]
     verdicts = [
-        {"changed verdicts": one.name, "committed": one.verdicts[0], "fresh": one.verdicts[1]}
-        for one in differing
-        if one.verdicts
+        {"changed verdicts": difference.name, "committed": difference.verdicts[0], "fresh": difference.verdicts[1]}
+        for difference in differing
+        if difference.verdicts
     ]
     for rows in (machines, counts, largest, verdicts):
         if rows:

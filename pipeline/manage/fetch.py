@@ -152,12 +152,12 @@ def download(source: Source, where: str, folder: Path) -> None:
 
 def _read_checked(origin: "Origin", file: File) -> bytes:
     """Read a file, as CSV if it is an archive of pickled samples, and check its hash."""
-    found = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
-    if found is None:
+    path = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
+    if path is None:
         remedy = f"Is this the right source? {USE_FROM}"
         raise CaptureError(f"{origin.name}: no file {file.at} or {file.path}. {remedy}")
-    content, name = origin.read(found), f"{origin.name} {found}"
-    if found.endswith(".npz"):
+    content, name = origin.read(path), f"{origin.name} {path}"
+    if path.endswith(".npz"):
         content, name = to_lab_csv(content, name), f"{name} as CSV"
     digest = sha256(content).hexdigest()
     if digest != file.sha256:
@@ -170,7 +170,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
 
 def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> None:
     """Add each recording that its scene does not have yet; recordings stay added if a later one fails."""
-    done_n = 0
+    added_n = 0
     try:
         for recording in source.recordings:
             labels = CaptureNames(recording.board, recording.skin, None)
@@ -180,10 +180,10 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
             else:
                 header = add.add(root, scene, prepared, allow_copy=False)
                 say(f"added {scene}/{header.capture} (board {header.board}, skin {header.skin})")
-            done_n += 1
+            added_n += 1
     except BaseException:
         all_n = len(source.recordings)
-        say(f"{done_n} of {all_n} recordings are in scene {scene}; run the same command again to add the rest")
+        say(f"{added_n} of {all_n} recordings are in scene {scene}; run the same command again to add the rest")
         raise
 
 
@@ -232,8 +232,8 @@ class Origin:
             same = [mine == theirs for mine, theirs in parts]
             return same.index(False) if False in same else len(same)
 
-        found = [path for path in self.paths if common_n(path)]
-        return min(found, key=lambda path: (-common_n(path), len(path), path), default=None)
+        candidates = [path for path in self.paths if common_n(path)]
+        return min(candidates, key=lambda path: (-common_n(path), len(path), path), default=None)
 
 
 def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:

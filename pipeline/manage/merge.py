@@ -131,19 +131,19 @@ def _versions(root: Path, blobs: Mapping[str, str]) -> Versions:
 
 def _unmerged(root: Path) -> dict[str, dict[str, str]]:
     """List the files in conflict: name -> side -> git's blob."""
-    found: dict[str, dict[str, str]] = {}
+    unmerged: dict[str, dict[str, str]] = {}
     for line in _git(root, "ls-files", "--unmerged", "-z").split("\0")[:-1]:
         entry, name = line.split("\t", 1)
         _, blob, side = entry.split()
-        found.setdefault(name, {})[side] = blob
-    return found
+        unmerged.setdefault(name, {})[side] = blob
+    return unmerged
 
 
 def _git(root: Path, *words: str) -> str:
     """Run git in the checkout, and return its output."""
     if not which("git"):
         raise ParamsError("reskin merge needs git: install it.")
-    done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise ParamsError(f"git {words[0]} failed: {' '.join(done.stderr.split())[-300:]}")
-    return done.stdout
+    completed = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+    if completed.returncode:
+        raise ParamsError(f"git {words[0]} failed: {' '.join(completed.stderr.split())[-300:]}")
+    return completed.stdout

@@ -86,7 +86,7 @@ def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool =
 
 
 def _git(root: Path, *words: str) -> str:
-    done = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SchemaError(f"git {words[0]} failed: {done.stderr.strip()[-300:]}")
-    return done.stdout
+    completed = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+    if completed.returncode:
+        raise SchemaError(f"git {words[0]} failed: {completed.stderr.strip()[-300:]}")
+    return completed.stdout

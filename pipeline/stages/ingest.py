@@ -50,20 +50,19 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
     cache = home() / CACHE / settings.scene
     policy = [settings.shared["faults"], settings.shared["lost_fraction_max"]]
     common_inputs = repr(policy).encode() + io.read_bytes(code)
-    before = {file.stem.partition("-")[0]: file for file in cache.glob("*-*.parquet")}
+    cached = {file.stem.partition("-")[0]: file for file in cache.glob("*-*.parquet")}
     used, read_n = set(), 0
     with io.replacing(indentations) as folder:
         folder.mkdir()
         for name in settings.captures:
             key = _cache_key(raw / name, common_inputs)
-            if key not in before or not _is_whole(before[key]):
+            if key not in cached or not _is_whole(cached[key]):
                 fresh = cache / f"{key}.parquet"
                 ingest(settings, raw / name, fresh)
-                before[key], read_n = fresh.rename(cache / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
-            shutil.copyfile(
-                before[key], folder / f"{name}.parquet"
-            )  # not a link: an edit of one must not change the other
-            used.add(before[key])
+                cached[key], read_n = fresh.rename(cache / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
+            # Not a link, because an edit of one file must not change the other.
+            shutil.copyfile(cached[key], folder / f"{name}.parquet")
+            used.add(cached[key])
     for file in set(cache.glob("*.parquet")) - used:
         io.remove(file)
     captures_n = len(settings.captures)
@@ -90,14 +89,16 @@ def _cache_key(capture: Path, common_inputs: bytes) -> str:
 def describe(settings: Settings, indentations: Path, description: Path) -> None:
     """Describe the recordings of a scene: fields, noise, steps and forces, over its skins."""
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in settings.captures_in(indentations)]
-    accounts = {one.capture: io.read_ingest_counts(indentations / f"{one.capture}.parquet") for one in captures}
-    described = {one.capture: describe_capture(one) for one in captures}
+    accounts = {
+        readings.capture: io.read_ingest_counts(indentations / f"{readings.capture}.parquet") for readings in captures
+    }
+    described = {readings.capture: describe_capture(readings) for readings in captures}
     described |= {
         name: without_rest(described[name])
         for name, account in accounts.items()
         if account.get("baseline_subtracted_rows_n")
     }
-    summary = over_skins([(one.skin, described[one.capture]) for one in captures])
+    summary = over_skins([(readings.skin, described[readings.capture]) for readings in captures])
     readings_n = sum(map(len, captures))
     counts = {"captures_n": len(captures), "readings_n": readings_n}
     counts["indentations_n"] = sum(account.get("indentations_n", 0) for account in accounts.values())
@@ -112,6 +113,7 @@ def split(settings: Settings, section: Split, indentations: Path, folds: Path) -
         io.write_json(folds, render_folds(captures, NO_ROWS, []))
         return say(f"{settings.scene}: {len(captures)} captures; no experiment holds rows out")
     rows = load_rows([indentations / f"{name}.parquet" for name in captures], settings.section(Selection, "selection"))
-    drawn = draw_folds(rows, settings.held_out, section, settings.seed)
-    io.write_json(folds, render_folds(captures, rows, drawn))
-    say(f"{settings.scene}: {len(rows)} rows of {len(captures)} captures, {len(drawn)} folds; left out: {rows.dropped}")
+    new_folds = draw_folds(rows, settings.held_out, section, settings.seed)
+    io.write_json(folds, render_folds(captures, rows, new_folds))
+    counts = f"{len(rows)} rows of {len(captures)} captures, {len(new_folds)} folds"
+    say(f"{settings.scene}: {counts}; left out: {rows.dropped}")

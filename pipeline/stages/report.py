@@ -129,7 +129,9 @@ def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, res
         studies=read(scene.studies),
         described={scene.described: io.read_json(results / "described.json")},
         before_touch=[
-            io.read_table(models / one / BEFORE_CONTACT_FILE) for one in scene.model_stages if one == "train_single"
+            io.read_table(models / model_stage / BEFORE_CONTACT_FILE)
+            for model_stage in scene.model_stages
+            if model_stage == "train_single"
         ],
         accounts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
         dropped=split_of_scene["dropped"],
@@ -155,7 +157,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
         **before_touch_numbers(inputs.before_touch),
         "trainings": count_trainings(inputs.cards, inputs.points, analyses),
         "described": inputs.described,
-        **{one.key: experiments[one.key] for one in scene.entries if one.key in experiments},
+        **{entry.key: experiments[entry.key] for entry in scene.entries if entry.key in experiments},
         "runtime": runtime,
     }  # fmt: skip
     if scene.source == "simulated":
@@ -172,7 +174,7 @@ def write_index(reports: Path) -> None:
     results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
     files = reports.glob(f"*/figures/{HEADLINE_FIGURE}")
     headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}
-    io.write_text(reports / "index.html", index([one for one in results if "described" in one], headlines))
+    io.write_text(reports / "index.html", index([numbers for numbers in results if "described" in numbers], headlines))
 
 
 def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
@@ -194,8 +196,8 @@ def read_curves(scene: Scene, results: Path) -> Curves:
     curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(points).items()}
     for experiment in scene.analyses:
         numbers = io.read_json(results / f"{experiment}.json")["numbers"]
-        named = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]
-        curves[experiment] = [(head, step, {tail: value}) for (head, _, tail), value, step in named]
+        named_values = [(name.rpartition("."), value, step) for name, value, step in metrics_of({experiment: numbers})]
+        curves[experiment] = [(head, step, {tail: value}) for (head, _, tail), value, step in named_values]
     return curves
 
 

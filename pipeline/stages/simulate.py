@@ -22,9 +22,9 @@ def simulate(settings: Settings, protocol: str, raw: Path) -> None:
         raise ParamsError(settings.where, f"skins_n of protocol {protocol}", rule, skins_n, "Reduce it.")
     with io.replacing(raw) as folder, make_executor(len(pairs), imports="reskin.simulation.capture") as executor:
         folder.mkdir()
-        waiting = [executor.submit(_write_capture, simulation, protocol, pair, seed, folder) for pair in pairs]
-        for i, done in enumerate(waiting, 1):
-            say(f"{settings.scene}: simulated {done.result()} ({i}/{len(pairs)})")
+        futures = [executor.submit(_write_capture, simulation, protocol, pair, seed, folder) for pair in pairs]
+        for i, future in enumerate(futures, 1):
+            say(f"{settings.scene}: simulated {future.result()} ({i}/{len(pairs)})")
 
 
 def _write_capture(

@@ -44,13 +44,13 @@ def sweep_pokes(
     if section.boards_n > len(held_out):
         rule = f"at most the {len(held_out)} boards of the scene"
         raise ParamsError(settings.where, "sweep_pokes.boards_n", rule, section.boards_n, "Reduce it.")
-    named = (HEADLINE, recipe)
+    named_recipe = (HEADLINE, recipe)
     pairs = [
         (job, pokes_n)
         for fold in held_out
         for pokes_n in section.pokes_n
         if pokes_n
-        for job in adaptation_jobs(data, fold, named, networks, experiment="pokes", pokes_n=pokes_n)
+        for job in adaptation_jobs(data, fold, named_recipe, networks, experiment="pokes", pokes_n=pokes_n)
     ]
     jobs = [job for job, _ in pairs]
     results = train_jobs(data, jobs, "sweep_pokes")
@@ -98,11 +98,11 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         for job, result in zip(jobs, results, strict=True)
         if job.what == "triplet"
     }
-    named = (HEADLINE, adaptation)
+    named_recipe = (HEADLINE, adaptation)
     adapted = [
         job
         for fold in draws
-        for job in adaptation_jobs(data, fold, named, pretrained, experiment="sensors", pokes_n=section.pokes_n)
+        for job in adaptation_jobs(data, fold, named_recipe, pretrained, experiment="sensors", pokes_n=section.pokes_n)
     ]
     methods = [job.what for job in jobs] + ["adapted"] * len(adapted)
     jobs, results = jobs + adapted, results + train_jobs(data, adapted, "sweep_sensors")

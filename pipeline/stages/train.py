@@ -72,8 +72,8 @@ def adapt(
     jobs = [
         job
         for fold in data.folds_of("lobo")
-        for named in section.recipes.items()
-        for job in adaptation_jobs(data, fold, named, networks, experiment="adapt", pokes_n=section.pokes_n)
+        for named_recipe in section.recipes.items()
+        for job in adaptation_jobs(data, fold, named_recipe, networks, experiment="adapt", pokes_n=section.pokes_n)
     ]
     write_models(models, data, jobs, train_jobs(data, jobs, "adapt"), "adapt")
 

@@ -31,11 +31,14 @@ def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds
     """Score networks, adapted networks and classical methods on the same rows, with every number of labels."""
     data = read_data(settings, indentations, folds)
     study = few.Study(data.rows, data.folds_of(few.EXPERIMENT), settings.seed, section)
-    done: list[few.TrainedEntry] = []
+    trained_entries: list[few.TrainedEntry] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):  # each uses networks of earlier steps
-        pairs = step(study, done)
+        pairs = step(study, trained_entries)
         trained = train_jobs(data, [job for _, job in pairs], "few_labels")
-        done = [*done, *((entry, job, result) for (entry, job), result in zip(pairs, trained, strict=True))]
+        trained_entries = [
+            *trained_entries,
+            *((entry, job, result) for (entry, job), result in zip(pairs, trained, strict=True)),
+        ]
     tasks = few.classical_jobs(study)
     with make_executor(imports="reskin.models.classical") as executor:
         fitted = run_classical_jobs(
@@ -44,7 +47,9 @@ def few_labels(settings: Settings, section: FewLabels, indentations: Path, folds
             executor,
             lambda line: say(f"{data.scene} few_labels: {line}"),
         )
-    points = [_point(data, entry, trained.predicted) | collapse_record(trained) for entry, _, trained in done]
+    points = [
+        _point(data, entry, trained.predicted) | collapse_record(trained) for entry, _, trained in trained_entries
+    ]
     points += [_point(data, entry, result.predicted) for (entry, _), result in zip(tasks, fitted, strict=True)]
     io.write_json(scores, points)
 

@@ -79,19 +79,19 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
     """
     parts: list[tuple[np.ndarray, ...]] = []
     passes_n: dict[str, int] = {}
-    for one in sorted(captures, key=lambda readings: readings.capture):
-        before_n = passes_n.get(one.skin, 0)
-        passes_n[one.skin] = before_n + int(one.pass_i.max()) + 1
-        touches = np.flatnonzero(np.isfinite(one.x_mm) & (one.Fz_N > 0))
-        empty = np.flatnonzero(np.isnan(one.x_mm) & (one.Fz_N == 0))
+    for capture in sorted(captures, key=lambda readings: readings.capture):
+        before_n = passes_n.get(capture.skin, 0)
+        passes_n[capture.skin] = before_n + int(capture.pass_i.max()) + 1
+        touches = np.flatnonzero(np.isfinite(capture.x_mm) & (capture.Fz_N > 0))
+        empty = np.flatnonzero(np.isnan(capture.x_mm) & (capture.Fz_N == 0))
         after = np.searchsorted(touches, empty)
         inside = (after > 0) & (after < len(touches))
         empty, last, coming = empty[inside], touches[after[inside] - 1], touches[after[inside]]
-        same = (one.pass_i[last] == one.pass_i[empty]) & (one.pass_i[coming] == one.pass_i[empty])
+        same = (capture.pass_i[last] == capture.pass_i[empty]) & (capture.pass_i[coming] == capture.pass_i[empty])
         empty, coming = empty[same], coming[same]
-        place_mm = np.column_stack([one.x_mm[coming], one.y_mm[coming]])
-        skins, pass_i = np.full(len(empty), one.skin), one.pass_i[empty].astype(np.int64) + before_n
-        parts.append((one.b_uT[empty] - one.noload_uT[empty], place_mm, skins, pass_i))
+        place_mm = np.column_stack([capture.x_mm[coming], capture.y_mm[coming]])
+        skins, pass_i = np.full(len(empty), capture.skin), capture.pass_i[empty].astype(np.int64) + before_n
+        parts.append((capture.b_uT[empty] - capture.noload_uT[empty], place_mm, skins, pass_i))
     return Hover(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -124,10 +124,12 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
     """Score models of contacts on the hovering rows in the test passes of a fold."""
     rows = data.rows
     test_passes = set(zip(rows.skin[fold.test], rows.pass_i[fold.test].tolist(), strict=True))
-    own = np.array([pair in test_passes for pair in zip(hover.skin, hover.pass_i.tolist(), strict=True)], bool)
-    if not own.any():
+    in_test_passes = np.array(
+        [pair in test_passes for pair in zip(hover.skin, hover.pass_i.tolist(), strict=True)], bool
+    )
+    if not in_test_passes.any():
         return []
-    db_uT, place_mm = hover.db_uT[own], hover.place_mm[own]
+    db_uT, place_mm = hover.db_uT[in_test_passes], hover.place_mm[in_test_passes]
     rng = rng_for(data.settings.seed, "before-touch", "hover")
     neighbours = fit(NEIGHBOURS, rows.db_uT[fold.train], rows.target[fold.train], rng, weight=None)
     predictions = {"hover": [neighbours.predict(db_uT)], "hover_network": [network(db_uT) for network in networks]}
@@ -139,7 +141,7 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
     for name, of_models in predictions.items():
         scores = [score(true, predicted) for predicted in of_models]
         if scores:
-            means = {metric: float(np.mean([one[metric] for one in scores])) for metric in PLACE}
+            means = {metric: float(np.mean([values[metric] for values in scores])) for metric in PLACE}
             lines.append({"question": fold.experiment, "fold": fold.name, "told_by": name, **means, **magnitudes})
     return lines
 

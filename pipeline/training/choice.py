@@ -122,9 +122,11 @@ def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, 
 
 
 def _check_budgets(cards: Cards, stage: str) -> None:
-    tried = {card["recipe_name"]: {_budget(other) for other in cards if _key(other) == _key(card)} for card in cards}
-    all_budgets = set().union(*tried.values())
-    for name, budgets in tried.items():
+    budgets_by_name = {
+        card["recipe_name"]: {_budget(other) for other in cards if _key(other) == _key(card)} for card in cards
+    }
+    all_budgets = set().union(*budgets_by_name.values())
+    for name, budgets in budgets_by_name.items():
         if budgets != all_budgets:
             what, got = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(all_budgets)}"
             remedy = "Try every candidate with every number of steps."

@@ -80,7 +80,7 @@ class Entry:
 TrainedEntry = tuple[Entry, TrainingJob, TrainingResult]
 
 
-def network_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
+def network_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
     """List the jobs that train every recipe on every fold."""
     return [
         (
@@ -92,10 +92,10 @@ def network_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[Entry
     ]
 
 
-def adaptation_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
+def adaptation_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
     """List the jobs that adapt the recipes in `adapted` with all indentations of the pool, unlabelled."""
     pairs = []
-    for entry, job, trained in done:
+    for entry, job, trained in trained_entries:
         if job.recipe_name in study.settings.adapted:
             lines = grid_lines(study.rows, entry.fold.pool)
             tuning = Adaptation(_to_pretrained(trained), study.settings.adapting, lines)
@@ -104,10 +104,10 @@ def adaptation_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[En
     return pairs
 
 
-def fine_tuning_jobs(study: Study, done: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
+def fine_tuning_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
     """List the jobs that fine-tune every network on every number of labelled indentations."""
     pairs = []
-    for entry, job, trained in done:
+    for entry, job, trained in trained_entries:
         for labels_n, row in _labelled_rows(study, entry.fold).items():
             if labels_n:
                 tuning = FineTuning(_to_pretrained(trained), study.settings.labelling, row)

@@ -30,10 +30,8 @@ EXPERIMENT = "labels"  # its folds are scored
 METHODS = ("universal map, ", "universal, ")  # the map alone; map and networks
 WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # titles of the variants
 REACH = 1.645  # half width of a 90 % interval, in standard deviations
-BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidates, calibrated on other boards
-NOMINAL_POWERS = tuple(
-    np.geomspace(0.1, 1.6, 13).tolist()
-)  # candidates at a misfit of 1, calibrated on simulated skins
+BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidates for calibration on other boards
+NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidates for a misfit of 1, for simulated skins
 ASSUMED_POWER = 0.5  # of the map's estimates if none is calibrated: as if channels had equal errors in pairs
 FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is not tabulated below
 
@@ -155,8 +153,8 @@ def score_fold(
                 powers = benchmark.board_powers[board][n]
             else:
                 (powers,) = lower_by_labels(calibration, n, [calibration.nominal_powers(benchmark.nominal_powers[n])])
-            (found,) = estimate(calibration.with_labels(n), test_uT, [powers])
-            for name, estimates in zip(METHODS, found, strict=True):
+            (by_method,) = estimate(calibration.with_labels(n), test_uT, [powers])
+            for name, estimates in zip(METHODS, by_method, strict=True):
                 points.append({
                     "method": f"{name}{WAYS[way]}", "labels_n": n, "fold": fold.board, "seed_i": fold.draw_i,
                     "inputs": "map" if "map" in name else "map and network",
@@ -193,14 +191,14 @@ def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate:
 def pool_rows(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
     """Return the rows of each press of the pool, in the order in which experiment `labels` labels the presses."""
     indentation = data.rows.indentation[fold.pool]
-    return [fold.pool[indentation == one] for one in labelling_order(data.rows, fold, data.settings.seed)]
+    return [fold.pool[indentation == press] for press in labelling_order(data.rows, fold, data.settings.seed)]
 
 
 def pool_of(known: KnownBoards, fold: Fold) -> LabelledPresses:
     """Return the mean readings of the presses of `pool_rows`."""
     rows, presses = known.data.rows, pool_rows(known.data, fold)
-    target = np.array([rows.target[one].mean(axis=0) for one in presses], float)
-    db_uT = np.array([rows.db_uT[one].mean(axis=0) for one in presses], float)
+    target = np.array([rows.target[press_rows].mean(axis=0) for press_rows in presses], float)
+    db_uT = np.array([rows.db_uT[press_rows].mean(axis=0) for press_rows in presses], float)
     return LabelledPresses(known.frame.place(target[:, :2]), target[:, 2], known.frame.field(db_uT))
 
 

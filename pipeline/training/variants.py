@@ -65,9 +65,9 @@ def adapt_and_predict(
     trained = train_jobs(data, adapted, stage)
     write_timings(data.scene, stage, adapted, trained)
     predictions = []
-    for (variant, job), done in zip(jobs, trained, strict=True):
+    for (variant, job), result in zip(jobs, trained, strict=True):
         board, true = str(data.rows.board[job.test[0]]), data.rows.target[job.test]
-        predictions.append(VariantPrediction(variant, board, job.skin, job.seed_i, true, done.predicted))
+        predictions.append(VariantPrediction(variant, board, job.skin, job.seed_i, true, result.predicted))
     return predictions, statistics.tally(map(collapse_record, trained))
 
 
@@ -119,8 +119,8 @@ def compare_variants(predictions: Sequence[VariantPrediction], of: str, over: st
 
 def _tidy(predictions: Sequence[VariantPrediction], metric: Metric) -> pd.DataFrame:
     rows = (
-        {"method": one.variant, "board": one.board, "skin": one.skin, "seed": one.seed_i}
-        | metric(one.true, one.predicted)
-        for one in predictions
+        {"method": prediction.variant, "board": prediction.board, "skin": prediction.skin, "seed": prediction.seed_i}
+        | metric(prediction.true, prediction.predicted)
+        for prediction in predictions
     )
     return pd.DataFrame(rows)
