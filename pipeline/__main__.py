@@ -8,7 +8,7 @@ import pipeline
 
 
 def main() -> None:
-    """Run the stage or the `reskin` command that the command line names."""
+    """Run the stage or `reskin` command that is named on the command line."""
     here, code = Path.cwd().resolve(), Path(pipeline.__file__).resolve()
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if not code.is_relative_to(here) and (here / "pipeline/__main__.py").is_file():

@@ -117,7 +117,10 @@ def add(
 
 
 def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) -> None:
-    """Raise if an option is given that the layout does not use; `options`: values, and the layouts that use them."""
+    """Raise `ParamsError` if an option is given that the layout does not use.
+
+    options: for each option, its value and the layouts that use it.
+    """
     for option, (value, layouts) in options.items():
         if value not in (None, []) and layout not in layouts:
             used = " and ".join(sorted(layouts))
@@ -155,7 +158,7 @@ def remove(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def merge() -> None:
-    """Resolve conflicts in captures, plan, dvc.lock and reports after a git merge of two people's recordings."""
+    """Resolve conflicts in captures, plan, dvc.lock and reports after branches with different recordings are merged."""
     from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(ROOT))
@@ -163,7 +166,7 @@ def merge() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write missing training runs and reports to MLflow, for example after it was deleted or unreachable."""
+    """Write training runs and reports that MLflow lacks, for example because it was deleted or unreachable."""
     from pipeline.scenes import read_scene
     from pipeline.stages.report import read_curves
     from pipeline.tracking import publish as write
@@ -253,7 +256,7 @@ def use(names: Annotated[list[str], Argument(help="Scenes to run; they replace t
 
 @scenes.command()
 def tidy() -> None:
-    """Delete the results of experiments that no scene runs any more."""
+    """Delete the results of experiments that planned scenes no longer run."""
     from pipeline.manage import tidy as tidying
 
     stale = tidying.tidy(ROOT, checked_plan())

@@ -22,10 +22,10 @@ from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
-CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # a worker that starts at the same time needs seconds for its imports
+CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # workers may start at the same time; their imports take seconds
 HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
-CODE = (".py", ".json", ".safetensors")  # sources and their tables; settings are sent with each call
+CODE = (".py", ".json", ".safetensors")  # files of code and tables; settings are sent with each call
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
 
 
@@ -43,7 +43,7 @@ IMPORTED = {"sources as imported": package_digest(*PACKAGES, suffixes=CODE)} | {
 
 
 class Cluster(Executor):
-    """Executor that submits calls to a Dask scheduler; they run in this process's working directory, one per worker."""
+    """Executor that submits calls to a Dask scheduler; workers run them in this process's working directory."""
 
     def __init__(self, address: str, imports: str) -> None:
         self._expected, self._address = describe_process(), address
@@ -78,7 +78,7 @@ def run_on_worker(folder: str, expected: Mapping[str, str], call: Callable[[], A
     The worker is checked again, because it may have joined after `_check_workers`.
     """
     _compare(expected, describe_process(), f"process {os.getpid()}")
-    os.chdir(folder)  # a worker has one thread
+    os.chdir(folder)  # safe, because a worker has one thread
     return call()
 
 

@@ -159,13 +159,13 @@ def check(root: Path) -> Plan:
 
 
 def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Derive the plan of these scenes of a checkout."""
+    """Derive the plan for these scenes of a checkout."""
     scenes = {name: read_scene(root, scene_file(root, name).stem) for name in dict.fromkeys(names)}
     return make_plan(scenes, read_registry(root))
 
 
 def _in_short_lines(value: Any) -> Any:
-    """Make ruamel write lists, and mappings that hold plain values only, on one line."""
+    """Make ruamel write lists, and mappings whose values are all strings, in flow style."""
     from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
     if isinstance(value, list):

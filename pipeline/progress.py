@@ -14,13 +14,13 @@ ORDER = Path(".reskin/order.json")
 
 def stage_position() -> str | None:
     """Return the position of this stage among all stages; None if DVC does not run it."""
-    stage = os.environ.get(VARIABLE, "").rpartition(":")[2]  # with several files, DVC puts `dvc.yaml:` before it
+    stage = os.environ.get(VARIABLE, "").rpartition(":")[2]  # without prefix `dvc.yaml:`, which DVC may add
     if not stage:
         return None
     try:
         order = stages_in_order()
         return f"stage {order.index(stage) + 1} of {len(order)}" if stage in order else None
-    except Exception as error:  # a stage must not fail because of this line
+    except Exception as error:  # a stage must not fail because this line cannot be made
         return f"its position among all stages is unknown ({type(error).__name__} {error})"
 
 

@@ -21,7 +21,8 @@ COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # times of training and prediction on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
 CPUINFO = Path("/proc/cpuinfo")  # Linux only
-INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}  # by CPU flag
+# Names of instruction sets, by the CPU's flag.
+INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}
 
 
 def home() -> Path:
@@ -97,7 +98,7 @@ def versions() -> dict[str, str]:
 
 
 def clear_cost(folder: Path, stage: str) -> None:
-    """Delete the record of the training runs in a stage's last run."""
+    """Delete what the last run of a stage recorded about its training runs."""
     io.remove(_trainings_file(folder, stage))
 
 
@@ -105,7 +106,7 @@ def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float
     """Record the training runs of a stage.
 
     trained: for each key, the seconds that training took, and whether its result was reused from an earlier run.
-    waited_s: how long the stage waited for them.
+    waited_s: how long the stage waited for the training runs.
     """
     before = _read_trainings(folder, stage)
     reused = {key for key, (_, was_reused) in trained.items() if was_reused} - set(before["computed_s"])

@@ -28,5 +28,5 @@ class NetworkModel:
 
 
 def _load_pyfunc(path: str) -> NetworkModel:
-    """Load the weights that the run's file MLmodel names (called by MLflow)."""
+    """Load the weights that file MLmodel of the run names; MLflow calls this function."""
     return NetworkModel(read_network(Path(path)))

@@ -204,7 +204,7 @@ def check_scene(settings: Settings) -> Scene:
 
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's experiments and that it has the sections they need, but not the content of the sections."""
+    """Check a scene's experiments, and that it has the sections that they need; what these contain is not checked."""
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))

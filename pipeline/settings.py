@@ -1,4 +1,4 @@
-"""Settings of a scene: its own file, `params.yaml`, and the nominal skin of the library, each read once.
+"""Settings of a scene, from its own file, `params.yaml`, and the library's nominal skin; each file is read once.
 
 The sections that a stage parses are its `params` in `dvc.yaml` (tests/test_settings.py compares the two).
 """
@@ -87,7 +87,7 @@ class Adaptations(SectionWithRows):
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a scene; its sections are parsed into typed models when they are first read, once each.
+    """The settings of a scene; each section is parsed into a typed model when it is first read.
 
     where: the scene's file, for error messages. of_scene: its content.
     shared: the content of `params.yaml` and of the library's nominal skin.

@@ -15,7 +15,7 @@ from reskin.errors import ReskinError, explaining
 
 
 def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run the function of a stage with the paths that the options give and the settings of `--scene`."""
+    """Run the function of a stage with the paths given as options and the settings of `--scene`."""
     stage = work.__name__
     parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=work.__doc__)
     parser.add_argument("--scene", required=True)

@@ -28,14 +28,14 @@ STORE = "mlflow.db"
 ARTIFACTS = "mlartifacts"
 LOADER = "pipeline.pyfunc"
 PARENT = "mlflow.parentRunId"
-LAYOUT = 2  # version of what an MLflow run contains; runs of an older version are written again
+LAYOUT = 2  # version of the content of MLflow runs; runs of older versions are written again
 METRICS_MAX_N = 1000  # in one call to MLflow
 TIMEOUT_S = 2.0
 LOCK_TIMEOUT_S = 5.0  # UIs and other writers lock the store for a much shorter time
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for all writing; a local server takes 0.1 s per run
 NOT_METRICS = {"provenance", "runtime", "described", "variants"}  # costs, and values that other MLflow runs contain
 
-# A point of a sweep or an experiment: the name of its curve, its step (pokes, skins or contacts), and means by name.
+# A point of a sweep or experiment: the name of its curve, its step (a number of pokes, skins, ...), and means by name.
 Point = tuple[str, int, Mapping[str, float]]
 Curves = Mapping[str, Sequence[Point]]
 
@@ -284,7 +284,7 @@ class Publisher:
 
 
 def run_key(card: Mapping[str, Any]) -> str:
-    """Return a digest of a card without its commit: equal results of two commits are one run."""
+    """Return a digest of a card without its commit: equal results of two commits are the same run."""
     return _digest({name: value for name, value in card.items() if name != "git"} | {"published_as": LAYOUT})
 
 

@@ -129,7 +129,7 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
 
 @contextmanager
 def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
-    """In errors, name the user's own files instead of their copies, which are removed."""
+    """Make errors name the user's own files instead of their copies, which are removed."""
     try:
         yield
     except ReskinError as error:
@@ -162,7 +162,7 @@ def _remove_files(target: Path) -> None:
 
 
 def _track(folder: Path, root: Path) -> None:
-    """Track a folder with DVC, as `dvc add` does, but in this process, because starting another takes seconds."""
+    """Track a folder with DVC, as `dvc add` does, but in this process, because starting another one takes seconds."""
     from dvc.exceptions import DvcException  # imported late: it takes a second
     from dvc.repo import Repo
 

@@ -54,7 +54,7 @@ class Difference:
 
     @property
     def verdicts(self) -> tuple[str, str] | None:
-        """The verdicts that two texts begin with; None if these are equal, or if a text begins with none."""
+        """The verdicts that two texts begin with; None if these are equal, or if a text has no verdict."""
         old, new = (VERDICT.match(value) if isinstance(value, str) else None for value in (self.committed, self.fresh))
         return (old[1], new[1]) if old and new and old[1] != new[1] else None
 
@@ -95,7 +95,7 @@ def compare(committed: Mapping[str, Any], fresh: Mapping[str, Any]) -> Compariso
 
 
 def _equal(old: Leaf, new: Leaf) -> bool:
-    both_nan = old != old and new != new  # the only value that is unequal to itself
+    both_nan = old != old and new != new  # NaN is the only value that is unequal to itself
     return (old == new or both_nan) and isinstance(old, bool) == isinstance(new, bool)
 
 
@@ -124,7 +124,7 @@ def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
         before, after = _label_rows([] if old is MISSING else old, [] if new is MISSING else new)
         for label in {**before, **after}:
             yield from _pairs(before.get(label, MISSING), after.get(label, MISSING), f"{name}[{label}]")
-    elif any(isinstance(value, Mapping | list) for value in present):  # of different kinds
+    elif any(isinstance(value, Mapping | list) for value in present):  # a mapping or list on one side only
         yield from _pairs(old, MISSING, name)
         yield from _pairs(MISSING, new, name)
     else:
@@ -250,7 +250,7 @@ def _parse_cell(cell: str) -> int | float | str:
 
 
 def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -> int:
-    """Print how the reports of two runs differ, the summary last; return 0 if all values are equal, else 1."""
+    """Print how the reports of two runs differ, with a summary last; return 0 if all values are equal, else 1."""
     parts = {
         "numbers.json": compare(committed.numbers, fresh.numbers),
         "tables": compare(committed.tables, fresh.tables),

@@ -65,7 +65,7 @@ class Recording(Strict):
 
 
 class Source(Strict):
-    """One public set of recordings; without a scene, it is fetched but not added, and the note says why."""
+    """A public set of recordings; if it has no scene, it is fetched but not added, and `note` says why."""
 
     home: str
     commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
@@ -151,7 +151,7 @@ def download(source: Source, where: str, folder: Path) -> None:
 
 
 def _read_checked(origin: "Origin", file: File) -> bytes:
-    """Read a file, as CSV if it is an archive of pickled samples, and check its hash."""
+    """Read a file, convert it to CSV if it is an archive of pickled samples, and check its hash."""
     path = file.at if file.at in origin.paths else origin.find(file.path) or origin.find(file.at)
     if path is None:
         remedy = f"Is this the right source? {USE_FROM}"
@@ -239,7 +239,7 @@ class Origin:
 def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
     """Open a folder, or a git repository at a commit (None: the newest); `scratch` is an empty folder for git."""
     folder = Path(where)
-    if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # not a path, a URL or host:path
+    if not folder.exists() and not re.search(r"^[^/]{2,}:", where):  # neither an existing path nor a URL or host:path
         raise CaptureError(f"{where}: no such mirror or folder. Check the path; {USE_FROM}")
     is_bare = (folder / "HEAD").is_file() and (folder / "objects").is_dir()
     if folder.is_dir() and not is_bare and not (folder / ".git").exists():

@@ -1,4 +1,4 @@
-"""Resolve the conflicts of a `git merge` of two people's recordings: in the registry, the plan, dvc.lock and reports.
+"""Resolve the conflicts when branches with different recordings are merged: in registry, plan, dvc.lock and reports.
 
 Conflicts in files that people write (params.yaml, scenes, code) must be resolved by hand first.
 """
@@ -27,7 +27,7 @@ from reskin.errors import ParamsError
 LOCK = "dvc.lock"
 RESOLVED = (REGISTRY, PLAN, LOCK)
 REPORTS = "reports/"  # written by stages; our version is kept until the next `dvc repro`
-SIDES = ("1", "2", "3")  # git's numbers of base, ours and theirs
+SIDES = ("1", "2", "3")  # git's stage numbers of base, ours and theirs
 Versions = tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
 
 
@@ -42,7 +42,7 @@ def merge(root: Path) -> str:
     with io.restoring(*files):
         if REGISTRY in unmerged:
             write_registry(root, merge_registries(*_registries(root, unmerged[REGISTRY])))
-        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # also if only captures changed
+        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # needed even if only captures changed
         both = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
     deleted = {name for name in unmerged if name.startswith(REPORTS) and "2" not in unmerged[name]}
     for name in unmerged:
@@ -56,7 +56,7 @@ def merge(root: Path) -> str:
 
 
 def merge_registries(base: Registry, ours: Registry, theirs: Registry) -> Registry:
-    """Apply their changes since the base to our registry; raise if one of their captures conflicts with ours."""
+    """Apply the changes from base to theirs to our registry; raise if one of their captures conflicts with ours."""
     merged, before, after = ours, _entries(base), _entries(theirs)
     for (scene, name), entry in before.items():
         if after.get((scene, name)) != entry == _entries(ours).get((scene, name)):
@@ -90,7 +90,7 @@ def merge_stages(
 
 
 def merge_scenes(base: Sequence[str], ours: Sequence[str], theirs: Sequence[str]) -> list[str]:
-    """Return the scenes to run: ours, without those that they removed, and with those that they added."""
+    """Return the scenes to run: ours, without the scenes removed in theirs, and with the scenes added there."""
     added = [name for name in theirs if name not in ours and name not in base]
     return [name for name in ours if name in theirs or name not in base] + added
 

@@ -71,7 +71,7 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
 
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
-    """Return the registry without a capture, and without its scene if no capture of it is left."""
+    """Return the registry without a capture, and without its scene if that has no other capture."""
     if scene not in registry.captures:
         guess, known = did_you_mean(scene, registry.captures), ", ".join(sorted(registry.captures)) or "none"
         raise CaptureError(f"no scene {scene} has recorded captures.{guess} Scenes that have some: {known}.")

@@ -7,7 +7,7 @@ from reskin import io
 from reskin.errors import ParamsError, SchemaError
 
 DVC_FILES = Path(".dvc/tmp")
-LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages; the second lists the users of files
+LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages, and lists users in the second
 
 
 def require_idle(root: Path) -> None:

@@ -41,7 +41,7 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
         _bring_recordings(root, clone, names)
-        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # stages run `python`
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # because stages run `python`
         environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
@@ -63,7 +63,7 @@ def _clear(reports: Path) -> None:
 
 
 def _bring_recordings(root: Path, clone: Path, names: Sequence[str]) -> None:
-    """Copy the recordings of these scenes, which are not in git."""
+    """Copy the recordings of these scenes, because git does not contain them."""
     shutil.copy(root / REGISTRY, clone / REGISTRY)
     for name in names:
         if (root / RAW / name).is_dir() and any((root / RAW / name).glob("*.dvc")):

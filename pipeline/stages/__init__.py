@@ -1,7 +1,7 @@
 """The stages of the pipeline: thin functions that read inputs, call the library, and write outputs.
 
-dvc.yaml runs a stage by `python -m pipeline STAGE --scene NAME ...`. An experiment in `pipeline.experiments`
-is a module whose stage is the function with the name of the module.
+dvc.yaml runs a stage by `python -m pipeline STAGE --scene NAME ...`. For an experiment, the stage
+is the function in module `pipeline.experiments.NAME` that has the same name.
 """
 
 from importlib import import_module

@@ -44,7 +44,7 @@ def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
 def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -> None:
     """Read all captures of a recorded scene in one stage.
 
-    It is used for scenes with many captures, for which one DVC stage per capture would take longer than reading them.
+    For scenes with many captures, one DVC stage per capture would take longer than reading the captures.
     Captures that were already read, with the same bytes, code and settings, come from a cache (docs/growth.md).
     """
     cache = home() / CACHE / settings.scene
@@ -87,7 +87,7 @@ def _cache_key(capture: Path, common_inputs: bytes) -> str:
 
 
 def describe(settings: Settings, indentations: Path, description: Path) -> None:
-    """Describe the recordings of a scene: fields, noise, steps and forces, over its skins."""
+    """Describe the recordings of a scene: fields, noise, resolution and forces, summarised over its skins."""
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in settings.captures_in(indentations)]
     accounts = {
         readings.capture: io.read_ingest_counts(indentations / f"{readings.capture}.parquet") for readings in captures

@@ -170,7 +170,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
 
 
 def write_index(reports: Path) -> None:
-    """Write the page of all scenes that have reports."""
+    """Write the page that lists all scenes with reports."""
     results = [io.read_json(file) for file in sorted(reports.glob("*/numbers.json"))]
     files = reports.glob(f"*/figures/{HEADLINE_FIGURE}")
     headlines = {file.parents[1].name: io.read_bytes(file).decode() for file in files}

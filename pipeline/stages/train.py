@@ -47,7 +47,7 @@ def train_single(settings: Settings, section: Training, indentations: Path, fold
 
 
 def train_multi(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
-    """Train on the skins of all boards but one (paper section 5.1)."""
+    """Train on the skins of all boards except one (paper section 5.1)."""
     preload_training()
     data = read_data(settings, indentations, folds)
     jobs = make_jobs(data, section, data.folds_of("lobo"))
@@ -55,7 +55,7 @@ def train_multi(settings: Settings, section: Training, indentations: Path, folds
 
 
 def train_triplet(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
-    """Train on the skins of all boards but one, with the triplet loss (paper section 5)."""
+    """Train on the skins of all boards except one, with the triplet loss (paper section 5)."""
     preload_training()
     data = read_data(settings, indentations, folds)
     jobs = make_jobs(data, section, data.folds_of("lobo"), experiment="triplet")

@@ -170,7 +170,7 @@ DIGITS = 4  # significant digits; rounding errors are smaller, and changes of th
 def fingerprint(sections: Mapping[str, Any]) -> str:
     """Return a digest of the fields and forces of two skins under fixed indentations, and of the rig and chip settings.
 
-    A refactoring keeps the fingerprint; a change of the physics or of a setting changes it.
+    A refactoring does not change it; a change of the physics or of a setting does.
     """
     design = parse(SkinDesign, sections["skin"], "skin")
     spreads = parse(Spreads, sections["spreads"], "spreads")

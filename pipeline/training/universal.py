@@ -32,7 +32,7 @@ WAYS = {"rig": "boards of the rig", "nominal": "simulated alone"}  # titles of t
 REACH = 1.645  # half width of a 90 % interval, in standard deviations
 BOARD_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15)  # candidates for calibration on other boards
 NOMINAL_POWERS = tuple(np.geomspace(0.1, 1.6, 13).tolist())  # candidates for a misfit of 1, for simulated skins
-ASSUMED_POWER = 0.5  # of the map's estimates if none is calibrated: as if channels had equal errors in pairs
+ASSUMED_POWER = 0.5  # if none is calibrated, for the map: as if channels had equal errors in pairs
 FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is not tabulated below
 
 
@@ -195,23 +195,21 @@ def pool_rows(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
 
 
 def pool_of(known: KnownBoards, fold: Fold) -> LabelledPresses:
-    """Return the mean readings of the presses of `pool_rows`."""
+    """Return the mean reading of each press in `pool_rows`."""
     rows, presses = known.data.rows, pool_rows(known.data, fold)
     target = np.array([rows.target[press_rows].mean(axis=0) for press_rows in presses], float)
     db_uT = np.array([rows.db_uT[press_rows].mean(axis=0) for press_rows in presses], float)
     return LabelledPresses(known.frame.place(target[:, :2]), target[:, 2], known.frame.field(db_uT))
 
 
-CALIBRATION_SKINS_N = (
-    24  # number of simulated skins for each of LAW_ERRORS, to calibrate the powers of the nominal variant
-)
+CALIBRATION_SKINS_N = 24  # simulated skins for each of LAW_ERRORS, to calibrate the nominal variant's powers
 
 Coverages = Float[np.ndarray, "t 2"]  # rows: powers; columns: the map alone, the map with networks
 LawError = Callable[[Population, np.random.Generator], np.ndarray]  # returns changes of field with errors of the law
 
 
 def law_error(scale: float = 1.0) -> LawError:
-    """Return a function that adds errors of the law, scaled relative to those in training."""
+    """Return a function that adds errors of the law, `scale` times as large as in training."""
     least, most = ERROR_OF_NOMINAL
 
     def add(skins: Population, rng: np.random.Generator) -> Float32[np.ndarray, "s m ch"]:
@@ -220,7 +218,7 @@ def law_error(scale: float = 1.0) -> LawError:
     return add
 
 
-AS_TRAINED = "further"  # the names of errors select random streams
+AS_TRAINED = "further"  # names of errors are also names of random streams
 LAW_ERRORS = {AS_TRAINED: law_error(), "further, missed twice": law_error(2.0)}
 
 

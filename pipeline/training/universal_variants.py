@@ -101,7 +101,7 @@ def make_variants(known: KnownBoards, settings: TrainingSettings) -> Variants:
 
 
 def read_variants(known: KnownBoards, models: Path) -> Variants:
-    """Read the networks that `write_networks` wrote; fit laws and tabulate maps again."""
+    """Read the networks that `write_networks` wrote; fit laws and tabulate maps again, because these are not stored."""
     with make_executor(imports="reskin.universal.map") as executor:
         priors = _priors(known, executor)
         tables = [executor.submit(tabulate, prior.centre, prior.spreads, known.setup) for prior in priors]
@@ -113,7 +113,7 @@ def read_variants(known: KnownBoards, models: Path) -> Variants:
 
 
 def _priors(known: KnownBoards, executor: Executor) -> list[SkinPrior]:
-    """Return the nominal prior, and for each board the prior for holding it out."""
+    """Return the nominal prior, and for each board the prior made without it."""
     boards, setup = known.presses, known.setup
     laws = dict(
         zip(boards, executor.map(fit, boards.values(), [setup] * len(boards), [TEN] * len(boards)), strict=True)
@@ -147,10 +147,12 @@ def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarr
     """Select a board's readings for training: the same number for each press with a force."""
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
-    each = own[first[:, None] + np.arange(READINGS_N) % counts[:, None]]  # the readings of a press are adjacent
-    db_uT = frame.field(rows.db_uT[each.ravel()]).reshape(*each.shape, -1)
-    place_mm = frame.place(rows.target[each[:, 0], :2].astype(float))
-    parts = db_uT, rest_uT, place_mm, rows.target[each, 2]
+    rows_by_press = own[
+        first[:, None] + np.arange(READINGS_N) % counts[:, None]
+    ]  # the readings of a press are adjacent
+    db_uT = frame.field(rows.db_uT[rows_by_press.ravel()]).reshape(*rows_by_press.shape, -1)
+    place_mm = frame.place(rows.target[rows_by_press[:, 0], :2].astype(float))
+    parts = db_uT, rest_uT, place_mm, rows.target[rows_by_press, 2]
     return RecordedBoard(*(part.astype(np.float32) for part in parts))
 
 

@@ -25,7 +25,7 @@ from reskin.models.job import TrainingJob
 from reskin.models.recipe import AdaptationWithBase
 from reskin.numerics import device
 
-FORCE = 2  # column
+FORCE = 2  # column of the force
 BEFORE, AFTER, CONTROL = "before", "after", "control"  # the control is trained as long, without the skin's pokes
 Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # takes true and predicted x_mm, y_mm, F_N
 
