@@ -37,7 +37,7 @@ def check_protocols(simulation: SimulationSettings, where: str) -> None:
             f"kind must be {kind}, which its experiment reads, not {protocol.kind}": protocol.kind != kind,
             f"boards must be {main}, as for {MAIN}, not {boards}": name in ON_MAIN_BOARDS and boards != main,
             f"boards must differ from {boards}, the boards of {MAIN}": name in ON_OTHER_BOARDS and boards == main,
-            f"skins_n must be 1, as one skin is read, not {skins_n}": name in OF_ONE_SKIN and skins_n != 1,
+            f"skins_n must be 1, as only one skin is read, not {skins_n}": name in OF_ONE_SKIN and skins_n != 1,
         }
         for fault in (rule for rule, is_broken in faults.items() if is_broken):
             raise ParamsError(f"{where}: protocol {name}: {fault}. Correct it there.")

@@ -73,7 +73,7 @@ def test_damaged_object_and_its_copies_are_removed(root):
     (root / WEIGHTS / "a.safetensors").write_bytes(b"w3ights")
     status, output = check(root)
     assert status == 1
-    assert "is damaged: its MD5 is not its name" in output
+    assert "is damaged: its MD5 differs from its name" in output
     assert f"removed from {WEIGHTS}/a.safetensors. Run: dvc repro train_multi@one" in output
     assert not cache_file(root, md5(b"weights")).exists()
     assert [file.name for file in (root / WEIGHTS).iterdir()] == ["a.json"]

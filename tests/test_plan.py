@@ -186,7 +186,7 @@ def test_each_protocol_has_a_folder_and_stages(tmp_path):
     [
         ({"protocols__wear__terms": ["wind"]}, r"protocols.wear.terms.0 must be 'ageing', 'friction', "),
         ({"protocols__wear__skins_n": 99}, "protocol wear: skins_n 99 is more than the 6 skins of rigid boards"),
-        ({"protocols__press__skins_n": 3}, "protocol press: skins_n must be 1, as one skin is read, not 3"),
+        ({"protocols__press__skins_n": 3}, "protocol press: skins_n must be 1, as only one skin is read, not 3"),
         ({"protocols__flexible__boards": "rigid"}, "protocol flexible: boards must differ from rigid"),
     ],
 )

@@ -41,7 +41,7 @@ def check(root: Path, echo: Callable[[str], None]) -> int:
     uses = _uses(root, objects) if damaged else {}
     for name, file in damaged.items():
         outcome = _set_aside(root, name, file, uses.get(name, []))
-        echo(f"error: {file} is damaged: its MD5 is not its name. {outcome}")
+        echo(f"error: {file} is damaged: its MD5 differs from its name. {outcome}")
     echo(f"DVC's cache: {len(objects)} objects, {len(damaged)} of them damaged")
     return 1 if damaged else 0
 

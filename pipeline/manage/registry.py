@@ -98,5 +98,5 @@ def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_c
         return
     remedy = "It is in the scene already."
     if relabelled:
-        remedy = "Under two labels, folds would train and test on the same readings; to allow that, use --allow-copy."
+        remedy = "Under two names, folds would train and test on the same readings; to allow that, use --allow-copy."
     raise CaptureError(f"{where}: it has the same readings as {original}. {remedy}")

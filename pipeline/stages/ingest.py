@@ -66,7 +66,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
     for file in set(cache.glob("*.parquet")) - used:
         io.remove(file)
     captures_n = len(settings.captures)
-    say(f"{settings.scene}: {captures_n} captures, {captures_n - read_n} of them read before")
+    say(f"{settings.scene}: {captures_n} captures, {captures_n - read_n} of them from the cache")
 
 
 def _is_whole(cached: Path) -> bool:
