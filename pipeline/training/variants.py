@@ -101,14 +101,14 @@ def force_biases(predictions: Sequence[VariantPrediction]) -> dict[str, dict[str
     }
 
 
-def compare_variants(predictions: Sequence[VariantPrediction], of: str, over: str) -> dict[str, Any]:
-    """Summarise over boards the difference of two variants, `of` minus `over`, on the same skins.
+def compare_variants(predictions: Sequence[VariantPrediction], variant: str, reference: str) -> dict[str, Any]:
+    """Summarise over boards `variant` minus `reference`, two variants on the same skins.
 
     `by_board` has each board's value. `sd_seeds` is computed from differences between networks with equal seeds, which
     start from the same weights.
     """
     rows = _tidy(predictions, score)
-    sides = [statistics.select(rows, method=variant) for variant in (of, over)]
+    sides = [statistics.select(rows, method=name) for name in (variant, reference)]
     compared = statistics.paired(*sides)
     network = ["board", "skin", "seed"]
     metrics = [name for name in METRICS if name in rows]
