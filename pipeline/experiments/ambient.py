@@ -1,7 +1,7 @@
-"""Ambient fields and iron nearby that appear after the no-load reading (paper section 7, future work).
+"""Ambient fields and nearby iron that appear after the no-load reading (paper section 7, future work).
 
-Measures how much they degrade the scores on held-out boards, and how much is recovered by subtracting the reading of a
-reference chip, or the common part of the readings of the board's own chips.
+Measures how much these disturbances degrade the scores on held-out boards, and how much of the loss is recovered by
+subtracting the reading of a reference chip, or the common part of the readings of the board's own chips.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,7 +34,8 @@ from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation.settings import SimulationSettings
 
-REFERENCE_ASIDE_MM = 30.0  # reference chip, from the board's middle along x: assumed too far away to sense a poke
+# From the board's middle to the reference chip, along x; assumed too far away to sense a poke.
+REFERENCE_ASIDE_MM = 30.0
 AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
 
 Networks = Mapping[str, Sequence[Network]]  # by method
@@ -48,14 +49,17 @@ class Iron(Strict):
 
 
 class Ambient(Strict):
-    """Section ambient: uniform fields, and distances of a ball of iron."""
+    """Section ambient: strengths of uniform fields, and the ball of iron."""
 
     fields_uT: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
     iron: Iron
 
 
 def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Path, models: Path, results: Path) -> None:
-    """Test every held-out board in ambient fields; train networks without the common part for the last board."""
+    """Score the networks of every held-out board in ambient fields.
+
+    For the last board, networks are also trained on inputs without their common part.
+    """
     data = read_data(settings, indentations, folds)
     synthesis, seed = simulation_settings(data.settings), data.settings.seed
     training = data.settings.section(Training, "train_multi")
@@ -102,12 +106,15 @@ class Instrument:
     board: Board
     aside: Board
     turn: Float[np.ndarray, "k 3 3"]
-    noise_uT: Float[np.ndarray, " 3"]  # of the reference chip's change of field
+    noise_uT: Float[np.ndarray, " 3"]  # of a change of field of the reference chip
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One ambient field: its strength or distance, what it adds to each row, and what the reference chip subtracts."""
+    """One ambient field: its strength or distance, the field added to each row, and the field subtracted from each row.
+
+    The latter is estimated from the reference chip.
+    """
 
     keys: Mapping[str, float]
     added_uT: Float[np.ndarray, "f ch"]
@@ -118,13 +125,13 @@ def train_without_common_part(
     data: SceneData, fold: Fold, training: Training, instrument: Instrument
 ) -> tuple[list[Network], dict[str, int]]:
     """Train the headline recipe on inputs without their common part; also count collapsed training runs."""
-    without = project(data.rows.db_uT, remove_common_part(instrument.turn))
+    projected_uT = project(data.rows.db_uT, remove_common_part(instrument.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
     jobs = make_jobs(data, headline, [fold], experiment="ambient")
-    trained = train_jobs(replace(data, rows=replace(data.rows, db_uT=without)), jobs, "ambient")
+    trained = train_jobs(replace(data, rows=replace(data.rows, db_uT=projected_uT)), jobs, "ambient")
     networks = [
-        Network({"recipe": job.recipe.model_dump(mode="json")}, {**one.weights, **one.scaler.arrays()})
-        for job, one in zip(jobs, trained, strict=True)
+        Network({"recipe": job.recipe.model_dump(mode="json")}, {**result.weights, **result.scaler.arrays()})
+        for job, result in zip(jobs, trained, strict=True)
     ]
     return networks, tally(map(collapse_record, trained))
 
@@ -143,28 +150,28 @@ def score_board(
     db_uT, true = rows.db_uT[test], rows.target[test]
     without_common = remove_common_part(instrument.turn)
     methods: dict[str, Callable[[Disturbance], np.ndarray]] = {
-        AS_IT_IS: lambda field: db_uT + field.added_uT,
-        ASIDE: lambda field: db_uT + field.added_uT - field.reference_uT,
-        OWN: lambda field: project((db_uT + field.added_uT).astype(np.float32), without_common),
+        AS_IT_IS: lambda disturbance: db_uT + disturbance.added_uT,
+        ASIDE: lambda disturbance: db_uT + disturbance.added_uT - disturbance.reference_uT,
+        OWN: lambda disturbance: project((db_uT + disturbance.added_uT).astype(np.float32), without_common),
     }
-    names, which = np.unique(rows.skin[test], return_inverse=True)
+    names, skin_i = np.unique(rows.skin[test], return_inverse=True)
     rule = synthesis.main_boards.quadrature.in_si()
     skins = [draw_skin(synthesis.skin, synthesis.spreads, seed=seed, name=str(name), rule=rule) for name in names]
     uniform_rng, iron_rng = (rng_for(seed, "ambient", fold.name, kind) for kind in ("uniform", "iron"))
-    for field in (
+    for disturbance in (
         *uniform_fields(instrument, section.fields_uT, rows_n=len(test), rng=uniform_rng),
-        *iron_balls(instrument, skins, which, section.iron, rng=iron_rng),
+        *iron_balls(instrument, skins, skin_i, section.iron, rng=iron_rng),
     ):
         for method, trained in networks.items():
-            inputs_uT = methods[method](field).astype(np.float32)
+            inputs_uT = methods[method](disturbance).astype(np.float32)
             for network in trained:
-                yield {"board": fold.name, "arm": method, **field.keys, "scores": score(true, network(inputs_uT))}
+                yield {"board": fold.name, "arm": method, **disturbance.keys, "scores": score(true, network(inputs_uT))}
 
 
 def one_row_per_poke(
     indentation: Int64[np.ndarray, " f"], own: Int64[np.ndarray, " a"], rng: np.random.Generator
 ) -> Int64[np.ndarray, " b"]:
-    """Draw one row of every indentation."""
+    """Draw one row of every indentation at random."""
     drawn = rng.permutation(own)
     return np.sort(drawn[np.unique(indentation[drawn], return_index=True)[1]])
 
@@ -172,20 +179,20 @@ def one_row_per_poke(
 def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequence[str]) -> list[dict[str, Any]]:
     """Summarise scores over boards: one row per value of the axis, with each method that was tested on these boards.
 
-    Each point is the scores of one network. `sd_seeds` is the standard deviation over the networks of one board,
+    Each point contains the scores of one network. `sd_seeds` is the standard deviation over the networks of one board,
     averaged over boards.
     """
-    of_axis = [point for point in points if axis in point and point["board"] in boards]
+    selected = [point for point in points if axis in point and point["board"] in boards]
     rows = []
-    for step in sorted({point[axis] for point in of_axis}):
-        here = [point for point in of_axis if point[axis] == step]
-        row: dict[str, Any] = {axis: step}
+    for value in sorted({point[axis] for point in selected}):
+        at_value = [point for point in selected if point[axis] == value]
+        row: dict[str, Any] = {axis: value}
         for size, name in (("rms_uT", "field_uT"), ("aside_rms_uT", "aside_field_uT")):
-            if size in here[0]:
-                row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in here])))
-        for method in dict.fromkeys(point["arm"] for point in here):
+            if size in at_value[0]:
+                row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in at_value])))
+        for method in dict.fromkeys(point["arm"] for point in at_value):
             own = pd.DataFrame(
-                [{"board": point["board"], **point["scores"]} for point in here if point["arm"] == method]
+                [{"board": point["board"], **point["scores"]} for point in at_value if point["arm"] == method]
             )
             row[method] = add_seed_sd(summarise(own.groupby("board").mean(), boards=True), own, "board")
         rows.append(row)
@@ -200,31 +207,33 @@ def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
 # --- Fields at the chips ---
 
 
-def draw_instrument(of: SimulationSettings, name: str, *, seed: int) -> Instrument:
+def draw_instrument(simulation: SimulationSettings, name: str, *, seed: int) -> Instrument:
     """Draw the board of this name as in its captures, and a reference chip with equally large manufacturing errors."""
-    design, rig, chip = of.main_boards.design, of.rig, of.chip
+    design, rig, chip = simulation.main_boards.design, simulation.rig, simulation.chip
     lone = BoardDesign(chips_xy_mm=((REFERENCE_ASIDE_MM, 0.0),), chips_turn_deg=(0.0,), gap_mm=design.gap_mm)
     noise = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     return Instrument(
-        board=draw_board(design, of.spreads, seed=seed, name=name),
-        aside=draw_board(lone, of.spreads, seed=seed, name=f"{name}-aside"),
+        board=draw_board(design, simulation.spreads, seed=seed, name=name),
+        aside=draw_board(lone, simulation.spreads, seed=seed, name=f"{name}-aside"),
         turn=Rotation.from_euler("z", np.array(design.chips_turn_deg)[:, None], degrees=True).as_matrix(),
         noise_uT=noise * np.sqrt(1 / rig.readings_n + 1 / rig.noload_frames_n),
     )
 
 
 def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarray, "f ch"]:
-    """Return the change of the board's readings that a field in tesla at its chips causes, without noise."""
+    """Return the noiseless change of a board's readings that a field in tesla at its chips causes."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     return np.einsum("kij,fkj->fki", to_chip, b_T).reshape(len(b_T), -1) / micro
 
 
 def reference_uT(
-    own: Instrument, aside_T: Float[np.ndarray, "f 3"], rng: np.random.Generator
+    instrument: Instrument, aside_T: Float[np.ndarray, "f 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "f ch"]:
     """Return the field to subtract: the noisy reading of the reference chip, in each chip's axes by the design."""
-    read_uT = readings_uT(own.aside, aside_T[:, None]) + own.noise_uT * rng.standard_normal((len(aside_T), 3))
-    return np.einsum("kji,fj->fki", own.turn, read_uT).reshape(len(read_uT), -1)
+    read_uT = readings_uT(instrument.aside, aside_T[:, None]) + instrument.noise_uT * rng.standard_normal(
+        (len(aside_T), 3)
+    )
+    return np.einsum("kji,fj->fki", instrument.turn, read_uT).reshape(len(read_uT), -1)
 
 
 def remove_common_part(turn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "ch ch"]:
@@ -239,30 +248,35 @@ def project(db_uT: Float32[np.ndarray, "f ch"], matrix: Float[np.ndarray, "ch ch
 
 
 def uniform_fields(
-    own: Instrument, fields_uT: Sequence[float], *, rows_n: int, rng: np.random.Generator
+    instrument: Instrument, fields_uT: Sequence[float], *, rows_n: int, rng: np.random.Generator
 ) -> Iterator[Disturbance]:
-    """Yield no field, then uniform fields; each row has a random direction, the same at all strengths."""
+    """Yield a zero field, then uniform fields; each row has a random direction, the same at all strengths."""
     along = random_directions(rows_n, rng)
     for field_uT in sorted({0.0, *fields_uT}):
         b_T = field_uT * micro * along
-        added_uT = readings_uT(own.board, np.repeat(b_T[:, None], len(own.turn), axis=1))
-        yield Disturbance({"field_uT": field_uT}, added_uT, reference_uT(own, b_T, rng))
+        added_uT = readings_uT(instrument.board, np.repeat(b_T[:, None], len(instrument.turn), axis=1))
+        yield Disturbance({"field_uT": field_uT}, added_uT, reference_uT(instrument, b_T, rng))
 
 
 def iron_balls(
-    own: Instrument, skins: Sequence[Skin], which: Int64[np.ndarray, " f"], iron: Iron, *, rng: np.random.Generator
+    instrument: Instrument,
+    skins: Sequence[Skin],
+    skin_i: Int64[np.ndarray, " f"],
+    iron: Iron,
+    *,
+    rng: np.random.Generator,
 ) -> Iterator[Disturbance]:
-    """Yield the disturbance by a ball at every distance above each row's skin; `which` is the index of that skin."""
+    """Yield the disturbance by a ball at each distance above the skins; `skin_i` is the index of each row's skin."""
     for distance_mm in sorted(iron.distances_mm):
-        both = [iron_fields(own, skin, radius_mm=iron.radius_mm, distance_mm=distance_mm) for skin in skins]
+        both = [iron_fields(instrument, skin, radius_mm=iron.radius_mm, distance_mm=distance_mm) for skin in skins]
         chips_T, aside_T = np.stack([chips for chips, _ in both]), np.concatenate([aside for _, aside in both])
         keys = {"distance_mm": distance_mm, "rms_uT": rms_uT(chips_T), "aside_rms_uT": rms_uT(aside_T)}
-        added_uT = readings_uT(own.board, chips_T)[which]
-        yield Disturbance(keys, added_uT, reference_uT(own, aside_T[which], rng))
+        added_uT = readings_uT(instrument.board, chips_T)[skin_i]
+        yield Disturbance(keys, added_uT, reference_uT(instrument, aside_T[skin_i], rng))
 
 
 def iron_fields(
-    own: Instrument, skin: Skin, *, radius_mm: float, distance_mm: float
+    instrument: Instrument, skin: Skin, *, radius_mm: float, distance_mm: float
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "1 3"]]:
     """Return the field in tesla that a ball directly above the skin's middle adds at the chips and the reference chip.
 
@@ -270,7 +284,7 @@ def iron_fields(
     """
     above_m = skin.thickness_m + (distance_mm + radius_mm) * milli
     centre_m = np.append(skin.seat_m, above_m)
-    chips_m = np.concatenate([own.board.chips_m, own.aside.chips_m])
+    chips_m = np.concatenate([instrument.board.chips_m, instrument.aside.chips_m])
     added_T = ball_field(chips_m, EARTH_T, centre_m=centre_m, radius_m=radius_mm * milli)
     added_T += ball_images(chips_m, (skin.nodes_m, skin.moments_A_m2), centre_m=centre_m, radius_m=radius_mm * milli)
     return added_T[:-1], added_T[-1:]
@@ -285,7 +299,10 @@ DASHES = ("-", "--", "-.")  # two lines coincide where nothing is recovered
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate every method in every field, over all held-out boards, and on the last board, which has all methods."""
+    """Tabulate the scores of every method in every field.
+
+    Rows are over all held-out boards, and on the last board, which has networks of all methods.
+    """
     last = numbers["last_board"]
     parts = (("all held out", numbers), (str(last["board"]), last))
     rows = [
@@ -301,13 +318,12 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     meanings = "; ".join(f"{method}: {text}" for method, text in numbers["arms"].items())
     table.attrs["meaning"] = (
         "The field appears after the no-load reading, so subtracting that reading does not remove it. The direction of "
-        f"a uniform field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, "
-        "is directly above the skin's middle; it is magnetised by the earth's field "
-        f"({numbers['earth_uT']:g} µT, dipping {numbers['earth_dip_deg']:g}°) and by the skin's. Methods: {meanings}. "
-        f"The last method has networks for board {last['board']} only, so compare all methods on that board. "
-        "[low, high] is the 95 % confidence interval over held-out boards (Student's t); ± (seeds) is the standard "
-        f"deviation over {numbers['seeds_n']} network seeds on one board, averaged over boards. The paper gives no "
-        "number (section 7: future work)."
+        f"a uniform field: {numbers['directions']}. The ball of iron, {2 * numbers['iron_radius_mm']:g} mm across, is "
+        f"directly above the skin's middle; it is magnetised by the earth's field ({numbers['earth_uT']:g} µT, dipping "
+        f"{numbers['earth_dip_deg']:g}°) and by the skin's field. Methods: {meanings}. The last method has networks "
+        f"for board {last['board']} only, so compare all methods on that board. [low, high] is the 95 % confidence "
+        f"interval over held-out boards (Student's t); ± (seeds) is the standard deviation over {numbers['seeds_n']} "
+        "network seeds on one board, averaged over boards. The paper gives no number (section 7: future work)."
     )
     return {"ambient": table}
 

@@ -29,7 +29,7 @@ COLLAPSE = "collapse"
 
 
 class AuditSettings(Strict):
-    """Section audit: were the settings chosen by a study, which must have used other boards, or for speed?"""
+    """Section audit: whether a study on other boards chose the training settings, or they were chosen for speed."""
 
     settings: Literal["chosen", "for speed"]
 
@@ -79,9 +79,9 @@ def audit(
     io.write_json(results, [asdict(check) for check in checks])
     unchosen_n = sum(check.found.startswith(NOT_CHOSEN) for check in checks)
     collapsed_n = sum(check.known and check.what == COLLAPSE for check in checks)
-    papers_n = sum(check.known for check in checks) - collapsed_n
+    known_leaks_n = sum(check.known for check in checks) - collapsed_n
     say(
-        f"{settings.scene}: {len(checks)} checks, no leak; {papers_n} known, the paper's own; "
+        f"{settings.scene}: {len(checks)} checks, no leak; {known_leaks_n} known leaks of the paper's own protocol; "
         f"{collapsed_n} variants with collapsed networks; {unchosen_n} settings that the study did not choose"
     )
 
@@ -155,7 +155,7 @@ def _check_experiment(sides: Sides) -> None:
     if sides.experiment not in known:
         raise ParamsError(
                 f"fold {sides.where}", "the experiment", f"one of {', '.join(known)}", sides.experiment,
-                "State in pipeline/experiments/audit.py what its two sides may share.",
+                "State in pipeline/experiments/audit.py what its training and test rows may share.",
             )  # fmt: skip
     if not (len(sides.train) and len(sides.test)):
         got = f"{len(sides.train)} to train on, {len(sides.test)} to test on"
@@ -188,13 +188,13 @@ def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.rando
     if len(weak) or not len(train.name):
         found = f"undecidable: fields within the noise{_first_names(weak)}"
         return Check("copies", sides.where, rule, found, holds=False)
-    closest = most_alike(test, train, rng=rng)
-    most = max(closest, key=lambda one: one.share)
+    likenesses = most_alike(test, train, rng=rng)
+    closest = max(likenesses, key=lambda one: one.share)
     found = (
-        f"{len(closest)} of {len(np.unique(captures))} captures compared; "
-        f"{most.capture} like {most.train_skin}: {100 * most.share:.1f} % of {most.compared_n} indentations"
+        f"{len(likenesses)} of {len(np.unique(captures))} captures compared; "
+        f"{closest.capture} like {closest.train_skin}: {100 * closest.share:.1f} % of {closest.compared_n} indentations"
     )
-    return Check("copies", sides.where, rule, found, holds=most.share < COPIED_SHARE_MAX)
+    return Check("copies", sides.where, rule, found, holds=closest.share < COPIED_SHARE_MAX)
 
 
 def _check_pool(sides: Sides, labels: Labels) -> list[Check]:
@@ -220,18 +220,20 @@ def _first_names(names: np.ndarray) -> str:
 
 # --- Copies ---
 
-# One reading's noise by axis of a chip (x, y, z), measured on the lab's recordings: 3.0-3.3 and 4.4-5.0 uT.
+# Standard deviation of one reading on a chip's x, y and z axes; the lab's recordings have 3.0-3.3 uT on x and y, and
+# 4.4-5.0 uT on z.
 NOISE_uT = np.array([3.3, 3.3, 5.0])
-STRONG_NOISES = 10.0  # in noises of a reading; below, noise dominates the direction of dB
-# Two readings of one state differ by 1.4 noises (22 uT over 15 channels); a copy with 5 uT more in each channel by 1.3.
-ALIKE_NOISES = 2.0
-FACTOR_TOLERANCE = 0.1  # a copy was multiplied by one factor; genuine look-alikes differ in depth, so in the factor
+STRONG_NOISES = 10.0  # |dB| over the noise of a reading; below this, noise dominates the direction of dB
+# Largest distance of a copy over the noise of a reading. Two readings of one state are 1.4 apart (22 uT over 15
+# channels); a copy with 5 uT added to each channel is 1.3 away.
+COPY_DISTANCE_NOISES = 2.0
+FACTOR_TOLERANCE = 0.1  # all of a copy has one factor; similar genuine indentations differ in depth, so in the factor
 # Measured shares of similar indentations: 0 % between four recorded skins, at most 11 % between independent simulated
 # skins (60 skins, 4 draws); at least 55 % in a copy with up to 8 uT added to single readings, and 42 % in a copy with
 # 5 % random gain per channel.
 COPIED_SHARE_MAX = 0.3
-PAIRS_MAX_N = 100_000_000  # pairs of indentations compared per fold: a second at most, unless SAMPLE_MIN_N needs more
-SAMPLE_MIN_N = 100  # indentations of a capture
+PAIRS_MAX_N = 100_000_000  # pairs of indentations compared per fold, in at most a second; SAMPLE_MIN_N may need more
+SAMPLE_MIN_N = 100  # indentations sampled from each capture
 CHUNK_PAIRS_N = 4_000_000  # pairs compared at once: 16 MB
 
 
@@ -256,7 +258,7 @@ class Likeness:
 def strong_indentations(
     name: np.ndarray, indentation: Int[np.ndarray, " f"], db_uT: Float[np.ndarray, "f ch"]
 ) -> MeanFields:
-    """Average the readings of each indentation, and keep indentations whose |dB| is above ten noises of a reading."""
+    """Average the readings of each indentation, and keep those whose |dB| is above ten times a reading's noise."""
     _, first, group = np.unique(indentation, return_index=True, return_inverse=True)
     sums = np.stack([np.bincount(group, weights=channel) for channel in db_uT.T], axis=1)
     mean_uT = (sums / np.bincount(group)[:, None]).astype(np.float32)
@@ -270,23 +272,26 @@ def noise_uT(ch_n: int) -> float:
 
 
 def most_alike(test: MeanFields, train: MeanFields, *, rng: np.random.Generator) -> list[Likeness]:
-    """Find the training skin most like each test capture; a sample of the capture is compared with all of the skin."""
+    """Find the training skin most like each test capture.
+
+    A random sample of the capture's indentations is compared with all indentations of every skin.
+    """
     captures = np.unique(test.name)
     sample_n = max(SAMPLE_MIN_N, PAIRS_MAX_N // len(train.name) // len(captures))
-    closest = []
+    likenesses = []
     for capture in captures:
         own_uT = test.db_uT[test.name == capture]
         own_uT = own_uT[rng.permutation(len(own_uT))[:sample_n]]
         shares = _copied_shares(own_uT, train)
-        most = max(shares, key=lambda skin: shares[skin])
-        closest.append(Likeness(str(capture), most, shares[most], len(own_uT)))
-    return closest
+        closest_skin = max(shares, key=lambda skin: shares[skin])
+        likenesses.append(Likeness(str(capture), closest_skin, shares[closest_skin], len(own_uT)))
+    return likenesses
 
 
 def nearest_rays(
     db_uT: Float32[np.ndarray, "n ch"], others_uT: Float32[np.ndarray, "m ch"]
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Find for each row the one of `others_uT` nearest in direction, and the distance (uT) to its ray."""
+    """Find, for each row of `db_uT`, the row of `others_uT` nearest in direction, and the distance in uT to its ray."""
     rays = others_uT / np.linalg.norm(others_uT, axis=1, keepdims=True)
     rows_n = max(1, CHUNK_PAIRS_N // len(rays))
     chunks = [db_uT[i : i + rows_n] for i in range(0, len(db_uT), rows_n)]
@@ -298,13 +303,13 @@ def nearest_rays(
 
 def _copied_shares(own_uT: Float32[np.ndarray, "n ch"], train: MeanFields) -> dict[str, float]:
     nearest, off_uT = nearest_rays(own_uT, train.db_uT)
-    alike = off_uT < ALIKE_NOISES * noise_uT(own_uT.shape[1])
+    similar = off_uT < COPY_DISTANCE_NOISES * noise_uT(own_uT.shape[1])
     factor = np.linalg.norm(own_uT, axis=1) / np.linalg.norm(train.db_uT[nearest], axis=1)
     shares = {}
     for skin in np.unique(train.name):
-        hit = factor[alike & (train.name[nearest] == skin)]
-        steady = np.abs(hit / np.median(hit) - 1) < FACTOR_TOLERANCE if len(hit) else hit
-        shares[str(skin)] = float(steady.sum() / len(own_uT))
+        factors = factor[similar & (train.name[nearest] == skin)]
+        copied = np.abs(factors / np.median(factors) - 1) < FACTOR_TOLERANCE if len(factors) else factors
+        shares[str(skin)] = float(copied.sum() / len(own_uT))
     return shares
 
 
@@ -319,7 +324,7 @@ Fits = dict[tuple[str, str, str, str, int], Arrays]  # by fold, view, scaling an
 
 
 def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
-    """Check of every network: its scaler, whether it collapsed, and the data it was adapted with."""
+    """Check the scaler of every network, whether it collapsed, and the data it was adapted with."""
     views = {name: view(data.rows.db_uT) for name, view in VIEW.items()}
     fits: Fits = {}
     keys: dict[tuple[str, int], set[str]] = {}  # keys of the networks that may be adapted, by fold and seed
@@ -345,10 +350,10 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
 
 
 def _fit_once(fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray) -> Arrays:
-    of = (*key, len(db_uT))  # the number of rows distinguishes the training rows from both sides together
-    if of not in fits:
-        fits[of] = FIT[key[-1]](db_uT, target).arrays()
-    return fits[of]
+    fit_key = (*key, len(db_uT))  # the number of rows distinguishes the training rows from both sides together
+    if fit_key not in fits:
+        fits[fit_key] = FIT[key[-1]](db_uT, target).arrays()
+    return fits[fit_key]
 
 
 def audit_scaler(
@@ -369,7 +374,7 @@ def audit_scaler(
 
 
 def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
-    """Return the largest difference relative to the fitted value (absolute where that is 0); NaN if any one is."""
+    """Return the largest difference relative to the fitted value (absolute where that is 0); NaN if any is NaN."""
     gaps = []
     for name, value in fitted.items():
         if name not in arrays or arrays[name].shape != value.shape:
@@ -451,7 +456,7 @@ def audit_choice(
     test_skins: Sequence[str],
     physics: str,
 ) -> list[Check]:
-    """Check that settings were chosen on other boards and skins, and report headline recipes that differ from them.
+    """Check that settings were chosen on other boards and skins, and report headline recipes that were not chosen.
 
     Simulated skins of another seed are different skins, whatever their names; recorded skins are identified by name.
     """

@@ -1,6 +1,6 @@
 """Bound: smallest error that the chips' noise allows, compared with a network's scores (paper section 4).
 
-Cramér-Rao bound for place and force, estimated from one row of a simulated skin whose properties are known.
+Computes the Cramér-Rao bound for place and force estimated from one row of a simulated skin with known properties.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,36 +42,39 @@ def bound(settings: Settings, models: Path, results: Path) -> None:
     """Bound the errors of estimates from one row, and compare them with those of the paper's network."""
     numbers = bound_errors(simulation_settings(settings), seed=settings.seed)
     write_results(results, numbers | {"network": score_network(models, numbers["skin"])}, {})
-    least = numbers["all"]["with_label_errors"]
-    say(f"{settings.scene}: noise and labels allow {least['accuracy_pct']:.4g} % and {least['mse_xy_mm2']:.3g} mm2")
+    overall = numbers["all"]["with_label_errors"]
+    say(
+        f"{settings.scene}: bound with label errors: {overall['accuracy_pct']:.4g} % and {overall['mse_xy_mm2']:.3g} "
+        "mm2"
+    )
 
 
-def bound_errors(of: SimulationSettings, *, seed: int) -> dict[str, Any]:
+def bound_errors(simulation: SimulationSettings, *, seed: int) -> dict[str, Any]:
     """Bound the errors at every place and depth of the main protocol, on its first skin.
 
     Pokes that do not reach the skin are excluded and counted.
     """
-    kind, (board_name, skin_name) = of.main_boards, list_captures(of, MAIN)[0]
-    board = draw_board(kind.design, of.spreads, seed=seed, name=board_name)
+    kind, (board_name, skin_name) = simulation.main_boards, list_captures(simulation, MAIN)[0]
+    board = draw_board(kind.design, simulation.spreads, seed=seed, name=board_name)
     rule = kind.quadrature.in_si()
-    skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
+    skin = draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
     places_mm = points_mm() - CENTRE_MM
-    depths_mm = np.repeat(of.main.depths_mm, len(places_mm))
-    pokes_mm = np.column_stack([np.tile(places_mm, (len(of.main.depths_mm), 1)), depths_mm])
+    depths_mm = np.repeat(simulation.main.depths_mm, len(places_mm))
+    pokes_mm = np.column_stack([np.tile(places_mm, (len(simulation.main.depths_mm), 1)), depths_mm])
     touched = reach_skin(skin, depths_mm)
     pokes_mm = pokes_mm[touched]
     var_uT2 = noise_var_uT2(
-        of.chip, len(board.chips_m), readings_n=ROW_READINGS_N, noload_frames_n=of.rig.noload_frames_n
+        simulation.chip, len(board.chips_m), readings_n=ROW_READINGS_N, noload_frames_n=simulation.rig.noload_frames_n
     )
     covariance = least_covariance(
         slopes(lambda mm: readings_uT(board, changes_of_field(board, skin, mm * milli)[1]), pokes_mm),
         slopes(lambda mm: forces(skin, mm[:, 2] * milli)[:, None], pokes_mm)[:, 0],
         var_uT2,
     )
-    labels = {"place_sd_mm": of.rig.robot_place_sd_mm, "force_sd_N": of.rig.force_noise_N}
+    labels = {"place_sd_mm": simulation.rig.robot_place_sd_mm, "force_sd_N": simulation.rig.force_noise_N}
     return {
         "board": board_name, "skin": skin_name, "places_n": len(places_mm), "above_the_skin_n": int((~touched).sum()),
-        "readings_n": ROW_READINGS_N, "noload_frames_n": of.rig.noload_frames_n, "labels": labels,
+        "readings_n": ROW_READINGS_N, "noload_frames_n": simulation.rig.noload_frames_n, "labels": labels,
         **by_depth(pokes_mm[:, 2], covariance, labels),
     }  # fmt: skip
 
@@ -195,12 +198,12 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
     above = f" {above_n} pokes that do not touch the skin are left out." if above_n else ""
     return (
         "Bound (Cramér-Rao): the smallest error of an unbiased estimate from the change of field of one row "
-        f"({numbers['readings_n']} reading less the mean of {numbers['noload_frames_n']} no-load readings), averaged "
+        f"({numbers['readings_n']} reading minus the mean of {numbers['noload_frames_n']} no-load readings), averaged "
         f"over the {numbers['places_n']} places of skin {numbers['skin']}; its accuracy assumes normally distributed "
         "errors. The only sources of error are the chips' noise and rounding: the skin, its board and the "
-        "after-effects of earlier pokes are taken as known. Labels' errors, as standard deviations: "
-        f"{labels['place_sd_mm']:g} mm per axis for the robot's place, and {labels['force_sd_N']:.2g} N for the force "
-        f"sensor, which measures the force at the true depth.{above} Network: random passes of the same skin are held "
-        "out. All places are on a grid; a network that learns the grid is biased towards it and may have a smaller "
-        "error than the bound."
+        "after-effects of earlier pokes are taken as known. Errors of the labels, as standard deviations: "
+        f"{labels['place_sd_mm']:g} mm per axis for the robot's position, and {labels['force_sd_N']:.2g} N for the "
+        f"force sensor, which measures the force at the true depth.{above} Network: random passes of the same skin are "
+        "held out. All places are on a grid; a network that learns the grid is biased towards it and may have a "
+        "smaller error than the bound."
     )

@@ -2,8 +2,8 @@
 
 Each board is simulated in three ways: with the nominal skin, with a physical model (law) fitted to the board, and with
 the law of another board after fitting only the parameters that may differ between boards. Besides agreement, the
-experiment examines the friction under the tip, the part of a poke's change that remains in the next no-load reading
-(memory), and whether labels, chips and skin are oriented as the scene states.
+experiment examines the friction under the tip, the fraction of a poke's change of field that remains in the next
+no-load reading (memory), and whether labels, chips and skin are oriented as the scene states.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -53,12 +53,11 @@ class Compare(Strict):
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
     skin_flipped: bool  # every field has the other sign: a checkerboard skin that is rotated by a quarter turn
-    labels_middle_mm: tuple[float, float]  # the label of the board's middle
+    labels_middle_mm: tuple[float, float]  # labelled place of the board's middle
     labels_mirrored: bool  # y labels run against the board's y
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
-    memory: Annotated[
-        float, Field(ge=0, lt=1)
-    ]  # part of a poke's change that remains in the next no-load reading, assumed
+    # Fraction of a poke's change of field that remains in the next no-load reading; assumed.
+    memory: Annotated[float, Field(ge=0, lt=1)]
 
 
 def compare(settings: Settings, section: Compare, indentations: Path, results: Path) -> None:
@@ -73,11 +72,11 @@ def compare_boards(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare every board; return the numbers, and the data for the figures."""
     setup = make_setup(section, design)
-    seen = {board: to_board_axes(pokes, section) for board, pokes in boards.items()}
-    fitted = {board: fit(own, setup, TEN) for board, own in seen.items()}
-    names = list(seen)
-    by_board, drawn = {}, {}
-    for i, (board, own) in enumerate(seen.items()):
+    aligned = {board: to_board_axes(pokes, section) for board, pokes in boards.items()}
+    fitted = {board: fit(own, setup, TEN) for board, own in aligned.items()}
+    names = list(aligned)
+    by_board, plot_data = {}, {}
+    for i, (board, own) in enumerate(aligned.items()):
         laws, parameters = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
         if len(names) > 1:
             law_of = names[(i + 1) % len(names)]
@@ -100,7 +99,7 @@ def compare_boards(
             | {"noise_uT": dict(zip("xyz", own.recorded.noise_uT.tolist(), strict=True))}
             | {"pokes_n": len(own.recorded), "left_out_n": own.recorded.excluded_n}
         )
-        drawn[board] = _drawn(own, simulated_uT["fitted"]) | {"curve_uT": curves}
+        plot_data[board] = _plot_data(own, simulated_uT["fitted"]) | {"curve_uT": curves}
     numbers = {
         "by_board": by_board,
         "over_boards": summarise_boards(by_board),
@@ -108,7 +107,7 @@ def compare_boards(
         "light_N": LIGHT_N,
         "grip_N_mm": START.grip_N_mm,
     }
-    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": drawn}
+    return numbers, {"chips_mm": setup.chips_mm.tolist(), "curve_N": CURVE_N.tolist(), "boards": plot_data}
 
 
 def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
@@ -129,22 +128,22 @@ def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
 
 
 def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
-    """Return the agreement of a simulation; for the fitted law it is the board's own mapping."""
+    """Return the agreement of a simulation; for the fitted law this is the board's own mapping."""
     own: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
     return own
 
 
-def _drawn(seen: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
+def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
     """Choose the data for the figures: changes of field at some places of the middle group, and |dB| against force."""
-    own = np.flatnonzero(seen.recorded.group_i == len(seen.recorded.groups) // 2)
-    order = own[np.argsort(np.hypot(*seen.place_mm[own].T), kind="stable")]
+    own = np.flatnonzero(aligned.recorded.group_i == len(aligned.recorded.groups) // 2)
+    order = own[np.argsort(np.hypot(*aligned.place_mm[own].T), kind="stable")]
     chosen = order[np.unique(np.linspace(0, len(order) - 1, ARROWS_N).round().astype(int))]
-    fields = {"recorded": seen.db_uT, "simulated": simulated_uT}
+    fields = {"recorded": aligned.db_uT, "simulated": simulated_uT}
     return {
-        "group": seen.recorded.groups[len(seen.recorded.groups) // 2],
-        "places_mm": seen.place_mm[chosen].round(2).tolist(),
+        "group": aligned.recorded.groups[len(aligned.recorded.groups) // 2],
+        "places_mm": aligned.place_mm[chosen].round(2).tolist(),
         "arrows_uT": {name: of[chosen].round(1).tolist() for name, of in fields.items()},
-        "force_N": seen.recorded.force_N.round(3).tolist(),
+        "force_N": aligned.recorded.force_N.round(3).tolist(),
         "length_uT": {name: magnitudes_uT(of).round(1).tolist() for name, of in fields.items()},
     }
 
@@ -187,20 +186,20 @@ def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
 # --- Agreement, memory, friction ---
 
 
-def agreement(seen: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
+def agreement(aligned: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
     """Compare simulated changes with recorded ones: direction, size and growth with force."""
-    cosine, groups = cosines(simulated_uT, seen.db_uT), seen.recorded.groups
-    grown = {"recorded": growth(seen.recorded, seen.db_uT), "simulated": growth(seen.recorded, simulated_uT)}
+    cosine, groups = cosines(simulated_uT, aligned.db_uT), aligned.recorded.groups
+    grown = {"recorded": growth(aligned.recorded, aligned.db_uT), "simulated": growth(aligned.recorded, simulated_uT)}
     return {
         "cosine_mean": float(cosine.mean()),
-        "cosine_by_group": {name: float(cosine[seen.recorded.group_i == i].mean()) for i, name in enumerate(groups)},
-        "explained_median": float(np.median(explained(simulated_uT, seen.db_uT))),
+        "cosine_by_group": {name: float(cosine[aligned.recorded.group_i == i].mean()) for i, name in enumerate(groups)},
+        "explained_median": float(np.median(explained(simulated_uT, aligned.db_uT))),
     } | ({"growth": grown} if None not in grown.values() else {})
 
 
-def estimate_memory(seen: AlignedPresses, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
-    """Estimate the memory of the recordings, and of simulated no-load readings with the memory of the section."""
-    pokes = seen.recorded  # memory does not depend on the axes of the chips
+def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
+    """Estimate the memory of the recordings, and of simulated no-load readings with the memory of section compare."""
+    pokes = aligned.recorded  # memory does not depend on the axes of the chips
     rng = rng_for(seed, "compare", pokes.board)
     walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
     noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
@@ -220,7 +219,7 @@ def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"
     return np.median(length_uT, axis=0)
 
 
-def fit_frictions(seen: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
+def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
     """Refit the law with other frictions under the tip; return agreement, and the field of a light touch.
 
     `grip_N` is the force at which two thirds of the slide are reached in the skin's middle.
@@ -229,9 +228,9 @@ def fit_frictions(seen: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[
     for grip_N_mm in GRIPS_N_MM:
         law = replace(fitted, grip_N_mm=grip_N_mm)
         if grip_N_mm != fitted.grip_N_mm:
-            law = fit(seen, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
-        agreed = agreement(seen, simulate_uT(law, setup, seen.place_mm, seen.recorded.force_N))
-        length_uT = size_against_force(law, setup, seen.place_mm)
+            law = fit(aligned, setup, TEN, replace(START, grip_N_mm=grip_N_mm))
+        agreed = agreement(aligned, simulate_uT(law, setup, aligned.place_mm, aligned.recorded.force_N))
+        length_uT = size_against_force(law, setup, aligned.place_mm)
         rows.append(
             {name: agreed[name] for name in ("cosine_mean", "explained_median", "growth") if name in agreed}
             | {"grip_N_mm": grip_N_mm, "grip_N": grip_N_mm * milli * float(np.hypot(law.give_x_um, law.give_y_um))}
@@ -243,7 +242,7 @@ def fit_frictions(seen: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[
 # --- Frames: are labels, chips and skin oriented as the scene states? ---
 
 # A departure from the scene must raise the sum of the cosines over chips by this much. Assumed: each chip with wrong
-# axes loses 0.5 or more, and a skin that is displaced by 0.5 mm changes no cosine by as much.
+# axes loses 0.5 or more, and a skin displaced by 0.5 mm changes every cosine by less.
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin lie as the scene says."
@@ -251,7 +250,7 @@ AS_SAID = "Labels, chips and skin lie as the scene says."
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation by quarter turns about z, applied after axes of a chip changed sign."""
+    """A rotation by quarter turns about z, applied after sign changes of a chip's axes."""
 
     quarters: int
     signs: tuple[int, int, int]
@@ -267,8 +266,8 @@ class Turn:
         return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))
 
 
-# Each of 16 orientations once: a mirrored x rotated by a half turn is a mirrored y. The first is the scene's own; the
-# first eight leave z unchanged, as labels do.
+# Each of 16 orientations once: mirroring x and rotating by a half turn is the same as mirroring y. The first is the
+# scene's own; the first eight leave z unchanged, and only these are possible for labels.
 PLAIN = [(quarters, 1, 1) for quarters in range(4)] + [(0, -1, 1), (0, 1, -1), (1, -1, 1), (1, 1, -1)]
 TURNS = [Turn(quarters, (x, y, z)) for z in (1, -1) for quarters, x, y in PLAIN]
 
@@ -320,11 +319,11 @@ def _describe_exchanges(at: Int[np.ndarray, " k"]) -> list[str]:
     return [f"chips are exchanged ({places})"] if moved else []
 
 
-def check_frames(seen: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
+def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
     """Check whether labels, chips and skin are oriented as the scene states."""
     found = find_frames(
-        seen.place_mm, seen.recorded.db_uT, chip_rotations(section),
-        lambda at_mm: nominal_uT(setup, at_mm, seen.recorded.force_N),
+        aligned.place_mm, aligned.recorded.db_uT, chip_rotations(section),
+        lambda at_mm: nominal_uT(setup, at_mm, aligned.recorded.force_N),
     )  # fmt: skip
     columns = zip(found.chips.tolist(), found.as_written.tolist(), found.cosines.tolist(), found.turns, strict=True)
     chips = [
@@ -349,15 +348,15 @@ def find_frames(
     as_written, found = np.empty(0), []
     for labels in TURNS[:8]:
         simulated_uT = nominal(place_mm @ labels.matrix[:2, :2].T)
-        # [k recorded, k simulated, turn]: the cosine over all pokes of a recorded chip, turned, with a simulated one.
+        # [recorded chip, simulated chip, turn]: cosine over all pokes of the turned recorded and the simulated field.
         at_chips_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
         moments = np.einsum("nka,nlb->klab", read_uT, at_chips_uT)
         sizes = np.linalg.norm(read_uT, axis=(0, 2))[:, None] * np.linalg.norm(simulated_uT, axis=(0, 2))
         cosine = np.einsum("klab,tba->klt", moments, turns) / sizes[..., None]
         if labels == TURNS[0]:
             as_written = np.diagonal(cosine[..., 0]).copy()
-        ways = product((False, True), TURNS)
-        found += [_best_chips(labels, flipped, common, cosine, as_written) for flipped, common in ways]
+        candidates = product((False, True), TURNS)
+        found += [_best_chips(labels, flipped, common, cosine, as_written) for flipped, common in candidates]
     return max(found, key=lambda one: one.worth)
 
 
@@ -380,12 +379,12 @@ def _best_chips(
 
 
 CHIPS_N = 5  # orientations are determined only for boards with chips on all sides of the middle
-# Fewer pokes are not reliable; more take seconds and add nothing: in scene lab, every third of 65 places is enough.
+# Fewer pokes are unreliable; more take seconds without a gain (in scene lab, every third of 65 places is enough).
 POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
 def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
-    """Describe how a capture departs from the scene; None if it does not, or if it has too little data to decide."""
+    """Describe how a capture departs from the scene; None if it does not, or if there is too little data to decide."""
     if blocks[0].chips_n != CHIPS_N or not any(_pressed_rows(block).any() for block in blocks):
         return None
     pokes = _thin(pool(blocks))
@@ -411,32 +410,32 @@ def _thin(pokes: RecordedPresses) -> RecordedPresses:
 COSINE_MIN = {"nominal": 0.90, "fitted": 0.90, "refitted": 0.85}
 EXPLAINED_MIN, GROWTH_WITHIN, MEMORY_PCT = 0.80, 0.10, (5.0, 8.0)
 SIMULATIONS = {
-    "nominal": "nominal skin, nothing fitted", "fitted": "ten numbers, fitted on this board",
-    "refitted": "law of another board, seven refitted",
+    "nominal": "nominal skin, nothing fitted", "fitted": "ten parameters, fitted to this board",
+    "refitted": "law of another board, seven parameters refitted",
 }  # fmt: skip
 COSINE, EXPLAINED, GROWTH = "cosine", f"explained (≥ {EXPLAINED_MIN:.2f})", f"growth (within {GROWTH_WITHIN:.2f})"
 HELD = "held at the deepest"
 MEMORY = "memory, % ({:g} to {:g})".format(*MEMORY_PCT)
 NONE = "–"
 MEANING = (
-    "Compares dB of each recorded poke (mean in contact less mean before contact) with dB simulated at the labelled "
+    "Compares dB of each recorded poke (mean in contact minus mean before contact) with dB simulated at the labelled "
     "place and the recorded force. Bounds are in brackets. Cosine: between recorded and simulated dB over all "
     "channels, mean over pokes. Explained: 1 - |simulated - recorded|² / |recorded|², median over pokes. Growth: d "
     "log|dB| / d log F at one place, median over places, simulated / recorded. Whether one board is within the bounds "
     "is judged by its own numbers; four or more boards are also judged together, by the 95 % confidence interval over "
     "boards (Student's t). Law: the physical model of a skin. The form of the law, its tip radius, its exponent of "
-    "stiffening and the force at which the slide is gone were chosen with data of both boards of scene lab: only a new "
-    "board tests them. Why a skin slides towards its middle is not explained. Memory, simulated / recorded: the share "
-    "of a poke's change of field that remains in the next no-load reading. The simulated memory is set to {:g} %, so "
-    "it tests the estimator and is not a prediction. Held at the deepest: number of pokes whose force is larger than "
-    "at the deepest indentation that the law can follow (0.72 of the thickness); they are simulated at that depth, and "
-    "count like all others."
+    "stiffening and the force at which the slide ends were chosen with data of both boards of scene lab, so only a new "
+    "board can test them. The law does not explain why a skin slides towards its middle. Memory, simulated / recorded: "
+    "the fraction of a poke's change of field that remains in the next no-load reading. The simulated memory is set to "
+    "{:g} %, so its estimate tests the estimator and is not a prediction. Held at the deepest: number of pokes whose "
+    "force is larger than at the deepest indentation that the law can follow (0.72 of the thickness); they are "
+    "simulated at that depth, and count like all others."
 )
 ABOUT_PARAMETERS = (
     "Seat: position of the skin's middle relative to the board's. Label offset: from the labelled place to the tip. "
     "Slide: displacement of the material under the tip towards the skin's middle at vanishing force, per distance from "
-    "the middle. Give: compliance of the rig's arm. Gap and amplitude compensate each other in the fit: neither is a "
-    "measurement."
+    "the middle. Give: compliance of the rig's arm. Gap and amplitude compensate each other in the fit, so neither "
+    "is a measurement."
 )
 ABOUT_GRIP = (
     "A tip slides the skin no further than the friction under the tip allows: k |u| <= mu F, with springs k, slide u, "
@@ -456,8 +455,8 @@ TITLES = {
     "modulus_MPa": "Young's modulus, MPa", "away_um_mm": "slide to the middle, µm/mm", "give_x_um": "give x, µm",
     "give_y_um": "give y, µm",
 }  # fmt: skip
-ARROW_MM = 6.0  # the longest of a board
-BOARDS_MAX_N = 4  # of which arrows are drawn
+ARROW_MM = 6.0  # length of the longest arrow of a board
+BOARDS_MAX_N = 4  # boards whose arrows are drawn
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -526,7 +525,7 @@ def _friction_rows(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
             line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
             grown = row.get("growth")
             line[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}" if grown else NONE
-            lines.append(line | {"|dB| of 1 mN, µT (median place)": f"{row['light_uT']:.3g}"})
+            lines.append(line | {"|dB| at 1 mN, µT (median place)": f"{row['light_uT']:.3g}"})
     return lines
 
 
@@ -597,7 +596,7 @@ def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -
                     axes.plot(*place_mm, marker="x", color="black")
                     for (x_mm, y_mm), (*_, z_uT) in zip(chips_mm, db_uT, strict=True):
                         axes.text(x_mm, y_mm - 1.2, f"{z_uT:+.0f}", fontsize=6, ha="center", va="top")
-            panels[2 * row_i][0].set_title(f"longest {longest_uT:.0f} µT", fontsize=8, loc="left")
+            panels[2 * row_i][0].set_title(f"longest arrow {longest_uT:.0f} µT", fontsize=8, loc="left")
         for axes in panels.ravel():
             axes.set(xlim=(-half_mm, half_mm), ylim=(-half_mm, half_mm), aspect="equal", xticks=[], yticks=[])
         title = f"Change of field at the chips ({source}; ×: poke; number: along z, µT)"

@@ -51,15 +51,15 @@ from reskin.simulation.settings import MAIN, SimulationSettings
 KNOWN_ROWS_N = 6000  # rows, drawn at random, in which detectors search for neighbours
 SINGLES_N = 1000  # single contacts for setting a threshold, and as many for testing
 DRAWN_N = 60  # pairs per board and separation in the figure
-SAME_PLACE = 0.0  # mm: shows the effect of strength and noise of two readings, without two places
-TOLERANCE_MM = 0.5  # of a pair's distance, assumed, as places are on a grid
+SAME_PLACE = 0.0  # mm: two pokes at one place show the effect of strength and noise alone
+TOLERANCE_MM = 0.5  # of a pair's distance, assumed; needed because places are on a grid
 PLACE_DECIMALS = 2  # places closer than 0.01 mm count as one
 
 Predict = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and y in mm, F in N
 
 
 class Contacts(Strict):
-    """Section contacts: the pairs to draw, and the share of false alarms of detectors."""
+    """Section contacts: the pairs to draw, and the fraction of false alarms that thresholds are set for."""
 
     pairs_n: Annotated[int, Field(ge=1)]
     separations_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
@@ -78,8 +78,8 @@ def contacts(
     stats = summarise_nested(boards)
 
     def row(separation_mm: float) -> dict[str, Any]:
-        falls, detected = stats["falls"][separation_mm], stats["by_separation"][separation_mm]
-        return {"separation_mm": separation_mm, **falls, **detected}
+        prediction, detected = stats["falls"][separation_mm], stats["by_separation"][separation_mm]
+        return {"separation_mm": separation_mm, **prediction, **detected}
 
     numbers: dict[str, Any] = {
         "pairs_n": section.pairs_n,
@@ -112,7 +112,7 @@ def evaluate_board(
     """Evaluate pairs of one held-out board; return its numbers, and the predicted places for the figure."""
     rows = data.rows
     rng = rng_for(data.settings.seed, "contacts", fold.name)
-    fit, aside, what = keep_aside(rows, fold.train)
+    fit, aside, kept_aside = keep_aside(rows, fold.train)
     known = rng.choice(fit, min(KNOWN_ROWS_N, len(fit)), replace=False)
     singles = {
         side: rng.choice(own, min(SINGLES_N, len(own)), replace=False)
@@ -148,7 +148,7 @@ def evaluate_board(
         f"{s:g}": position_along_line(*truth[s], predicted[s][0])[:DRAWN_N].round(2).tolist()
         for s in section.separations_mm
     }
-    return numbers, {"kept_aside": what, "along": along}
+    return numbers, {"kept_aside": kept_aside, "along": along}
 
 
 # --- Pairs of pokes ---
@@ -170,7 +170,7 @@ def draw_pairs(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
 ) -> Pairs:
     """Draw pairs of rows: two places of a skin at this distance, then one row at each; at 0 mm, one place twice."""
-    found = [_places_apart(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])]
+    found = [_pairs_at_distance(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])]
     sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in found for i, j in pairs]
     if not sides:
         what = f"no two held-out places of one skin are {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
@@ -183,7 +183,7 @@ def draw_pairs(
     return Pairs(np.where(swap, other, one), np.where(swap, one, other))
 
 
-def _places_apart(
+def _pairs_at_distance(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float
 ) -> tuple[list[Int64[np.ndarray, " b"]], Int64[np.ndarray, "p 2"]]:
     """Return the rows at each place of a skin, and the pairs of places (by index) at this distance."""
@@ -251,12 +251,12 @@ def detection_rates(
     Thresholds are set on the contacts kept `aside`. The rates for double contacts are by separation.
     """
     limits = thresholds(aside, false_alarm_fraction)
-    apart = {
+    separated = {
         name: np.concatenate([own[name] for separation_mm, own in double.items() if separation_mm]) for name in aside
     }
     return {
         "false_alarm_pct": above_pct(single, limits),
-        "auc": roc_areas(single, apart),
+        "auc": roc_areas(single, separated),
         "by_separation": {
             separation_mm: {"detected_pct": above_pct(own, limits), "auc": roc_areas(single, own)}
             for separation_mm, own in double.items()
@@ -271,8 +271,8 @@ def residual(
 ) -> Float[np.ndarray, " f"]:
     """Return the residual of a single contact at the prediction, relative to |dB| plus noise.
 
-    The field of that contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; uT) nearest to the
-    prediction; forces count if they are known.
+    The field of that contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; uT) that are nearest to the
+    prediction in place and, if forces are known, in force.
     """
     from sklearn.neighbors import KNeighborsRegressor  # imported late: it takes a second
 
@@ -301,24 +301,26 @@ def summarise_nested(boards: Sequence[Any]) -> Any:
 # --- Superposition of simulated fields ---
 
 PAIRS_N = 6  # drawn for each distance
-MIDDLE_MM = 2.0  # largest distance along each axis of a pair's middle from the skin's
+MIDDLE_MM = 2.0  # largest distance along each axis from a pair's middle to the skin's middle
 HEIGHTS_N = 9  # in the table of displacements, which is interpolated linearly for the second contact
 
 
-def superposition(of: SimulationSettings, separations_mm: Sequence[float], *, seed: int) -> list[dict[str, Any]]:
+def superposition(
+    simulation: SimulationSettings, separations_mm: Sequence[float], *, seed: int
+) -> list[dict[str, Any]]:
     """Return the rms error of adding the fields of two contacts of the scene's first skin, at two depths."""
-    board_name, skin_name = list_captures(of, MAIN)[0]
-    board = draw_board(of.main_boards.design, of.spreads, seed=seed, name=board_name)
-    rule = of.main_boards.quadrature.in_si()
-    skin = draw_skin(of.skin, of.spreads, seed=seed, name=skin_name, rule=rule)
+    board_name, skin_name = list_captures(simulation, MAIN)[0]
+    board = draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board_name)
+    rule = simulation.main_boards.quadrature.in_si()
+    skin = draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin_name, rule=rule)
     rng = rng_for(seed, "superposition")
     centres_mm, angles = rng.uniform(-MIDDLE_MM, MIDDLE_MM, (PAIRS_N, 2)), rng.uniform(0, np.pi, PAIRS_N)
-    ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     rows = []
-    for depth_mm in (max(of.main.depths_mm) / 2, max(of.main.depths_mm)):
+    for depth_mm in (max(simulation.main.depths_mm) / 2, max(simulation.main.depths_mm)):
         depth_m = np.full(PAIRS_N, depth_mm * milli + skin.depth_zero_m)
         for separation_mm in separations_mm:
-            half_mm = separation_mm / 2 * ways
+            half_mm = separation_mm / 2 * directions
             ends_m = [
                 np.column_stack([at_mm * milli, depth_m]) for at_mm in (centres_mm - half_mm, centres_mm + half_mm)
             ]
@@ -332,9 +334,9 @@ def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Di
     """Displace and rotate dipoles, at rest or already moved, by a poke (x, y, true depth)."""
     nodes_m, moments_A_m2 = dipoles
     heights = np.linspace(0, 1, HEIGHTS_N)
-    at = nodes_m[:, 2] / skin.thickness_m * (HEIGHTS_N - 1)
-    low = np.clip(at.astype(np.intp), 0, HEIGHTS_N - 2)
-    share = (at - low)[:, None]
+    position = nodes_m[:, 2] / skin.thickness_m * (HEIGHTS_N - 1)
+    low = np.clip(position.astype(np.intp), 0, HEIGHTS_N - 2)
+    fraction = (position - low)[:, None]
     table = deformation.tabulate(
         skin.thickness_m, skin.tip_radius_m, float(poke_m[2]), heights=tuple(heights.tolist()), base=skin.base
     )
@@ -344,11 +346,11 @@ def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Di
         )
         for i in (0, 1)
     )
-    after_m, turned_A_m2 = nodes_m.copy(), moments_A_m2.copy()
-    near = share[below.i]
-    after_m[below.i] = (1 - near) * below.after[0] + near * above.after[0]
-    turned_A_m2[below.i] = (1 - near) * below.after[1] + near * above.after[1]
-    return after_m, turned_A_m2
+    after_m, rotated_A_m2 = nodes_m.copy(), moments_A_m2.copy()
+    weight = fraction[below.i]
+    after_m[below.i] = (1 - weight) * below.after[0] + weight * above.after[0]
+    rotated_A_m2[below.i] = (1 - weight) * below.after[1] + weight * above.after[1]
+    return after_m, rotated_A_m2
 
 
 def _changes_of_pair(
@@ -376,20 +378,22 @@ def _errors(changes_T: Float[np.ndarray, "p 4 k 3"]) -> dict[str, float]:
 MEANING = (
     "Two contacts at once are modelled as the sum of two changes of field that were recorded on one held-out skin, so "
     "their noise is that of two readings. Networks trained on single contacts predict one place and one force (columns "
-    "`answer` and `along the line`). Detected: the score of a detector is above its threshold. Thresholds are set so "
-    "that a given share of single contacts of training skins exceeds them; row `single contacts` gives the share of "
-    "the held-out boards' single contacts above them, the false alarms. The networks behind residual and networks "
-    "disagree were trained on the contacts that set the thresholds, so these two thresholds may be too low. At 0 mm "
+    "`prediction` and `along the line`). Detected: the score of a detector is above its threshold. Thresholds are set "
+    "so that a given share of single contacts of training skins exceeds them; row `single contacts` gives the share of "
+    "the held-out boards' single contacts above them, the false alarms. The networks behind `residual` and `networks "
+    "disagree` were trained on the contacts that set the thresholds, so these two thresholds may be too low. At 0 mm "
     "both pokes are at one place: this shows the effect of strength and noise alone. [low, high] is the 95 % "
     "confidence interval over held-out boards (Student's t). The paper gives no number (section 7: future work)."
 )
-TWO_TIPS = "Two real tips cannot be closer than their width; smaller distances are sums of two readings all the same."
+TWO_TIPS = (
+    "Two real tips cannot be closer than their width; smaller distances are possible only for sums of two readings."
+)
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate predictions and detections by distance, and the error of superposition."""
     rows = [_table_row(numbers["same_place"], numbers), *(_table_row(one, numbers) for one in numbers["by_separation"])]
-    false_alarm = {"distance of the two, mm": "single contacts"} | {
+    false_alarm = {"distance of the contacts, mm": "single contacts"} | {
         f"detected by {name}, %": show_digits(one["realised"], 1) for name, one in numbers["false_alarm_pct"].items()
     }
     table = pd.DataFrame([*rows, false_alarm]).fillna("–").assign(source=source)
@@ -420,7 +424,7 @@ def _draw_places(axes: Any, along: Mapping[str, Sequence[float]]) -> None:
     ends_mm = [separations_mm[0] - width_mm, separations_mm[-1] + width_mm]
     axes.plot(ends_mm, ends_mm, color=COLOURS[2], label="stronger contact")
     axes.plot(ends_mm, [0, 0], color=COLOURS[1], linestyle="--", label="weaker contact")
-    axes.set(xlabel="distance of the two / mm", ylabel="predicted place along their line / mm")
+    axes.set(xlabel="distance of the contacts / mm", ylabel="predicted place along their line / mm")
     axes.set_title("Predicted place (box: middle half; whiskers: 90 %)", loc="left", fontsize=10)
     axes.set_ylim(top=1.45 * ends_mm[1])
     axes.legend(frameon=False, loc="upper left", fontsize=9)
@@ -438,25 +442,25 @@ def _draw_detection(axes: Any, numbers: Mapping[str, Any]) -> None:
             together["separation_mm"], at_one, color=colour, marker=marker, markerfacecolor="white", clip_on=False
         )
         axes.axhline(alarm["realised"]["mean"], color=colour, linestyle=":", linewidth=1)
-    axes.set(xlabel="distance of the two / mm", ylabel="detected as two contacts / %", ylim=(0, 100))
+    axes.set(xlabel="distance of the contacts / mm", ylabel="detected as two contacts / %", ylim=(0, 100))
     axes.set_title("Detected as two (dotted: false alarms;\nhollow: both at one place)", loc="left", fontsize=10)
     axes.legend(frameon=False, loc="upper left", fontsize=9)
 
 
-def _table_row(one: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[str, str]:
+def _table_row(result: Mapping[str, Any], numbers: Mapping[str, Any]) -> dict[str, str]:
     row = {
-        "distance of the two, mm": f"{one['separation_mm']:g}",
-        "answer within 1 mm of either, %": show_digits(one["near_either_pct"], 1),
-        "distance to the nearer, mm": show_digits(one["nearest_mm"], 2),
+        "distance of the contacts, mm": f"{result['separation_mm']:g}",
+        "prediction within 1 mm of either, %": show_digits(result["near_either_pct"], 1),
+        "distance to the nearer, mm": show_digits(result["nearest_mm"], 2),
     }
     optional = {
         "along": "along the line (0 weaker, 1 stronger)",
         "force_over_sum": "force / sum of both",
         "force_over_larger": "force / larger of both",
     }
-    row |= {title: show_digits(one[name], 2) for name, title in optional.items() if name in one}
+    row |= {title: show_digits(result[name], 2) for name, title in optional.items() if name in result}
     return row | {
-        f"detected by {name}, %": show_digits(one["detected_pct"][name], 1) for name in numbers["false_alarm_pct"]
+        f"detected by {name}, %": show_digits(result["detected_pct"][name], 1) for name in numbers["false_alarm_pct"]
     }
 
 
@@ -464,7 +468,7 @@ def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFra
     table = pd.DataFrame(
         {
             "depth of both, mm": f"{row['depth_mm']:g}",
-            "distance of the two, mm": f"{row['separation_mm']:g}",
+            "distance of the contacts, mm": f"{row['separation_mm']:g}",
             "error of the sum, % of the change of field": f"{row['error_pct']:.1f}",
             "orders differ by, %": f"{row['orders_differ_pct']:.1f}",
             "pairs": row["pairs_n"],

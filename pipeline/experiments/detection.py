@@ -20,7 +20,7 @@ def neighbour_distance(known: Float[np.ndarray, "a c"], tested: Float[np.ndarray
 def direction_distance(
     known_uT: Float[np.ndarray, "a ch"], tested_uT: Float[np.ndarray, "f ch"]
 ) -> Float[np.ndarray, " f"]:
-    """Return the mean distance to the nearest known directions dB / (|dB| + noise), which are short for weak fields."""
+    """Return the mean distance to the nearest known directions dB / (|dB| + noise); weak fields give short vectors."""
     known, tested = (
         db_uT / (np.linalg.norm(db_uT, axis=1, keepdims=True) + NOISE_uT) for db_uT in (known_uT, tested_uT)
     )
@@ -28,7 +28,7 @@ def direction_distance(
 
 
 def _neighbour_distance(known: Float[np.ndarray, "a c"], tested: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
-    from sklearn.neighbors import NearestNeighbors  # imported late: it takes a second, and checking scenes needs none
+    from sklearn.neighbors import NearestNeighbors  # imported late: it takes a second, which checks of scenes save
 
     neighbours = NearestNeighbors(n_neighbors=min(NEIGHBOURS_N, len(known))).fit(known)
     return neighbours.kneighbors(tested)[0].mean(axis=1)

@@ -54,8 +54,8 @@ from reskin.seeds import rng_for
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of a target
-POINTS_MAX_N = 2000  # of the scatter plot
-DECIMALS = 3  # of a newton or millimetre
+POINTS_MAX_N = 2000  # points in the scatter plot
+DECIMALS = 3  # of forces in N and places in mm
 
 Count = Annotated[int, Field(ge=1)]
 # When the no-load reading is renewed: never, every few contacts, before each contact, or whenever a reading is judged
@@ -68,13 +68,13 @@ Errors = Mapping[str, Float[np.ndarray, "u w"]]  # by metric; rows are networks 
 class Drift(SectionWithTraining):
     """Section drift: windows of contacts for training and testing, and the no-load policies."""
 
-    unit: Literal["indentation", "pass"]  # of the numbers below
+    unit: Literal["indentation", "pass"]  # unit of the counts below
     train_n: Count
     test_n: Count
     every_n: Count
     policies: Annotated[tuple[PolicyName, ...], Field(min_length=1)]
-    regular_n: Count | None = None  # indentations from one no-load reading of policy `regular` to its next
-    # Random walk added to the field after training, sd per contact; simulated scenes only.
+    regular_n: Count | None = None  # indentations from one no-load reading to the next under policy `regular`
+    # Standard deviations per contact of a random walk that is added to the field after training; simulated scenes only.
     wander_uT: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = ()
     training: Training
 
@@ -104,7 +104,7 @@ class WindowPredictions:
     seed_i: int
     window_i: int
     contacts_n: int  # contacts of the skin before the window
-    noload_off_uT: float  # rms over rows and channels: the policy's no-load field less that read before the contact
+    noload_off_uT: float  # rms difference between the policy's no-load field and that read before the contact
     indentation: Int[np.ndarray, " f"]
     true: Float[np.ndarray, "f 3"]
     predicted: Float[np.ndarray, "f 3"]
@@ -124,8 +124,8 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
     trained = train_jobs(data, [job for job, _ in jobs], "drift")
 
     predictions: dict[str, list[WindowPredictions]] = {name: [] for name in section.training.recipes}
-    for (job, tests), one in zip(jobs, trained, strict=True):
-        predictions[job.recipe_name] += split_predictions(job, one, tests)
+    for (job, tests), result in zip(jobs, trained, strict=True):
+        predictions[job.recipe_name] += split_predictions(job, result, tests)
     numbers: dict[str, Any] = section.model_dump(
         mode="json", include={"unit", "train_n", "test_n", "every_n", "regular_n"}, exclude_none=True
     )
@@ -133,11 +133,13 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
     numbers |= pace(captures) | {"left_out_units_n": windows.left_out_units_n}
     if section.wander_uT:
         headline = [
-            (job, tests, one) for (job, tests), one in zip(jobs, trained, strict=True) if job.recipe_name == HEADLINE
+            (job, tests, result)
+            for (job, tests), result in zip(jobs, trained, strict=True)
+            if job.recipe_name == HEADLINE
         ]
         numbers["wander"] = score_wandering(section, selection, captures, headline, settings.seed)
-    of_headline, drawn = summarise_headline(section, predictions.pop(HEADLINE), parts, field_sizes(captures))
-    numbers |= of_headline
+    headline_numbers, plot_data = summarise_headline(section, predictions.pop(HEADLINE), parts, field_sizes(captures))
+    numbers |= headline_numbers
     if predictions:
         tables_of = {name: score_windows(own) for name, own in predictions.items()}
         numbers["variants"] = {
@@ -145,11 +147,11 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
             for name, table in tables_of.items()
         }
     losses = read_losses(indentations, numbers["dropped"])
-    write_results(results, numbers, drawn, losses, tally(map(collapse_record, trained)))
+    write_results(results, numbers, plot_data, losses, tally(map(collapse_record, trained)))
 
 
 def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
-    """Cut the captures into windows that all of them have, and gather the rows of each under every policy."""
+    """Cut all captures into the same windows, and gather the rows of each window under every policy."""
     check_one_per_skin(captures)
     units = [rank(getattr(one, UNIT_COLUMN[section.unit])) for one in captures]
     units_n = [1 + int(own.max()) for own in units]
@@ -205,28 +207,28 @@ def summarise_headline(
     policy = "regular" if "regular" in windows else section.policies[0]
     window_i = late_window(windows[policy])
     numbers: dict[str, Any] = windows | {"field": field}
-    drawn: dict[str, Any] = {}
+    plot_data: dict[str, Any] = {}
     late = late_force(predictions, policy, window_i)
     if late is not None:
         left_pct = force_left_pct(parts, policy, window_i)
         numbers["late"] = {"policy": policy, "contacts_n": windows[policy][window_i]["contacts_n"]} | late[0]
         numbers["late"] |= {} if left_pct is None else {"force_left_pct": left_pct}
-        drawn = {"late": late[1]}
+        plot_data = {"late": late[1]}
     errors: dict[str, Errors] = {name: network_errors(scores, name) for name in section.policies}
     boards = scores[scores["policy"] == policy].groupby(["skin", "seed_i"])["board"].first().tolist()
     contacts_n = [row["contacts_n"] for row in windows[policy]]
     numbers["findings"] = judge_findings(errors, boards=boards, contacts_n=contacts_n, late=numbers.get("late"))
     numbers["last_window"] = {name: last_window(scores, name) for name in section.policies}
-    return numbers, drawn
+    return numbers, plot_data
 
 
 # --- Scores of windows ---
 
 
 def score_windows(predictions: Sequence[WindowPredictions]) -> pd.DataFrame:
-    """Score every window of every network: one row each, including `bias_f_N` (mean of predicted less true force).
+    """Score every window of every network: one row each, including `bias_f_N` (mean of predicted minus true force).
 
-    Metrics of force are absent where no force is known.
+    Metrics of force are absent if no force is known.
     """
     rows = []
     for one in predictions:
@@ -260,7 +262,7 @@ def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
 def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndarray, "u w"]]:
     """Return, by metric, the errors of each network (rows) in each window (columns).
 
-    Equal rows of two policies are the same skin and seed, so they form a pair.
+    Row i has the same skin and seed under every policy, so the rows of two policies form pairs.
     """
     own = scores[scores["policy"] == policy]
     return {
@@ -315,14 +317,14 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
 
 
 def force_bias(contacts: ContactForces) -> dict[str, Any]:
-    """Return the mean of predicted less true force, its standard error over contacts, and the least-squares slope."""
+    """Return the mean of predicted minus true force, its standard error over contacts, and the least-squares slope."""
     error_N = contacts.predicted_N - contacts.true_N
-    away_N = contacts.true_N - contacts.true_N.mean()
+    deviation_N = contacts.true_N - contacts.true_N.mean()
     return {
         "bias_N": float(error_N.mean()),
         "bias_pct": float(100 * error_N.mean() / contacts.true_N.mean()),
         "bias_se_N": float(error_N.std(ddof=1) / np.sqrt(len(error_N))),
-        "slope": float(away_N @ contacts.predicted_N / (away_N @ away_N)),
+        "slope": float(deviation_N @ contacts.predicted_N / (deviation_N @ deviation_N)),
         "indentations_n": len(error_N),
     }
 
@@ -348,7 +350,7 @@ def late_force(
 
 
 def points(contacts: ContactForces) -> dict[str, list[float]]:
-    """Return true and predicted forces for the figure, to 1 mN; every second, third, ... if there are very many."""
+    """Return true and predicted forces for the figure, to 1 mN; at most about `POINTS_MAX_N` contacts."""
     every_n = ceil(len(contacts.true_N) / POINTS_MAX_N)
     sides = {"true_N": contacts.true_N, "predicted_N": contacts.predicted_N}
     return {name: np.round(values[::every_n], DECIMALS).tolist() for name, values in sides.items()}
@@ -436,7 +438,7 @@ def rms(values: Float[np.ndarray, "..."]) -> float:
     return float(np.sqrt(np.mean(values.astype(float) ** 2)))
 
 
-# --- A field at rest that drifts more than the simulated one ---
+# --- Additional drift of the field at rest ---
 
 
 def score_wandering(
@@ -539,8 +541,8 @@ def judge_findings(
 ) -> list[dict[str, Any]]:
     """Test each finding of the paper for which the required policies and quantities are available.
 
-    `networks` are the errors of the networks by policy; equal rows of two policies are a pair, whose board is in
-    `boards`. `contacts_n` is the number of contacts before each window.
+    `networks` are the errors of the networks by policy; rows i of two policies are a pair, on the board `boards[i]`.
+    `contacts_n` is the number of contacts before each window.
     """
     frequent = [policy for policy in ("regular", "each") if policy in networks]
     findings = []
@@ -574,9 +576,9 @@ def judge_findings(
 
 def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float[np.ndarray, " u"]:
     """Return the least-squares slope of each network's errors against contacts, per 10,000 contacts."""
-    tens = np.array(contacts_n, float) / PER_CONTACTS_N
-    away = tens - tens.mean()
-    return errors @ away / (away @ away)
+    contacts = np.array(contacts_n, float) / PER_CONTACTS_N
+    deviation = contacts - contacts.mean()
+    return errors @ deviation / (deviation @ deviation)
 
 
 def late_bias(late: Mapping[str, Any]) -> Comparison:
@@ -614,12 +616,12 @@ WANDER_MEANING = (
     "The networks of figure 5a, tested again on their last window after a random walk was added to the captures: one "
     "normally distributed step per contact and channel after the end of training, the same in contact readings and "
     "no-load readings. The row without an added walk is the last window of figure 5a. The table of skins gives the "
-    "drift of the field at rest without an added walk: rms change over 1 to 1,000 contacts."
+    "drift of the field at rest without an added walk, as rms change over 1 to 1,000 contacts."
 )
 FINDINGS_MEANING = (
-    f"{VERDICTS} A finding with several parts is contradicted if one part is, and supported if all are. Of these "
-    "trainings: the same verdicts, but from the 95 % interval over pairs of networks (policies trained from the same "
-    "seed on the same skin); for the force bias this interval is widened to two standard errors over indentations "
+    f"{VERDICTS} A finding with several parts is contradicted if one part is, and supported if all are. Over these "
+    "training runs: the same verdicts, but from the 95 % interval over pairs of networks (policies trained from the "
+    "same seed on the same skin); for the force bias this interval is widened to two standard errors over indentations "
     "where these are larger. Several training runs on one skin show how much training runs vary, not how much boards "
     "do. Measured: values by no-load policy; brackets are the 95 % interval over boards, or over these training runs "
     "where there are too few boards."
@@ -640,7 +642,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         {
             "finding (paper)": one["finding"],
             "holds": one["verdict"],
-            "of these trainings": one["of_trainings"],
+            "over these training runs": one["of_trainings"],
             "measured": one["measured"],
             "source": source,
         }
@@ -653,7 +655,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     if "wander" in numbers:
         walked = []
         for i, first in enumerate(next(iter(numbers["wander"].values()))):
-            line = {"further walk, µT a contact": f"{first['step_uT']:g}", "source": source}
+            line = {"added walk, µT per contact": f"{first['step_uT']:g}", "source": source}
             for policy, (title, _) in policies.items():
                 row = numbers["wander"][policy][i]
                 line[f"no-load reading off by, µT ({title})"] = f"{row['noload_off_uT']:.3g}"
@@ -664,7 +666,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _possible_reasons(numbers: Mapping[str, Any]) -> str:
-    """Describe how large no-load errors are beside a contact's field, and how much force bias softening explains."""
+    """Compare no-load errors with a contact's field, and describe how much of the force bias softening explains."""
     field, late = numbers["field"], numbers.get("late", {})
     off = ", ".join(
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
@@ -723,7 +725,7 @@ def _protocol(numbers: Mapping[str, Any]) -> str:
     )
     text = (
         f"Trained on the first {train} of each skin, tested on {test} after every {every}; each policy of "
-        "the no-load reading has networks of its own. Contacts: number of contacts of the skin before the test."
+        "the no-load reading has its own networks. Contacts: number of contacts of the skin before the test."
     )
     return text + (
         f" The last {left} do not fill a test window, and are not used." if numbers["left_out_units_n"] else ""
@@ -732,7 +734,7 @@ def _protocol(numbers: Mapping[str, Any]) -> str:
 
 # --- Figures ---
 
-MARGIN = 0.05  # of the largest force
+MARGIN = 0.05  # of the range of forces
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
@@ -759,8 +761,8 @@ def _draw_scores(
             for policy, (name, _) in policies.items():
                 i, rows = POLICIES.index(policy), lines[policy]
                 bars = [row["spread"].get(metric, 0.0) for row in rows] if rows[0]["spread"] else None
-                look = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
-                axes.errorbar([row[x] for row in rows], [row[metric] for row in rows], bars, label=name, **look)
+                style = {"color": COLOURS[i], "marker": MARKERS[i], "markersize": 5, "linewidth": 1.2, "capsize": 2}
+                axes.errorbar([row[x] for row in rows], [row[metric] for row in rows], bars, label=name, **style)
             axes.set_ylabel(COLUMNS[metric].replace(", ", " / "))
             if x == "contacts_n":
                 axes.set_xlabel("contacts of the skin before the test")

@@ -1,4 +1,4 @@
-"""Dynamic presses: readings of presses that never rest, at the full rate (paper section 7, future work).
+"""Dynamic presses: readings at the full rate while the force keeps changing (paper section 7, future work).
 
 Place and force are estimated from each reading alone, and from the mean of the last five readings, which is the paper's
 protocol at rest.
@@ -29,7 +29,7 @@ from reskin.models.trained import networks_held_out
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
 FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, whose contact is hard to locate
 BINS_N = 5
-LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # candidates
+LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # candidate lags
 METHODS = ("one", "mean5", "mean5_of_middle")
 
 Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
@@ -37,7 +37,7 @@ Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 
 @dataclass(frozen=True)
 class Presses:
-    """Readings of presses in order of time; `press_i` counts from 0, `duration_s` is the duration of a row's press."""
+    """Readings of presses in order of time; each row has the index and the duration of its press."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     true: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
@@ -52,13 +52,13 @@ class Presses:
 
 def dynamics(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
     """Score the networks of train_multi that were trained without the board of the pressed skin."""
-    one = only(read_captures(indentations), indentations)
-    true = np.stack([getattr(one, name) for name in TARGETS], axis=1)
-    presses = find_presses(subtract(one.b_uT, one.noload_uT), true, one.t_s, one.indentation)
-    numbers = score_presses(presses, networks_held_out(models, one.board), board=one.board)
+    capture = only(read_captures(indentations), indentations)
+    true = np.stack([getattr(capture, name) for name in TARGETS], axis=1)
+    presses = find_presses(subtract(capture.b_uT, capture.noload_uT), true, capture.t_s, capture.indentation)
+    numbers = score_presses(presses, networks_held_out(models, capture.board), board=capture.board)
     write_results(results, numbers, {}, read_losses(indentations, {}))
-    of_presses = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
-    say(f"{settings.scene}: {numbers['readings_n']} readings of {of_presses}")
+    described = f"{numbers['presses_n']} presses at {numbers['rate_hz']:.0f} Hz"
+    say(f"{settings.scene}: {numbers['readings_n']} readings of {described}")
 
 
 def find_presses(
@@ -70,8 +70,8 @@ def find_presses(
     """Find the presses; each lasts from half a frame before its first reading to half a frame after its last."""
     _, first_i, press_i, frames_n = np.unique(indentation, return_index=True, return_inverse=True, return_counts=True)
     duration_s = (t_s[first_i + frames_n - 1] - t_s[first_i]) + 1 / rate_of(t_s, press_i)
-    place = np.arange(len(t_s)) - first_i[press_i]
-    scored = (true[:, 2] >= FORCE_MIN_N) & (place >= WINDOW_N - 1)
+    position = np.arange(len(t_s)) - first_i[press_i]
+    scored = (true[:, 2] >= FORCE_MIN_N) & (position >= WINDOW_N - 1)
     return Presses(db_uT, true.astype(np.float64), t_s, press_i, duration_s[press_i], scored)
 
 
@@ -81,59 +81,59 @@ def rate_of(t_s: Float64[np.ndarray, " f"], press_i: Int64[np.ndarray, " f"]) ->
 
 
 def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]:
-    """Average each row with the four rows before it; the first four rows with as many as there are."""
+    """Average each row with the four rows before it, or with all earlier rows if there are fewer than four."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0, dtype=np.float64)])
     end = np.arange(1, len(values) + 1)
     start = np.maximum(end - WINDOW_N, 0)
     return (total[end] - total[start]) / (end - start)[:, None]
 
 
-def score_presses(of: Presses, networks: Sequence[Predict], *, board: str) -> dict[str, Any]:
+def score_presses(presses: Presses, networks: Sequence[Predict], *, board: str) -> dict[str, Any]:
     """Score estimates from each reading alone and from the mean of the last five readings.
 
     The mean is also compared with the truth at its middle reading. All presses are on one skin of this `board`, so
     `paired`, which compares the first two methods, has no interval.
     """
-    mean_uT = running_mean(of.db_uT).astype(np.float32)
-    alone, meant = ([network(one) for network in networks] for one in (of.db_uT, mean_uT))
-    predictions = {"one": alone, "mean5": meant, "mean5_of_middle": meant}
-    edges_s = np.geomspace(of.duration_s.min(), of.duration_s.max() * (1 + 1e-9), BINS_N + 1)
+    mean_uT = running_mean(presses.db_uT).astype(np.float32)
+    single, averaged = ([network(one) for network in networks] for one in (presses.db_uT, mean_uT))
+    predictions = {"one": single, "mean5": averaged, "mean5_of_middle": averaged}
+    edges_s = np.geomspace(presses.duration_s.min(), presses.duration_s.max() * (1 + 1e-9), BINS_N + 1)
     by_duration = []
     for low_s, high_s in pairwise(edges_s):
-        own = of.scored & (of.duration_s >= low_s) & (of.duration_s < high_s)
+        own = presses.scored & (presses.duration_s >= low_s) & (presses.duration_s < high_s)
         if own.any():
-            presses_n = len(np.unique(of.press_i[own]))
+            presses_n = len(np.unique(presses.press_i[own]))
             keys = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(own.sum()), "presses_n": presses_n}
-            by_duration.append(keys | _scores(of, predictions, own, board))
+            by_duration.append(keys | _scores(presses, predictions, own, board))
     return {
-        "readings_n": int(of.scored.sum()),
-        "presses_n": len(np.unique(of.press_i[of.scored])),
-        "rate_hz": rate_of(of.t_s, of.press_i),
+        "readings_n": int(presses.scored.sum()),
+        "presses_n": len(np.unique(presses.press_i[presses.scored])),
+        "rate_hz": rate_of(presses.t_s, presses.press_i),
         "window_n": WINDOW_N,
         "force_min_N": FORCE_MIN_N,
         "by_duration": by_duration,
-        "all": _scores(of, predictions, of.scored, board),
-        "lag_ms": {name: lags(of, [one[:, 2] for one in predictions[name]]) for name in ("one", "mean5")},
+        "all": _scores(presses, predictions, presses.scored, board),
+        "lag_ms": {name: lags(presses, [one[:, 2] for one in predictions[name]]) for name in ("one", "mean5")},
     }
 
 
 def _scores(
-    of: Presses, predictions: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
+    presses: Presses, predictions: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
 ) -> dict[str, Any]:
-    # The middle of the last five readings is two before the last, and in the same press where a row is scored.
+    # The middle of the last five readings is two rows before the last; for a scored row, it is in the same press.
     middle = np.flatnonzero(rows) - WINDOW_N // 2
-    true = {"one": of.true[rows], "mean5": of.true[rows], "mean5_of_middle": of.true[middle]}
+    true = {"one": presses.true[rows], "mean5": presses.true[rows], "mean5_of_middle": presses.true[middle]}
     scores = {name: pd.DataFrame([score(true[name], one[rows]) for one in predictions[name]]) for name in METHODS}
-    sides = (scores[name].assign(board=board, skin="") for name in ("mean5", "one"))
-    return {name: summarise(own) for name, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*sides)}}
+    methods = (scores[name].assign(board=board, skin="") for name in ("mean5", "one"))
+    return {name: summarise(own) for name, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*methods)}}
 
 
-def lags(of: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, float]:
+def lags(presses: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, float]:
     """Find by how many ms the predicted forces lag behind the true ones, over presses and networks."""
     found_ms = [
-        lag_ms(of.t_s[rows], predicted_N[rows], of.t_s[own], of.true[own, 2])
-        for own in (of.press_i == press_i for press_i in np.unique(of.press_i[of.scored]))
-        for rows in [own & of.scored]
+        lag_ms(presses.t_s[rows], predicted_N[rows], presses.t_s[own], presses.true[own, 2])
+        for own in (presses.press_i == press_i for press_i in np.unique(presses.press_i[presses.scored]))
+        for rows in [own & presses.scored]
         if rows.sum() > WINDOW_N
         for predicted_N in force_N
     ]
@@ -154,7 +154,7 @@ def lag_ms(
 
 MEANING = (
     "Half-sine presses at random places of the grid, recorded at the full rate. The model is the paper's network, "
-    "trained on readings at rest of other boards. A reading is scored if four readings of the same press come before "
+    "trained on other boards with readings at rest. A reading is scored if four readings of the same press come before "
     f"it and its force is at least {FORCE_MIN_N:g} N. The mean of the last five readings is the paper's protocol at "
     "rest; during a press, these five readings are taken at different depths. The third method compares the same mean "
     "with place and force at its middle reading, two frames earlier: the difference in error is due to lag. Presses "
@@ -164,7 +164,7 @@ MEANING = (
 TITLES = {
     "one": "each reading alone",
     "mean5": "mean of the last five",
-    "mean5_of_middle": "the same, two frames late",
+    "mean5_of_middle": "same mean, compared with its middle reading",
 }
 LESS = "less force error than each reading alone, N²"  # column
 TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
@@ -180,7 +180,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             "press lasts about, s": label,
             "presses": one["presses_n"],
             "readings": one["n"],
-            "answered by": title,
+            "estimated from": title,
             **{column: _show(one[method].get(name)) for name, column in METRICS.items()},
             "lag / ms": _show(_lag(numbers, method)) if label == "all" else "",
             LESS: _less(one) if method == "mean5" else "",
@@ -222,7 +222,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _less(one: Mapping[str, Any]) -> str:
     """Judge whether the mean of the last five readings has less force error than each reading alone."""
     if "paired" not in one or "mse_f_N2" not in one["paired"]["mean5_minus_one"]:
-        return "–"  # no force is known, or an older run
+        return "–"  # no force is known, or the results are from an older version
     difference = one["paired"]["mean5_minus_one"]["mse_f_N2"]
     return f"{verdict(negate(difference))}: {show_difference(difference)}"
 

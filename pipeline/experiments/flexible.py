@@ -38,7 +38,7 @@ from reskin.seeds import rng_for
 DEPTH_DECIMALS = 2  # of a commanded depth in mm
 DRAWN_N = 400  # points in a panel
 FORCE_DECIMALS = 3  # of a force in N in the figure
-SHAPE = "shape"  # recipe with direction and length as inputs, if the scene has one: should depend less on the gap
+SHAPE = "shape"  # optional recipe whose inputs are direction and length of dB; expected to depend less on the gap
 
 
 def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
@@ -78,8 +78,8 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
         numbers[SHAPE] = summarise_flexible(
             before[SHAPE] + [replace(one, variant=AFTER) for one in after if one.variant == SHAPE]
         )
-    drawn = draw_forces(own, rng_for(data.settings.seed, "flexible", "drawn"))
-    write_results(results, numbers, drawn, read_losses(indentations, poked.dropped), trainings)
+    plot_data = draw_forces(own, rng_for(data.settings.seed, "flexible", "drawn"))
+    write_results(results, numbers, plot_data, read_losses(indentations, poked.dropped), trainings)
 
 
 ByDepth = Mapping[float, Float[np.ndarray, " d"]]  # |dB| in uT by commanded depth in mm
@@ -87,9 +87,9 @@ ByDepth = Mapping[float, Float[np.ndarray, " d"]]  # |dB| in uT by commanded dep
 
 def sizes_by_depth(readings: Readings) -> dict[float, np.ndarray]:
     """Group the sizes |dB| of a capture by commanded depth."""
-    length_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
+    size_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
     depth_mm = np.round(readings.depth_mm.astype(float), DEPTH_DECIMALS)
-    return {float(depth): length_uT[depth_mm == depth] for depth in np.unique(depth_mm)}
+    return {float(depth): size_uT[depth_mm == depth] for depth in np.unique(depth_mm)}
 
 
 def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
@@ -103,10 +103,12 @@ def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dic
 
 
 def gaps(data: SceneData) -> dict[str, Any]:
-    """Return the gap between skin and chips on rigid and flexible boards, and how many percent less the latter is."""
-    of = simulation_settings(data.settings)
+    """Return the gap between skin and chips on rigid and flexible boards, and the difference in percent."""
+    simulation = simulation_settings(data.settings)
     protocols = {"rigid": "grid", "flexible": "flexible"}
-    gap_mm = {kind: of.boards[of.protocols[name].boards].design.gap_mm for kind, name in protocols.items()}
+    gap_mm = {
+        kind: simulation.boards[simulation.protocols[name].boards].design.gap_mm for kind, name in protocols.items()
+    }
     return {"gap_mm": gap_mm, "gap_less_pct": 100 * (1 - gap_mm["flexible"] / gap_mm["rigid"])}
 
 
@@ -119,7 +121,10 @@ def summarise_flexible(predictions: Sequence[VariantPrediction]) -> dict[str, An
 def draw_forces(
     predictions: Sequence[VariantPrediction], rng: np.random.Generator
 ) -> dict[str, dict[str, list[float]]]:
-    """Choose the same random readings before and after adaptation, first networks: true and predicted force in N."""
+    """Return true and predicted forces in N of random readings, by the networks of the first seed.
+
+    The readings are the same before and after adaptation.
+    """
     first = {name: [one for one in predictions if one.variant == name and one.seed_i == 0] for name in (BEFORE, AFTER)}
     shown = rng.permutation(sum(len(one.true) for one in first[BEFORE]))[:DRAWN_N]
     return {
@@ -177,7 +182,7 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
     return (
         f"Networks of fold {numbers['fold']}, trained on {numbers['trained_on_skins_n']} skins of rigid boards and "
         f"tested on {numbers['skins_n']} skins of {numbers['boards_n']} flexible boards; adapted with "
-        f"{numbers['pokes_n']} pokes of each skin. Bias: mean of predicted less true force, also as a percentage of "
+        f"{numbers['pokes_n']} pokes of each skin. Bias: mean of predicted minus true force, also as a percentage of "
         f"the mean force; the paper reports {FLEXIBLE_BIAS} after adaptation, without a number. In our simulation, "
         f"|dB| at equal depth is {show(numbers['strength_ratio'])} times that on rigid boards (± over depths). The gap "
         f"between chips and skin is {gap_mm['flexible']:g} mm instead of {gap_mm['rigid']:g} mm, "

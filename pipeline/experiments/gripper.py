@@ -1,7 +1,7 @@
 """Gripper: force control by the force estimates of networks or of the universal model (paper section 6).
 
-A simulated gripper squeezes objects of several stiffnesses; the true force is judged, without and with one press whose
-force is known.
+A simulated gripper squeezes objects of several stiffnesses. The true force is compared with the intended force, with
+and without one press of known force.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,10 +31,10 @@ from reskin.seeds import rng_for
 from reskin.simulation.protocols import load_steps_N
 from reskin.universal.model import Universal, load_universal
 
-RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; from SETTLED_S on the force is judged
+RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; forces are scored from SETTLED_S on
 SWING = 3.0  # factor by which an object becomes stiffer and softer than its nominal stiffness
 DEPTH_OF_1_N_MM = 0.8  # assumed, for a round tip (Hertz); affects how fast a force is reached, not its value
-READINGS_N = 5  # of the known press, as of each indentation (paper section 3)
+READINGS_N = 5  # of the known press, as many as of each indentation (paper section 3)
 WITHIN = 0.1  # tolerance relative to the aim (in paper section 6 a gripper holds a blueberry; the tolerance is ours)
 Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
 Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # of changes of field: x, y in mm, F in N
@@ -88,8 +88,8 @@ def gripper(settings: Settings, section: Gripper, indentations: Path, models: Pa
     weight_N = load_steps_N(load.force_max_N, load.step_N)
     fingers = [make_finger(capture, weight_N) for capture in read_captures(indentations)]
     networks = {finger.board: networks_held_out(models, finger.board) for finger in fingers}
-    numbers, drawn = hold_all(fingers, networks, section, seed=settings.seed)
-    write_results(results, numbers, drawn, read_losses(indentations, {}))
+    numbers, plot_data = hold_all(fingers, networks, section, seed=settings.seed)
+    write_results(results, numbers, plot_data, read_losses(indentations, {}))
     best = max(numbers["rows"], key=lambda row: row["held_pct"])
     say(
         f"{settings.scene}: {best['aim_N']} N held in {best['held_pct']:.0f} % of runs by {best['feedback']}, "
@@ -138,36 +138,36 @@ def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
 
 
 def hold(
-    finger: Finger, estimate: Estimate, aim_N: float, how: Gripper, rng: np.random.Generator
+    finger: Finger, estimate: Estimate, aim_N: float, section: Gripper, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f r"]:
-    """Hold objects of all stiffnesses, each in a run of its own; return the true force at each step."""
-    own_N_mm = np.array(how.stiffness_N_mm)
-    closed_mm, force_N = np.zeros(len(own_N_mm)), np.zeros(len(own_N_mm))
+    """Hold objects of all stiffnesses, in one run each; return the true force at each step."""
+    nominal_N_mm = np.array(section.stiffness_N_mm)
+    closed_mm, force_N = np.zeros(len(nominal_N_mm)), np.zeros(len(nominal_N_mm))
     touch_uT = finger.noise_uT * (np.sqrt(len(finger.noload_uT)) + CONTACT_SDS)
     held_N = []
     for step in range(round(SECONDS * RATE_HZ)):
         b_uT = finger.read(force_N, rng)
         touched = np.linalg.norm(b_uT - finger.noload_uT, axis=1) > touch_uT
         estimate_N = np.where(touched, estimate(b_uT), 0.0)
-        closed_mm = np.maximum(closed_mm + how.gain_mm_N * (aim_N - estimate_N), 0.0)  # the controller
-        stiffness_N_mm = own_N_mm * SWING ** np.sin(2 * np.pi * step / RATE_HZ / SECONDS)
+        closed_mm = np.maximum(closed_mm + section.gain_mm_N * (aim_N - estimate_N), 0.0)  # the controller
+        stiffness_N_mm = nominal_N_mm * SWING ** np.sin(2 * np.pi * step / RATE_HZ / SECONDS)
         force_N = finger.squeezed_N(closed_mm, stiffness_N_mm)
         held_N.append(force_N)
     return np.array(held_N)
 
 
 def hold_all(
-    fingers: Sequence[Finger], networks: Mapping[str, Sequence[Predict]], how: Gripper, *, seed: int
+    fingers: Sequence[Finger], networks: Mapping[str, Sequence[Predict]], section: Gripper, *, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Hold each force with every estimator on every skin; return the numbers, and the data of the figure."""
-    rows, drawn = [], []
-    for aim_N in how.aims_N:
+    rows, plot_rows = [], []
+    for aim_N in section.aims_N:
         runs: dict[tuple[str, str], dict[str, list[Float64[np.ndarray, "f r"]]]] = {}
         for finger in fingers:
             rng = rng_for(seed, "gripper", finger.board, f"{aim_N:g}")
             known_uT = finger.read(np.full(READINGS_N, aim_N), rng).mean(axis=0)
             for model, press, estimate in estimators(finger, networks[finger.board], Press(aim_N, known_uT)):
-                held_N = hold(finger, estimate, aim_N, how, rng)
+                held_N = hold(finger, estimate, aim_N, section, rng)
                 runs.setdefault((model, press), {}).setdefault(finger.board, []).append(held_N)
         for (model, press), by_board in runs.items():
             keys = {"aim_N": aim_N, "feedback": model, "press": press}
@@ -175,15 +175,15 @@ def hold_all(
             mean_N = np.concatenate(
                 [held_N[round(SETTLED_S * RATE_HZ) :].mean(axis=0) for own in by_board.values() for held_N in own]
             )
-            drawn.append(keys | {"off_pct": np.round(100 * (mean_N / aim_N - 1), 2).tolist()})
+            plot_rows.append(keys | {"off_pct": np.round(100 * (mean_N / aim_N - 1), 2).tolist()})
     return {
         "rows": rows,
         "within_pct": 100 * WITHIN,
         "skins_n": len(fingers),
         "seeds_n": max(len(own) for own in networks.values()),
         "rate_hz": RATE_HZ,
-        **how.model_dump(mode="json"),
-    }, {"rows": drawn}
+        **section.model_dump(mode="json"),
+    }, {"rows": plot_rows}
 
 
 def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float) -> dict[str, Any]:
@@ -192,18 +192,18 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
     `runs` are by board, one array per estimator (network seed); `sd_seeds` is the standard deviation over the
     estimators of one board, averaged over boards.
     """
-    off = {board: [one[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for one in own] for board, own in runs.items()}
-    every = np.concatenate([one for own in off.values() for one in own], axis=1)
+    deviations = {board: [one[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for one in own] for board, own in runs.items()}
+    all_runs = np.concatenate([one for own in deviations.values() for one in own], axis=1)
     rows = pd.DataFrame(
-        [{"board": board, "error_pct": 100 * np.abs(one).mean()} for board, own in off.items() for one in own]
+        [{"board": board, "error_pct": 100 * np.abs(one).mean()} for board, own in deviations.items() for one in own]
     )
     error = add_seed_sd(summarise(rows.groupby("board").mean(), boards=True), rows, "board")["error_pct"]
     return {
-        "runs_n": every.shape[1],
-        "held_pct": 100 * float((np.abs(every.mean(axis=0)) < WITHIN).mean()),
-        "always_pct": 100 * float((np.abs(every) < WITHIN).all(axis=0).mean()),
-        "median_error_pct": 100 * float(np.median(np.abs(every).mean(axis=0))),
-        "worst_error_pct": 100 * float(np.abs(every).mean(axis=0).max()),
+        "runs_n": all_runs.shape[1],
+        "held_pct": 100 * float((np.abs(all_runs.mean(axis=0)) < WITHIN).mean()),
+        "always_pct": 100 * float((np.abs(all_runs) < WITHIN).all(axis=0).mean()),
+        "median_error_pct": 100 * float(np.median(np.abs(all_runs).mean(axis=0))),
+        "worst_error_pct": 100 * float(np.abs(all_runs).mean(axis=0).max()),
         "error_pct": error,
     }
 
@@ -215,9 +215,9 @@ MEANING = (
     "{skins_n} skins, one per board, pressed at the skin's middle. The networks were trained without the board; `map` "
     "is the universal model that comes with the project. The known press has the aimed force, at the place where the "
     "object is then held: as a factor, it scales all estimates; as a label, it calibrates the universal model. The "
-    "true force from one second on is judged. Held: the run's mean force is within {within_pct:g} % of the aim. "
+    "true force is scored from one second on. Held: the run's mean force is within {within_pct:g} % of the aim. "
     "Always: the force never leaves that band. Error: mean absolute deviation from the aim over a run. [low, high]: 95 "
-    "% confidence interval over boards. Each of the {seeds_n} networks of a board controls runs of its own; ± (seeds): "
+    "% confidence interval over boards. Each of the {seeds_n} networks of a board controls its own runs; ± (seeds): "
     "standard deviation over {seeds_n} network seeds on one board, averaged over boards."
 )
 PRESSES = {"none": "no", "factor": "as a factor", "label": "as a label"}
@@ -261,7 +261,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
             labels = [f"{row['feedback']}\n{PRESSES[row['press']]}" for row in rows]
             axes.set_xticks(range(len(rows)), labels, fontsize=8, rotation=45)
             axes.set_title(f"{aim_N:g} N", fontsize=10)
-        panels[0].set_ylabel("mean force less the aim / %")
+        panels[0].set_ylabel("mean force minus aim / %")
         title = f"Force control by estimated force; labels: model, and use of a known press ({source})"
         figure.suptitle(title, x=0.01, ha="left", fontsize=11)
         return {"gripper.svg": svg(figure)}

@@ -51,17 +51,17 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board
     networks = networks_held_out(models, board)
-    found = estimate(t_s, b_uT, networks, where=str(folder / LOG_FILE))
-    numbers, true = describe(found) | {"networks_n": len(networks), "account": account}, None
+    estimated = estimate(t_s, b_uT, networks, where=str(folder / LOG_FILE))
+    numbers, true = describe(estimated) | {"networks_n": len(networks), "account": account}, None
     if (folder / PROBE_FILE).is_file():
         log = probe.parse(folder / PROBE_FILE, str(folder / PROBE_FILE))
         known = np.stack([log.x_mm, log.y_mm, log.Fz_N], axis=1)
         known[~log.contact] = np.nan
         true = truth_at(t_s, log.t_start_s, log.t_end_s, known)
-        numbers |= score_contacts(found, true)
-        numbers |= score_turning(Log(t_s, b_uT, true, found.quiet_n), board, settings, networks)
+        numbers |= score_contacts(estimated, true)
+        numbers |= score_turning(Log(t_s, b_uT, true, estimated.quiet_n), board, settings, networks)
     losses = {"accounts": [numbers["account"]], "left_out": {}}
-    write_results(results, numbers, thin(found, true), losses)
+    write_results(results, numbers, thin(estimated, true), losses)
     say(f"{settings.scene}: {numbers['contacts_n']} contacts in {numbers['duration_s']:.1f} s of log")
 
 
@@ -70,7 +70,7 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
 
 @dataclass(frozen=True)
 class Log:
-    """A log of a board that keeps its orientation, the length of its quiet start, and its true contacts."""
+    """A log of a board that keeps its orientation, the number of rows in its quiet start, and its true contacts."""
 
     t_s: Float64[np.ndarray, " f"]
     b_uT: Float32[np.ndarray, "f ch"]
@@ -80,33 +80,34 @@ class Log:
 
 def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
     """Score the networks on the log as if its board rotated in the earth's field, with and without a reference chip."""
-    of, seed = simulation_settings(settings), settings.seed
-    noise_uT = np.array([of.chip.noise_xy_uT, of.chip.noise_xy_uT, of.chip.noise_z_uT])  # single readings, no averages
-    own = replace(draw_instrument(of, board, seed=seed), noise_uT=noise_uT)
+    simulation, seed = simulation_settings(settings), settings.seed
+    chip = simulation.chip
+    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])  # of single readings, not of means
+    instrument = replace(draw_instrument(simulation, board, seed=seed), noise_uT=noise_uT)
     return {
-        "turning": score_pitches(log, own, networks, rng_for(seed, "logs", board, "aside")),
+        "turning": score_pitches(log, instrument, networks, rng_for(seed, "logs", board, "aside")),
         "turning_period_s": step_period_s(log.t_s, np.isfinite(log.true[:, 2])),
         "earth_uT": EARTH_SIZE_T / micro,
     }
 
 
 def score_pitches(
-    log: Log, own: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
+    log: Log, instrument: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
 ) -> list[dict[str, Any]]:
     """Score the log with a board that pitches after the quiet start, without and with a reference chip.
 
-    `own.noise_uT` is the noise of one reading of the reference chip.
+    `instrument.noise_uT` is the noise of one reading of the reference chip.
     """
     period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
     rows = []
     for pitch_deg in PITCHES_DEG:
         swing_rad = np.radians(pitch_deg) * swing(log.t_s, start_s=float(log.t_s[log.quiet_n - 1]), period_s=period_s)
         field_T = earth_in_board_T(swing_rad)
-        added_uT = readings_uT(own.board, np.repeat(field_T[:, None], len(own.turn), axis=1))
-        less_uT = added_uT - reference_uT(own, field_T, rng)
+        added_uT = readings_uT(instrument.board, np.repeat(field_T[:, None], len(instrument.turn), axis=1))
+        corrected_uT = added_uT - reference_uT(instrument, field_T, rng)
         rows.append(
             {"pitch_deg": pitch_deg} | _score(log, added_uT, networks)
-            | {"reference_chip": _score(log, less_uT, networks)}
+            | {"reference_chip": _score(log, corrected_uT, networks)}
         )  # fmt: skip
     return rows
 
@@ -144,17 +145,17 @@ MEANING = (  # {rate_hz} comes from the numbers
     "above its noise. Places and forces are predicted by networks trained without the board, each scored separately: ± "
     "is the standard deviation over {networks_n} network seeds. Errors are over the readings detected as contact, "
     "against the true values of the simulation. The board does not rotate: the earth's field is part of the no-load "
-    "reading and remains constant, which is not so in a dog's shoe or on a hand."
+    "reading and remains constant, unlike in a dog's shoe or on a hand."
 )
 TURNING = (
-    "The same log, as if the board pitched to either side by the given angle, as a sine once per step "
+    "The same log, as if the board pitched to either side by the given angle, sinusoidally once per step "
     "({turning_period_s:.2g} s) in the earth's field of {earth_uT:.0f} µT, walking north (the worst direction); the "
     "angles are assumed. Changes of that field are mistaken for contacts. As a remedy, one additional chip of the same "
     "type and noise, placed aside, is read with every frame; its reading, rotated to each chip's axes by the board's "
     "design, is subtracted from all others. Errors are over the readings in contact that were detected as contact: "
-    "where more weak ones are detected, the mean error of force falls. ± is the standard deviation over network seeds."
+    "if more weak contacts are detected, the mean force error falls. ± is the standard deviation over network seeds."
 )
-VARIANTS = {"as logged": None, "a chip's aside taken off": "reference_chip"}
+VARIANTS = {"as logged": None, "reference chip subtracted": "reference_chip"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -167,13 +168,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         ("readings lost to failed reads and stuck chips", f"{account['rows_read_n'] - account['rows_n']}", "–"),
         ("frames missing in gaps of time", f"{account['gap_frames_n']}", "–"),
         ("contacts found", f"{numbers['contacts_n']}", "–"),
-        ("contacts made", _show(numbers, "contacts_true_n"), "–"),
+        ("true contacts", _show(numbers, "contacts_true_n"), "–"),
         ("readings in contact", f"{numbers['contact_readings_n']}", "–"),
         ("readings in contact that were missed", _show(numbers, "missed_readings_n"), "–"),
         ("largest force of a missed reading, N", _show(numbers, "missed_force_max_N"), "–"),
-        ("readings without contact taken for one", _show(numbers, "false_readings_n"), "–"),
+        ("readings without contact detected as contact", _show(numbers, "false_readings_n"), "–"),
         ("largest force found, N", _show(numbers, "force_max_N"), "–"),
-        ("largest force made, N", _show(numbers, "force_true_max_N"), "–"),
+        ("largest true force, N", _show(numbers, "force_true_max_N"), "–"),
         ("accuracy, %", _show(numbers, "accuracy_pct"), "–"),
         ("MSE_xy, mm²", _show(numbers, "mse_xy_mm2"), "–"),
         ("MSE_F, N²", _show(numbers, "mse_f_N2"), "–"),
@@ -196,8 +197,8 @@ def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
                     "pitch / °": f"± {row['pitch_deg']:g}",
                     "readings": title,
                     "contacts found": _show(own, "contacts_n"),
-                    "contacts made": _show(numbers, "contacts_true_n"),
-                    "readings without contact taken for one": _show(own, "false_readings_n"),
+                    "true contacts": _show(numbers, "contacts_true_n"),
+                    "readings without contact detected as contact": _show(own, "false_readings_n"),
                     "readings in contact that were missed": _show(own, "missed_readings_n"),
                     "MSE_F / N²": _show(own, "mse_f_N2"),
                     "accuracy / %": _show(own, "accuracy_pct"),

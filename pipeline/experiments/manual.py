@@ -54,8 +54,8 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pret
     data = read_data(settings, main, folds)
     starts = read_pretrained(pretrained)
     adapting = data.settings.section(Adaptations, "adapt")
-    poked, found = hand_rows(read_captures(indentations))
-    lines = {skin: shift_rows(own, len(data.rows)) for skin, own in found.items()}
+    poked, lines_by_skin = hand_rows(read_captures(indentations))
+    lines = {skin: shift_rows(own, len(data.rows)) for skin, own in lines_by_skin.items()}
     data = replace(data, rows=stack(data.rows, poked))
     jobs: list[tuple[str, TrainingJob]] = []
     predictions: list[VariantPrediction] = []
@@ -94,14 +94,14 @@ def fold_without(data: SceneData, board: str) -> Fold:
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
         what = f"board {board} is in no fold of lobo ({', '.join(sorted(folds))})"
-        raise SchemaError(f"experiment manual: {what}. Poke skins by hand that the main captures have too.")
+        raise SchemaError(f"experiment manual: {what}. Use skins of the main captures for hand pokes.")
     return folds[board]
 
 
 def summarise_manual(
     predictions: Sequence[VariantPrediction], *, pokes_n: Sequence[int], lines_n: Sequence[int]
 ) -> dict[str, Any]:
-    """Summarise predictions over boards; `pokes_n` and `lines_n` are given by skin, and averaged."""
+    """Summarise predictions over boards; `pokes_n` and `lines_n` have one value per skin, and are averaged."""
     variants = summarise_variants(predictions)
     counts = {
         "pokes_n": round(np.mean(pokes_n)),
@@ -120,14 +120,14 @@ def summarise_manual(
 
 VARIANTS = {
     "before": "before",
-    "after": "adapted by hand",
+    "after": "adapted with hand pokes",
     "control": "as long, without pokes",
-    "grid": "adapted by as many pokes of the robot",
+    "grid": "adapted with as many robot pokes",
 }
 DIFFERENCES = {
-    "after_minus_before": "by hand less before, on the same skin",
-    "after_minus_control": "by hand less without pokes, on the same skin",
-    "after_minus_grid": "by hand less by the robot, on the same skin",
+    "after_minus_before": "with hand pokes minus before, on the same skin",
+    "after_minus_control": "with hand pokes minus without pokes, on the same skin",
+    "after_minus_grid": "with hand pokes minus with robot pokes, on the same skin",
 }
 PAPER_DIFFERENCES = {"after_minus_before": GAINS["by_hand"]}
 
@@ -136,7 +136,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the variants, then their differences on the same skins."""
 
     def judge(difference: Stat | None, metric: str) -> str:
-        """Return the verdict whether a difference is a gain, and its size."""
+        """Return the verdict on whether a difference is a gain, and its size."""
         return "–" if difference is None else f"{verdict(gain(difference, metric))}: {show_difference(difference)}"
 
     lines = []

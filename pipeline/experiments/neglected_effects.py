@@ -37,9 +37,9 @@ MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
 WARMER_K = 1.0
 EARTH_T = np.array([20e-6, 0.0, -45e-6])  # at a middle latitude
 PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # indentations for effects inside the skin: flank and edge
-BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # of the powder's own field
+BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # for the powder's own field
 FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed
-FEW = 5
+FEW = 5  # indentations for effects that take long to compute
 COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # for effects that need every node to be followed separately
 
 
@@ -69,43 +69,43 @@ class Subject:
     used: tuple[str, ...]
 
 
-def measure(of: SimulationSettings, *, seed: int) -> list[Effect]:
+def measure(simulation: SimulationSettings, *, seed: int) -> list[Effect]:
     """Measure every neglected effect on a scene."""
-    subject = _make_subject(of, seed)
-    without = _simulate(subject, Terms(), seed)
-    of_protocols = *_over_time(subject, without, seed), _temperature(subject, without), _friction(subject)
+    subject = _make_subject(simulation, seed)
+    plain = _simulate(subject, Terms(), seed)
+    protocol_effects = *_over_time(subject, plain, seed), _temperature(subject, plain), _friction(subject)
     return [
-        *(_by_protocol(effect, of) for effect in of_protocols),
-        _earth(without), *_hold(subject), *_inside(subject), *_free_edge(subject), _steps(without, of),
-        _own_field(subject, of), _too_deep(of, seed),
+        *(_by_protocol(effect, simulation) for effect in protocol_effects),
+        _earth(plain), *_hold(subject), *_inside(subject), *_free_edge(subject), _steps(plain, simulation),
+        _own_field(subject, simulation), _too_deep(simulation, seed),
     ]  # fmt: skip
 
 
-def _by_protocol(effect: Effect, of: SimulationSettings) -> Effect:
+def _by_protocol(effect: Effect, simulation: SimulationSettings) -> Effect:
     """Add the protocols that neglect an effect, and those that compute it."""
-    computed = tuple(name for name, protocol in of.protocols.items() if effect.term in protocol.terms)
+    computed = tuple(name for name, protocol in simulation.protocols.items() if effect.term in protocol.terms)
     return replace(
-        effect, left_out_by=tuple(name for name in of.protocols if name not in computed), computed_by=computed
+        effect, left_out_by=tuple(name for name in simulation.protocols if name not in computed), computed_by=computed
     )
 
 
-def _make_subject(of: SimulationSettings, seed: int) -> Subject:
-    kind, (board, skin) = of.main_boards, list_captures(of, MAIN)[0]
-    plan = of.main.plan(rng_for(seed, "left out"), kind.skin_mm)
+def _make_subject(simulation: SimulationSettings, seed: int) -> Subject:
+    kind, (board, skin) = simulation.main_boards, list_captures(simulation, MAIN)[0]
+    plan = simulation.main.plan(rng_for(seed, "left out"), kind.skin_mm)
     tip_mm = np.stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM, plan.depth_mm], axis=2)
     return Subject(
-        draw_board(kind.design, of.spreads, seed=seed, name=board),
-        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=kind.quadrature.in_si()),
-        draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE),
+        draw_board(kind.design, simulation.spreads, seed=seed, name=board),
+        draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin, rule=kind.quadrature.in_si()),
+        draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin, rule=COARSE),
         plan,
         tip_mm * milli,
-        of.main.terms,
+        simulation.main.terms,
     )
 
 
-def _over_time(on: Subject, without: Response, seed: int) -> list[Effect]:
+def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
     """Compare simulations of the whole protocol with a term and without it."""
-    n, relaxation = len(on.plan), RELAXATION
+    n, relaxation = len(subject.plan), RELAXATION
     rows = []
     for name, terms, how in (
         ("ageing", Terms(ageing=AGEING), f"at the last of {n} contacts, a no-load reading before each"),
@@ -116,94 +116,98 @@ def _over_time(on: Subject, without: Response, seed: int) -> list[Effect]:
         ),
         ("memory", Terms(memory=MEMORY), f"pokes held for {MEMORY.contact_s:g} s, {MEMORY.rest_s:g} s between them"),
     ):
-        simulated = _simulate(on, terms, seed)
-        rest_uT = np.abs(simulated.rest_T[-1] - without.rest_T[-1]).max() / micro
-        force_pct = _error_pct(without.force_N[-1], simulated.force_N[-1])
-        field_pct = _error_pct(without.change_T, simulated.change_T)
-        rows.append(Effect(name, _status(name, on), field_pct, float(rest_uT), force_pct, how))
+        simulated = _simulate(subject, terms, seed)
+        rest_uT = np.abs(simulated.rest_T[-1] - plain.rest_T[-1]).max() / micro
+        force_pct = _error_pct(plain.force_N[-1], simulated.force_N[-1])
+        field_pct = _error_pct(plain.change_T, simulated.change_T)
+        rows.append(Effect(name, _status(name, subject), field_pct, float(rest_uT), force_pct, how))
     return rows
 
 
-def _temperature(on: Subject, without: Response) -> Effect:
+def _temperature(subject: Subject, plain: Response) -> Effect:
     factor = aging.relative_remanence(np.array([WARMER_K]))[0]
-    rest_uT = float(np.abs((factor - 1) * without.rest_T).max() / micro)
-    field_pct = _error_pct(without.change_T, factor * without.change_T)
+    rest_uT = float(np.abs((factor - 1) * plain.rest_T).max() / micro)
+    field_pct = _error_pct(plain.change_T, factor * plain.change_T)
     how = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
-    return Effect("temperature", _status("temperature", on), field_pct, rest_uT, 0.0, how)
+    return Effect("temperature", _status("temperature", subject), field_pct, rest_uT, 0.0, how)
 
 
-def _friction(on: Subject) -> Effect:
-    tip_m, pressed = on.tip_m[:FEW], changes_of_field(on.board, on.skin, on.tip_m[:FEW].reshape(-1, 3))[1]
-    dragged = drag_tip(on.board, on.skin, tip_m, tilt=on.plan.tilt[:FEW], how=FRICTION)
+def _friction(subject: Subject) -> Effect:
+    tip_m = subject.tip_m[:FEW]
+    _, pressed = changes_of_field(subject.board, subject.skin, tip_m.reshape(-1, 3))
+    dragged = drag_tip(subject.board, subject.skin, tip_m, tilt=subject.plan.tilt[:FEW], how=FRICTION)
     field_pct = _error_pct(pressed.reshape(dragged.change_T.shape), dragged.change_T)
-    force_pct = 100 * float(np.abs(dragged.force_N).max() / forces(on.skin, tip_m[..., 2].ravel()).max())
+    force_pct = 100 * float(np.abs(dragged.force_N).max() / forces(subject.skin, tip_m[..., 2].ravel()).max())
     how = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
-    return Effect("friction", _status("friction", on), field_pct, 0.0, force_pct, how)
+    return Effect("friction", _status("friction", subject), field_pct, 0.0, force_pct, how)
 
 
-def _earth(without: Response) -> Effect:
+def _earth(plain: Response) -> Effect:
     """Add a steady field to the no-load reading and to the contact, and subtract the former from the latter."""
-    rest_T = without.rest_T[:, None] + EARTH_T
-    seen_T = (rest_T + without.change_T) - rest_T
+    rest_T = plain.rest_T[:, None] + EARTH_T
+    seen_T = (rest_T + plain.change_T) - rest_T
     how = "a steady field, as long as the board does not turn; a no-load reading before each contact"
     rest_uT = float(np.abs(EARTH_T).max() / micro)
-    return Effect("the earth's field", "left out", _error_pct(without.change_T, seen_T), rest_uT, 0.0, how)
+    return Effect("the earth's field", "left out", _error_pct(plain.change_T, seen_T), rest_uT, 0.0, how)
 
 
-def _hold(on: Subject) -> list[Effect]:
+def _hold(subject: Subject) -> list[Effect]:
     """Compare with an infinite layer that slides freely and whose force is that of linear elasticity."""
-    if on.skin.hold is None:
+    if subject.skin.hold is None:
         return []
-    free, deepest_m = replace(on.skin, hold=None), np.array([on.tip_m[..., 2].max()])
-    pokes_m = on.tip_m[:FEW].reshape(-1, 3)
-    held_T, free_T = (changes_of_field(on.board, skin, pokes_m)[1] for skin in (on.skin, free))
-    force_pct = _error_pct(forces(free, deepest_m), forces(on.skin, deepest_m))
+    free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])
+    pokes_m = subject.tip_m[:FEW].reshape(-1, 3)
+    held_T, free_T = (changes_of_field(subject.board, skin, pokes_m)[1] for skin in (subject.skin, free))
+    force_pct = _error_pct(forces(free, deepest_m), forces(subject.skin, deepest_m))
     how = (
         f"an endless layer that slides freely, its force linear elasticity's; {FEW} indentations, force at the deepest"
     )
     return [Effect("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, how)]
 
 
-def _free_edge(on: Subject) -> list[Effect]:
+def _free_edge(subject: Subject) -> list[Effect]:
     """Compare with a finite skin: a free disc stretches by c r / 3 R^2 on top of the c / r of an infinite layer."""
-    if on.skin.base == "bonded":
+    if subject.skin.base == "bonded":
         return []
-    depth_m = float(on.tip_m[..., 2].max())
-    poke_m = np.array([[*on.skin.seat_m, depth_m]])
-    [(_, before, after)] = moved_dipoles(on.skin, poke_m)
-    edge_m = min(on.skin.sides_m) / 2
-    away_m, then_m = (part[0][:, :2] - on.skin.seat_m for part in (before, after))
+    depth_m = float(subject.tip_m[..., 2].max())
+    poke_m = np.array([[*subject.skin.seat_m, depth_m]])
+    [(_, before, after)] = moved_dipoles(subject.skin, poke_m)
+    edge_m = min(subject.skin.sides_m) / 2
+    away_m, then_m = (part[0][:, :2] - subject.skin.seat_m for part in (before, after))
     far = np.argmax(np.hypot(*away_m.T))
     grown_m2 = float((then_m[far] ** 2).sum() - (away_m[far] ** 2).sum())
-    stretched_m = np.column_stack([then_m * (1 + grown_m2 / 2 / (3 * edge_m**2)) + on.skin.seat_m, after[0][:, 2]])
-    endless_T = change_of_field(before, after, on.board.chips_m)
-    ended_T = change_of_field(before, (stretched_m, after[1]), on.board.chips_m)
+    stretched_m = np.column_stack([then_m * (1 + grown_m2 / 2 / (3 * edge_m**2)) + subject.skin.seat_m, after[0][:, 2]])
+    endless_T = change_of_field(before, after, subject.board.chips_m)
+    ended_T = change_of_field(before, (stretched_m, after[1]), subject.board.chips_m)
     how = f"a free disc of {2 * edge_m / milli:g} mm, plane stress, poked in its middle to {depth_m / milli:.2g} mm"
     return [Effect("the skin's free edge", "left out", _error_pct(endless_T, ended_T), 0.0, None, how)]
 
 
-def _inside(on: Subject) -> list[Effect]:
-    """Deform the material under a few indentations as the scene does, and without one part of the physics each."""
-    skin, depth_m = on.skin, float(on.tip_m[..., 2].max()) + on.skin.depth_zero_m
+def _inside(subject: Subject) -> list[Effect]:
+    """Compare the deformation under a few indentations with and without one part of the physics at a time."""
+    skin, depth_m = subject.skin, float(subject.tip_m[..., 2].max()) + subject.skin.depth_zero_m
     base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
     swapped = replace(press, base=base)
-    true = _flow(on, depth_m, press)
-    swapped_N, true_N = (
+    complete = _flow(subject, depth_m, press)
+    swapped_N, complete_N = (
         layer.force(np.array([depth_m]), **asdict(pressed), modulus_Pa=skin.modulus_Pa) for pressed in (swapped, press)
     )
     cases: dict[str, tuple[list[Moved], float, str]] = {
-        "rotation of the magnetisation": ([(r, z, np.zeros_like(a)) for r, z, a in true], 0.0, "moments do not turn"),
+        "rotation of the magnetisation": (
+            [(r, z, np.zeros_like(a)) for r, z, a in complete], 0.0, "moments do not turn",
+        ),
         "increments": (
-            [_one_shot(on, place_m, depth_m, press) for place_m in PLACES_M], 0.0, "one linear step to the full depth",
+            [_one_shot(subject, place_m, depth_m, press) for place_m in PLACES_M], 0.0,
+            "one linear step to the full depth",
         ),
         f"{skin.base} base": (
-            _flow(on, depth_m, swapped), _error_pct(swapped_N, true_N), f"a {base} base",
+            _flow(subject, depth_m, swapped), _error_pct(swapped_N, complete_N), f"a {base} base",
         ),
     }  # fmt: skip
-    true_T, pokes = _change(on, true), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
+    complete_T, pokes = _change(subject, complete), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
     return [
-        Effect(term, "kept", _error_pct(_change(on, moved), true_T), 0.0, force_pct, f"{how}; {pokes}")
+        Effect(term, "kept", _error_pct(_change(subject, moved), complete_T), 0.0, force_pct, f"{how}; {pokes}")
         for term, (moved, force_pct, how) in cases.items()
     ]
 
@@ -211,24 +215,24 @@ def _inside(on: Subject) -> list[Effect]:
 Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray, " s"]]  # r_m, z_m, angle_rad
 
 
-def _flow(on: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
+def _flow(subject: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
     """Follow the material under all indentations at once, because the contact pressures are the same."""
-    r_m = np.concatenate([np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
-    z_m = np.tile(on.coarse.nodes_m[:, 2], len(PLACES_M))
+    r_m = np.concatenate([np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
+    z_m = np.tile(subject.coarse.nodes_m[:, 2], len(PLACES_M))
     end = deformation.follow(r_m, z_m, deformation.depth_steps((depth_m,), press), press=press)[-1]
     moved = (np.split(values, len(PLACES_M)) for values in (end.r_m, end.z_m, deformation.rotation_angle(end.f)))
     return list(zip(*moved, strict=True))
 
 
-def _one_shot(on: Subject, place_m: tuple[float, float], depth_m: float, press: layer.IndentedLayer) -> Moved:
-    r_m, z_m = np.hypot(*(on.coarse.nodes_m[:, :2] - place_m).T), on.coarse.nodes_m[:, 2].copy()
+def _one_shot(subject: Subject, place_m: tuple[float, float], depth_m: float, press: layer.IndentedLayer) -> Moved:
+    r_m, z_m = np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T), subject.coarse.nodes_m[:, 2].copy()
     u = layer.displacement(r_m, z_m, layer.waves(press.contact(depth_m), press.thickness_m, press.base))
     return r_m + u.r_m, z_m + u.z_m, (u.r_z - u.z_r) / 2
 
 
-def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
+def _change(subject: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
     """Return dB at the chips for the moved material of each indentation."""
-    skin, changes_T = on.coarse, []
+    skin, changes_T = subject.coarse, []
     for place_m, (moved_r_m, moved_z_m, angle_rad) in zip(PLACES_M, moved, strict=True):
         away_m = skin.nodes_m[:, :2] - place_m
         r_m = np.hypot(*away_m.T)
@@ -236,54 +240,57 @@ def _change(on: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
         moved_m = np.column_stack([place_m + out * moved_r_m[:, None], moved_z_m])
         axis = np.column_stack([-out[:, 1], out[:, 0], np.zeros(len(out))])
         moments = Rotation.from_rotvec(angle_rad[:, None] * axis).apply(skin.moments_A_m2)
-        changes_T.append(change_of_field((skin.nodes_m, skin.moments_A_m2), (moved_m, moments), on.board.chips_m))
+        changes_T.append(change_of_field((skin.nodes_m, skin.moments_A_m2), (moved_m, moments), subject.board.chips_m))
     return np.array(changes_T)
 
 
-def _steps(without: Response, of: SimulationSettings) -> Effect:
-    change_uT = without.change_T / micro
-    step_uT = chip.steps_uT(of.chip.gain_sel)
-    share = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
-    return Effect("the chips' steps", "kept", float(100 * share), float(step_uT.max() / 2), 0.0, "rounding alone")
+def _steps(plain: Response, simulation: SimulationSettings) -> Effect:
+    change_uT = plain.change_T / micro
+    step_uT = chip.steps_uT(simulation.chip.gain_sel)
+    fraction = np.sqrt((step_uT**2 / 12).mean() / (change_uT**2).mean())
+    return Effect("the chips' steps", "kept", float(100 * fraction), float(step_uT.max() / 2), 0.0, "rounding alone")
 
 
-def _own_field(on: Subject, of: SimulationSettings) -> Effect:
+def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
     """Compare with powder that is also magnetised by its own field, to first order (boxes, magpylib)."""
-    rest = midpoints(on.skin.thickness_m, BOXES)
-    b_T = magnet.array_field(rest.nodes_m, on.skin.thickness_m, of.skin.polarity)
-    sizes = {"saturation_T": of.skin.saturation_T, "half_field_T": of.skin.half_field_T}
+    rest = midpoints(subject.skin.thickness_m, BOXES)
+    b_T = magnet.array_field(rest.nodes_m, subject.skin.thickness_m, simulation.skin.polarity)
+    sizes = {"saturation_T": simulation.skin.saturation_T, "half_field_T": simulation.skin.half_field_T}
     j_T, boxes_n = magnet.magnetise(b_T, **sizes), len(b_T)
     away_m = (rest.nodes_m[:, None] - rest.nodes_m).reshape(-1, 3)
-    boxes_m = np.tile(box_m(on.skin.thickness_m, BOXES), (boxes_n**2, 1))
+    boxes_m = np.tile(box_m(subject.skin.thickness_m, BOXES), (boxes_n**2, 1))
     own_T = magnet_cuboid_Bfield(away_m, boxes_m, np.tile(j_T, (boxes_n, 1))).reshape(boxes_n, boxes_n, 3).sum(axis=1)
     with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # mu0 H = B - J acts on the powder
-    pokes_m = np.array([(*place_m, float(on.tip_m[..., 2].max())) for place_m in PLACES_M])
-    nodes_m = rest.nodes_m + np.append(on.skin.seat_m, 0.0)
+    pokes_m = np.array([(*place_m, float(subject.tip_m[..., 2].max())) for place_m in PLACES_M])
+    nodes_m = rest.nodes_m + np.append(subject.skin.seat_m, 0.0)
     moments_A_m2 = [magnet.moments(each_T, rest.volumes_m3) for each_T in (j_T, with_own_T)]
-    skins = [replace(on.skin, nodes_m=nodes_m, moments_A_m2=each_A_m2) for each_A_m2 in moments_A_m2]
-    changes_T = [changes_of_field(on.board, skin, pokes_m)[1] for skin in skins]
+    skins = [replace(subject.skin, nodes_m=nodes_m, moments_A_m2=each_A_m2) for each_A_m2 in moments_A_m2]
+    changes_T = [changes_of_field(subject.board, skin, pokes_m)[1] for skin in skins]
     how = (
         f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
     )
     return Effect("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, how)
 
 
-def _too_deep(of: SimulationSettings, seed: int) -> Effect:
-    """Count, over all skins, the stops that are deeper than published solutions."""
-    depth_m = milli * of.main.plan(rng_for(seed, "left out"), of.main_boards.skin_mm).depth_mm.ravel()
-    skins = [draw_skin(of.skin, of.spreads, seed=seed, name=skin, rule=COARSE) for _, skin in list_captures(of, MAIN)]
+def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
+    """Count, over all skins, the stops that are deeper than published solutions cover."""
+    depth_m = milli * simulation.main.plan(rng_for(seed, "left out"), simulation.main_boards.skin_mm).depth_mm.ravel()
+    skins = [
+        draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin, rule=COARSE)
+        for _, skin in list_captures(simulation, MAIN)
+    ]
     share_pct = 100 * sum(count_beyond_verified(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
     how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
     return Effect("depths past 0.6 of the thickness", "kept", None, None, None, how)
 
 
-def _simulate(on: Subject, terms: Terms, seed: int) -> Response:
+def _simulate(subject: Subject, terms: Terms, seed: int) -> Response:
     rng = rng_for(seed, "left out", "walk")
-    return simulate_response(on.board, on.skin, on.tip_m, tilt=on.plan.tilt, terms=terms, rng=rng)
+    return simulate_response(subject.board, subject.skin, subject.tip_m, tilt=subject.plan.tilt, terms=terms, rng=rng)
 
 
-def _status(term: str, on: Subject) -> str:
-    return "kept" if term in on.used else "left out"
+def _status(term: str, subject: Subject) -> str:
+    return "kept" if term in subject.used else "left out"
 
 
 def _error_pct(without: Float[np.ndarray, "..."], true: Float[np.ndarray, "..."]) -> float:
@@ -291,9 +298,9 @@ def _error_pct(without: Float[np.ndarray, "..."], true: Float[np.ndarray, "..."]
 
 
 def neglected_effects(settings: Settings, results: Path) -> None:
-    """Measure every effect on the scene's first skin, and name the protocols that neglect it."""
-    of, seed = simulation_settings(settings), settings.seed
-    effects = measure(of, seed=seed)
+    """Measure every effect on the scene's first skin, and name the protocols that neglect the effect."""
+    simulation, seed = simulation_settings(settings), settings.seed
+    effects = measure(simulation, seed=seed)
     io.write_json(results, [asdict(effect) for effect in effects])
     left = ", ".join(effect.term for effect in effects if effect.done == "left out")
     say(f"{settings.scene}: neglected by the main protocol, and measured: {left}")
@@ -327,8 +334,10 @@ def neglected_effects_table(rows: Sequence[Mapping[str, Any]], source: str) -> p
 
 
 def _where(row: Mapping[str, Any]) -> str:
-    by = {"neglected": row["left_out_by"], "computed": row["computed_by"]}
-    shown = "; ".join(f"{what}: {', '.join(protocols)}" for what, protocols in by.items() if protocols)
+    protocols_by_status = {"neglected": row["left_out_by"], "computed": row["computed_by"]}
+    shown = "; ".join(
+        f"{status}: {', '.join(protocols)}" for status, protocols in protocols_by_status.items() if protocols
+    )
     return shown or row["done"].replace("left out", "neglected")
 
 

@@ -1,7 +1,8 @@
-"""The universal model, built from simulated skins alone, on held-out skins of a simulated scene.
+"""The universal model, built from simulated skins alone and tested on held-out skins of a simulated scene.
 
 The model is calibrated to each skin with its no-load field, unlabelled presses and labelled presses; forces are also
-corrected with one known weight. Networks of more and more training skins show how the error falls with their number.
+corrected with one known weight. Networks trained on increasing numbers of skins show how the error falls with this
+number.
 """
 
 import hashlib
@@ -62,10 +63,10 @@ WEIGHT_SD = 0.02  # sd of the log of its assumed force: friction of the guide, a
 LOG_FORCE_MIN_N = 0.2  # smaller forces do not count in errors of log F: they hardly change the field
 
 PACKAGE = Path(reskin.universal.__file__).parent
-TRAINS = "reskin.universal.training"
+TRAINING_MODULE = "reskin.universal.training"
 PART_N = 100  # skins per cached array
 LOG_FORCE_STEP = 0.6  # largest step of log F between two tabulated forces
-FORCE_SHARES = (0.7, 1.5)  # margins below the smallest and above the largest force of the design, as skins differ
+FORCE_SHARES = (0.7, 1.5)  # factors on the smallest and the largest force of the design, because skins differ
 
 
 class CalibrationSize(NamedTuple):
@@ -78,8 +79,8 @@ class CalibrationSize(NamedTuple):
 class PopulationSettings(Strict):
     """Section population.
 
-    skins_n: number of simulated training skins of each network, which are the first of one population. steps_n: of each
-    training run. unlabelled_n, labels_n: numbers of presses for calibration.
+    skins_n: number of simulated training skins of each network; all networks use the first skins of one population.
+    steps_n: steps of each training run. unlabelled_n, labels_n: numbers of presses for calibration.
     """
 
     skins_n: Annotated[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], Field(min_length=1)]
@@ -114,7 +115,7 @@ class DesignedSkins:
 
 
 def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, ...], seed: int) -> DesignedSkins:
-    """Return skins drawn around a design, on boards as designed, with the law's parameters and slide of the design."""
+    """Return skins drawn around a design: its physical parameters and slide, on boards as designed."""
     if design.hold is None:
         what = "hold of section skin is null, but this experiment needs a skin that slides"
         raise ParamsError(f"nominal.yaml: {what}. Run it in a scene whose skin has hold.")
@@ -126,10 +127,10 @@ def designed_skins(design: SkinDesign, kind: BoardKind, depths_mm: tuple[float, 
     )  # fmt: skip
     chips_mm = np.array(kind.design.places_mm)
     setup = Setup(design, chips_mm, kind.design.gap_mm, kind.skin_mm, design.flipped, design.tip_radius_mm)
-    deep_m = 1e-3 * np.array([min(depths_mm), max(depths_mm)])
+    depths_m = 1e-3 * np.array([min(depths_mm), max(depths_mm)])
     tip_m = design.tip_radius_mm * milli
     ends_N = FORCE_SHARES * force_at(
-        deep_m, modulus_Pa=mega * modulus_MPa, thickness_m=setup.thickness_m, tip_radius_m=tip_m
+        depths_m, modulus_Pa=mega * modulus_MPa, thickness_m=setup.thickness_m, tip_radius_m=tip_m
     )
     prior = SkinPrior("as designed", law, RIG_SPREADS, setup, follows_law=True)
     return DesignedSkins(prior, (float(ends_N[0]), float(ends_N[1])), seed)
@@ -140,7 +141,7 @@ def draw(designed: DesignedSkins, skins_n: int, report: Callable[[str], None]) -
     parts = []
     for first in range(0, skins_n, PART_N):
         which = slice(first, min(first + PART_N, skins_n))
-        parts.append(_cached(designed, f"skins {which}", partial(_drawn, designed, which)))
+        parts.append(_cached(designed, f"skins {which}", partial(_skins_array, designed, which)))
         report(f"{which.stop} of {skins_n} skins drawn")
     channels_n = (parts[0].shape[2] - 3) // 2
     stacked = np.split(np.concatenate(parts), (channels_n, 2 * channels_n, -1), axis=2)
@@ -149,37 +150,37 @@ def draw(designed: DesignedSkins, skins_n: int, report: Callable[[str], None]) -
 
 
 def train_network(designed: DesignedSkins, skins: Population, skins_n: int, steps_n: int) -> Weights:
-    """Train a network on the first skins of a population, or take it from the cache."""
+    """Train a network on the first skins of a population, or load it from the cache."""
     first = Population(*(getattr(skins, name)[:skins_n] for name in Population.__annotations__))
-    rng_name = (designed.seed, "population", "network")  # without skins_n: equal initial weights
+    rng_name = (designed.seed, "population", "network")  # without skins_n, so that initial weights are equal
     empty = draw_weights(skins.rest_uT.shape[1], rng_for(*rng_name))
 
     def make() -> Float[np.ndarray, " w"]:
         weights = train(first, designed.prior, steps_n, rng_for(*rng_name))
         return np.concatenate([weights[name].ravel() for name in empty])
 
-    flat, found, start = _cached(designed, f"network of {skins_n} skins, {steps_n} steps", make), {}, 0
+    flat, by_name, start = _cached(designed, f"network of {skins_n} skins, {steps_n} steps", make), {}, 0
     for name, value in empty.items():
-        found[name] = flat[start : start + value.size].reshape(value.shape)
+        by_name[name] = flat[start : start + value.size].reshape(value.shape)
         start += value.size
-    return found
+    return by_name
 
 
 def _cached(designed: DesignedSkins, what: str, make: Callable[[], np.ndarray]) -> np.ndarray:
     """Return an array from the cache, or make it; the key contains name, prior, code and the first skin's fields."""
-    first_skin = hashlib.sha256(_drawn(designed, slice(1)).tobytes()).hexdigest()
+    first_skin = hashlib.sha256(_skins_array(designed, slice(1)).tobytes()).hexdigest()
     spreads = sorted(designed.prior.spreads.items())
-    code = [digest(module) for module in imported(TRAINS)]
-    of = f"torch {version('torch')}; {code}; {first_skin}"
-    name = f"{what}; {of}; {designed.prior.centre}; {spreads}; {designed.forces_N}; seed {designed.seed}"
-    found = io.load_cached_array(PACKAGE, name)
-    if found is None:
-        found = make()
-        io.save_cached_array(PACKAGE, name, found)
-    return found
+    code = [digest(module) for module in imported(TRAINING_MODULE)]
+    versions = f"torch {version('torch')}; {code}; {first_skin}"
+    name = f"{what}; {versions}; {designed.prior.centre}; {spreads}; {designed.forces_N}; seed {designed.seed}"
+    array = io.load_cached_array(PACKAGE, name)
+    if array is None:
+        array = make()
+        io.save_cached_array(PACKAGE, name, array)
+    return array
 
 
-def _drawn(designed: DesignedSkins, which: slice) -> np.ndarray:
+def _skins_array(designed: DesignedSkins, which: slice) -> np.ndarray:
     """Draw skins for training, as one array for the cache."""
     skins = designed.draw("taught", which)
     rest_uT = np.repeat(skins.rest_uT[:, None], skins.db_uT.shape[1], axis=1)
@@ -200,7 +201,7 @@ class TestSkin:
 
     board: str
     rest_uT: Float[np.ndarray, " ch"]
-    pool: LabelledPresses  # calibration uses the first of these
+    pool: LabelledPresses  # calibration uses its first presses
     weight: KnownWeight
     test_uT: Float[np.ndarray, "n ch"]
     true: Float[np.ndarray, "n 3"]  # x, y in mm from the board's middle, F in N
@@ -208,7 +209,7 @@ class TestSkin:
 
 def scene_skins(data: SceneData, fold: Fold, frame: Frame, rest_uT: Mapping[str, np.ndarray]) -> list[TestSkin]:
     """Return the skins of a held-out board: one press per place from the first passes, test rows from later ones."""
-    rows, found = data.rows, []
+    rows, skins = data.rows, []
     for skin in np.unique(rows.skin[fold.test]):
         rng = rng_for(data.settings.seed, "population", "asked", str(skin))
         pooled = fold.pool[rows.skin[fold.pool] == skin]
@@ -219,12 +220,12 @@ def scene_skins(data: SceneData, fold: Fold, frame: Frame, rest_uT: Mapping[str,
         true = np.column_stack([place_mm, rows.target[test, 2]])
         noload_uT = frame.field(rest_uT[str(skin)][None])[0]
         weight = find_weight(data, pooled, frame, rng_for(data.settings.seed, "population", "weight", str(skin)))
-        found.append(TestSkin(str(rows.board[test[0]]), noload_uT, pool, weight, frame.field(rows.db_uT[test]), true))
-    return found
+        skins.append(TestSkin(str(rows.board[test[0]]), noload_uT, pool, weight, frame.field(rows.db_uT[test]), true))
+    return skins
 
 
 def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> LabelledPresses:
-    """Draw one indentation at each place; a press is the mean of its readings."""
+    """Draw one indentation at each place; each press is the mean of an indentation's readings."""
     rows = data.rows
     first = np.unique(rows.indentation[own], return_index=True)[1]
     _, place_i = np.unique(rows.target[own[first], :2].round(2), axis=0, return_inverse=True)
@@ -237,13 +238,13 @@ def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generat
 
 
 def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generator) -> KnownWeight:
-    """Use as the weight, of the presses nearest to the middle, the one whose force is nearest to `WEIGHT_N`."""
+    """Among the presses nearest to the middle, use the one with the force nearest to `WEIGHT_N` as the weight."""
     rows = data.rows
     off_mm = np.linalg.norm(frame.place(rows.target[own, :2].astype(float)), axis=1).round(1)
     middle = own[off_mm == off_mm.min()]
     press_i, first = np.unique(rows.indentation[middle], return_index=True)
     ratio = rows.target[middle[first], 2] / WEIGHT_N
-    off = np.full(len(ratio), np.inf)  # a gauge may read 0 N and less, which have no logarithm
+    off = np.full(len(ratio), np.inf)  # a gauge may read 0 N or less, which has no logarithm
     off[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
     if np.isinf(off).all():
         what = f"none of the {len(ratio)} presses near the middle has a force above 0 N"
@@ -266,8 +267,11 @@ def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
 
 
 def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSkin]:
-    """Return simulated skins with noise: presses on the grid are the pool, the last is the weight's, others test."""
-    found = []
+    """Return simulated skins with noise.
+
+    Presses on the grid are the pool, the last press is that of the weight, and all others are test presses.
+    """
+    tested = []
     for i in range(len(skins)):
         db_uT = skins.db_uT[i] + np.tile(NOISE_uT, 5) * rng.standard_normal(skins.db_uT[i].shape)
         order, place_mm, force_N = rng.permutation(PLACES_N), skins.place_mm[i], skins.force_N[i]
@@ -275,8 +279,8 @@ def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSki
         true = np.column_stack([place_mm, force_N])[PLACES_N:-1].astype(float)
         weight = known_weight(db_uT[-1], float(force_N[-1]), rng)
         rest_uT = skins.rest_uT[i].astype(float)
-        found.append(TestSkin(f"population {i}", rest_uT, pool, weight, db_uT[PLACES_N:-1], true))
-    return found
+        tested.append(TestSkin(f"population {i}", rest_uT, pool, weight, db_uT[PLACES_N:-1], true))
+    return tested
 
 
 def estimate(
@@ -331,7 +335,10 @@ def weight_share(weight_off: Float[np.ndarray, " s"], others_off: Float[np.ndarr
 def score_skin(
     model: PriorModel, skin: TestSkin, size: CalibrationSize, calibration: Calibration
 ) -> list[dict[str, Any]]:
-    """Score each way on a skin; forces also corrected by one known weight, and by the best factor (diagnosis)."""
+    """Score each way on a skin.
+
+    The error of forces is also given after a correction by one known weight, and by the best factor (a diagnosis).
+    """
     rows = []
     (by_way,) = estimate(model, skin, size, [calibration.power])
     for way, found in by_way.items():
@@ -434,21 +441,21 @@ SHORT_NAMES = {"map": "map", "network": "network", "universal": "both"}
 COVERAGE = "in 90 % intervals / %"
 FURTHER = {
     "mse_f_weight_N2": "MSE_F with one known weight / N²",
-    "mse_f_factor_N2": "MSE_F after one factor a skin (diagnosis) / N²",
+    "mse_f_factor_N2": "MSE_F after one factor per skin (diagnosis) / N²",
     "coverage_pct": COVERAGE,
 }
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate errors by calibration data, and by number of simulated skins."""
-    scaling = [{"method": NAMES[row["way"]], "skins taught": str(row["skins_n"])} for row in numbers["scaling"]]
+    scaling = [{"method": NAMES[row["way"]], "training skins": str(row["skins_n"])} for row in numbers["scaling"]]
     shown = {
         "population": tabulate([_line(row, source) for row in numbers["told"]], meaning=_meaning(numbers)),
         "population_scaling": tabulate(
             [first | _line(row, source) for first, row in zip(scaling, numbers["scaling"], strict=True)],
             meaning=f"Networks trained for {numbers['steps_n']} steps each, from the same initial weights, on the "
-            "first skins of one population (column `skins taught`: how many). All rows use the same map and the same "
-            "likelihood powers, which were chosen with the network of most skins.",
+            "first skins of one population (column `training skins`: their number). All rows use the same map and the "
+            "same likelihood powers, which were chosen with the network of the most skins.",
         ),
     }
     if "fresh" in numbers:  # absent from results of earlier versions
@@ -457,7 +464,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             "[low, high]: 95 % confidence interval over n skins. The population has wider spreads than the scene's "
             f"{numbers['skins_asked_n']} skins."
         )
-        shown["population_fresh"] = tabulate(_fresh(numbers["fresh"], source), meaning=meaning)
+        shown["population_fresh"] = tabulate(_fresh_lines(numbers["fresh"], source), meaning=meaning)
     return shown
 
 
@@ -485,7 +492,7 @@ def _line(row: Mapping[str, Any], source: str) -> dict[str, str]:
     return line | {"source": source} | scores(row) | scores(row, FURTHER) | {"n": n_of(row)}
 
 
-def _fresh(rows: Sequence[Mapping[str, Any]], source: str) -> list[dict[str, str]]:
+def _fresh_lines(rows: Sequence[Mapping[str, Any]], source: str) -> list[dict[str, str]]:
     lines: dict[tuple[int, int], dict[str, str]] = {}
     for row in rows:
         size = row["pokes_n"], row["labels_n"]
@@ -502,9 +509,10 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
         "Models built from simulated skins that are drawn around the skin as designed and include none of the scene's "
         f"{numbers['skins_asked_n']} skins; tested on {numbers['rows_asked_n']:,} rows of later passes. Unlabelled "
         f"pokes: one at each of the {numbers['pool_n']} places of the grid, at any of its depths, or the first of "
-        "these; the labelled pokes are among them. One known weight: of the first passes' presses in the middle, the "
-        f"one nearest to {numbers['weight_N']:g} N is used, and its force is known to {100 * numbers['weight_sd']:g} "
-        "%. One factor a skin: the best factor, computed from all true forces; no weight that scales all forces alike "
-        "can do better. Likelihood powers, and the share of the weight's error by which all forces are corrected, were "
-        f"chosen on further skins of the population; on those, 90 % intervals cover: {coverage}."
+        "these; the labelled pokes are among them. One known weight: among the first passes' presses nearest to the "
+        f"middle, the one whose force is nearest to {numbers['weight_N']:g} N is used; its force is known to "
+        f"{100 * numbers['weight_sd']:g} %. One factor per skin: the best factor, computed from all true forces; no "
+        "other common factor can do better. Likelihood powers, and the share of the weight's error by which all "
+        "forces are corrected, were chosen on further skins of the population; on those, 90 % intervals cover: "
+        f"{coverage}."
     )

@@ -103,8 +103,8 @@ def reference_methods(
     variants = read_variants(known, models)
     seconds: list[Seconds] = []
     for fold in of_labels:
-        unlabelled_points, took = score_unlabelled(known, of_labels, fold, variants)
-        points, seconds = points + unlabelled_points, seconds + took
+        unlabelled_points, fold_seconds = score_unlabelled(known, of_labels, fold, variants)
+        points, seconds = points + unlabelled_points, seconds + fold_seconds
         say(f"{settings.scene} reference_methods: methods with unlabelled pokes on {fold.name} done")
 
     alarm, flagged = evaluate_alarm(known, of_labels, section.false_alarm_fraction)
@@ -174,7 +174,7 @@ ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
     """Score a regressor of known boards without changes, with every alignment, and with labels as training rows."""
     rows, view, pokes = data.rows, VIEW[method.inputs], pool_rows(data, fold)
-    known, new, test = (view(rows.db_uT[at]) for at in (fold.train, fold.pool, fold.test))
+    known, new, test = (view(rows.db_uT[part]) for part in (fold.train, fold.pool, fold.test))
     target, name = rows.target[fold.train], f"{method.title} ({method.inputs})"
     draws = partial(rng_for, data.settings.seed, RNG, name, fold.name)
     score = partial(point, data, fold)
@@ -215,7 +215,7 @@ def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) ->
 def pairs_uT(
     rows: Rows, train: Int64[np.ndarray, " a"], pokes: Sequence[Int64[np.ndarray, " r"]]
 ) -> Float[np.ndarray, "m ch"]:
-    """Return what known boards read at the place and force of each poke, mean over boards; NaN where there is no pair.
+    """Return the mean field of the known boards at the place and force of each poke; NaN where there is no pair.
 
     Channels are interpolated linearly in log F between a board's forces at a place, and are constant beyond them.
     """
@@ -223,9 +223,9 @@ def pairs_uT(
     boards = [_poke_means(rows, train[rows.board[train] == board]) for board in np.unique(rows.board[train])]
     for i, row in enumerate(pokes):
         x_mm, y_mm, force_N = rows.target[row].mean(axis=0, dtype=np.float64)
-        there = [_interpolate(*known, (x_mm, y_mm), float(force_N)) for known in boards]
-        if there := [one for one in there if one is not None]:
-            found[i] = np.mean(there, axis=0)
+        fields_uT = [_interpolate(*known, (x_mm, y_mm), float(force_N)) for known in boards]
+        if fields_uT := [one for one in fields_uT if one is not None]:
+            found[i] = np.mean(fields_uT, axis=0)
     return found
 
 
@@ -241,8 +241,8 @@ def _poke_means(rows: Rows, own: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, n
 def _interpolate(
     target: Float[np.ndarray, "p 3"], db_uT: Float[np.ndarray, "p ch"], place_mm: tuple[float, float], force_N: float
 ) -> Float[np.ndarray, " ch"] | None:
-    apart_mm = np.hypot(*(target[:, :2] - place_mm).T)
-    here = np.flatnonzero((apart_mm <= SAME_MM) & (target[:, 2] > 0))
+    distance_mm = np.hypot(*(target[:, :2] - place_mm).T)
+    here = np.flatnonzero((distance_mm <= SAME_MM) & (target[:, 2] > 0))
     if not len(here):
         return None
     here = here[np.argsort(target[here, 2])]
@@ -256,7 +256,7 @@ def score_adversarial(
     """Score a domain-adversarial network and its control; also return the records of their training."""
     view, rows = VIEW[recipe.inputs], data.rows
     scaler = FIT[recipe.scaling](view(rows.db_uT[fold.train]), rows.target[fold.train])
-    known, new, test = (scaler.encode(view(rows.db_uT[at])) for at in (fold.train, fold.pool, fold.test))
+    known, new, test = (scaler.encode(view(rows.db_uT[part])) for part in (fold.train, fold.pool, fold.test))
     domains = Domains(known, scaler.encode_target(rows.target[fold.train]), new)
     points, trainings = [], []
     for method, pokes, own_weight in ((CONTROL, NONE, 0.0), (ADVERSARIAL, OWN, weight)):
@@ -270,7 +270,7 @@ def score_adversarial(
 def train_until_converged(
     domains: Domains, recipe: Recipe, weight: float, seed: int, fold: str
 ) -> tuple[Weights, dict[str, Any]]:
-    """Train, and repeat with other random draws while the network collapses, as for all networks.
+    """Train, and repeat with other random draws while the network collapses, as for all other networks.
 
     The draws do not depend on the weight, so a network and its control differ only in the weight.
     """
@@ -317,7 +317,7 @@ def score_unlabelled(
     known: KnownBoards, folds: Sequence[Fold], fold: Fold, variants: Variants
 ) -> tuple[list[Point], list[Seconds]]:
     """Score the universal models and the inversion, given a skin's own pokes, none, and another skin's."""
-    points, took = [], []
+    points, own_seconds = [], []
     test_uT = known.frame.field(known.data.rows.db_uT[fold.test])
     rest_uT = known.presses[fold.board].rest_uT.ravel()
     own = pool_of(known, fold)
@@ -330,8 +330,8 @@ def score_unlabelled(
         ]:
             predicted = np.column_stack([known.frame.label(place_mm), force_N])
             points.append(point(known.data, fold, predicted, method=method, pokes=given))
-            took += [replace(seconds, name=f"{method}.{fold.name}")] if given == OWN else []
-    return points, took
+            own_seconds += [replace(seconds, name=f"{method}.{fold.name}")] if given == OWN else []
+    return points, own_seconds
 
 
 def estimate_universal(
@@ -369,7 +369,7 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Name as control of each method without the skin's own pokes the same method with them."""
+    """Name the control of each method without the skin's own pokes: the same method with these pokes."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
@@ -381,7 +381,7 @@ OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards, made from the board's own readings: the effect of a wrong plug, driver or skin on its fields.
+# Foreign boards, simulated by changing the board's own readings as a wrong plug, driver or skin would.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
@@ -427,10 +427,10 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
 
     charts = {board: fit_board(own) for board, own in boards.items()}
     found = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}
-    left = {board: own.left for board, own in found.items()}
+    residuals = {board: own.left for board, own in found.items()}
     true_mm = {board: data.rows.target[first[board].test[::TESTED_EVERY_N], :2].astype(float) for board in boards}
     off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in found.items()}
-    limits = limits_of(left, fraction)
+    limits = limits_of(residuals, fraction)
     strangers: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     names = list(boards)
     for i, (board, own) in enumerate(boards.items()):
@@ -443,13 +443,13 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
     alarm = {
         "asked_pct": 100 * fraction,
         "limit": statistic(list(limits.values()), boards=True),
-        "right": alarm_statistics(left, left, limits),
+        "right": alarm_statistics(residuals, residuals, limits),
         "strangers": [
-            {"stranger": stranger, "law": law} | alarm_statistics(own, left, limits)
+            {"stranger": stranger, "law": law} | alarm_statistics(own, residuals, limits)
             for (stranger, law), own in strangers.items()
         ],
     }
-    return alarm, {"method": INVERSION, "by": "left over"} | score_flagged(left, off_mm, fraction)
+    return alarm, {"method": INVERSION, "by": "left over"} | score_flagged(residuals, off_mm, fraction)
 
 
 def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
@@ -469,7 +469,7 @@ def alarm_statistics(left: ByBoard, right: ByBoard, limits: Mapping[str, float])
 
 
 def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]], fraction: float) -> dict[str, Any]:
-    """Summarise over boards the errors of flagged readings, over the boards that have any, and of all others."""
+    """Summarise over boards the errors of flagged readings (over the boards that have any) and of all others."""
     found: dict[str, list[float]] = {}
     for board, limit in limits_of(value, fraction).items():
         flagged = value[board] > limit
@@ -504,29 +504,29 @@ def flag_by_universal(
 DASH = "–"
 # What each method can and cannot correct by its mechanism; the table's other columns show whether it helps.
 WHY = {
-    "channels matched": "corrects the gain of each channel; a seat or a rotation mixes channels, and standard "
-    "deviations also differ where forces do",
+    "channels matched": "corrects the gain of each channel; a shifted or rotated skin mixes channels, and standard "
+    "deviations also differ if forces differ",
     "CORAL": "also corrects mixed channels, as far as the presses determine all covariances; many linear maps give "
     "the same covariances, and only one of them preserves places",
-    "direct standardisation": "is given which places correspond, but has as many unknowns as channels squared, and a "
-    "seat does not change the field linearly",
+    "direct standardisation": "knows which places correspond, but has as many unknowns as the square of the number of "
+    "channels, and a shift of the skin does not change the field linearly",
     "labels as rows": "adds fields of this skin, at the labelled places only",
     "network, domain-adversarial": "makes the distributions of features equal on both boards; equal features need not "
     "have equal places",
 }
 BASELINES = (
     "Regressors and networks of the known boards, tested on the held-out board. They are aligned with all its "
-    "unlabelled pokes, or with the given number of labelled ones; direct standardisation pairs each of these with what "
-    "known boards read at its place and force. Paired: difference to the same method without alignment (the regressor "
-    "without labels; the network trained as long without it), board by board. The ridge penalty of direct "
-    "standardisation is chosen by leave-one-out over these pairs, because with a single training board there is no "
-    "second one to validate on. No other setting was tuned."
+    "unlabelled pokes, or with the given number of labelled ones; direct standardisation pairs each of these with the "
+    "field that known boards read at the same place and force. Paired: difference to the same method without alignment "
+    "(the regressor without labels; the network trained as long without it), board by board. The ridge penalty of "
+    "direct standardisation is chosen by leave-one-out over these pairs, because with a single training board there is "
+    "no second one for validation. No other setting was tuned."
 )
 UNLABELLED = (
     "No label of the held-out board is used. Paired: difference to the same method with the skin's own pokes, board by "
     "board. Physics inversion: eight parameters of the physical model (the law), and place and force of each poke, are "
-    "fitted by least squares, starting from nominal parameters; the nominal stiffness and slide are the middle of "
-    "recorded boards, these boards included. Each tested reading is then looked up in the fitted model. Centred: "
+    "fitted by least squares, starting from nominal parameters; the nominal stiffness and slide are typical values "
+    "of recorded boards, including these boards. Each tested reading is then looked up in the fitted model. Centred: "
     "places are shifted so that the mean of the pokes is the middle, which maps and networks assume too. The stiffness "
     "of the model is nominal, so its forces are in nominal units. Another skin's: the pokes of the next board, "
     "together with the held-out board's own field at rest."
@@ -534,16 +534,16 @@ UNLABELLED = (
 ALARM = (
     "Left over: the residual |dB - simulated| / |dB| at the best place in the physical model (the law), median over "
     "readings. A reading raises the alarm if its residual is above the limit that {asked:g} % of the readings of the "
-    "other boards exceed; limit {limit}. Area under the ROC curve: 0.5 is chance, 1 is perfect. Strangers: recorded "
-    "readings of another board, or of the same board with its chips changed in software. The law is that of the right "
-    "skin, or is fitted again to the stranger's own pokes and field at rest. n boards; [low, high]: 95 % confidence "
-    "interval over them (Student's t; it may extend beyond the possible range)."
+    "other boards exceed; limit {limit}. Area under the ROC curve: 0.5 is chance level, 1 is perfect. Strangers: "
+    "recorded readings of another board, or of the same board with its chips changed in software. The law is that of "
+    "the right skin, or is fitted again to the stranger's own pokes and field at rest. n boards; [low, high]: 95 % "
+    "confidence interval over them (Student's t; it may extend beyond the possible range)."
 )
 FLAGGED = (
     "Each method receives the right skin's own unlabelled pokes and no label. Flagged: readings above the limit that "
     "{asked:g} % of the readings of the other boards exceed. n boards; errors of flagged readings are over the boards "
     "that flag any. A large misfit means that dB is unlike any that such a skin produces; a large standard deviation "
-    "means that several places give similar readings. Only the latter says something about the error of the place."
+    "means that several places give similar readings. Only the standard deviation is related to the error of the place."
 )
 
 

@@ -140,14 +140,14 @@ def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ER
     tried = {row.setting: row for row in rows if row.method == CANDIDATES}
     passing = [row for row in tried.values() if row.error is not None and row.error < error_max]
     best = min(passing, key=lambda row: (row.work_n, row.error), default=None)
-    now = tried.get(rule_name(used))
+    in_use = tried.get(rule_name(used))
     return Choice(
         setting=best.setting if best else None,
         nodes_n=best.work_n if best else None,
         error=best.error if best else None,
         used_setting=rule_name(used),
-        used_nodes_n=now.work_n if now else None,
-        used_error=now.error if now else None,
+        used_nodes_n=in_use.work_n if in_use else None,
+        used_error=in_use.error if in_use else None,
         differs=best is None or best.setting != rule_name(used),
     )
 
@@ -237,10 +237,10 @@ def errors(
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)
-    wrong_T = np.stack(found_T).reshape(shape) - true_T
-    each = np.linalg.norm(wrong_T, axis=2) / np.linalg.norm(true_T, axis=2)
-    named = {f"{depth:.3g} mm": float(worst) for depth, worst in zip(depths_mm, each.max(axis=0), strict=True)}
-    return named | {ALL: float(np.linalg.norm(wrong_T) / np.linalg.norm(true_T))}
+    error_T = np.stack(found_T).reshape(shape) - true_T
+    relative = np.linalg.norm(error_T, axis=2) / np.linalg.norm(true_T, axis=2)
+    named = {f"{depth:.3g} mm": float(worst) for depth, worst in zip(depths_mm, relative.max(axis=0), strict=True)}
+    return named | {ALL: float(np.linalg.norm(error_T) / np.linalg.norm(true_T))}
 
 
 def _row(method: str, rule: Quadrature, nodes_n: int, parts: dict[str, float]) -> Precision:
@@ -254,7 +254,7 @@ def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
 EXACT, EULER = "exact update", "explicit Euler"
 SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # of scipy.integrate
 IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept the Jacobian, which is constant
-ATOL = 1e-3  # absolute over relative tolerance: states are a few percent of a force of 1
+ATOL = 1e-3  # ratio of absolute to relative tolerance; states are a few percent of a force of 1
 DIVERGED = 1.0  # relative error that counts as divergence: as large as the force itself
 PERIOD_S = 1.5  # twenty indentations take 30 s
 DOWN_S, HELD_S = 0.3, 0.7
@@ -312,7 +312,7 @@ def study_integrators(tried: Integrators) -> tuple[list[Precision], list[TimedCa
             error, failure = _judge(run, counter, truth)
             rows.append(Precision(study_name(ratio), method, setting, counter.calls_n, error, failure))
             if failure is None:
-                calls.append(TimedCall(rows[-1].key, partial(_fresh, run, calls_max_n), tried.pokes_n))
+                calls.append(TimedCall(rows[-1].key, partial(_run_with_new_counter, run, calls_max_n), tried.pokes_n))
     return rows, calls
 
 
@@ -353,7 +353,10 @@ def integrate(history: History, prony: Prony, piece: Piece, counter: Counter) ->
 
 
 def euler(rates: Rates, length_s: float, state: State, *, step_s: float) -> State:
-    """Explicit Euler with equal steps of at most `step_s`; stable below twice the shortest relaxation time."""
+    """Integrate by explicit Euler with equal steps of at most `step_s`.
+
+    Stable for steps below twice the shortest relaxation time.
+    """
     steps_n = ceil(length_s / step_s - 1e-9)
     with np.errstate(over="ignore", invalid="ignore"):  # divergence is detected at the end
         for _ in range(steps_n):
@@ -364,12 +367,12 @@ def euler(rates: Rates, length_s: float, state: State, *, step_s: float) -> Stat
 def solve(rates: Rates, length_s: float, state: State, *, method: str, tolerance: float, prony: Prony) -> State:
     """Integrate with one of SciPy's adaptive solvers."""
     jacobian = np.diag(-1 / prony.tau_s)
-    more = {"jac": lambda _, __: jacobian} if method in IMPLICIT else {}
+    options = {"jac": lambda _, __: jacobian} if method in IMPLICIT else {}
     span_s = (0.0, length_s)
-    found = solve_ivp(rates, span_s, state, method=method, rtol=tolerance, atol=ATOL * tolerance, **more)
-    if not found.success:
-        raise Failed(found.message)
-    return found.y[:, -1]
+    solution = solve_ivp(rates, span_s, state, method=method, rtol=tolerance, atol=ATOL * tolerance, **options)
+    if not solution.success:
+        raise Failed(solution.message)
+    return solution.y[:, -1]
 
 
 def _entries(history: History, prony: Prony, tried: Integrators) -> list[tuple[str, str, Run]]:
@@ -383,7 +386,7 @@ def _entries(history: History, prony: Prony, tried: Integrators) -> list[tuple[s
     return entries + [(method, setting, partial(integrate, history, prony, piece)) for method, setting, piece in pieces]
 
 
-def _fresh(run: Run, calls_max_n: int) -> Forces:
+def _run_with_new_counter(run: Run, calls_max_n: int) -> Forces:
     return run(Counter(calls_max_n))
 
 
@@ -431,14 +434,14 @@ def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of nodes, already moved, with the compiled kernel, for comparison with magpylib's times.
+    """Sum the field of already displaced nodes with the compiled kernel, for comparison with magpylib's times.
 
     The kernel computes each node both at rest and moved, which avoids the difference of large sums; for magpylib, the
     field at rest is computed once.
     """
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
-    moments = _turned(path, skin.moments_A_m2)
+    moments = _rotated_moments(path, skin.moments_A_m2)
 
     def call() -> Changes:
         rest, poked = (skin.nodes_m, skin.moments_A_m2), zip(path.nodes_m, moments, strict=True)
@@ -451,7 +454,7 @@ def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
     """Sum the field of the nodes with magpylib.core: all pairs of node and chip in one call per indentation."""
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
-    moments = _turned(path, skin.moments_A_m2)
+    moments = _rotated_moments(path, skin.moments_A_m2)
     rest_T = field_of((skin.nodes_m, skin.moments_A_m2), trial.board.chips_m)
 
     def call() -> Changes:
@@ -487,7 +490,7 @@ METHODS: dict[str, Callable[[Trial, Quadrature], Prepared]] = {
 }
 
 
-def _turned(path: NodePath, moments_A_m2: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "n s 3"]:
+def _rotated_moments(path: NodePath, moments_A_m2: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "n s 3"]:
     return np.stack([Rotation.from_rotvec(turns_rad).apply(moments_A_m2) for turns_rad in path.turns_rad])
 
 
@@ -573,7 +576,7 @@ def _deformation_splines(
     return found, reach_m
 
 
-COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # its nodes are replaced
+COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # only for drawing a skin, whose nodes are then replaced
 
 
 def draw_trial(
@@ -591,7 +594,7 @@ def draw_trial(
 
 
 def with_nodes(trial: Trial, rest: Nodes) -> Skin:
-    """Return the trial's skin with other nodes (from its centre and base), magnetised as usual."""
+    """Return the trial's skin with other nodes (relative to its centre and base), magnetised as usual."""
     b_T = magnet.array_field(rest.nodes_m, trial.skin.thickness_m, trial.design.polarity)
     j_T = magnet.magnetise(b_T, saturation_T=trial.design.saturation_T, half_field_T=trial.design.half_field_T)
     nodes_m = rest.nodes_m + np.append(trial.skin.seat_m, 0.0)
@@ -614,7 +617,7 @@ def box_m(thickness_m: float, rule: Quadrature) -> tuple[float, float, float]:
 
 
 def gauss_everywhere(thickness_m: float, rule: Quadrature, *, per_cell_n: int) -> Nodes:
-    """Place nodes in cells that end at the seams, with Gauss nodes along x and y too, for a higher order."""
+    """Place nodes in cells that end at the seams, with Gauss nodes also along x and y, for a higher order."""
     spans_m = pairwise((-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2))
     edges_m = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in spans_m]
     starts_m, widths_m = np.concatenate([e[:-1] for e in edges_m]), np.concatenate([np.diff(e) for e in edges_m])
@@ -650,29 +653,32 @@ class RunTime(Strict):
 
 def runtime(settings: Settings, section: RunTime, results: Path) -> None:
     """Compare quadratures and integrators; times differ between equal runs, so they are not an output of DVC."""
-    of = simulation_settings(settings)
-    rows, calls = study_quadratures(_trials(of, section.quadratures, settings.seed), section.quadratures.rules_of())
-    more, more_calls = study_integrators(section.integrators)
-    choice = choose(rows, used=of.main_boards.quadrature.in_si())
-    seconds = time_calls([*calls, *more_calls], section.repeats_n)
+    simulation = simulation_settings(settings)
+    rows, calls = study_quadratures(
+        _trials(simulation, section.quadratures, settings.seed), section.quadratures.rules_of()
+    )
+    integrator_rows, integrator_calls = study_integrators(section.integrators)
+    choice = choose(rows, used=simulation.main_boards.quadrature.in_si())
+    seconds = time_calls([*calls, *integrator_calls], section.repeats_n)
     io.write_json(SECONDS / settings.scene / "runtime.json", [asdict(row) for row in seconds])
     content: dict[str, Any] = {"choice": asdict(choice)}
-    content |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in more]}
+    content |= {"quadratures": [asdict(row) for row in rows], "integrators": [asdict(row) for row in integrator_rows]}
     io.write_json(results, content)
-    failed_n = sum(row.failure is not None for row in [*rows, *more])
+    failed_n = sum(row.failure is not None for row in [*rows, *integrator_rows])
     say(
-        f"{settings.scene}: {len(rows) + len(more)} settings tried, {failed_n} failed; "
+        f"{settings.scene}: {len(rows) + len(integrator_rows)} settings tried, {failed_n} failed; "
         f"cheapest quadrature: {choice.setting}"
     )
 
 
-def _trials(of: SimulationSettings, tried: Quadratures, seed: int) -> list[Trial]:
+def _trials(simulation: SimulationSettings, tried: Quadratures, seed: int) -> list[Trial]:
     """Return the skins on the boards with the nearest chips, which need the finest quadrature."""
     drawn = [
-        (draw_board(of.main_boards.design, of.spreads, seed=seed, name=board), skin)
-        for board, skin in list_captures(of, MAIN)
+        (draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board), skin)
+        for board, skin in list_captures(simulation, MAIN)
     ]
     nearest = sorted(drawn, key=lambda pair: -pair[0].chips_m[0, 2])[: tried.skins_n]
     return [
-        draw_trial(board, of.skin, spreads=of.spreads, seed=seed, name=skin, pokes=tried) for board, skin in nearest
+        draw_trial(board, simulation.skin, spreads=simulation.spreads, seed=seed, name=skin, pokes=tried)
+        for board, skin in nearest
     ]

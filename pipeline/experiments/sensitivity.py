@@ -20,7 +20,7 @@ from reskin.data.baseline import subtract
 from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
 
-RESOLVED_SHARE = 0.95  # a difference is resolved if this share of reading pairs is in the right order
+RESOLVED_SHARE = 0.95  # a difference is resolved if this fraction of reading pairs is correctly ordered
 WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
 
 
@@ -33,8 +33,8 @@ def group_by_level(
     where: str,
 ) -> Float32[np.ndarray, "n p r ch"]:
     """Group readings by filling, weight and reading; a stop is a run of readings with equal force in the log."""
-    new = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
-    stops = np.split(np.arange(len(force_N)), new)
+    starts = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
+    stops = np.split(np.arange(len(force_N)), starts)
     fillings_n = len(np.unique(indentation))
     lengths = {len(stop) for stop in stops}
     if len(stops) != fillings_n * levels_n or len(lengths) != 1:
@@ -75,14 +75,14 @@ def analyse_levels(
         "noise_uT": float(np.sqrt(along_uT.var(axis=2, ddof=1).mean())),
         "gain_uT_per_N": float(np.polyfit(weight_N, response_uT, 1)[0]),
     }
-    drawn: dict[str, Any] = {
+    plot_data: dict[str, Any] = {
         "weight_N": np.round(weight_N, 4).tolist(),
         "response_uT": np.round(response_uT, 2).tolist(),
         "sd_uT": np.round(along_uT.std(axis=(0, 2), ddof=1), 2).tolist(),
     }
-    drawn["by_direction"] = {name: np.round(share, 4).tolist() for name, share in by_direction.items()}
-    drawn["told_by_length"] = {name: np.round(share, 4).tolist() for name, share in by_length.items()}
-    return numbers, drawn
+    plot_data["by_direction"] = {name: np.round(share, 4).tolist() for name, share in by_direction.items()}
+    plot_data["told_by_length"] = {name: np.round(share, 4).tolist() for name, share in by_length.items()}
+    return numbers, plot_data
 
 
 def _known(steps_N: dict[str, float | None]) -> dict[str, float]:
@@ -96,7 +96,7 @@ def direction(db_uT: Float64[np.ndarray, "n p r ch"]) -> Float64[np.ndarray, " c
 
 
 def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarray, " d"]:
-    """Return the share of reading pairs in the order of their weights, for differences of 1 step, 2 steps, ...
+    """Return the fraction of reading pairs in the order of their weights, for differences of 1 step, 2 steps, ...
 
     A pair is two readings of the same filling, which share a no-load reading; equal responses count half.
     """
@@ -148,13 +148,16 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
 def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     """Find the smallest difference of weight that the loaded skin resolves."""
     load = load_protocol(settings, "glass")
-    one = only(read_captures(indentations), indentations)
+    capture = only(read_captures(indentations), indentations)
     weight_N = load_steps_N(load.force_max_N, load.step_N)
-    change_uT = subtract(one.b_uT, one.noload_uT)
-    levels_uT = group_by_level(change_uT, one.indentation, one.Fz_N, levels_n=len(weight_N), where=one.capture)
-    numbers, drawn = analyse_levels(levels_uT, weight_N)
-    write_results(results, numbers, drawn, read_losses(indentations, {}))
-    say(f"{settings.scene}: weights {numbers['smallest_step_N']} N apart resolved, {numbers['fillings_n']} fillings")
+    change_uT = subtract(capture.b_uT, capture.noload_uT)
+    levels_uT = group_by_level(
+        change_uT, capture.indentation, capture.Fz_N, levels_n=len(weight_N), where=capture.capture
+    )
+    numbers, plot_data = analyse_levels(levels_uT, weight_N)
+    write_results(results, numbers, plot_data, read_losses(indentations, {}))
+    resolved = ", ".join(f"{step_N:.3g} N ({READINGS[name]})" for name, step_N in numbers["smallest_step_N"].items())
+    say(f"{settings.scene}: smallest resolved step: {resolved or 'none'}; {numbers['fillings_n']} fillings")
 
 
 MEANING = (  # {told_pct} comes from the numbers
@@ -171,15 +174,15 @@ READINGS = {"one_reading": "one reading", "five_readings": "mean of a stop's rea
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the smallest resolved step, in N and mL of water, and whether the response is monotonic."""
     rows = []
-    for name, words in READINGS.items():
+    for name, title in READINGS.items():
         rows += [
             (
-                f"smallest resolved step, {words}, N",
+                f"smallest resolved step, {title}, N",
                 _show(numbers["smallest_step_N"], name, numbers),
                 f"< {paper.SENSITIVITY_N:g}",
             ),
-            (f"smallest resolved step, {words}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
-            (f"the same by |dB| alone, {words}, N", _show(numbers["by_length_N"], name, numbers), "–"),
+            (f"smallest resolved step, {title}, mL of water", _show_mL(name, numbers), f"< {paper.SENSITIVITY_ML:g}"),
+            (f"the same from |dB| alone, {title}, N", _show(numbers["by_length_N"], name, numbers), "–"),
         ]
     rise = numbers["monotonic"]
     rows += [
@@ -196,7 +199,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Plot the response against weight, and the share of pairs in the right order against their difference."""
+    """Plot the response against weight, and the fraction of correctly ordered pairs against the weight difference."""
     with drawing(7.6, 3.6) as figure:
         left, right = figure.subplots(1, 2)
         weight_N, response_uT, sd_uT = (np.array(drawn[name]) for name in ("weight_N", "response_uT", "sd_uT"))
@@ -204,14 +207,16 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         left.plot(weight_N, response_uT, color=COLOURS[1])
         left.set(xlabel="weight / N", ylabel="response / µT (mean, standard deviation)")
         difference_N = numbers["step_N"] * np.arange(1, len(weight_N))
-        for colour, (name, words) in zip(COLOURS[1:], READINGS.items(), strict=False):
+        for colour, (name, title) in zip(COLOURS[1:], READINGS.items(), strict=False):
             share_pct = 100 * np.array(drawn["by_direction"][name])
-            right.plot(difference_N, share_pct, "o-", color=colour, markersize=3, linewidth=1.2, label=words)
+            right.plot(difference_N, share_pct, "o-", color=colour, markersize=3, linewidth=1.2, label=title)
         told_pct = numbers["told_pct"]
         right.axhline(told_pct, color="0.3", linestyle="--", linewidth=1, label=f"{told_pct:g} %")
-        right.axvline(paper.SENSITIVITY_N, color="0.6", linestyle=":", linewidth=1.2, label="paper: less than this")
-        right.set(xscale="log", xlabel="difference of weight / N", ylabel="pairs in the right order / %")
-        right.set_ylim(48, 102)  # half is chance
+        right.axvline(
+            paper.SENSITIVITY_N, color="0.6", linestyle=":", linewidth=1.2, label="upper bound stated in the paper"
+        )
+        right.set(xscale="log", xlabel="weight difference / N", ylabel="correctly ordered pairs / %")
+        right.set_ylim(48, 102)  # 50 % is chance level
         right.legend(frameon=True, framealpha=1, edgecolor="none", fontsize=9, loc="lower right")
         figure.suptitle(f"Response while a glass on the skin is filled ({source})", x=0.01, ha="left", fontsize=11)
         return {"sensitivity.svg": svg(figure)}
@@ -229,7 +234,7 @@ def _rises(rise: Mapping[str, Any]) -> str:
 
 
 def _falls(found: Mapping[str, Any], numbers: Mapping[str, Any]) -> str:
-    expected = f", {found['expected_falls_n']:.1f} expected of noise" if "expected_falls_n" in found else ""
+    expected = f", {found['expected_falls_n']:.1f} expected from noise" if "expected_falls_n" in found else ""
     return f"{found['falls_n']} of {numbers['levels_n'] - 1}{expected}"
 
 

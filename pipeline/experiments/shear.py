@@ -1,6 +1,6 @@
 """Shear: place and all three force components of dragged lines (paper section 4).
 
-Two splits of every skin: random readings held out, and whole lines held out.
+Every skin is split in two ways: random readings are held out, or whole lines are held out.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -26,7 +26,7 @@ from reskin.seeds import rng_for, seed_for
 
 PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
 PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
-DRAWN_N = 400  # points in a panel
+DRAWN_N = 400  # points in a panel of the figure
 FORCE_DECIMALS = 3  # of a force in N in the figure
 
 
@@ -60,12 +60,12 @@ def shear(settings: Settings, section: Shear, indentations: Path, results: Path)
     first_i = next(i for i, job in enumerate(jobs) if job.fold in names)
     shown = rng_for(settings.seed, "shear", "drawn").permutation(len(jobs[first_i].test))[:DRAWN_N]
     true, predicted = rows.target[jobs[first_i].test], trained[first_i].predicted
-    drawn = {
+    plot_data = {
         side: [np.round(forces[shown, i].astype(float), FORCE_DECIMALS).tolist() for i in range(2, 5)]
         for side, forces in (("true", true), ("predicted", predicted))
     }
     write_results(
-        results, numbers, drawn, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained))
+        results, numbers, plot_data, read_losses(indentations, rows.dropped), tally(map(collapse_record, trained))
     )
 
 
@@ -135,7 +135,7 @@ FORCES = ("Fx", "Fy", "Fz")
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate both splits beside the paper's numbers; the paper does not say which split it used."""
     splits = {
-        "random readings held out (ours; the paper names no split)": numbers,
+        "random readings held out (ours; the paper does not state its split)": numbers,
         "whole lines held out": numbers["by_line"],
     }
     lines = []
@@ -151,8 +151,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: the "
         f"path of a held-out line is also dragged along in {numbers['passes_n'] - 1} other passes. Our forces are "
         f"{rms_N} rms. The paper does not state its forces, and an MSE grows with the square of the force; explained "
-        "variance, 1 - MSE / variance, does not. MSE_Fxy, too, is a mean over two axes; the paper does not say whether "
-        "it sums or averages."
+        "variance, 1 - MSE / variance, does not. Our MSE_Fxy is a mean over two axes; the paper does not say whether "
+        "it sums or averages over axes."
     )
     spread = (
         "± is the standard deviation over n random splits; the score of a split is the mean over "

@@ -84,15 +84,15 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Pat
         "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": NEAR_MM,
         **scored.pop(HEADLINE), "variants": scored,
     }  # fmt: skip
-    drawn = draw_errors(area, true, errors_mm(true, predictions[HEADLINE][0]), indentation)
+    plot_data = draw_errors(area, true, errors_mm(true, predictions[HEADLINE][0]), indentation)
     losses = read_losses(indentations, data.rows.dropped)
-    write_results(results, numbers, drawn, losses, tally(map(collapse_record, trained)))
+    write_results(results, numbers, plot_data, losses, tally(map(collapse_record, trained)))
 
 
 def area_of(settings: Settings) -> Area:
     """Return the area of the simulated sleeve."""
-    of = simulation_settings(settings)
-    kind = of.boards[of.protocols["sleeve"].boards]
+    simulation = simulation_settings(settings)
+    kind = simulation.boards[simulation.protocols["sleeve"].boards]
     tiles = kind.design.tiles
     boards_n, pitch_mm = ((1, 1), 0.0) if tiles is None else ((tiles.columns_n, tiles.rows_n), tiles.pitch_mm)
     return lay_out(kind.skin_mm, kind.design.places_mm, boards_n=boards_n, pitch_mm=pitch_mm)
@@ -105,7 +105,7 @@ def lay_out(
     boards_n: tuple[int, int],
     pitch_mm: float,
 ) -> Area:
-    """Convert chip positions (from the skin's middle) to the labels' coordinates, and compute the borders of boards."""
+    """Convert chip positions (from the skin's middle) to the labels' coordinates; compute the borders between boards."""
     middle_mm = np.array(sides_mm) / 2
     x_mm, y_mm = (
         tuple(float(m + pitch_mm * (i - n / 2)) for i in range(1, n)) for m, n in zip(middle_mm, boards_n, strict=True)
@@ -211,7 +211,7 @@ def draw_errors(
 
 
 PLACES = {"median_error_mm": "median error, mm", "p95_error_mm": "95 % within, mm"}
-PARTS = {"near_seam": "median near a border of boards, mm", "inside": "median elsewhere, mm"}
+PARTS = {"near_seam": "median near a border between boards, mm", "inside": "median elsewhere, mm"}
 NO_NUMBER = "none: a demonstration"
 SPREAD = "± is the standard deviation over the network seeds; column `seeds` gives their number."
 NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbours (shape of dB)"}
@@ -233,7 +233,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw a map of the skin: every tested poke, coloured by its error, over chips and borders of boards."""
+    """Draw a map of the skin: every tested poke, coloured by its error, over chips and borders between boards."""
     with drawing(6.2, 3.5) as figure:
         axes = figure.subplots()
         _draw_boards(axes, drawn)
@@ -258,7 +258,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _draw_boards(axes: Any, drawn: Mapping[str, Any]) -> None:
     x_mm, y_mm = drawn["area_mm"]
     thin = {"color": "0.5", "linewidth": 0.8, "zorder": 1}
-    axes.vlines(drawn["borders_y_mm"], 0, x_mm, **thin, label="border of two boards")
+    axes.vlines(drawn["borders_y_mm"], 0, x_mm, **thin, label="border between boards")
     axes.hlines(drawn["borders_x_mm"], 0, y_mm, **thin)
     axes.plot([0, y_mm, y_mm, 0, 0], [0, 0, x_mm, x_mm, 0], color=COLOURS[0], linewidth=1.2, label="edge of the skin")
     chips = {"marker": "+", "s": 45, "color": COLOURS[2], "linewidths": 1.2, "zorder": 4, "label": "chip"}

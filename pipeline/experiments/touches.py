@@ -53,7 +53,7 @@ Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # by place
 
 
 class Touches(Strict):
-    """Section touches: how a recording is cut by time, and the share of single touches that may be called two."""
+    """Section touches: how a recording is cut by time, and the fraction of single touches that may be called two."""
 
     train_fraction: Fraction
     aside_fraction: Fraction
@@ -70,21 +70,21 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
     """Evaluate touches at numbered places."""
     selection = settings.section(Selection, "selection")
     sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
-    found = sort_recordings(
+    recordings = sort_recordings(
         touched_rows(io.read_readings(file), io.read_ingest_counts(file), selection) for file in sources
     )
-    single, double = found.single, found.double
+    single, double = recordings.single, recordings.double
     counts = {
         "force_min_N": selection.force_min_N,
         "single": {"recordings_n": len(single), "rows_n": sum(len(one.db_uT) for one in single)},
         "double": {"recordings_n": len(double), "rows_n": sum(len(one.db_uT) for one in double)},
-        "left_out": found.left_out,
+        "left_out": recordings.left_out,
     }
-    for name, reason in found.left_out.items():
+    for name, reason in recordings.left_out.items():
         say(f"{settings.scene}: warning: {name} left out: {reason}")
-    if found.problem:
-        write_results(results, counts | {"not_computed": found.problem}, {})
-        say(f"{settings.scene}: warning: touches not computed: {found.problem}")
+    if recordings.problem:
+        write_results(results, counts | {"not_computed": recordings.problem}, {})
+        say(f"{settings.scene}: warning: touches not computed: {recordings.problem}")
         return
     blocks = [split_by_time(one, section) for one in single]
     numbers = counts | {
@@ -146,7 +146,10 @@ def split_by_time(recording: Touched, section: Touches) -> Split:
 
 @dataclass(frozen=True)
 class Sorted:
-    """Recordings of one place and of two, why others are left out, and why nothing can be computed, if so."""
+    """Recordings of one place and of two, and the reasons why others are left out.
+
+    `problem` is the reason why nothing can be computed, if so.
+    """
 
     single: list[Touched]
     double: list[Touched]
@@ -187,8 +190,8 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
 
 def stack_touches(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
     """Stack single touches: their changes of field, and the place number of each row."""
-    numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
-    return np.concatenate([part.db_uT for part in parts]), numbers
+    place_numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
+    return np.concatenate([part.db_uT for part in parts]), place_numbers
 
 
 # --- Fields of touches ---
@@ -245,10 +248,13 @@ def score_unlike_one(
 
 
 def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
-    """Predict the place of later single touches, and test whether that of two touches is one of their two places."""
-    known_uT, numbers = stack_touches([one.train for one in blocks])
+    """Predict the place of later single touches.
+
+    Also test whether the place predicted for two touches is one of their two places.
+    """
+    known_uT, place_numbers = stack_touches([one.train for one in blocks])
     right_pct = [
-        100 * float(np.isin(predict_places(known_uT, numbers, part.db_uT), part.places).mean())
+        100 * float(np.isin(predict_places(known_uT, place_numbers, part.db_uT), part.places).mean())
         for part in [*(one.test for one in blocks), *double]
     ]
     singles_n = len(blocks)
@@ -293,17 +299,19 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
 
 def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
     """Return the residual of two touches after a fit by their two places, by one place, and by all other pairs."""
-    left = {of: float(np.median(relative_residual(known, of, db_uT))) for of in combinations(sorted(known), 2)}
+    residuals = {
+        places: float(np.median(relative_residual(known, places, db_uT))) for places in combinations(sorted(known), 2)
+    }
     alone = {place: float(np.median(relative_residual(known, (place,), db_uT))) for place in known}
-    least = min(alone, key=lambda place: alone[place])
-    others = [share for of, share in left.items() if of != pair]
+    best_place = min(alone, key=lambda place: alone[place])
+    others = [share for places, share in residuals.items() if places != pair]
     return {
-        "places": list(pair), "rows_n": len(db_uT), "left_over_pct": 100 * left[pair],
+        "places": list(pair), "rows_n": len(db_uT), "left_over_pct": 100 * residuals[pair],
         "weaker_alone_pct": 100 * max(alone[place] for place in pair),
         "stronger_alone_pct": 100 * min(alone[place] for place in pair),
-        "best_alone_pct": 100 * alone[least], "best_alone": least,
-        "other_pairs_pct": 100 * float(np.mean(others)), "rank": 1 + sum(share < left[pair] for share in others),
-        "pairs_n": len(left),
+        "best_alone_pct": 100 * alone[best_place], "best_alone": best_place,
+        "other_pairs_pct": 100 * float(np.mean(others)), "rank": 1 + sum(share < residuals[pair] for share in others),
+        "pairs_n": len(residuals),
     }  # fmt: skip
 
 
@@ -311,8 +319,8 @@ def evaluate_detection(
     blocks: Sequence[Split], double: Sequence[Touched], section: Touches, seed: int
 ) -> dict[str, Any]:
     """Detect two touches at a given share of false alarms, with two controls: sums, and touches at unknown places."""
-    known_uT, numbers = stack_touches([one.train for one in blocks])
-    known = directions(known_uT, numbers)
+    known_uT, place_numbers = stack_touches([one.train for one in blocks])
+    known = directions(known_uT, place_numbers)
 
     def scored(parts: Sequence[Float32[np.ndarray, "_ ch"]]) -> Scores:
         return score_unlike_one(known_uT, known, np.concatenate(parts))
@@ -348,8 +356,8 @@ def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: floa
     called = []
     for one in blocks:
         others = [other for other in blocks if other is not one]
-        known_uT, numbers = stack_touches([other.train for other in others])
-        known = directions(known_uT, numbers)
+        known_uT, place_numbers = stack_touches([other.train for other in others])
+        known = directions(known_uT, place_numbers)
         aside = score_unlike_one(known_uT, known, stack_touches([other.aside for other in others])[0])
         limits = thresholds(aside, false_alarm_fraction)
         called.append(above_pct(score_unlike_one(known_uT, known, one.test.db_uT), limits))
@@ -385,7 +393,7 @@ def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
     if "one_of_two" in place:
         two = place["one_of_two"]
         chance = f"{two['chance_pct']:.1f}"
-        rows.append(_row("two touches, in their own recordings: answer is one of the two", two, "%", chance))
+        rows.append(_row("two touches, in their own recordings: predicted place is one of the two", two, "%", chance))
     variance = f"{force['variance']['mean']:.3g} (variance)"
     for way, words in (("by_time", BY_TIME), ("place_left_out", "at a place left out of training")):
         rows.append(_row(f"force of one touch, squared error, {words}", force[way], "N²", variance))
@@ -467,7 +475,7 @@ def _detection(numbers: Mapping[str, Any]) -> pd.DataFrame:
     table.attrs["meaning"] = (
         f"Thresholds are set for {numbers['false_alarm_asked_pct']:g} % false alarms, as in `contacts`, on single "
         "touches recorded after the known and before the tested ones. A detector that also calls a single touch at an "
-        "unknown place `two` responds to what is new, not to two touches; then the first column is no evidence that it "
-        f"detects two touches. {APART}"
+        "unknown place `two` responds to anything unfamiliar, not to two touches; its first column is then no evidence "
+        f"that it detects two touches. {APART}"
     )
     return table

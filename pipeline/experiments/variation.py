@@ -26,7 +26,7 @@ from reskin.schema import Readings
 
 SAME_MM = 1e-3  # tolerance of labels, which are commanded values in float32
 LISTED_N = 8  # places or depths that an error message names
-LINES_MAX_N = 40  # visits drawn in a panel
+LINES_MAX_N = 40  # visits drawn in a panel of the figure
 DECIMALS = 1  # of a field in uT in the figures
 
 Count = Annotated[int, Field(ge=1)]
@@ -44,25 +44,25 @@ class Variation(Strict):
 
 def variation(settings: Settings, section: Variation, main: Path, indentations: Path, results: Path) -> None:
     """Compare visits of the same places: over time on the worn skin in `indentations`, and between skins in `main`."""
-    worn = read_captures(indentations)[0]
+    worn_capture = read_captures(indentations)[0]
     boards: dict[str, str] = {}
     visits: dict[str, list[Visits]] = {}
     for name in settings.captures_in(main):  # one capture in memory at a time
-        one = io.read_readings(main / f"{name}.parquet")
-        boards[one.skin] = one.board
-        visits[one.skin] = [find_visits(one, place_mm, section.depth_mm) for place_mm in section.places_mm]
+        capture = io.read_readings(main / f"{name}.parquet")
+        boards[capture.skin] = capture.board
+        visits[capture.skin] = [find_visits(capture, place_mm, section.depth_mm) for place_mm in section.places_mm]
     skins = first_of_each_board(boards, section.skins_n)
 
     places: list[dict[str, Any]] = []
-    drawn: list[dict[str, Any]] = []
+    plot_data: list[dict[str, Any]] = []
     for place_i, (x_mm, y_mm) in enumerate(section.places_mm):
-        time, time_lines = over_time(find_visits(worn, (x_mm, y_mm), section.depth_mm), section.contacts_n)
+        time, time_lines = over_time(find_visits(worn_capture, (x_mm, y_mm), section.depth_mm), section.contacts_n)
         of_skins, skin_lines = over_skins({skin: visits[skin][place_i] for skin in skins})
         places.append({"x_mm": x_mm, "y_mm": y_mm, "time": time, "skins": of_skins})
-        drawn.append({"x_mm": x_mm, "y_mm": y_mm, "time": time_lines, "skins": skin_lines})
-    numbers = {"depth_mm": section.depth_mm, "worn_skin": worn.skin} | pace([worn])
-    numbers |= duration_and_warming(worn, section.contacts_n) | {"places": places}
-    write_results(results, numbers, {"places": drawn}, read_losses(indentations, {}))
+        plot_data.append({"x_mm": x_mm, "y_mm": y_mm, "time": time_lines, "skins": skin_lines})
+    numbers = {"depth_mm": section.depth_mm, "worn_skin": worn_capture.skin} | pace([worn_capture])
+    numbers |= duration_and_warming(worn_capture, section.contacts_n) | {"places": places}
+    write_results(results, numbers, {"places": plot_data}, read_losses(indentations, {}))
 
 
 @dataclass(frozen=True)
@@ -76,17 +76,17 @@ class Visits:
 
 def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: float) -> Visits:
     """Average the readings of each indentation at one place and depth; raise `ParamsError` if there are none."""
-    at = _at(readings, place_mm, depth_mm)
-    if not at.any():
+    selected = _at(readings, place_mm, depth_mm)
+    if not selected.any():
         what = f"{place_mm[0]:g}, {place_mm[1]:g} mm is never visited at a depth of {depth_mm:g} mm"
         where = f"experiment variation, capture {readings.capture}"
         raise ParamsError(f"{where}: {what} (variation.places_mm, depth_mm). {_visited(readings, place_mm)}")
-    b_uT = readings.b_uT[at]
-    visit_i, n_contacts = rank(readings.indentation[at]), readings.n_contacts[at]
+    b_uT = readings.b_uT[selected]
+    visit_i, n_contacts = rank(readings.indentation[selected]), readings.n_contacts[selected]
     _, first_i, n = np.unique(visit_i, return_index=True, return_counts=True)
     means = [
         np.add.reduceat(values, first_i, axis=0, dtype=np.float64) / n[:, None]
-        for values in (b_uT, subtract(b_uT, readings.noload_uT[at]))
+        for values in (b_uT, subtract(b_uT, readings.noload_uT[selected]))
     ]
     return Visits(n_contacts[first_i], *means)
 
@@ -97,24 +97,24 @@ def _at(readings: Readings, place_mm: tuple[float, float], depth_mm: float | Non
 
 
 def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
-    """List the depths visited at a place, or the places and depths visited at all."""
+    """List the depths visited at a place or, if there are none, all visited depths and some places."""
 
-    def listed(values_mm: np.ndarray) -> str:
+    def join(values_mm: np.ndarray) -> str:
         return ", ".join(f"{value:g}" for value in values_mm[:LISTED_N])
 
-    at = _at(readings, place_mm, None)
-    if at.any():
-        return f"Visited depths there: {listed(np.unique(readings.depth_mm[at]))} mm."
+    at_place = _at(readings, place_mm, None)
+    if at_place.any():
+        return f"Visited depths there: {join(np.unique(readings.depth_mm[at_place]))} mm."
     places = np.unique(np.stack([readings.x_mm, readings.y_mm], axis=1), axis=0)
-    some = "; ".join(f"{x:g}, {y:g}" for x, y in places[:LISTED_N])
-    depths = listed(np.unique(readings.depth_mm))
-    return f"Visited: depths {depths} mm, and {len(places)} places, among them {some} mm."
+    examples = "; ".join(f"{x:g}, {y:g}" for x, y in places[:LISTED_N])
+    depths = join(np.unique(readings.depth_mm))
+    return f"Visited: depths {depths} mm, and {len(places)} places, among them {examples} mm."
 
 
 def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the visits within a skin's first contacts with the first visit: field as read, and change of field.
 
-    Returns rms differences over channels at the last visit, and the lines to draw: field of each visit less the first.
+    Returns rms differences over channels at the last visit, and the lines to draw: fields minus the first visit's.
     """
     early = visits.contacts_n - visits.contacts_n[0] < contacts_n
     before_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]
@@ -135,7 +135,7 @@ def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str
 
 def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Compare the mean changes of field of several skins: rms difference over channels and pairs, also in percent."""
-    mean_uT = {skin: of.db_uT.mean(axis=0) for skin, of in visits.items()}
+    mean_uT = {skin: skin_visits.db_uT.mean(axis=0) for skin, skin_visits in visits.items()}
     size_uT = rms(np.array(list(mean_uT.values())))
     numbers: dict[str, Any] = {"skins": list(mean_uT), "mean_db_uT": size_uT}
     if len(mean_uT) > 1:
@@ -213,7 +213,7 @@ def _draw_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], 
 
     most_n = max(place["time"]["contacts_n"][-1] for place in places)
     title = f"Field over time at {numbers['depth_mm']:g} mm depth, first visit subtracted ({source})"
-    with _panels(places, title, "field less that of the first visit / µT") as (figure, panels):
+    with _panels(places, title, "field minus that of the first visit / µT") as (figure, panels):
         # Without the upper end of the colour map: its yellow is pale on white.
         colours = mpl.colors.ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.85, 256)))
         scale = mpl.colors.Normalize(0, most_n)
@@ -231,8 +231,8 @@ def _draw_skins(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]],
     with _panels(places, title, "change of field / µT") as (figure, panels):
         for axes, place in zip(panels, places, strict=True):
             for i, (skin, line_uT) in enumerate(place["skins"].items()):
-                look = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
-                axes.plot(line_uT, label=skin, linewidth=1, **look)
+                style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
+                axes.plot(line_uT, label=skin, linewidth=1, **style)
             _name_channels(axes, len(line_uT))
         names = panels[0].get_legend_handles_labels()
         figure.legend(*names, loc="outside lower center", ncols=5, frameon=False, title="skin")

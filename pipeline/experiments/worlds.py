@@ -1,4 +1,4 @@
-"""What decides table 2: its rows for different spreads and model errors of the simulated skins.
+"""What decides table 2: its rows for simulated skins with different spreads and model errors.
 
 A world is a simulation that differs from the scene in one factor.
 """
@@ -53,7 +53,7 @@ EXPERIMENTS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "ada
 
 
 class Residual(Strict):
-    """Error of the simulation: rms sizes relative to |dB|, correlation lengths, and the part specific to each skin."""
+    """Error of the simulation: rms sizes relative to |dB|, correlation lengths, and fraction specific to each skin."""
 
     sizes: Sizes
     length_mm: Annotated[float, Field(gt=0, le=50)]
@@ -67,7 +67,7 @@ class Worlds(Strict):
     residual: Residual
     skin_modulus: Sizes  # spreads.skin_modulus
     amplitude_and_gap: Sizes  # factor on spreads.skin_amplitude and spreads.board_gap
-    friction: Sizes  # skin.hold.friction, under the tip that slides a skin
+    friction: Sizes  # skin.hold.friction: between skin and tip, which limits how far a tip slides a skin
 
 
 @dataclass(frozen=True)
@@ -107,18 +107,23 @@ def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
 
 
 def draw_smooth_error(
-    at: Float[np.ndarray, "n 3"], channels_n: int, how: Residual, rng: np.random.Generator
+    points: Float[np.ndarray, "n 3"], channels_n: int, residual: Residual, rng: np.random.Generator
 ) -> Float[np.ndarray, "n ch"]:
     """Draw a smooth random function of each channel with variance 1, over x and y in mm and log force."""
-    lengths = np.array([how.length_mm, how.length_mm, how.length_log_N])
+    lengths = np.array([residual.length_mm, residual.length_mm, residual.length_log_N])
     waves = rng.standard_normal((3, WAVES_N)) / lengths[:, None]
     phase = rng.uniform(0, 2 * np.pi, WAVES_N)
     amplitude = rng.standard_normal((WAVES_N, channels_n)) * np.sqrt(2 / WAVES_N)
-    return np.cos(at @ waves + phase) @ amplitude
+    return np.cos(points @ waves + phase) @ amplitude
 
 
 def with_residual(
-    change_uT: Float[np.ndarray, "n ch"], at: Float[np.ndarray, "n 3"], size: float, how: Residual, seed: int, skin: str
+    change_uT: Float[np.ndarray, "n ch"],
+    points: Float[np.ndarray, "n 3"],
+    size: float,
+    residual: Residual,
+    seed: int,
+    skin: str,
 ) -> Float[np.ndarray, "n ch"]:
     """Add the simulation's error to a skin's changes of field; its rms over indentations is `size` times |dB|.
 
@@ -127,9 +132,9 @@ def with_residual(
     if size == 0:
         return change_uT
     channels_n = change_uT.shape[1]
-    shared = draw_smooth_error(at, channels_n, how, rng_for(seed, "worlds", "residual"))
-    own = draw_smooth_error(at, channels_n, how, rng_for(seed, "worlds", "residual", skin))
-    unit = np.sqrt(1 - how.own_share) * shared + np.sqrt(how.own_share) * own
+    shared = draw_smooth_error(points, channels_n, residual, rng_for(seed, "worlds", "residual"))
+    own = draw_smooth_error(points, channels_n, residual, rng_for(seed, "worlds", "residual", skin))
+    unit = np.sqrt(1 - residual.own_share) * shared + np.sqrt(residual.own_share) * own
     length_uT = np.linalg.norm(change_uT, axis=1, keepdims=True)
     return change_uT + size * length_uT / np.sqrt(channels_n) * unit
 
@@ -156,9 +161,9 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
     _, change_T = changes_of_field(board, skin, tip_m)
     read_T = np.einsum("kij,nkj->nki", board.sensitivity @ board.turn.transpose(0, 2, 1), change_T)
     force_N = forces(skin, tip_m[:, 2])
-    at = np.column_stack([tip_m[:, :2] / milli, np.log(np.maximum(force_N, rig.force_noise_N))])
+    points = np.column_stack([tip_m[:, :2] / milli, np.log(np.maximum(force_N, rig.force_noise_N))])
     change_uT = with_residual(
-        read_T.reshape(len(tip_m), -1) / micro, at, world.residual, section.residual, seed, skin_name
+        read_T.reshape(len(tip_m), -1) / micro, points, world.residual, section.residual, seed, skin_name
     )
     n, channels_n = change_uT.shape
     noise_uT = np.tile([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT], channels_n // 3)
@@ -260,7 +265,8 @@ def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dic
 
 DEFAULT_WORLD = "default"
 FACTORS = {
-    "residual": "error of the simulation, part of |dB|", "skin_modulus": "spread of stiffness (sd of the logarithm)",
+    "residual": "error of the simulation, relative to |dB|",
+    "skin_modulus": "spread of stiffness (sd of the logarithm)",
     "amplitude_and_gap": "spreads of amplitude and gap, times the default", "friction": "friction under the tip",
 }  # fmt: skip
 DRAWN = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2")
@@ -271,7 +277,7 @@ MEANING = (
     "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
     "error. {folds_n} boards are held out in turn; one network per row, fold and world; {steps_n} steps."
 )
-DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # those of the other factors are in the numbers
+DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # the defaults of the other factors are in the numbers
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -141,7 +141,7 @@ NUMBERS = {
 def test_dynamics_table_compares_filters():
     table = tables(NUMBERS, "simulated")["dynamics"]
     judged = table[LESS] != ""
-    assert list(table.loc[judged, "answered by"].unique()) == ["mean of the last five"]
+    assert list(table.loc[judged, "estimated from"].unique()) == ["mean of the last five"]
     assert set(table.loc[judged, LESS]) == {"not judged (fewer than 4 boards): -0.25"}
     assert list(table["lag / ms"][-3:]) == ["0.9", "–", "–"]
     assert table["MSE_F / N²"][0] == "0.5 ± 0.1"

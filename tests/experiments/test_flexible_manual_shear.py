@@ -290,7 +290,7 @@ def test_shear_table_has_both_splits():
     table = shear.tables(SHEAR_NUMBERS, "simulated")["shear"]
     assert table["accuracy, % (ours)"].tolist() == ["96 ± 0.1 ± 0.02 (seeds)", "58 ± 0.1 ± 0.02 (seeds)"]
     assert "± (seeds) is the standard deviation over 3 network seeds" in text
-    assert table["split"].tolist()[0] == "random readings held out (ours; the paper names no split)"
+    assert table["split"].tolist()[0] == "random readings held out (ours; the paper does not state its split)"
     assert "4590 readings of 54 dragged lines in 1 passes" in text
     text = texts_of(shear.figures(SHEAR_NUMBERS, CURVES, "simulated")["shear.svg"])
     assert "0.980 ± 0.020 (seeds) sideways, 0.999 ± 0.020 (seeds) normal" in text
@@ -299,11 +299,11 @@ def test_shear_table_has_both_splits():
 
 def test_manual_table_has_variants_and_differences():
     table = manual.tables(MANUAL_NUMBERS, "simulated")["manual"].set_index("networks")
-    for variant, name in (("before", "before"), ("after", "adapted by hand")):
+    for variant, name in (("before", "before"), ("after", "adapted with hand pokes")):
         assert table.loc[name, "accuracy, % (paper)"] == f"{MANUAL[variant]['accuracy_pct']:g}"
-    difference = table.loc["by hand less before, on the same skin", "accuracy, % (ours)"]
+    difference = table.loc["with hand pokes minus before, on the same skin", "accuracy, % (ours)"]
     assert difference == "not judged (fewer than 4 boards): +2 ± 0.1 ± 0.02 (seeds)"
-    assert table.loc["adapted by hand", "accuracy, % (ours)"] == "83 ± 0.1 ± 0.02 (seeds)"
+    assert table.loc["adapted with hand pokes", "accuracy, % (ours)"] == "83 ± 0.1 ± 0.02 (seeds)"
     assert "over 3 network seeds" in to_markdown(manual.tables(MANUAL_NUMBERS, "simulated")["manual"])
     assert len(table) == 7
     without = {name: value for name, value in MANUAL_NUMBERS.items() if name != "control"}

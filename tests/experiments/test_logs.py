@@ -221,7 +221,7 @@ SERIES = {name: [None, 1.0, 2.0] for name in ("x_mm", "y_mm", "F_N")}
 
 def test_log_without_truth_has_no_scores():
     table = tables(NUMBERS, "recorded")["logs"].set_index("what")["ours"]
-    assert table["accuracy, %"] == table["contacts made"] == "unknown"
+    assert table["accuracy, %"] == table["true contacts"] == "unknown"
     assert table["readings lost to failed reads and stuck chips"] == "1"
     assert table["contacts found"] == "3"
 
@@ -233,8 +233,8 @@ def test_pitched_log_has_its_own_table():
     pitched = {"pitch_deg": 20.0} | FOUND | {"accuracy_pct": 50.0, "reference_chip": FOUND | {"false_readings_n": 0}}
     numbers = NUMBERS | {"contacts_true_n": 3, "turning": [pitched], "turning_period_s": 0.7, "earth_uT": 50.0}
     table = tables(numbers, "simulated")["logs_turning"]
-    assert list(table["readings without contact taken for one"]) == ["7", "0"]
-    assert list(table["contacts made"]) == ["3", "3"]
+    assert list(table["readings without contact detected as contact"]) == ["7", "0"]
+    assert list(table["true contacts"]) == ["3", "3"]
     assert list(table["accuracy / %"]) == ["50", "unknown"]
     assert set(table["source"]) == {"simulated"}
     assert "once per step (0.7 s) in the earth's field of 50 µT" in table.attrs["meaning"]

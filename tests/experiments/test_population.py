@@ -147,7 +147,7 @@ def test_tables_and_figure_list_every_method():
     assert [*tables["population_fresh"]][-4:] == [*held, "n"]  # the map, both, the network
     earlier = {name: value for name, value in numbers.items() if name != "fresh"}
     assert set(tables) - set(population.tables(earlier, "simulated")) == {"population_fresh"}
-    assert set(tables["population_scaling"]["skins taught"]) == {"30", "3000"}
+    assert set(tables["population_scaling"]["training skins"]) == {"30", "3000"}
     assert all("universal" in method for method in tables["population"]["method"])
     assert (
         "simulated skins that the network was trained on"

@@ -46,7 +46,7 @@ def test_simulations_are_compared_with_bounds():
     table = tables(NUMBERS, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
-    assert table["simulated with"][2] == "law of b2, seven refitted"
+    assert table["simulated with"][2] == "law of b2, seven parameters refitted"
     assert table["memory, % (5 to 8)"].tolist()[1] == "6.5 / 7.0"
     assert table["held at the deepest"].tolist() == ["3", "0", "0", "–"]
     assert set(table["source"]) == {"recorded"}
@@ -87,5 +87,5 @@ def test_figure_labels():
 def test_friction_table_has_the_field_of_a_light_touch():
     table = tables(NUMBERS, "recorded")["compare_grip"]
     assert table["k / mu, N/mm"].tolist() == ["1e-06", "8.75"]
-    assert table["|dB| of 1 mN, µT (median place)"].tolist() == ["300", "3"]
+    assert table["|dB| at 1 mN, µT (median place)"].tolist() == ["300", "3"]
     assert "k / mu = 8.75 N/mm is used" in table.attrs["meaning"]

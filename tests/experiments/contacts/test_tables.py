@@ -27,7 +27,7 @@ DRAWN = {"along": {"4": [0.5, 0.6, 1.1], "8": [0.2, 0.9, 0.7]}}
 
 def test_table_has_all_distances_and_single_contacts():
     table = tables(NUMBERS, "recorded")["contacts"]
-    assert table["distance of the two, mm"].tolist() == ["0", "4", "8", "single contacts"]
+    assert table["distance of the contacts, mm"].tolist() == ["0", "4", "8", "single contacts"]
     assert set(table["source"]) == {"recorded"}
     assert table["along the line (0 weaker, 1 stronger)"].tolist() == ["–", "0.75 [0.60, 0.90]", "–", "–"]
     assert table["detected by residual, %"].tolist()[-1] == "17.0 [13.6, 20.4]"
@@ -45,7 +45,7 @@ def test_superposition_table_is_only_in_simulated_scenes():
 def test_figure_labels():
     drawn = figures(NUMBERS, DRAWN, "recorded")
     labels = texts_of(drawn["contacts.svg"])
-    for label in ("direction", "residual", "stronger contact", "distance of the two / mm", "%", "(recorded)"):
+    for label in ("direction", "residual", "stronger contact", "distance of the contacts / mm", "%", "(recorded)"):
         assert label in labels
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
     nearer = figures(NUMBERS | {"same_place": row(2.0)}, DRAWN, "recorded")

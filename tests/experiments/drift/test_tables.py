@@ -53,7 +53,7 @@ def test_each_window_is_a_row_with_all_policies(source):
 def test_findings_table_has_verdicts_and_sizes():
     table = tables(numbers(), "simulated")["drift_findings"]
     assert table["holds"].tolist() == ["yes", "no", "not judged (fewer than 4 boards)"]
-    assert table["of these trainings"].tolist() == ["yes", "no", "yes"]
+    assert table["over these training runs"].tolist() == ["yes", "no", "yes"]
     assert set(table["source"]) == {"simulated"}
     text = to_markdown(table)
     assert "95 % interval over pairs of networks" in text
@@ -134,7 +134,7 @@ def test_added_walk_has_a_row_for_each_step():
         for policy in ("initial", "regular", "each")
     }
     table = tables(numbers(wander=steps), "simulated")["drift_wander"]
-    assert table["further walk, µT a contact"].tolist() == ["0", "0.5", "5"]
+    assert table["added walk, µT per contact"].tolist() == ["0", "0.5", "5"]
     assert table["accuracy, % (once at the start)"].tolist() == ["90 ± 1.5", "89.5 ± 1.5", "85 ± 1.5"]
     assert "± is the standard deviation over 2 network seeds" in to_markdown(table)
     assert "After 10,000 contacts, with" in figures(numbers(wander=steps), DRAWN, "simulated")["drift_wander.svg"]
