@@ -105,7 +105,7 @@ def lay_out(
     boards_n: tuple[int, int],
     pitch_mm: float,
 ) -> Area:
-    """Convert chip positions (from the skin's middle) to the labels' coordinates; compute the borders between boards."""
+    """Convert chip positions (from the skin's middle) to the labels' coordinates; compute borders between boards."""
     middle_mm = np.array(sides_mm) / 2
     x_mm, y_mm = (
         tuple(float(m + pitch_mm * (i - n / 2)) for i in range(1, n)) for m, n in zip(middle_mm, boards_n, strict=True)

@@ -41,7 +41,7 @@ def stability(settings: Settings, results: Path) -> None:
     for case in cases:
         if not case.holds:
             say(f"warning: {settings.scene}: {case.area}, {case.case}: {case.happened}")
-    say(f"{settings.scene}: {sum(case.holds for case in cases)} of {len(cases)} extreme cases behave as they should")
+    say(f"{settings.scene}: {sum(case.holds for case in cases)} of {len(cases)} extreme cases behave as expected")
 
 
 def _learning_cases(seed: int) -> list[Case]:

@@ -17,16 +17,16 @@ from reskin.seeds import rng_for
 AREA = "chip"
 FRAMES_N = 800
 BROKEN_I = 3  # the chip that breaks
-FULL_TURN_N = 2**16
+WRAP_COUNTS_N = 2**16  # an int16 wraps by this number of counts
 
 
 def chip_cases(chip: ChipDesign, chips_n: int, seed: int) -> list[Case]:
-    """Run cases of fields beyond int16 and 50 mT, and of a failed, a stuck and a reset chip on a board."""
-    sound_uT = _still_board(chip, chips_n, seed)
+    """Run cases of fields beyond int16 and 50 mT, and of boards with a failed, a stuck or a reset chip."""
+    intact_uT = _still_board(chip, chips_n, seed)
     broken_i = min(BROKEN_I, chips_n - 1)
     return [
-        *_range(), *_failed(sound_uT, broken_i), *_stuck(sound_uT, broken_i),
-        *_reset(sound_uT, broken_i, chip.gain_sel),
+        *_range(), *_failed(intact_uT, broken_i), *_stuck(intact_uT, broken_i),
+        *_reset(intact_uT, broken_i, chip.gain_sel),
     ]  # fmt: skip
 
 
@@ -45,34 +45,36 @@ def out_of_range(b_uT: Float[np.ndarray, "n 3"], case: str, should: str, *, wrap
     read_uT, overruns = read_bare(b_uT * micro, quiet(7), rng_for(0, "stability", "range"))
     step_uT = steps_uT(7)
     truth_uT = b_uT.clip(-50e3, 50e3)
-    truth_uT -= FULL_TURN_N * step_uT * np.rint(truth_uT / (FULL_TURN_N * step_uT))
+    truth_uT -= WRAP_COUNTS_N * step_uT * np.rint(truth_uT / (WRAP_COUNTS_N * step_uT))
     counted = (overruns.wrapped_n, overruns.clipped_n) == (wrapped_n, clipped_n)
-    happened = (
+    observed = (
         f"{', '.join(f'{value:.0f}' for value in read_uT[0])} uT; {overruns.wrapped_n} counted as wrapped, "
         f"{overruns.clipped_n} as clipped"
     )
     error = float((np.abs(read_uT - truth_uT) / step_uT).max()) if counted else np.inf
-    return error_case(AREA, case, should=should, happened=happened, error=error, limit=0.51)
+    return error_case(AREA, case, should=should, happened=observed, error=error, limit=0.51)
 
 
-def _failed(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
-    few = np.zeros((FRAMES_N, sound_uT.shape[1] // 3), bool)
-    few[100:150, broken_i] = True
+def _failed(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
+    one_chip = np.zeros((FRAMES_N, intact_uT.shape[1] // 3), bool)
+    one_chip[100:150, broken_i] = True
     cases = []
-    for case, which in (("50 dropped readings of one chip", few), ("every chip dropped", np.ones_like(few))):
-        b_uT = np.where(which[..., None], faults.FAILED_B_uT, sound_uT.reshape(*which.shape, 3)).reshape(sound_uT.shape)
-        found = faults.failed_reads(b_uT, np.where(which, faults.FAILED_TEMPERATURE_degC, 25.0))
+    every_chip = np.ones_like(one_chip)
+    for case, dropped in (("50 dropped readings of one chip", one_chip), ("every chip dropped", every_chip)):
+        b_uT = np.where(dropped[..., None], faults.FAILED_B_uT, intact_uT.reshape(*dropped.shape, 3))
+        b_uT = b_uT.reshape(intact_uT.shape)
+        found = faults.failed_reads(b_uT, np.where(dropped, faults.FAILED_TEMPERATURE_degC, 25.0))
         case += ": 8028.16, 5194.00, 12943.36 uT, -880.49 degC"
-        cases.append(_marked(case, found, which, should="every such reading marked, and no other"))
+        cases.append(_marked(case, found, dropped, should="every such reading marked, and no other"))
     return cases
 
 
-def _stuck(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
-    stuck_uT, from_i = sound_uT.copy(), FRAMES_N // 2
+def _stuck(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
+    stuck_uT, from_i = intact_uT.copy(), FRAMES_N // 2
     stuck_uT[from_i:, _axes(broken_i)] = stuck_uT[from_i, _axes(broken_i)]
-    expected = np.zeros((FRAMES_N, sound_uT.shape[1] // 3), bool)
+    expected = np.zeros((FRAMES_N, intact_uT.shape[1] // 3), bool)
     expected[from_i + faults.STUCK_FRAMES_MIN_N - 1 :, broken_i] = True
-    resting = np.tile(sound_uT[:1], (FRAMES_N, 1))
+    resting = np.tile(intact_uT[:1], (FRAMES_N, 1))
     return [
         _marked("a chip that stops while the board moves", faults.stuck_chips(stuck_uT), expected,
                 should=f"marked from its {faults.STUCK_FRAMES_MIN_N}th equal reading on, and no other"),
@@ -83,18 +85,20 @@ def _stuck(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
 
 def _marked(case: str, found: Bool[np.ndarray, "f k"], expected: Bool[np.ndarray, "f k"], *, should: str) -> Case:
     hits_n, false_n = int((found & expected).sum()), int((found & ~expected).sum())
-    happened = (
+    observed = (
         f"{hits_n} of {int(expected.sum())} readings marked, and {false_n} of the {int((~expected).sum())} others"
     )
-    return condition_case(AREA, case, should=should, happened=happened, holds=bool((found == expected).all()))
+    return condition_case(AREA, case, should=should, happened=observed, holds=bool((found == expected).all()))
 
 
-def _reset(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) -> list[Case]:
-    grid_uT = np.array([faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT])  # at power-on
-    reset_uT, axes = sound_uT.copy(), _axes(broken_i)
-    reset_uT[:, axes] = np.rint(sound_uT[:, axes] / grid_uT) * grid_uT
+def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) -> list[Case]:
+    lsb_uT = np.array([faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT])  # at power-on
+    reset_uT, axes = intact_uT.copy(), _axes(broken_i)
+    reset_uT[:, axes] = np.rint(intact_uT[:, axes] / lsb_uT) * lsb_uT
     found_uT = faults.find_lsb(reset_uT)[broken_i]
-    flagged, falsely = (np.flatnonzero(faults.reset_chips(b_uT, None)).tolist() for b_uT in (reset_uT, sound_uT))
+    flagged, flagged_intact = (
+        np.flatnonzero(faults.reset_chips(b_uT, None)).tolist() for b_uT in (reset_uT, intact_uT)
+    )
     known = {f"GAIN_SEL {gain_sel} in the header": gain_sel, "no settings in the header": None}
     return [
         condition_case(AREA, f"chip {broken_i} lost its settings: its LSB is 0.98 and 1.58 uT",
@@ -102,10 +106,10 @@ def _reset(sound_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) 
                        happened=f"flagged: {flagged}; LSB found {found_uT[0]:.2f} and {found_uT[1]:.2f} uT",
                        holds=flagged == [broken_i]),
         condition_case(AREA, "no chip lost its settings", should="none flagged",
-                       happened=f"flagged: {falsely}", holds=not falsely),
+                       happened=f"flagged: {flagged_intact}", holds=not flagged_intact),
         *(
             rejection_case(AREA, f"a chip loses its settings while it is recorded, {of_header}",
-                           attempt=partial(_detect, np.concatenate([sound_uT, reset_uT]), gain_of_header),
+                           attempt=partial(_detect, np.concatenate([intact_uT, reset_uT]), gain_of_header),
                            should="reported by the ingest, with the chip and the frame")
             for of_header, gain_of_header in known.items()
         ),

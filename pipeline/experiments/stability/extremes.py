@@ -21,12 +21,12 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 
 AREA = "physics"
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # also for the reference: steps and scaling are tested, not quadrature
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # also for the reference, so that errors of quadrature cancel
 PLACE_M = np.array([2.3, -1.1]) * milli  # on no node's axis
 DEPTHS = (0.6, 0.66, slide.DEEPEST)  # of the thickness
 FINER = 4  # factor on the number of the simulator's steps
 STEPS_N = 40  # of the simulator, over a depth of one thickness
-RINGS_N, KEPT_WAVES = 160, 400.0  # rings of pressure; the shortest wave, k times the contact's radius
+RINGS_N, KEPT_WAVES = 160, 400.0  # rings of pressure; largest wave number times the contact radius
 SIZES = (0.1, 1.0, 10.0)  # tip radius over thickness
 PRESSED = 0.4  # depth relative to the smaller of thickness and tip radius
 GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # gaps between skin and chips, and cell size relative to the gap
@@ -35,15 +35,15 @@ THICKNESSES_MM = (0.2, 20.0)
 
 
 def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Run cases of deep indentations, sharp and blunt tips, near chips, thin and thick skins."""
-    even = no_spread(spreads)
-    drawn = draw_board(board, even, seed=seed, name="b0")
-    one = draw_skin(skin, even, seed=seed, name="b0_s0", rule=COARSE)
-    return [*deep(drawn, one), *tips(skin.base), *near(skin), *scaled(drawn, one)]
+    """Run cases of deep indentations, sharp and blunt tips, near chips, and thin and thick skins."""
+    spread_free = no_spread(spreads)
+    drawn_board = draw_board(board, spread_free, seed=seed, name="b0")
+    drawn_skin = draw_skin(skin, spread_free, seed=seed, name="b0_s0", rule=COARSE)
+    return [*deep(drawn_board, drawn_skin), *tips(skin.base), *near(skin), *scaled(drawn_board, drawn_skin)]
 
 
 def deep(board: Board, skin: Skin) -> list[Case]:
-    """Run cases of the deepest indentations: dB by tables, compared with finer steps without tables."""
+    """Run cases of the deepest indentations: compare dB from tables with dB from finer steps without tables."""
     cases = []
     for share in DEPTHS:
         depth_m = share * skin.thickness_m
@@ -61,14 +61,14 @@ def deep(board: Board, skin: Skin) -> list[Case]:
 
 
 def tips(base: layer.Base) -> list[Case]:
-    """Run cases of sharp and blunt tips: force, compared with rings of pressure on the textbook's layer."""
+    """Run cases of sharp and blunt tips: compare the force with that of rings of pressure on a layer."""
     cases = []
     for size in SIZES:
         thickness_m, tip_m = 2 * milli, 2 * milli * size
         depth_m = PRESSED * min(thickness_m, tip_m)
-        of = {"thickness_m": thickness_m, "tip_radius_m": tip_m}
-        found_N = layer.force(np.array([depth_m]), **of, modulus_Pa=1e6, base=base)[0]
-        contact = layer.contact_of_depth(depth_m, **of, base=base)
+        sizes = {"thickness_m": thickness_m, "tip_radius_m": tip_m}
+        found_N = layer.force(np.array([depth_m]), **sizes, modulus_Pa=1e6, base=base)[0]
+        contact = layer.contact_of_depth(depth_m, **sizes, base=base)
         truth_N = ring_force_N(depth_m, thickness_m, tip_m, 1e6, base, reach_m=1.15 * contact.radius_m)
         error = abs(found_N / truth_N - 1)
         cases.append(
@@ -97,7 +97,7 @@ def ring_force_N(
     else:
         compliance = (np.sinh(twice) - twice) / (np.cosh(twice) + twice**2 / 2 + 1)
     disc = edges_m * j1(np.outer(k_per_m, edges_m))
-    ring = (disc[:, 1:] - disc[:, :-1]) / k_per_m[:, None]  # Hankel transform of a ring's pressure of 1
+    ring = (disc[:, 1:] - disc[:, :-1]) / k_per_m[:, None]  # Hankel transform of a ring of unit pressure
     shear_Pa = modulus_Pa / 3
     sinks_m = (j0(np.outer(middles_m, k_per_m)) * (weights * compliance)) @ ring / (2 * shear_Pa)
     sphere_m = depth_m - tip_radius_m + np.sqrt(tip_radius_m**2 - middles_m**2)
@@ -113,7 +113,7 @@ def ring_force_N(
 
 
 def near(skin: SkinDesign) -> list[Case]:
-    """Run cases of a uniformly magnetised skin that slides over ever nearer chips: dipoles, compared with a box."""
+    """Run cases of a uniformly magnetised skin that slides over near chips: compare its dipoles with a box."""
     cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
     j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
     box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
@@ -135,15 +135,16 @@ def near(skin: SkinDesign) -> list[Case]:
 
 
 def scaled(board: Board, skin: Skin) -> list[Case]:
-    """Run cases with all lengths scaled: fields stay equal, forces scale as the square of lengths."""
+    """Run cases with all lengths scaled: fields stay equal, and forces scale as the square of the lengths."""
     poke_m = np.array([[*PLACE_M, 0.45 * skin.thickness_m]])
     (force_N,), (_, (change_T,)) = forces(skin, poke_m[:, 2]), changes_of_field(board, skin, poke_m)
     cases = []
     for thickness_mm in THICKNESSES_MM:
-        by = thickness_mm * milli / skin.thickness_m
-        other, chips = scale_skin(skin, by), replace(board, chips_m=board.chips_m * by)
-        (other_N,), (_, (other_T,)) = forces(other, by * poke_m[:, 2]), changes_of_field(chips, other, by * poke_m)
-        error = max(_error(other_T, change_T), abs(float(other_N / (by**2 * force_N)) - 1))
+        scale = thickness_mm * milli / skin.thickness_m
+        other, chips = scale_skin(skin, scale), replace(board, chips_m=board.chips_m * scale)
+        (other_N,) = forces(other, scale * poke_m[:, 2])
+        _, (other_T,) = changes_of_field(chips, other, scale * poke_m)
+        error = max(_error(other_T, change_T), abs(float(other_N / (scale**2 * force_N)) - 1))
         cases.append(
             error_case(AREA, f"a skin of {thickness_mm:g} mm",
                        should="equal dB where all lengths scale, force as their square",
@@ -152,20 +153,20 @@ def scaled(board: Board, skin: Skin) -> list[Case]:
     return cases
 
 
-def scale_skin(skin: Skin, by: float) -> Skin:
+def scale_skin(skin: Skin, scale: float) -> Skin:
     """Scale every length of a skin; its material is unchanged, so springs scale as lengths."""
     hold = skin.hold
     if hold is not None:
         x_m, y_m = hold.give_m
         hold = slide.Hold(
             **asdict(hold)
-            | {"give_m": (by * x_m, by * y_m), "lets_go_m2": by**2 * hold.lets_go_m2}
-            | {"springs_N_per_m": by * hold.springs_N_per_m}
+            | {"give_m": (scale * x_m, scale * y_m), "lets_go_m2": scale**2 * hold.lets_go_m2}
+            | {"springs_N_per_m": scale * hold.springs_N_per_m}
         )
     return replace(
-        skin, nodes_m=by * skin.nodes_m, moments_A_m2=by**3 * skin.moments_A_m2, seat_m=by * skin.seat_m,
-        sides_m=(by * skin.sides_m[0], by * skin.sides_m[1]), thickness_m=by * skin.thickness_m,
-        tip_radius_m=by * skin.tip_radius_m, depth_zero_m=by * skin.depth_zero_m, hold=hold,
+        skin, nodes_m=scale * skin.nodes_m, moments_A_m2=scale**3 * skin.moments_A_m2, seat_m=scale * skin.seat_m,
+        sides_m=(scale * skin.sides_m[0], scale * skin.sides_m[1]), thickness_m=scale * skin.thickness_m,
+        tip_radius_m=scale * skin.tip_radius_m, depth_zero_m=scale * skin.depth_zero_m, hold=hold,
     )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ STEPS_N = BLOCK_STEPS_N  # the training loop checks its loss once
 CONSTANT_uT = 12.3
 BOTTLENECK = "layer3.weight"
 ROUNDING = 1e-4  # of weights near 0.1: float32 sums in another order differ by 6e-8, which 50 steps amplify
-STILL = 1e-12  # a learning rate at which the weights hardly change
+NEGLIGIBLE_RATE = 1e-12  # learning rate at which the weights hardly change
 SCALE_POWERS = (-20, -10, 10, 20)  # of two, about 1e-6 to 1e6: float32 labels are scaled by these without rounding
 RECIPE = Recipe(
     architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=32,
@@ -54,14 +54,18 @@ def triplet_cases(seed: int) -> list[Case]:
 
 
 def loop_cases(seed: int) -> list[Case]:
-    """Run cases of overflowing rates and weights, a dead network, very few rows, and the same seed twice."""
+    """Run cases of overflowing rates and weights, a dead network, very few rows, and two runs from one seed."""
     job, rows = _job(seed), _rows(seed)
-    overflow = [_explodes(job, rows, 1e1), _explodes(job, rows, 1e10), _beside_one_that_overflows(job, rows)]
+    overflow = [
+        _exploding_weights(job, rows, 1e1),
+        _exploding_weights(job, rows, 1e10),
+        _overflowing_neighbour(job, rows),
+    ]
     return [*overflow, _collapsed(job, rows), *_few_rows(job, rows), _same_seed(job, rows)]
 
 
 def fold_cases() -> list[Case]:
-    """Run cases of folds that need more groups than exist."""
+    """Run cases of folds that need more boards or skins than there are."""
     boards = ["b1", "b2", "b3"]
     folds = {
         "one board, to be left out": ("lobo", boards[:1], Split()),
@@ -90,20 +94,22 @@ def _constant(job: TrainingJob, rows: TrainingData, channels: list[int], case: s
     db_uT[:, channels] = CONSTANT_uT
     trained = _train(job, replace(rows, db_uT=db_uT))
     scaler = trained.scaler
-    seen = float(np.abs(scaler.encode(db_uT)[:, channels]).max())
-    happened = f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {seen:g} seen; {_outcome(trained)}"
-    return error_case(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=happened,
-                      error=seen if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
+    largest_input = float(np.abs(scaler.encode(db_uT)[:, channels]).max())
+    observed = (
+        f"its scale {scaler.input_scale[channels].min():.0e} uT, at most {largest_input:g} seen; {_outcome(trained)}"
+    )
+    return error_case(AREA, case, should="seen as 0 by a floor under its scale; trained as ever", happened=observed,
+                      error=largest_input if _is_sound(trained) else np.inf, limit=0.0)  # fmt: skip
 
 
 def _identical(job: TrainingJob, rows: TrainingData) -> Case:
-    same = replace(rows, db_uT=np.full_like(rows.db_uT, CONSTANT_uT))
-    plain, pulled = (_train(_with(job, triplet_weight=weight), same) for weight in (0.0, 1e3))
-    apart = _distance(plain.weights, pulled.weights)
-    happened = f"weights {apart:g} apart from those without triplets after {STEPS_N} steps; {_outcome(pulled)}"
+    identical = replace(rows, db_uT=np.full_like(rows.db_uT, CONSTANT_uT))
+    plain, pulled = (_train(_with(job, triplet_weight=weight), identical) for weight in (0.0, 1e3))
+    distance = _distance(plain.weights, pulled.weights)
+    observed = f"weights {distance:g} apart from those without triplets after {STEPS_N} steps; {_outcome(pulled)}"
     should = "loss 0 and a finite gradient of 0: whatever its weight, it pulls nowhere"
-    return error_case(AREA, "triplets of identical readings, weighed 1000", should=should, happened=happened,
-                      error=apart if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
+    return error_case(AREA, "triplets of identical readings, weighed 1000", should=should, happened=observed,
+                      error=distance if _is_sound(pulled) else np.inf, limit=0.0)  # fmt: skip
 
 
 def _equidistant(job: TrainingJob, rows: TrainingData) -> list[Case]:
@@ -115,46 +121,49 @@ def _equidistant(job: TrainingJob, rows: TrainingData) -> list[Case]:
         "two pokes a skin: from each, only the other one": (replace(job, train=np.arange(4)), rows),
     }
     should = "refused: nothing is nearer than anything, and no sampler is endless"
-    return [rejection_case(AREA, case, should=should, attempt=partial(_train, *at)) for case, at in attempts.items()]
+    return [
+        rejection_case(AREA, case, should=should, attempt=partial(_train, *arguments))
+        for case, arguments in attempts.items()
+    ]
 
 
-def _explodes(job: TrainingJob, rows: TrainingData, rate: float) -> Case:
+def _exploding_weights(job: TrainingJob, rows: TrainingData, rate: float) -> Case:
     start, steps_n = _start(job, rows, 1e3), 3 * STEPS_N
     trained = _train(_tuned(job, start, steps_n=steps_n, rate_max=rate), rows)
     kept_step = STEPS_N * len(trained.curve)
     stopped = "never stopped" if trained.stopped_step is None else f"not finite at step {trained.stopped_step}"
     losses = f", losses {max(trained.curve):.1e} at most, {trained.curve[-1]:.2g} at last" if trained.curve else ""
     sound = all(np.isfinite(value).all() for value in trained.weights.values())
-    happened = f"{stopped}; weights of step {kept_step} of {steps_n}, {'all' if sound else 'not all'} finite{losses}"
+    observed = f"{stopped}; weights of step {kept_step} of {steps_n}, {'all' if sound else 'not all'} finite{losses}"
     case = f"bottleneck scaled 1e3, learning rate {rate:g}"
-    return condition_case(AREA, case, should="stops, says where, and keeps the last finite weights", happened=happened,
+    return condition_case(AREA, case, should="stops, says where, and keeps the last finite weights", happened=observed,
                 holds=sound and trained.stopped_step == kept_step + STEPS_N)  # fmt: skip
 
 
-def _beside_one_that_overflows(job: TrainingJob, rows: TrainingData) -> Case:
+def _overflowing_neighbour(job: TrainingJob, rows: TrainingData) -> Case:
     sound, broken = (_tuned(job, _start(job, rows, scale)) for scale in (1.0, 1e30))
     alone = _train(sound, rows)
     beside, overflowing = train_stack([sound, broken], rows)
-    apart = _distance(alone.weights, beside.weights)
-    happened = f"{_outcome(overflowing)}; its neighbour: {_outcome(beside)}, {apart:g} from what it becomes alone"
+    change = _distance(alone.weights, beside.weights)
+    observed = f"{_outcome(overflowing)}; its neighbour: {_outcome(beside)}, {change:g} from what it becomes alone"
     return error_case(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
-                      happened=happened, limit=ROUNDING,
-                      error=apart if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
+                      happened=observed, limit=ROUNDING,
+                      error=change if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
 
 
 def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:
     dead, alive = (
-        _train(_tuned(job, _start(job, rows, scale), steps_n=CHECKED_STEPS_N, rate_max=STILL), rows)
+        _train(_tuned(job, _start(job, rows, scale), steps_n=CHECKED_STEPS_N, rate_max=NEGLIGIBLE_RATE), rows)
         for scale in (0.0, 1.0)
     )
     spread = float(np.ptp(dead.predicted, axis=0).max())
-    happened = (
+    observed = (
         f"{_outcome(dead)}, which differ by {spread:.1g}; explains {dead.explained_min:.2g} of its training rows, "
         f"{'counted as collapsed' if dead.collapsed else 'taken as sound'}; the same network alive: "
         f"{alive.explained_min:.2g}, {'counted as collapsed' if alive.collapsed else 'taken as sound'}"
     )
     return condition_case(AREA, "a network that died, with a finite loss", should="counted as collapsed, and it alone",
-                          happened=happened,
+                          happened=observed,
                           holds=_is_sound(dead) and dead.collapsed and not alive.collapsed)  # fmt: skip
 
 
@@ -175,16 +184,16 @@ def _few_rows(job: TrainingJob, rows: TrainingData) -> list[Case]:
 
 def _label_scales(job: TrainingJob, rows: TrainingData) -> list[Case]:
     true = rows.target[job.test]
-    as_ever = score(true, _train(job, rows).predicted)
+    unscaled = score(true, _train(job, rows).predicted)
     cases = []
     for power in SCALE_POWERS:
         scale = 2.0**power
         trained = _train(job, replace(rows, target=_scale(rows.target, scale)))
-        back = score(true, _scale(trained.predicted, 1 / scale))
-        error = max(abs(back[name] / as_ever[name] - 1) for name in METRICS)
-        happened = ", ".join(f"{name} {back[name]:.4g}, was {as_ever[name]:.4g}" for name in METRICS)
+        rescaled = score(true, _scale(trained.predicted, 1 / scale))
+        error = max(abs(rescaled[name] / unscaled[name] - 1) for name in METRICS)
+        observed = ", ".join(f"{name} {rescaled[name]:.4g}, was {unscaled[name]:.4g}" for name in METRICS)
         cases.append(error_case(AREA, f"labels times 2^{power}", should="taken back to mm and N: exactly as ever",
-                                happened=happened, error=error, limit=0.0))  # fmt: skip
+                                happened=observed, error=error, limit=0.0))  # fmt: skip
     return cases
 
 
@@ -195,11 +204,13 @@ def _same_seed(job: TrainingJob, rows: TrainingData) -> Case:
         (first.predicted, again.predicted),
         *((first.weights[name], again.weights[name]) for name in again.weights),
     ]
-    same_n = sum(value.tobytes() == twin.tobytes() for value, twin in pairs)
-    away = _distance(first.weights, _train(replace(job, seed_i=1), rows).weights)
-    happened = f"{same_n} of {len(pairs)} arrays identical bit for bit; another seed's weights {away:.2g} away"
+    identical_n = sum(value.tobytes() == other.tobytes() for value, other in pairs)
+    seed_distance = _distance(first.weights, _train(replace(job, seed_i=1), rows).weights)
+    observed = (
+        f"{identical_n} of {len(pairs)} arrays identical bit for bit; another seed's weights {seed_distance:.2g} away"
+    )
     return condition_case(AREA, "trained twice from one seed", should="the same bytes, and others from another seed",
-                happened=happened, holds=same_n == len(pairs) and away > 0)  # fmt: skip
+                happened=observed, holds=identical_n == len(pairs) and seed_distance > 0)  # fmt: skip
 
 
 def _train(job: TrainingJob, rows: TrainingData) -> TrainingResult:

@@ -28,9 +28,9 @@ PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7]]) * milli
 DEPTH = 0.3  # of the thickness
 FLAGGED_DEPTH = 0.6  # of the thickness
 POKES_N = 2000
-BYTES_MAX_N = 1000  # per poke: 1e6 pokes need 1 GB; 120 bytes of each are its result
+BYTES_MAX_N = 1000  # per poke, so that 1e6 pokes need at most 1 GB; the result takes 120 of these bytes
 PATH_MM = (0.0, 0.1, 0.5, 4.0)  # of a drag
-STICKY = 1e6  # friction without slip
+STICKY = 1e6  # friction coefficient at which nothing slips
 STIFF = signals.stiff(1e8)
 
 
@@ -54,8 +54,8 @@ def time_cases() -> list[Case]:
 def _step(case: str, dt_over_fastest: float, should: str) -> Case:
     dt_s = dt_over_fastest * float(STIFF.tau_s[0])
     found, error = advance(signals.STATE, 1.3, dt_s, STIFF), signals.step_error(dt_s, STIFF)
-    happened = f"relative error {error:.1e}, {np.count_nonzero(np.isfinite(found))} of {len(found)} values finite"
-    return error_case("time", case, should=should, happened=happened, error=error, limit=signals.ROUNDING)
+    observed = f"relative error {error:.1e}, {np.count_nonzero(np.isfinite(found))} of {len(found)} values finite"
+    return error_case("time", case, should=should, happened=observed, error=error, limit=signals.ROUNDING)
 
 
 def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
@@ -88,7 +88,7 @@ def _pokes_m(skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n 3"]:
 
 
 def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
-    """Run cases of skins without stiffness and as stiff as metal.
+    """Run cases of skins without stiffness and with very high stiffness.
 
     The depth is prescribed, so the modulus affects only the friction.
     """
@@ -190,9 +190,9 @@ def single_precision(board: Board, fine: Skin) -> Case:
     each_T = magnet.field_of_each(moved_x, moved_m, chips) - magnet.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
     error_uT = float(np.abs(single_T - double_T).max() / micro)
-    happened = f"{single_T.dtype}, {len(x)} dipoles: {error_uT:.1e} uT off, of {np.abs(double_T).max() / micro:.3g} uT"
+    observed = f"{single_T.dtype}, {len(x)} dipoles: {error_uT:.1e} uT off, of {np.abs(double_T).max() / micro:.3g} uT"
     return error_case(AREA, "dB in single precision", should="within 0.25 uT of double: a tenth of a chip's noise",
-                      happened=happened, error=error_uT, limit=0.25)  # fmt: skip
+                      happened=observed, error=error_uT, limit=0.25)  # fmt: skip
 
 
 def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
@@ -211,13 +211,13 @@ def memory(board: Board, skin: Skin) -> Case:
     )
     changes_of_field(board, skin, pokes_m[:1])  # computes the cached table, so that it is not measured below
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
-    each_n = (many_n - few_n) / (3 * POKES_N)
-    happened = (
-        f"{POKES_N} pokes {few_n / 1e6:.2f} MB, {4 * POKES_N} pokes {many_n / 1e6:.2f} MB: {each_n:.0f} bytes a poke, "
-        f"results included, {each_n:.0f} MB for 1e6"
+    per_poke_n = (many_n - few_n) / (3 * POKES_N)
+    observed = (
+        f"{POKES_N} pokes {few_n / 1e6:.2f} MB, {4 * POKES_N} pokes {many_n / 1e6:.2f} MB: {per_poke_n:.0f} bytes a "
+        f"poke, results included, {per_poke_n:.0f} MB for 1e6"
     )
     return error_case(AREA, "1e6 pokes", should=f"memory grows by no more than {BYTES_MAX_N} bytes a poke",
-                      happened=happened, error=each_n, limit=float(BYTES_MAX_N))  # fmt: skip
+                      happened=observed, error=per_poke_n, limit=float(BYTES_MAX_N))  # fmt: skip
 
 
 def drag_cases(skin: SkinDesign) -> list[Case]:

@@ -21,7 +21,7 @@ from reskin.simulation.contact import TangentialResponse, drag_tip
 
 AREA = "physics"
 DEPTH = 0.35  # of the thickness: the deepest drag of a scene, and the steepest shear
-PLACE_M = np.array([5.0, -3.0]) * milli  # from the skin's centre: there a drag rotates it too
+PLACE_M = np.array([5.0, -3.0]) * milli  # from the skin's centre; a drag at this place also rotates the skin
 WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli
 HELD_M = 0.1 * milli  # displacement of a tip that then lifts
 LIFTS_N = (3, 30)  # stops on the way up
@@ -35,10 +35,15 @@ def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
     """Run cases of a skin without spreads on the first board; none if the skin is not held by springs."""
     if skin.hold is None:
         return []
-    even = no_spread(spreads)
-    drawn = draw_board(board, even, seed=seed, name="b0")
-    one = draw_skin(skin, even, seed=seed, name="b0_s0", rule=COARSE)
-    return [*stick_slip(drawn, one), lift(drawn, one), *edge(drawn, one), *force_control(one)]
+    spread_free = no_spread(spreads)
+    drawn_board = draw_board(board, spread_free, seed=seed, name="b0")
+    drawn_skin = draw_skin(skin, spread_free, seed=seed, name="b0_s0", rule=COARSE)
+    return [
+        *stick_slip(drawn_board, drawn_skin),
+        lift(drawn_board, drawn_skin),
+        *edge(drawn_board, drawn_skin),
+        *force_control(drawn_skin),
+    ]
 
 
 def stick_slip(board: Board, skin: Skin) -> list[Case]:
@@ -47,12 +52,12 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
     normal_N = forces(skin, path_m[:, 2])
     smooth, sticky = (_drag(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
     assert skin.hold is not None
-    slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))  # pressing slides it as little as dragging
+    slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))  # a press, like a drag, hardly slides this skin
     _, pressed_T = changes_of_field(board, slippery, path_m)
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
     off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
     off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
-    # Without slip, layer and springs, which are in series, take up the whole path.
+    # Without slip, layer and springs (in series) take up the whole path.
     pulled_N = sticky.force_N[0]
     slides_m_per_N = slide.compliance_m_per_N(path_m[:, :2] - skin.seat_m, skin.sides_m, _springs(skin))
     taken_m = pulled_N / _layer_N_per_m(skin, DEPTH) + (slides_m_per_N @ pulled_N[:, :, None])[:, :, 0]
@@ -84,12 +89,12 @@ def lift(board: Board, skin: Skin) -> Case:
         reach_m = np.minimum.accumulate(np.minimum(HELD_M, limit_N[1:-1] * give_m_per_N))
         errors.append(np.abs(pulled_N[1:-1, 0] - reach_m / give_m_per_N).max() / limit_N[0])
         last_N.append(np.abs(pulled_N[-1]).max())
-    happened = (
+    observed = (
         f"in {LIFTS_N[0]} and {LIFTS_N[1]} stops: {max(errors):.1e} of the first friction off; {max(last_N):g} N left"
     )
     return error_case(AREA, "a tip that pulls the skin and is lifted there",
                       should="the least of spring and friction so far, in any number of stops; no force once it is off",
-                      happened=happened, error=float(max(*errors, *last_N)), limit=1e-9)  # fmt: skip
+                      happened=observed, error=float(max(*errors, *last_N)), limit=1e-9)  # fmt: skip
 
 
 def edge(board: Board, skin: Skin) -> list[Case]:
@@ -107,8 +112,8 @@ def edge(board: Board, skin: Skin) -> list[Case]:
     wanted_m = slide.press_displacement_m(places_m, load, give_m=skin.hold.give_m, away=skin.hold.away)
     moved_m = slides.move_m + slides.spin_rad[:, None] * np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     share = (moved_m * wanted_m).sum(axis=1) / (wanted_m**2).sum(axis=1)
-    off = float(np.abs(moved_m - share[:, None] * wanted_m).max() / np.abs(wanted_m).max())
-    used = skin.hold.grip_N_per_m * np.hypot(*slides.move_m.T) / force_N
+    error = float(np.abs(moved_m - share[:, None] * wanted_m).max() / np.abs(wanted_m).max())
+    friction_used = skin.hold.grip_N_per_m * np.hypot(*slides.move_m.T) / force_N
     sizes_uT = ", ".join(f"{1e6 * size:.3g}" for size in np.abs(change_T).max(axis=(1, 2)))
     return [
         condition_case(AREA, f"pokes {EDGE_M / milli:g} mm inside the free edge, at a side and at a corner",
@@ -117,23 +122,23 @@ def edge(board: Board, skin: Skin) -> list[Case]:
                        holds=bool(np.isfinite(change_T).all() and (np.abs(change_T).max(axis=(1, 2)) > 0).all())),
         error_case(AREA, "the slide of a skin that is poked at its free edge",
                    should="the place goes where the press takes it, turn and motion together",
-                   happened=f"{np.abs(slides.spin_rad).max():.2g} rad, relative error {off:.1e}", error=off,
+                   happened=f"{np.abs(slides.spin_rad).max():.2g} rad, relative error {error:.1e}", error=error,
                    limit=ROUNDING),
         condition_case(AREA, "the force that this slide takes", should="some, and no more than friction holds",
-                       happened=f"at most {used.max():.3g} of the tip's friction",
-                       holds=bool((used > 0).all() and (used <= 1).all())),
+                       happened=f"at most {friction_used.max():.3g} of the tip's friction",
+                       holds=bool((friction_used > 0).all() and (friction_used <= 1).all())),
     ]  # fmt: skip
 
 
 def force_control(skin: Skin) -> list[Case]:
     """Run cases of force control: the depth for a force is the same on loading and unloading."""
     assert skin.hold is not None
-    of = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
+    sizes = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
-    force_N = slide.force_at(depth_m, **of)
-    off = float(np.abs(slide.depth_at(force_N, **of) - depth_m).max() / skin.thickness_m)
+    force_N = slide.force_at(depth_m, **sizes)
+    off = float(np.abs(slide.depth_at(force_N, **sizes) - depth_m).max() / skin.thickness_m)
     beyond_N = force_N.max() * np.array([1.0, 2.0, 1e6])
-    held_m, counted_n = slide.depth_at(beyond_N, **of), slide.count_clipped(beyond_N, **of)
+    held_m, counted_n = slide.depth_at(beyond_N, **sizes), slide.count_clipped(beyond_N, **sizes)
     deepest = held_m / (slide.DEEPEST * skin.thickness_m)
     return [
         error_case(AREA, f"pressed to {slide.DEEPEST:g} of the thickness by force, and let go",

@@ -18,7 +18,7 @@ AREA = "wire"
 FRAMES_N = 40
 CUT_I = 20  # the frame in which a stream is damaged
 GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
-BLOCKS_N = 3  # memory for this number of blocks is compared with that for four times as many
+BLOCKS_N = 3  # the memory for this number of blocks is compared with that for four times as many
 
 
 @dataclass(frozen=True)
@@ -77,23 +77,24 @@ def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
 def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
     """Decode a damaged stream, and count lost frames, false frames and bytes."""
     kept, account = decode_portions(damage.portions, wire, frames.temperature_degC.shape[1])
-    sent, got = (Counter(records(of)) for of in (_clean(encode(frames, wire), wire, frames), kept))
+    sent, got = (Counter(records(decoded)) for decoded in (_clean(encode(frames, wire), wire, frames), kept))
     missing_n, false_n = (sent - got).total(), (got - sent).total()
     skipped_n = sum(n for name, n in account.items() if name.startswith("skipped_"))
-    open_n, not_finite_n = account["bytes_n"] - account["frame_bytes_n"] - skipped_n, account["not_finite_frames_n"]
-    happened = (
+    unaccounted_n = account["bytes_n"] - account["frame_bytes_n"] - skipped_n
+    not_finite_n = account["not_finite_frames_n"]
+    observed = (
         f"{got.total() - false_n} of {sent.total()} frames back, {false_n} false, {not_finite_n} not finite; "
-        f"{skipped_n} bytes counted as lost, {open_n} unaccounted for"
+        f"{skipped_n} bytes counted as lost, {unaccounted_n} unaccounted for"
     )
-    holds = missing_n <= damage.lost_n and false_n <= damage.false_n and open_n == 0
+    holds = missing_n <= damage.lost_n and false_n <= damage.false_n and unaccounted_n == 0
     holds = holds and account["bytes_n"] == sum(map(len, damage.portions))
     holds = holds and damage.not_finite_n in (None, not_finite_n)
-    return Case(AREA, f"{damage.case} ({wire})", damage.should, happened, float(missing_n), float(damage.lost_n), holds)
+    return Case(AREA, f"{damage.case} ({wire})", damage.should, observed, float(missing_n), float(damage.lost_n), holds)
 
 
 def _refusals(frames: Frames) -> list[Case]:
     chips_n = frames.temperature_degC.shape[1]
-    # At room temperature no float contains CR LF, at which a frame of another length could end by chance.
+    # At room temperature no float contains CR LF; otherwise, a frame of another length could end there by chance.
     data = encode(replace(frames, temperature_degC=np.full_like(frames.temperature_degC, 25.0)), "binary")
     attempts: dict[str, tuple[bytes, Wire, int, str]] = {
         "a stream without a byte": (b"", "binary", chips_n, "refused"),
@@ -118,11 +119,11 @@ def _memory(frames: Frames, wire: Wire) -> Case:
     decode(1)
     few_n, many_n = (peak_bytes(partial(decode, n)) for n in (BLOCKS_N, 4 * BLOCKS_N))
     frames_n = BLOCK_FRAMES_N // len(frames) * len(frames)
-    happened = (
+    observed = (
         f"blocks of {frames_n} frames: {BLOCKS_N} need {few_n / 1e6:.1f} MB, {4 * BLOCKS_N} need {many_n / 1e6:.1f} MB"
     )
     return error_case(AREA, f"a stream of any length ({wire})", should="no more memory for a longer stream, within 2 %",
-                      happened=happened, error=many_n / few_n - 1, limit=0.02)  # fmt: skip
+                      happened=observed, error=many_n / few_n - 1, limit=0.02)  # fmt: skip
 
 
 def _with_not_finite(frames: Frames, wire: Wire) -> bytes:

@@ -32,7 +32,7 @@ from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, p
 
 HALF_SPACE_M = 100.0  # thickness of a layer whose base has no influence under a tip of a few millimetres
 A0 = 1.770  # integral of 1 - compliance (Dimitriadis et al. 2002 fit 1.780)
-BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002, powers of chi = sqrt(R d) / h
+BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
 RINGS_N = 40
 SKIN_FORCE = "force of the skin"
 FRICTION = 0.8
@@ -93,7 +93,9 @@ def dense_profile(kh: Any) -> Callable[[Any], Any]:
     """Solve for W under a pressure of 1 in 2 G k: W'' + W = 0 at both faces, W = 0 below, 3 W' - W''' = 2 above."""
     basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
     conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
-    rows = [[sum(c * mpmath.diff(w, z, n) for n, c in of.items()) for w in basis] for of, z in conditions]
+    rows = [
+        [sum(c * mpmath.diff(w, z, n) for n, c in derivatives.items()) for w in basis] for derivatives, z in conditions
+    ]
     weights = mpmath.lu_solve(mpmath.matrix(rows), mpmath.matrix([0, 0, 0, 1]))
     return lambda z: sum(weight * w(z) for weight, w in zip(weights, basis, strict=True))
 
@@ -166,7 +168,7 @@ def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarr
 
 
 def _disc_deflection_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float:
-    # Deflection under unit pressure / 2G on a disc: a half-space's (elliptic integrals) less the effect of the base.
+    # Deflection under unit pressure / 2G on a disc: that of a half-space (elliptic integrals) minus the base's effect.
     m = (min(r_m, disc_m) / max(r_m, disc_m)) ** 2
     free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
     k = np.linspace(1e-3, 25, 1500) / h_m
@@ -240,7 +242,7 @@ def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 def descent(depth_m: float, steps_n: int = STEPS_N) -> Float[np.ndarray, " d"]:
     """List depths from 0 in equal steps; stops at a quarter and half of the first are added.
 
-    At small depths the contact radius grows as a square root.
+    These are needed because the contact radius grows as a square root at small depths.
     """
     even = np.linspace(0, depth_m, steps_n + 1)
     return np.concatenate([[0.0, even[1] / 4, even[1] / 2], even[1:]])
@@ -288,7 +290,8 @@ def finite_deformation(press: layer.IndentedLayer, depth_m: float) -> list[Check
     depths_m = descent(depth_m)
     end = deformation.follow(all_r_m, all_z_m, depths_m, press=press)[-1]
     _, right, left, above, below, base = np.split(np.stack([end.r_m, end.z_m]), inside * np.arange(1, 6), axis=1)
-    numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)  # 2 (r, z), 2 (by r0, by z0), places
+    # Axes: r and z, derivative with respect to r0 and z0, place.
+    numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)
     f, hoop = end.f[:inside], end.hoop[:inside]
     gradient = max(max_error(f, numeric.transpose(2, 0, 1)), max_error(hoop, end.r_m[:inside] / r_m))
     return [
@@ -315,7 +318,7 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 
 
 def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check that, on a slipping base, the displaced volume flows out through every circle around the tip."""
+    """Check that, on a slipping base, the displaced volume passes through every circle around the tip."""
     h_m = press.thickness_m
     r_m, z_m = (part.ravel() for part in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
     end = deformation.follow(r_m, z_m, descent(depth_m), press=press)[-1]
@@ -333,7 +336,7 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
 
 
 def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
-    """Follow all dipoles of a skin through an indentation to true depths without a table; then slide the skin.
+    """Follow all dipoles of a skin through an indentation to true depths, without a table, then slide the skin.
 
     Each moment rotates by R of F = R U, from a singular value decomposition. No dipole may be on the tip's axis.
     """
@@ -358,7 +361,7 @@ COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # for checks that hold for any r
 DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # for the errors of the table and of the steps
 EVERY_PLACE = 5  # every fifth of the protocol's 65 places
 REFERENCE_STEPS_N = 16
-UNSEEN_uT = 1.0  # a third of a chip's noise; added in squares, it increases the noise by 5 %
+UNSEEN_uT = 1.0  # a third of a chip's noise; added in quadrature, it increases the noise by 5 %
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # on no node's axis
 Places = Float[np.ndarray, "p 2"]
 
@@ -378,7 +381,7 @@ def check_indentations(
         skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
     )
     dense = skin_of(DENSE)
-    # The rig's compliance has a direction, so the symmetries hold only without it.
+    # The rig's compliance depends on direction, so the symmetries hold only without compliance.
     even = (
         skin
         if skin.hold is None
@@ -436,9 +439,9 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
-    """Check that dB rotates, mirrors or stays with board, skin and indentations (without spreads).
+    """Check that dB rotates and mirrors with board, skin and indentations, and is unchanged if all are shifted.
 
-    The check by shifting holds for any skin.
+    Rotation and mirror hold only without spreads, the shift for any skin.
     """
     sign = -1 if polarity == "checkerboard" else 1  # a quarter turn, or a mirror in x, swaps a checkerboard's poles
     mirror, shift_m = np.diag([-1.0, 1.0, 1.0]), np.array([0.4, -0.7, 0.0]) * milli

@@ -28,7 +28,7 @@ from reskin.seeds import rng_for
 
 NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in units of a cell's side
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
-MU_0_DIGITS = 1e-8  # between CODATA years mu_0 differs by 1e-10 to 1e-9
+MU_0_DIGITS = 1e-8  # mu_0 differs by 1e-10 to 1e-9 between CODATA years
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter turn about z
 
 
@@ -122,15 +122,15 @@ def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polar
 
 def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     rng = rng_for(seed, "verification", "dipoles")
-    # Not centred at the origin: otherwise a wrong sign of the separation could go unnoticed.
+    # Not centred at the origin, because a wrong sign of the separation could then go unnoticed.
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), (60, 3))
     moments = 1e-5 * rng.standard_normal((60, 3))
     moved_m, turned = nodes_m + 1e-4 * rng.standard_normal((60, 3)), moments + 1e-6 * rng.standard_normal((60, 3))
     observers_m = rng.uniform((-3e-3, -3e-3, -2e-3), (3e-3, 3e-3, -1e-3), (5, 3))
     before_T, after_T = (
-        magpylib.getB([magpylib.misc.Dipole(moment=m, position=x) for x, m in zip(places_m, those, strict=True)],
+        magpylib.getB([magpylib.misc.Dipole(moment=m, position=x) for x, m in zip(places_m, m_A_m2, strict=True)],
                       observers_m, sumup=True)
-        for places_m, those in ((nodes_m, moments), (moved_m, turned))
+        for places_m, m_A_m2 in ((nodes_m, moments), (moved_m, turned))
     )  # fmt: skip
     change_T = change_of_field((nodes_m, moments), (moved_m, turned), observers_m)
     scaled_T = change_of_field((nodes_m, factor * moments), (moved_m, factor * turned), observers_m)
@@ -227,14 +227,14 @@ def noise(chip: ChipDesign, seed: int) -> list[Check]:
 def temperature(seed: int) -> Check:
     rng = rng_for(seed, "verification", "temperature")
     true_degC = rng.uniform(0, 60, (500, 5))
-    raw = np.rint((true_degC - 25) * 45.2 + 46244)  # counts of the data sheet, back by its own formula
+    raw = np.rint((true_degC - 25) * 45.2 + 46244)  # counts by the data sheet's formula, which the next line inverts
     error_degC = max_error(read_temperature(true_degC, quiet(7), rng), 25 + (raw - 46244) / 45.2)
     return Check("chip", "temperature", "25 + (raw - 46244) / 45.2, data sheet", error_degC, "degC", 4e-6,
                  "rounding of float32 near 60")  # fmt: skip
 
 
 FRAMES_N = 300
-CRLF_degC = 34.513275  # its float32 holds CR LF
+CRLF_degC = 34.513275  # the bytes of its float32 contain CR LF
 CRLF_SHARE = 0.05
 
 
@@ -255,8 +255,8 @@ def make_frames(frames_n: int, chips_n: int, *, gain_sel: int, rng: np.random.Ge
     counts = rng.integers(-20_000, 20_000, (frames_n, chips_n, 3))
     b_uT = (counts * steps_uT(gain_sel)).reshape(frames_n, -1).astype(np.float32)
     usual_degC = (rng.integers(2000, 4000, (frames_n, chips_n)) / 100).astype(np.float32)
-    held_degC = np.where(rng.random(usual_degC.shape) < CRLF_SHARE, np.float32(CRLF_degC), usual_degC)
-    return Frames(b_uT, held_degC, np.arange(frames_n) / 512.0, np.zeros(frames_n, np.int64))
+    temperature_degC = np.where(rng.random(usual_degC.shape) < CRLF_SHARE, np.float32(CRLF_degC), usual_degC)
+    return Frames(b_uT, temperature_degC, np.arange(frames_n) / 512.0, np.zeros(frames_n, np.int64))
 
 
 def binary(frames: Frames, layout: Wire) -> list[Check]:
@@ -313,8 +313,8 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
 POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 indentations in 30 s
 NAME = "relaxation of the force"
 STATE = np.array([0.7, -0.2, 0.4])
-RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # of the slowest relaxation to the fastest, which takes 1 ms
-STEPS = (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)  # over the fastest relaxation
+RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # of the slowest to the fastest relaxation time, which is 1 ms
+STEPS = (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)  # time steps over the fastest relaxation time
 ROUNDING = 1e-14  # a few dozen operations on doubles
 
 
@@ -330,7 +330,7 @@ def check_relaxation() -> list[Check]:
 
 
 def stiff(ratio: float) -> Prony:
-    """Return a relaxation with three times: 1 ms, `ratio` times as long, and their geometric mean."""
+    """Return a relaxation with three times: 1 ms, `ratio` times 1 ms, and their geometric mean."""
     return Prony(np.array([1e-3, 1e-3 * np.sqrt(ratio), 1e-3 * ratio]), np.array([0.3, 0.2, 0.1]))
 
 

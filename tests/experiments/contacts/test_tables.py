@@ -32,7 +32,7 @@ def test_table_has_all_distances_and_single_contacts():
     assert table["along the line (0 weaker, 1 stronger)"].tolist() == ["–", "0.75 [0.60, 0.90]", "–", "–"]
     assert table["detected by residual, %"].tolist()[-1] == "17.0 [13.6, 20.4]"
     assert "noise is that of two readings" in table.attrs["meaning"]
-    assert "residual and networks disagree were trained on" in table.attrs["meaning"]
+    assert "`residual` and `networks disagree` were trained on" in table.attrs["meaning"]
     assert "5 % false alarms" in table.attrs["meaning"]
 
 
