@@ -49,7 +49,7 @@ class Iron(Strict):
 
 
 class Ambient(Strict):
-    """Section ambient: strengths of uniform fields, and the ball of iron."""
+    """Settings section `ambient`: strengths of uniform fields, and the ball of iron."""
 
     fields_uT: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
     iron: Iron
@@ -113,7 +113,7 @@ class Instrument:
 class Disturbance:
     """One ambient field: its strength or distance, the field added to each row, and the field subtracted from each row.
 
-    The latter is estimated from the reference chip.
+    The subtracted field is estimated from the reading of the reference chip.
     """
 
     keys: Mapping[str, float]
@@ -177,7 +177,7 @@ def one_row_per_poke(
 
 
 def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequence[str]) -> list[dict[str, Any]]:
-    """Summarise scores over boards: one row per value of the axis, with each method that was tested on these boards.
+    """Summarise scores over boards: one row per value of `axis`, with each method that was tested on these boards.
 
     Each point contains the scores of one network. `sd_seeds` is the standard deviation over the networks of one board,
     averaged over boards.
@@ -295,13 +295,13 @@ def iron_fields(
 COLUMNS = {
     "accuracy_pct": ("accuracy, %", 1), "mse_xy_mm2": ("MSE_xy, mm²", 2), "mse_f_N2": ("MSE_F, N²", 3),
 }  # fmt: skip
-DASHES = ("-", "--", "-.")  # two lines coincide where nothing is recovered
+DASHES = ("-", "--", "-.")  # lines coincide if a method recovers nothing
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the scores of every method in every field.
 
-    Rows are over all held-out boards, and on the last board, which has networks of all methods.
+    Rows are over all held-out boards, or for the last board alone, which has networks of all methods.
     """
     last = numbers["last_board"]
     parts = (("all held out", numbers), (str(last["board"]), last))

@@ -24,12 +24,12 @@ from reskin.models.inputs import FIT, VIEW
 from reskin.models.recipe import HEADLINE
 from reskin.seeds import rng_for
 
-NOT_CHOSEN = "not chosen by the study"  # `Check.found` begins with this for such a setting
+NOT_CHOSEN = "not chosen by the study"  # `Check.found` begins with this for a setting that the study did not choose
 COLLAPSE = "collapse"
 
 
 class AuditSettings(Strict):
-    """Section audit: whether a study on other boards chose the training settings, or they were chosen for speed."""
+    """Settings section `audit`: whether training settings were chosen by a study on other boards, or for speed."""
 
     settings: Literal["chosen", "for speed"]
 
@@ -223,16 +223,16 @@ def _first_names(names: np.ndarray) -> str:
 # Standard deviation of one reading on a chip's x, y and z axes; the lab's recordings have 3.0-3.3 uT on x and y, and
 # 4.4-5.0 uT on z.
 NOISE_uT = np.array([3.3, 3.3, 5.0])
-STRONG_NOISES = 10.0  # |dB| over the noise of a reading; below this, noise dominates the direction of dB
-# Largest distance of a copy over the noise of a reading. Two readings of one state are 1.4 apart (22 uT over 15
-# channels); a copy with 5 uT added to each channel is 1.3 away.
+STRONG_NOISES = 10.0  # least |dB|, in units of a reading's noise; below this, noise dominates the direction
+# Largest distance between a copy and its original, in units of a reading's noise. Two readings of one state differ by
+# 1.4 units (22 uT over 15 channels); a copy with 5 uT added to each channel differs by 1.3 units.
 COPY_DISTANCE_NOISES = 2.0
-FACTOR_TOLERANCE = 0.1  # all of a copy has one factor; similar genuine indentations differ in depth, so in the factor
-# Measured shares of similar indentations: 0 % between four recorded skins, at most 11 % between independent simulated
-# skins (60 skins, 4 draws); at least 55 % in a copy with up to 8 uT added to single readings, and 42 % in a copy with
-# 5 % random gain per channel.
+FACTOR_TOLERANCE = 0.1  # relative; a copy has one factor, while factors of genuine indentations differ with their depth
+# Measured fractions of similar indentations: 0 % between four recorded skins, at most 11 % between independent
+# simulated skins (60 skins, 4 draws); at least 55 % in a copy with up to 8 uT added to single readings, and 42 % in a
+# copy with 5 % random gain per channel.
 COPIED_SHARE_MAX = 0.3
-PAIRS_MAX_N = 100_000_000  # pairs of indentations compared per fold, in at most a second; SAMPLE_MIN_N may need more
+PAIRS_MAX_N = 100_000_000  # pairs of indentations compared per fold, in at most a second; SAMPLE_MIN_N may require more
 SAMPLE_MIN_N = 100  # indentations sampled from each capture
 CHUNK_PAIRS_N = 4_000_000  # pairs compared at once: 16 MB
 
@@ -247,7 +247,7 @@ class MeanFields:
 
 @dataclass(frozen=True)
 class Likeness:
-    """The training skin most like a test capture, and the share of the capture's indentations that look copied."""
+    """The training skin most like a test capture, and the fraction of the capture's indentations that look copied."""
 
     capture: str
     train_skin: str

@@ -93,7 +93,7 @@ def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarra
 def noise_var_uT2(chip: ChipDesign, chips_n: int, *, readings_n: int, noload_frames_n: int) -> Float[np.ndarray, " ch"]:
     """Return the noise variance of one row's change of field: mean of its readings minus mean of its no-load frames."""
     noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
-    frame_uT2 = noise_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12  # rounding: uniform, as the noise exceeds a step
+    frame_uT2 = noise_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12  # rounding is uniform because the noise exceeds a step
     return np.tile(frame_uT2 * (1 / readings_n + 1 / noload_frames_n), chips_n)
 
 

@@ -48,13 +48,13 @@ Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class Compare(Strict):
-    """Section compare: geometry and orientation of the recorded board, its labels and skin, and simulated memory."""
+    """Settings section `compare`: orientation of the recorded board, its labels and skin, and simulated memory."""
 
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
-    skin_flipped: bool  # every field has the other sign: a checkerboard skin that is rotated by a quarter turn
-    labels_middle_mm: tuple[float, float]  # labelled place of the board's middle
-    labels_mirrored: bool  # y labels run against the board's y
+    skin_flipped: bool  # every field has the opposite sign, as for a checkerboard skin rotated by a quarter turn
+    labels_middle_mm: tuple[float, float]  # label of the place at the board's middle
+    labels_mirrored: bool  # the labels' y has the opposite sign of the board's y
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     # Fraction of a poke's change of field that remains in the next no-load reading; assumed.
     memory: Annotated[float, Field(ge=0, lt=1)]
@@ -142,9 +142,9 @@ def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]
     return {
         "group": aligned.recorded.groups[len(aligned.recorded.groups) // 2],
         "places_mm": aligned.place_mm[chosen].round(2).tolist(),
-        "arrows_uT": {name: of[chosen].round(1).tolist() for name, of in fields.items()},
+        "arrows_uT": {name: each_uT[chosen].round(1).tolist() for name, each_uT in fields.items()},
         "force_N": aligned.recorded.force_N.round(3).tolist(),
-        "length_uT": {name: magnitudes_uT(of).round(1).tolist() for name, of in fields.items()},
+        "length_uT": {name: magnitudes_uT(each_uT).round(1).tolist() for name, each_uT in fields.items()},
     }
 
 

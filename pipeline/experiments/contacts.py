@@ -59,7 +59,7 @@ Predict = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and 
 
 
 class Contacts(Strict):
-    """Section contacts: the pairs to draw, and the fraction of false alarms that thresholds are set for."""
+    """Settings section `contacts`: the pairs to draw, and the fraction of false alarms that thresholds are set for."""
 
     pairs_n: Annotated[int, Field(ge=1)]
     separations_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
@@ -200,7 +200,7 @@ def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, 
     """Split training rows into those that detectors know and those that set the thresholds.
 
     The latter are the last board, or the last skin of a single board, or the last pass of a single skin; the third
-    return value names which.
+    return value is `board`, `skin` or `pass`.
     """
     for what, labels in (("board", rows.board), ("skin", rows.skin), ("pass", rows.pass_i)):
         kinds = np.unique(labels[train])
@@ -274,7 +274,7 @@ def residual(
     The field of that contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; uT) that are nearest to the
     prediction in place and, if forces are known, in force.
     """
-    from sklearn.neighbors import KNeighborsRegressor  # imported late: it takes a second
+    from sklearn.neighbors import KNeighborsRegressor  # imported here because it takes a second
 
     target, known_uT = known
     columns = ~np.isnan(target).any(axis=0)
@@ -300,15 +300,15 @@ def summarise_nested(boards: Sequence[Any]) -> Any:
 
 # --- Superposition of simulated fields ---
 
-PAIRS_N = 6  # drawn for each distance
+PAIRS_N = 6  # pairs drawn for each distance
 MIDDLE_MM = 2.0  # largest distance along each axis from a pair's middle to the skin's middle
-HEIGHTS_N = 9  # in the table of displacements, which is interpolated linearly for the second contact
+HEIGHTS_N = 9  # heights in the table of displacements, which is interpolated linearly for the second contact
 
 
 def superposition(
     simulation: SimulationSettings, separations_mm: Sequence[float], *, seed: int
 ) -> list[dict[str, Any]]:
-    """Return the rms error of adding the fields of two contacts of the scene's first skin, at two depths."""
+    """Return the rms error of adding the fields of two contacts on the scene's first skin, at two depths."""
     board_name, skin_name = list_captures(simulation, MAIN)[0]
     board = draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board_name)
     rule = simulation.main_boards.quadrature.in_si()
@@ -356,7 +356,7 @@ def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Di
 def _changes_of_pair(
     board: Board, skin: Skin, a_m: Float[np.ndarray, "3"], b_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 k 3"]:
-    """Return four changes of field: of contact a alone, of b alone, of a before b, and of b before a."""
+    """Return four changes of field: by contact a alone, b alone, a pressed before b, and b before a."""
     rest = skin.nodes_m, skin.moments_A_m2
     only_a, only_b = press_on(skin, rest, a_m), press_on(skin, rest, b_m)
     pressed = (only_a, only_b, press_on(skin, only_a, b_m), press_on(skin, only_b, a_m))
@@ -406,7 +406,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw where predictions fall between two contacts, and how often two are detected."""
+    """Draw where predictions fall between two contacts, and how often two contacts are detected."""
     with drawing(7.8, 4.4) as figure:
         left, right = figure.subplots(1, 2)
         _draw_places(left, drawn["along"])

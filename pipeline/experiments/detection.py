@@ -28,7 +28,8 @@ def direction_distance(
 
 
 def _neighbour_distance(known: Float[np.ndarray, "a c"], tested: Float[np.ndarray, "f c"]) -> Float[np.ndarray, " f"]:
-    from sklearn.neighbors import NearestNeighbors  # imported late: it takes a second, which checks of scenes save
+    # Imported here because it takes a second, and checks of scenes do not need it.
+    from sklearn.neighbors import NearestNeighbors
 
     neighbours = NearestNeighbors(n_neighbors=min(NEIGHBOURS_N, len(known))).fit(known)
     return neighbours.kneighbors(tested)[0].mean(axis=1)

@@ -66,7 +66,7 @@ Errors = Mapping[str, Float[np.ndarray, "u w"]]  # by metric; rows are networks 
 
 
 class Drift(SectionWithTraining):
-    """Section drift: windows of contacts for training and testing, and the no-load policies."""
+    """Settings section `drift`: windows of contacts for training and testing, and the no-load policies."""
 
     unit: Literal["indentation", "pass"]  # unit of the counts below
     train_n: Count
@@ -169,7 +169,7 @@ def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.n
         return baseline.regular(*fields, regular_n=section.regular_n)
     if policy == "free":
         trained_on = rank(getattr(readings, UNIT_COLUMN[section.unit])) < section.train_n
-        within_uT = baseline.alike_within_uT(*(of[trained_on] for of in fields))
+        within_uT = baseline.alike_within_uT(*(field[trained_on] for field in fields))
         return baseline.free(readings.b_uT, *fields, within_uT=within_uT)
     return (baseline.initial if policy == "initial" else baseline.each)(*fields)
 
@@ -252,9 +252,13 @@ def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
     for _, own in scores[scores["policy"] == policy].groupby("window_i"):
         values = {name: own[name].to_numpy() for name in _metrics_in(own, *METRICS, "bias_f_N")}
         row: dict[str, Any] = {"contacts_n": round(float(np.mean(own["contacts_n"].to_numpy())))}
-        row |= {name: float(of.mean()) for name, of in values.items()}
+        row |= {name: float(scores_of_metric.mean()) for name, scores_of_metric in values.items()}
         row["noload_off_uT"] = float(np.mean(own["noload_off_uT"].to_numpy()))
-        row["spread"] = {name: float(of.std(ddof=1)) for name, of in values.items() if len(of) > 1}
+        row["spread"] = {
+            name: float(scores_of_metric.std(ddof=1))
+            for name, scores_of_metric in values.items()
+            if len(scores_of_metric) > 1
+        }
         rows.append(row)
     return rows
 
@@ -272,7 +276,7 @@ def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndar
 
 
 def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
-    """Summarise the scores of the last window over boards; `sd_seeds` is over the networks of one skin."""
+    """Summarise the scores of the last window over boards; `sd_seeds` is the sd over the networks of one skin."""
     own = scores[(scores["policy"] == policy) & (scores["window_i"] == scores["window_i"].max())]
     contacts_n = round(float(np.mean(own["contacts_n"].to_numpy())))
     rows = own.drop(columns=["policy", "seed_i", "window_i", "contacts_n", "noload_off_uT"]).dropna(axis=1, how="all")
@@ -334,7 +338,7 @@ def late_force(
 ) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
     """Return the force bias of one window (mean over seeds, and of each network), and the first seed's points to draw.
 
-    None if fewer than two contacts have a known force.
+    Returns None if fewer than two contacts have a known force.
     """
     own = [one for one in predictions if (one.policy, one.window_i) == (policy, window_i)]
     seeds = sorted({one.seed_i for one in own})
@@ -366,7 +370,7 @@ def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float |
 def force_left(early: Readings, late: Readings) -> float | None:
     """Return the ratio of late to early force at equal places and depths, in %; below 100 if the skin softened.
 
-    None if no place and depth with a known force was visited both early and late.
+    Returns None if no place and depth with a known force was visited both early and late.
     """
     sides = []
     for one in (early, late):
@@ -403,7 +407,7 @@ def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
 def pace(captures: Sequence[Readings]) -> dict[str, float]:
     """Return the median time from one indentation to the next, and the duration of the longest capture.
 
-    Empty if the recordings have no times, or only one indentation.
+    Returns an empty dict if the recordings have no times, or only one indentation.
     """
     timed = [one for one in captures if np.isfinite(one.t_s).all()]
     steps_s = [step_s for one in timed for step_s in np.diff(one.t_s[_first_rows(one)])]
@@ -453,7 +457,7 @@ def score_wandering(
     Returns, by policy, one row per step size: mean scores over skins and seeds, and their standard deviations under
     `spread`.
     """
-    from reskin.models.network import Predictor  # torch, late
+    from reskin.models.network import Predictor  # imports torch: only when needed
 
     trained_on = rank(getattr(captures[0], UNIT_COLUMN[section.unit])) < section.train_n
     after_n = 1 + int(rank(captures[0].indentation)[trained_on].max())
@@ -481,7 +485,7 @@ def score_wandering(
 def add_walk(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Readings:
     """Add a random walk to all readings after `after_n` contacts; `step_uT` is its sd per contact and channel."""
     since_n = np.maximum(rank(readings.indentation) + 1 - after_n, 0)
-    rng = rng_for(seed, "drift", "wander", readings.skin)  # the same walk at every step size, scaled
+    rng = rng_for(seed, "drift", "wander", readings.skin)  # the same walk for all step sizes, scaled
     walk_T = baseline_walk(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
     walk_uT = (walk_T / micro).astype(np.float32)
     return replace(readings, b_uT=readings.b_uT + walk_uT, noload_uT=readings.noload_uT + walk_uT)
@@ -541,19 +545,22 @@ def judge_findings(
 ) -> list[dict[str, Any]]:
     """Test each finding of the paper for which the required policies and quantities are available.
 
-    `networks` are the errors of the networks by policy; rows i of two policies are a pair, on the board `boards[i]`.
+    `networks` are the errors of the networks by policy; row i of two policies is a pair, for board `boards[i]`.
     `contacts_n` is the number of contacts before each window.
     """
     frequent = [policy for policy in ("regular", "each") if policy in networks]
     findings = []
 
-    def compare(quantity: str, of: str, over: str, value: Callable[[np.ndarray], np.ndarray]) -> list[Comparison]:
+    def compare(quantity: str, policy: str, other: str, value: Callable[[np.ndarray], np.ndarray]) -> list[Comparison]:
         return [
             compare_networks(
-                f"{title}, {quantity}", unit, {policy: value(networks[policy][metric]) for policy in (of, over)}, boards
+                f"{title}, {quantity}",
+                unit,
+                {name: value(networks[name][metric]) for name in (policy, other)},
+                boards,
             )
             for metric, (title, unit) in ERRORS.items()
-            if metric in networks[of]
+            if metric in networks[policy]
         ]
 
     def mean(errors: np.ndarray) -> np.ndarray:
@@ -738,7 +745,7 @@ MARGIN = 0.05  # of the range of forces
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw scores against contacts (figure 5a) and against an added walk; late forces if known (figure 5b)."""
+    """Draw scores against contacts (figure 5a) and an added walk, and late forces if known (figure 5b)."""
     windows = {policy: rows for policy, (_, rows) in _policies(numbers).items()}
     title = f"Trained on the first contacts, tested on later ones ({source})"
     texts = {"drift.svg": _draw_scores(numbers, windows, "contacts_n", title)}

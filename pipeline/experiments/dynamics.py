@@ -166,13 +166,13 @@ TITLES = {
     "mean5": "mean of the last five",
     "mean5_of_middle": "same mean, compared with its middle reading",
 }
-LESS = "less force error than each reading alone, N²"  # column
+LESS = "less force error than each reading alone, N²"  # title of a column
 TICKS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
 METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f_N2": "MSE_F / N²"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the errors of each method by duration of the press, and over all presses; the paper gives none."""
+    """Tabulate the errors of each method by duration of the press, and over all presses; the paper gives no numbers."""
     rows = [(f"{one['duration_s']:.2g}", one) for one in numbers["by_duration"]]
     rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
     table = pd.DataFrame(

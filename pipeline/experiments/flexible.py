@@ -36,7 +36,7 @@ from reskin.schema import Readings
 from reskin.seeds import rng_for
 
 DEPTH_DECIMALS = 2  # of a commanded depth in mm
-DRAWN_N = 400  # points in a panel
+DRAWN_N = 400  # points in a panel of the figure
 FORCE_DECIMALS = 3  # of a force in N in the figure
 SHAPE = "shape"  # optional recipe whose inputs are direction and length of dB; expected to depend less on the gap
 

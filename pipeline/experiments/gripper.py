@@ -42,7 +42,7 @@ Positive = Annotated[float, Field(gt=0, le=100)]
 
 
 class Gripper(Strict):
-    """Section gripper: forces to hold, stiffnesses of the objects, and the gain of the controller."""
+    """Settings section `gripper`: forces to hold, stiffnesses of the objects, and the gain of the controller."""
 
     aims_N: tuple[Positive, ...]
     stiffness_N_mm: tuple[Positive, ...]

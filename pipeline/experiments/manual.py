@@ -1,7 +1,7 @@
 """Manual: networks adapted with hand pokes, whose places are unknown (paper section 5).
 
-They are tested on the robot's grid of the same skin, and compared with networks adapted with as many pokes by the
-robot, and with a control.
+The networks are tested on the robot's grid of the same skin, and compared with networks adapted with as many pokes by
+the robot, and with a control.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -45,7 +45,7 @@ COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # for effects that need every no
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect, and the errors of neglecting it: rms of dB and force in %, largest of the no-load field in uT."""
+    """One effect, and the errors of neglecting it: rms in % (dB, force), and largest in uT (no-load field)."""
 
     term: str
     done: str  # "left out" or "kept" by the main protocol

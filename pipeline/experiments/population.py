@@ -52,7 +52,7 @@ from reskin.universal.population import PLACES_N, Forces, Population, draw_popul
 from reskin.universal.training import NOISE_uT, SkinPrior, draw_weights, train
 
 EXPERIMENT = "lobo"  # its folds are used, with the pools of unlabelled pokes that adaptation uses
-POOL_MAX_N = 65  # presses: one at each place of the paper's grid, under any of its depths
+POOL_MAX_N = 65  # presses: one at each place of the paper's grid, at any of its depths
 TESTED_MAX_N = 2000  # rows of a skin, drawn at random
 CALIBRATION_SKINS_N = 16  # simulated skins for choosing likelihood powers and weight shares
 FRESH_N = 32  # further simulated skins for measuring the coverage of intervals
@@ -77,7 +77,7 @@ class CalibrationSize(NamedTuple):
 
 
 class PopulationSettings(Strict):
-    """Section population.
+    """Settings section `population`.
 
     skins_n: number of simulated training skins of each network; all networks use the first skins of one population.
     steps_n: steps of each training run. unlabelled_n, labels_n: numbers of presses for calibration.
@@ -286,7 +286,7 @@ def simulated_skins(skins: Population, rng: np.random.Generator) -> list[TestSki
 def estimate(
     model: PriorModel, skin: TestSkin, size: CalibrationSize, powers: Sequence[Mapping[str, float]]
 ) -> list[dict[str, Estimate]]:
-    """Calibrate a model to a skin, and estimate its test presses and, as the last, the press of the weight.
+    """Calibrate a model to a skin, and estimate its test presses and, last, the press of the weight.
 
     Returns one mapping by way (map, universal, network) per mapping of likelihood powers.
     """
@@ -305,7 +305,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class Calibration:
-    """By way: the likelihood power, and the share of the weight's error in log F by which all forces are corrected."""
+    """For each way, the likelihood power, and the share of the weight's error in log F that corrects all forces."""
 
     power: Mapping[str, float]
     weight_share: Mapping[str, float]

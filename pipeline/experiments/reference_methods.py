@@ -65,7 +65,7 @@ RNG = "rivals"  # name of the random streams, from an earlier name of this exper
 
 
 class ReferenceMethods(SectionWithRows):
-    """Section reference_methods: numbers of labels, models of known boards, and the share of false alarms."""
+    """Settings section `reference_methods`: numbers of labels, models of known boards, and fraction of false alarms."""
 
     labels_n: Annotated[tuple[Annotated[int, Field(ge=1)], ...], Field(min_length=1)]
     methods: dict[Name, Classical]

@@ -644,7 +644,7 @@ def _product(
 
 
 class RunTime(Strict):
-    """Section `runtime`: both studies, and the number of timings of each call."""
+    """Settings section `runtime`: both studies, and the number of timings of each call."""
 
     quadratures: Quadratures
     integrators: Integrators

@@ -1,4 +1,4 @@
-"""The smallest difference of weight that readings resolve (paper section 6)."""
+"""The smallest weight difference that readings resolve (paper section 6)."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -251,4 +251,4 @@ def _show_mL(name: str, numbers: Mapping[str, Any]) -> str:
 
 
 def _least(step_N: float, numbers: Mapping[str, Any]) -> str:
-    return "at most " if step_N <= numbers["step_N"] else ""  # the finest step tried
+    return "at most " if step_N <= numbers["step_N"] else ""  # step_N is the finest step tried

@@ -31,7 +31,7 @@ FORCE_DECIMALS = 3  # of a force in N in the figure
 
 
 class Shear(SectionWithTraining):
-    """Section shear: the splits of dragged lines, and the training."""
+    """Settings section `shear`: the splits of dragged lines, and the training."""
 
     test_fraction: Annotated[float, Field(gt=0, lt=1)]
     repeats_n: Annotated[int, Field(ge=1)]

@@ -36,7 +36,7 @@ Stats = dict[str, dict[str, float]]
 
 
 class Sleeve(SectionWithTraining):
-    """Section sleeve: the share of pokes held out, k nearest neighbours, and the training."""
+    """Settings section `sleeve`: the fraction of pokes held out, k nearest neighbours, and the training."""
 
     test_fraction: Annotated[float, Field(gt=0, lt=1)]  # the last pokes of each capture
     neighbours_n: Annotated[int, Field(ge=1)]
@@ -45,11 +45,11 @@ class Sleeve(SectionWithTraining):
 
 @dataclass(frozen=True)
 class Area:
-    """A skin, and the chips and borders of boards under it, in the labels' coordinates: mm from the skin's corner."""
+    """A skin, and the chips and borders of boards under it, in the labels' coordinates (mm from the skin's corner)."""
 
     sides_mm: tuple[float, float]
     chips_mm: Float[np.ndarray, "k 2"]
-    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]  # between boards: x of those along y, y of those along x
+    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]  # x of the borders along y, and y of the borders along x
 
     def near_border(self, place_mm: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
         """Mark places closer than `NEAR_MM` to a border between two boards."""
@@ -187,7 +187,7 @@ def score_places(
 
 
 def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
-    """Return the mean, standard deviation (n - 1; absent for one) and number of each metric over training runs."""
+    """Return the mean, standard deviation (absent for one run) and number of each metric over training runs."""
     stats: Stats = {}
     for name in scores[0]:
         values = np.array([one[name] for one in scores])

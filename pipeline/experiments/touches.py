@@ -53,7 +53,7 @@ Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # by place
 
 
 class Touches(Strict):
-    """Section touches: how a recording is cut by time, and the fraction of single touches that may be called two."""
+    """Settings section `touches`: how a recording is cut by time, and the accepted fraction of false alarms."""
 
     train_fraction: Fraction
     aside_fraction: Fraction
@@ -206,7 +206,7 @@ def predict_places(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
     """Predict the place by majority of the nearest known directions."""
-    from sklearn.neighbors import KNeighborsClassifier  # imported late: it takes a second
+    from sklearn.neighbors import KNeighborsClassifier  # imported here because it takes a second
 
     voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit_directions(known_uT), places)
     return np.asarray(voters.predict(unit_directions(tested_uT)))

@@ -34,7 +34,7 @@ Place_mm = tuple[float, float]
 
 
 class Variation(Strict):
-    """Section variation: the places and the depth to compare, and the numbers of skins and contacts."""
+    """Settings section `variation`: the places and the depth to compare, and the numbers of skins and contacts."""
 
     places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
     depth_mm: Annotated[float, Field(gt=0)]

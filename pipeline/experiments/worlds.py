@@ -62,7 +62,7 @@ class Residual(Strict):
 
 
 class Worlds(Strict):
-    """Section `worlds`: the values of each factor; the other factors keep the scene's values."""
+    """Settings section `worlds`: the values of each factor; the other factors keep the scene's values."""
 
     residual: Residual
     skin_modulus: Sizes  # spreads.skin_modulus

@@ -181,7 +181,7 @@ def test_table_lists_methods_with_source_and_no_paper_number():
         numbers["median_error_mm"]["mean"], rel=5e-3
     )  # 3 digits
     near = numbers["near_seam"]["median_error_mm"]["mean"]
-    assert float(table["median near a border of boards, mm"][0]) == pytest.approx(near, rel=5e-3)
+    assert float(table["median near a border between boards, mm"][0]) == pytest.approx(near, rel=5e-3)
     assert f"first {4 * 40} pokes" in table.attrs["meaning"]
 
 
@@ -189,7 +189,7 @@ def test_part_without_pokes_is_a_dash():
     numbers, _ = numbers_and_figure_data()
     del numbers["near_seam"]
     table = tables(numbers, "simulated")["sleeve"]
-    assert table["median near a border of boards, mm"][0] == "–"
+    assert table["median near a border between boards, mm"][0] == "–"
     assert "0 of them less than" in table.attrs["meaning"]
 
 
@@ -210,7 +210,7 @@ def test_map_shows_tested_pokes_chips_and_source():
     assert len(drawn["chips_x_mm"]) in marks
     assert 40 in marks
     text = " ".join(re.findall(r">([^<>]+)</text>", texts["sleeve.svg"]))
-    for label in ("(simulated)", "x / mm", "y / mm", "place error", "border of two boards"):
+    for label in ("(simulated)", "x / mm", "y / mm", "place error", "border between boards"):
         assert label in text
 
 

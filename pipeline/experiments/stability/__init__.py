@@ -17,18 +17,18 @@ from reskin import io
 from reskin.simulation.settings import SimulationSettings
 
 
-def survey(of: SimulationSettings, seed: int) -> list[Case]:
+def survey(simulation: SimulationSettings, seed: int) -> list[Case]:
     """Run every case of physics, chips and wire formats with the settings of a scene."""
-    board = of.main_boards.design
+    board = simulation.main_boards.design
     chips_n = len(board.places_mm)
     return [
         *time_cases(),
-        *physics_cases(board, of.spreads, skin=of.skin, seed=seed),
-        *extreme_cases(board, of.spreads, skin=of.skin, seed=seed),
-        *drag_cases(of.skin),
-        *sliding_cases(board, of.spreads, skin=of.skin, seed=seed),
-        *chip_cases(of.chip, chips_n, seed),
-        *wire_cases(of.chip.gain_sel, chips_n, seed),
+        *physics_cases(board, simulation.spreads, skin=simulation.skin, seed=seed),
+        *extreme_cases(board, simulation.spreads, skin=simulation.skin, seed=seed),
+        *drag_cases(simulation.skin),
+        *sliding_cases(board, simulation.spreads, skin=simulation.skin, seed=seed),
+        *chip_cases(simulation.chip, chips_n, seed),
+        *wire_cases(simulation.chip.gain_sel, chips_n, seed),
     ]
 
 

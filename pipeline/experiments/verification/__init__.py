@@ -21,9 +21,9 @@ from reskin.physics.layer import IndentedLayer
 from reskin.simulation.settings import SimulationSettings
 
 
-def verify(of: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
+def verify(simulation: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
     """Compare every part of the simulator with its reference, for the settings of a scene."""
-    board, skin = of.main_boards, of.skin
+    board, skin = simulation.main_boards, simulation.skin
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     rule = board.quadrature.in_si()
     return [
@@ -31,17 +31,19 @@ def verify(of: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) ->
         *check_contact(skin),
         *check_kinematics(press, max(depths_m)),
         *check_sideways(skin),
-        *check_indentations(board.design, of.spreads, skin=skin, rule=rule, depths_m=depths_m, seed=seed),
+        *check_indentations(board.design, simulation.spreads, skin=skin, rule=rule, depths_m=depths_m, seed=seed),
         *check_relaxation(),
-        *check_electronics(of.chip, seed),
-        *check_frames(of.chip.gain_sel, len(board.design.places_mm), seed),
+        *check_electronics(simulation.chip, seed),
+        *check_frames(simulation.chip.gain_sel, len(board.design.places_mm), seed),
     ]
 
 
 def verification(settings: Settings, results: Path) -> None:
     """Check the scene's own skins, indentations and chips, and write the table."""
-    of = simulation_settings(settings)
-    checks = verify(of, depths_m=tuple(milli * depth_mm for depth_mm in of.main.depths_mm), seed=settings.seed)
+    simulation = simulation_settings(settings)
+    checks = verify(
+        simulation, depths_m=tuple(milli * depth_mm for depth_mm in simulation.main.depths_mm), seed=settings.seed
+    )
     io.write_json(results, [asdict(check) | {"holds": check.holds} for check in checks])
     for check in checks:
         if not check.holds:

@@ -90,7 +90,7 @@ def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
 
 
 def dense_profile(kh: Any) -> Callable[[Any], Any]:
-    """Solve for W under a pressure of 1 in 2 G k: W'' + W = 0 at both faces, W = 0 below, 3 W' - W''' = 2 above."""
+    """Solve for W under a pressure of 2 G k: W'' + W = 0 at both faces, W = 0 below, 3 W' - W''' = 2 above."""
     basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
     conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
     rows = [
@@ -240,7 +240,7 @@ def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 
 
 def descent(depth_m: float, steps_n: int = STEPS_N) -> Float[np.ndarray, " d"]:
-    """List depths from 0 in equal steps; stops at a quarter and half of the first are added.
+    """List depths from 0 in equal steps, with added stops at a quarter and half of the first step.
 
     These are needed because the contact radius grows as a square root at small depths.
     """

@@ -146,9 +146,9 @@ def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     ]  # fmt: skip
 
 
-def field_of(of: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
+def field_of(sources: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
     """Return magpylib.core's field of dipoles at observers in T, in one call over all pairs."""
-    places_m, moments = of
+    places_m, moments = sources
     separation_m = (observers_m[:, None] - places_m).reshape(-1, 3)
     h_A_m = dipole_Hfield(observers=separation_m, moments=np.tile(moments, (len(observers_m), 1)))
     return mu_0 * h_A_m.reshape(len(observers_m), -1, 3).sum(axis=1)
