@@ -172,8 +172,8 @@ def one_row_per_poke(
     indentation: Int64[np.ndarray, " f"], own: Int64[np.ndarray, " a"], rng: np.random.Generator
 ) -> Int64[np.ndarray, " b"]:
     """Draw one row of every indentation at random."""
-    drawn = rng.permutation(own)
-    return np.sort(drawn[np.unique(indentation[drawn], return_index=True)[1]])
+    shuffled = rng.permutation(own)
+    return np.sort(shuffled[np.unique(indentation[shuffled], return_index=True)[1]])
 
 
 def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequence[str]) -> list[dict[str, Any]]:
@@ -268,8 +268,8 @@ def iron_balls(
 ) -> Iterator[Disturbance]:
     """Yield the disturbance by a ball at each distance above the skins; `skin_i` is the index of each row's skin."""
     for distance_mm in sorted(iron.distances_mm):
-        both = [iron_fields(instrument, skin, radius_mm=iron.radius_mm, distance_mm=distance_mm) for skin in skins]
-        chips_T, aside_T = np.stack([chips for chips, _ in both]), np.concatenate([aside for _, aside in both])
+        fields_T = [iron_fields(instrument, skin, radius_mm=iron.radius_mm, distance_mm=distance_mm) for skin in skins]
+        chips_T, aside_T = np.stack([chips for chips, _ in fields_T]), np.concatenate([aside for _, aside in fields_T])
         keys = {"distance_mm": distance_mm, "rms_uT": rms_uT(chips_T), "aside_rms_uT": rms_uT(aside_T)}
         added_uT = readings_uT(instrument.board, chips_T)[skin_i]
         yield Disturbance(keys, added_uT, reference_uT(instrument, aside_T[skin_i], rng))

@@ -163,9 +163,9 @@ def _check_experiment(sides: Sides) -> None:
 
 
 def _check_readings(sides: Sides) -> Check:
-    seen = np.isin(sides.test, np.concatenate([sides.train, sides.pool]))
-    found = f"{int(seen.sum())} of {len(sides.test)} test readings trained on or adapted to"
-    return Check("readings", sides.where, "on one side only", found, holds=not seen.any())
+    used = np.isin(sides.test, np.concatenate([sides.train, sides.pool]))
+    found = f"{int(used.sum())} of {len(sides.test)} test readings trained on or adapted to"
+    return Check("readings", sides.where, "on one side only", found, holds=not used.any())
 
 
 def _check_disjoint(what: str, label: np.ndarray, sides: Sides, *, rule: str = "apart", known: bool = False) -> Check:
@@ -184,9 +184,9 @@ def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.rando
     )
     rule = f"in no capture {100 * COPIED_SHARE_MAX:g} % like one training skin"
     captures, skins = labels.capture[sides.test], labels.skin[sides.test]
-    weak = np.setdiff1d(skins, skins[np.isin(captures, test.name)])
-    if len(weak) or not len(train.name):
-        found = f"undecidable: fields within the noise{_first_names(weak)}"
+    weak_skins = np.setdiff1d(skins, skins[np.isin(captures, test.name)])
+    if len(weak_skins) or not len(train.name):
+        found = f"undecidable: fields within the noise{_first_names(weak_skins)}"
         return Check("copies", sides.where, rule, found, holds=False)
     likenesses = most_alike(test, train, rng=rng)
     closest = max(likenesses, key=lambda one: one.share)
@@ -366,11 +366,13 @@ def audit_scaler(
     fit: Callable[[np.ndarray, np.ndarray], Arrays],
 ) -> Check:
     """Check that a model's scaler was fitted to its training rows, and not to training and test rows together."""
-    both = np.concatenate([sides.train, sides.test])
-    honest, leaky = (_relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both))
-    found = f"off by {honest:.2g} from training rows alone, by {leaky:.2g} from both sides"
+    both_sides = np.concatenate([sides.train, sides.test])
+    train_gap, both_gap = (
+        _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)
+    )
+    found = f"off by {train_gap:.2g} from training rows alone, by {both_gap:.2g} from both sides"
     rule = f"that of the training rows, to {SCALER_TOLERANCE:.2g}"
-    return Check("scaler", where, rule, found, holds=honest <= SCALER_TOLERANCE and honest <= leaky)
+    return Check("scaler", where, rule, found, holds=train_gap <= SCALER_TOLERANCE and train_gap <= both_gap)
 
 
 def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
@@ -402,13 +404,18 @@ def audit_tuning(
 
 def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
     """Count the networks of a variant that predict nearly the same for any input, and the repeated training runs."""
-    kept = [
-        f"{one['question']}.{one['recipe_name']}.{one['fold']}.seed{one['seed_i']}" for one in cards if one["collapsed"]
+    collapsed = [
+        f"{card['question']}.{card['recipe_name']}.{card['fold']}.seed{card['seed_i']}"
+        for card in cards
+        if card["collapsed"]
     ]
-    again_n = sum(one["collapsed_before_n"] for one in cards)
-    found = f"{len(kept)} of {len(cards)} collapsed{': ' if kept else ''}{', '.join(kept)}; {again_n} trained again"
+    again_n = sum(card["collapsed_before_n"] for card in cards)
+    found = (
+        f"{len(collapsed)} of {len(cards)} collapsed{': ' if collapsed else ''}{', '.join(collapsed)}; "
+        f"{again_n} trained again"
+    )
     rule = "no network answers nearly the same to any input"
-    return Check(COLLAPSE, variant, rule, found, holds=not kept, known=bool(kept))
+    return Check(COLLAPSE, variant, rule, found, holds=not collapsed, known=bool(collapsed))
 
 
 # --- Settings ---
@@ -481,7 +488,7 @@ def audit_recipe(variant: str, recipe: Mapping[str, Any], record: Choice) -> Che
     chosen = record.chosen.get(studied)
     if chosen is None:
         return Check("settings: recipe", variant, rule, f"{NOT_CHOSEN}: it chose none for this", holds=True)
-    used, best = ({key: repr(value) for key, value in one.items()} for one in (recipe, chosen))
+    used, best = ({key: repr(value) for key, value in settings.items()} for settings in (recipe, chosen))
     differing = [
         f"{key} {used.get(key, 'absent')} (study: {best.get(key, 'absent')})"
         for key in sorted({*used, *best})

@@ -112,15 +112,15 @@ def compare_boards(
 
 def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
     """Summarise agreement over boards."""
-    found: dict[str, Any] = {}
+    summary: dict[str, Any] = {}
     for simulation in ("nominal", "fitted", "refitted"):
         rows = [_of_simulation(own, simulation) for own in by_board.values() if _has_simulation(own, simulation)]
         values = {name: [own[name] for own in rows] for name in ("cosine_mean", "explained_median")}
         grown = [own["growth"] for own in rows if "growth" in own]
         values["growth_difference"] = [one["simulated"] - one["recorded"] for one in grown]
         if rows:
-            found[simulation] = {name: statistic(each, boards=True) for name, each in values.items() if each}
-    return found
+            summary[simulation] = {name: statistic(each, boards=True) for name, each in values.items() if each}
+    return summary
 
 
 def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
@@ -204,11 +204,11 @@ def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Comp
     walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
     noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
     before_uT = np.roll(simulated_uT, 1, axis=0)  # the first poke of a capture has no predecessor, and is not used
-    found = {
+    memories = {
         "recorded": memory(pokes, pokes.db_uT, pokes.noload_uT),
         "simulated": memory(pokes, simulated_uT, walk_uT + noise_uT + section.memory * before_uT),
     }
-    return {"memory": found} if None not in found.values() else {}
+    return {"memory": memories} if None not in memories.values() else {}
 
 
 def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
@@ -311,26 +311,26 @@ def _name_chips(chips: Sequence[int], chips_n: int) -> str:
     return f"chip {chips[0]} is" if len(chips) == 1 else f"chips {', '.join(map(str, chips))} are"
 
 
-def _describe_exchanges(at: Int[np.ndarray, " k"]) -> list[str]:
-    moved = np.flatnonzero(at != np.arange(len(at))).tolist()
+def _describe_exchanges(positions: Int[np.ndarray, " k"]) -> list[str]:
+    moved = np.flatnonzero(positions != np.arange(len(positions))).tolist()
     if len(moved) == 2:
         return [f"chips {moved[0]} and {moved[1]} are exchanged"]
-    places = ", ".join(f"{i} sits at {at[i]}" for i in moved)
+    places = ", ".join(f"{i} sits at {positions[i]}" for i in moved)
     return [f"chips are exchanged ({places})"] if moved else []
 
 
 def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dict[str, Any]:
     """Check whether labels, chips and skin are oriented as the scene states."""
-    found = find_frames(
+    frames = find_frames(
         aligned.place_mm, aligned.recorded.db_uT, chip_rotations(section),
         lambda at_mm: nominal_uT(setup, at_mm, aligned.recorded.force_N),
     )  # fmt: skip
-    columns = zip(found.chips.tolist(), found.as_written.tolist(), found.cosines.tolist(), found.turns, strict=True)
+    columns = zip(frames.chips.tolist(), frames.as_written.tolist(), frames.cosines.tolist(), frames.turns, strict=True)
     chips = [
-        {"chip": i, "at": at, "cosine_as_written": written, "cosine_best": best, "read": turn.describe()}
-        for i, (at, written, best, turn) in enumerate(columns)
+        {"chip": i, "at": position, "cosine_as_written": written, "cosine_best": best, "read": turn.describe()}
+        for i, (position, written, best, turn) in enumerate(columns)
     ]
-    return {"sentence": found.sentence, "chips": chips}
+    return {"sentence": frames.sentence, "chips": chips}
 
 
 def find_frames(
@@ -345,7 +345,7 @@ def find_frames(
     board's axes. A chip at another chip's position is assumed to have that chip's rotation.
     """
     turns = np.stack([turn.matrix for turn in TURNS])
-    as_written, found = np.empty(0), []
+    as_written, candidate_frames = np.empty(0), []
     for labels in TURNS[:8]:
         simulated_uT = nominal(place_mm @ labels.matrix[:2, :2].T)
         # [recorded chip, simulated chip, turn]: cosine over all pokes of the turned recorded and the simulated field.
@@ -356,8 +356,8 @@ def find_frames(
         if labels == TURNS[0]:
             as_written = np.diagonal(cosine[..., 0]).copy()
         candidates = product((False, True), TURNS)
-        found += [_best_chips(labels, flipped, common, cosine, as_written) for flipped, common in candidates]
-    return max(found, key=lambda one: one.worth)
+        candidate_frames += [_best_chips(labels, flipped, common, cosine, as_written) for flipped, common in candidates]
+    return max(candidate_frames, key=lambda one: one.worth)
 
 
 def _best_chips(
@@ -371,11 +371,11 @@ def _best_chips(
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
     of_pair = worth.max(axis=2) - PENALTY * (1 - np.eye(len(worth)))
-    own, at = linear_sum_assignment(of_pair, maximize=True)
-    turn_i = worth[own, at].argmax(axis=1)
-    total = of_pair[own, at].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
+    own, positions = linear_sum_assignment(of_pair, maximize=True)
+    turn_i = worth[own, positions].argmax(axis=1)
+    total = of_pair[own, positions].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
     turns = tuple(TURNS[i] for i in turn_i)
-    return Frames(labels, flipped, at, turns, signed[own, at, turn_i], as_written, float(total))
+    return Frames(labels, flipped, positions, turns, signed[own, positions, turn_i], as_written, float(total))
 
 
 CHIPS_N = 5  # orientations are determined only for boards with chips on all sides of the middle
@@ -534,15 +534,15 @@ def _title(name: str, law: Mapping[str, Any]) -> str:
     return title.replace("another board", str(law["law_of"])) if "law_of" in law else title
 
 
-def _frames_row(board: str, own: Mapping[str, Any]) -> dict[str, str]:
-    chips, noise_uT = own["frames"]["chips"], own["noise_uT"]
+def _frames_row(board: str, board_numbers: Mapping[str, Any]) -> dict[str, str]:
+    chips, noise_uT = board_numbers["frames"]["chips"], board_numbers["noise_uT"]
     cosine = {
         f"cosine by chip, {title}": ", ".join(f"{chip[key]:.2f}" for chip in chips)
         for title, key in (("as written", "cosine_as_written"), ("best", "cosine_best"))
     }
     noise = {"noise of a reading x, y, z, µT": ", ".join(f"{value:.2g}" for value in noise_uT.values())}
-    pokes = {"pokes": str(own["pokes_n"]), "left out": str(own["left_out_n"])}
-    return {"board": board, "in one sentence": own["frames"]["sentence"]} | cosine | noise | pokes
+    pokes = {"pokes": str(board_numbers["pokes_n"]), "left out": str(board_numbers["left_out_n"])}
+    return {"board": board, "orientation": board_numbers["frames"]["sentence"]} | cosine | noise | pokes
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:

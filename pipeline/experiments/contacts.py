@@ -71,7 +71,7 @@ def contacts(
 ) -> None:
     """Add the pokes of every held-out board in pairs, and test networks trained without the board on the sums."""
     data = read_data(settings, indentations, folds)
-    boards, drawn = zip(
+    boards, plot_data = zip(
         *(evaluate_board(data, fold, section, networks_held_out(models, fold.name)) for fold in data.folds_of("lobo")),
         strict=True,
     )
@@ -86,7 +86,7 @@ def contacts(
         "boards_n": len(boards),
         # The networks behind two of the detectors were trained on all other boards, including these contacts.
         "threshold_set_on": (
-            f"training contacts of a {drawn[0]['kept_aside']} among which detectors look no neighbours up; the "
+            f"training contacts of a {plot_data[0]['kept_aside']} among which detectors look no neighbours up; the "
             "networks behind `residual` and `networks disagree` were trained on them"
         ),
         "noise": "that of two readings",
@@ -102,7 +102,7 @@ def contacts(
         numbers["superposition"] = superposition(
             simulation_settings(settings), section.separations_mm, seed=settings.seed
         )
-    along = {s: [value for one in drawn for value in one["along"][s]] for s in drawn[0]["along"]}
+    along = {s: [value for one in plot_data for value in one["along"][s]] for s in plot_data[0]["along"]}
     write_results(results, numbers, {"along": along})
 
 
@@ -141,8 +141,8 @@ def evaluate_board(
     numbers = detection_rates(single["aside"], single["test"], double, section.false_alarm_fraction)
     truth = {s: (rows.target[one.weaker], rows.target[one.stronger]) for s, one in pairs.items()}
     numbers["falls"] = {}
-    for separation_mm, both in truth.items():
-        each = [compare_prediction(*both, one) for one in predicted[separation_mm]]
+    for separation_mm, true_pair in truth.items():
+        each = [compare_prediction(*true_pair, one) for one in predicted[separation_mm]]
         numbers["falls"][separation_mm] = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
     along = {
         f"{s:g}": position_along_line(*truth[s], predicted[s][0])[:DRAWN_N].round(2).tolist()
@@ -170,13 +170,15 @@ def draw_pairs(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
 ) -> Pairs:
     """Draw pairs of rows: two places of a skin at this distance, then one row at each; at 0 mm, one place twice."""
-    found = [_pairs_at_distance(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])]
-    sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in found for i, j in pairs]
+    by_skin = [
+        _pairs_at_distance(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])
+    ]
+    sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in by_skin for i, j in pairs]
     if not sides:
         what = f"no two held-out places of one skin are {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
         raise ParamsError(f"contacts: {what}. Correct contacts.separations_mm of the scene.")
-    drawn = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
-    one, other = (np.array([rng.choice(side) for side in both]) for both in zip(*drawn, strict=True))
+    chosen = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
+    one, other = (np.array([rng.choice(side) for side in both]) for both in zip(*chosen, strict=True))
     force_N, length_uT = rows.target[:, 2], np.linalg.norm(rows.db_uT, axis=1)
     strength = length_uT if np.isnan(force_N[own]).any() else force_N
     swap = strength[one] > strength[other]
@@ -187,9 +189,9 @@ def _pairs_at_distance(
     rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float
 ) -> tuple[list[Int64[np.ndarray, " b"]], Int64[np.ndarray, "p 2"]]:
     """Return the rows at each place of a skin, and the pairs of places (by index) at this distance."""
-    places_mm, at = np.unique(rows.target[own, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
-    order = np.argsort(at.ravel(), kind="stable")
-    rows_at = np.split(own[order], np.cumsum(np.bincount(at.ravel()))[:-1])
+    places_mm, place_i = np.unique(rows.target[own, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
+    order = np.argsort(place_i.ravel(), kind="stable")
+    rows_at = np.split(own[order], np.cumsum(np.bincount(place_i.ravel()))[:-1])
     distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
     near = np.abs(distance_mm - separation_mm) <= TOLERANCE_MM
     # A place is paired with itself only at 0 mm, although 0 mm is also within the tolerance of small separations.

@@ -314,9 +314,9 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
     )
     known = ~np.isnan(true_N)
     skins, skin_i = np.unique(skin[known], return_inverse=True)
-    pairs, which = np.unique(np.stack([skin_i, indentation[known]], axis=1), axis=0, return_inverse=True)
-    n = np.bincount(which.ravel(), minlength=len(pairs))
-    means = [np.bincount(which.ravel(), values[known], len(pairs)) / n for values in (true_N, predicted_N)]
+    pairs, pair_i = np.unique(np.stack([skin_i, indentation[known]], axis=1), axis=0, return_inverse=True)
+    n = np.bincount(pair_i.ravel(), minlength=len(pairs))
+    means = [np.bincount(pair_i.ravel(), values[known], len(pairs)) / n for values in (true_N, predicted_N)]
     return ContactForces(skins[pairs[:, 0]], *means)
 
 
@@ -363,8 +363,8 @@ def points(contacts: ContactForces) -> dict[str, list[float]]:
 def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float | None:
     """Return `force_left` of a window relative to training, mean over skins; None if unknown for any skin."""
     own = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
-    left = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
-    return None if None in left else float(np.mean([one for one in left if one is not None]))
+    ratios_pct = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
+    return None if None in ratios_pct else float(np.mean([one for one in ratios_pct if one is not None]))
 
 
 def force_left(early: Readings, late: Readings) -> float | None:
@@ -378,12 +378,12 @@ def force_left(early: Readings, late: Readings) -> float | None:
         known = ~np.isnan(stop).any(axis=1) & ~np.isnan(one.Fz_N)
         sides.append((stop[known], one.Fz_N[known].astype(float)))
     stops, where = np.unique(np.concatenate([stop for stop, _ in sides]), axis=0, return_inverse=True)
-    at = np.split(where.ravel(), [len(sides[0][0])])
-    n = [np.bincount(own, minlength=len(stops)) for own in at]
+    stop_i = np.split(where.ravel(), [len(sides[0][0])])
+    n = [np.bincount(own, minlength=len(stops)) for own in stop_i]
     both = (n[0] > 0) & (n[1] > 0)
     if not both.any():
         return None
-    sums_N = [np.bincount(own, force_N, len(stops)) for own, (_, force_N) in zip(at, sides, strict=True)]
+    sums_N = [np.bincount(own, force_N, len(stops)) for own, (_, force_N) in zip(stop_i, sides, strict=True)]
     early_N, late_N = (total_N[both] / own_n[both] for total_N, own_n in zip(sums_N, n, strict=True))
     return float(100 * late_N.sum() / early_N.sum())
 
@@ -655,7 +655,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         }
         for one in numbers["findings"]
     ]
-    made = {
+    shown = {
         "drift": tabulate(lines, meaning=meaning, spread=spread),
         "drift_findings": tabulate(findings, meaning=f"{FINDINGS_MEANING} {_possible_reasons(numbers)}"),
     }
@@ -668,20 +668,20 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
                 line[f"no-load reading off by, µT ({title})"] = f"{row['noload_off_uT']:.3g}"
                 line |= {f"{COLUMNS[name]} ({title})": show(_stat(row, name)) for name in ("accuracy_pct", error)}
             walked.append(line)
-        made["drift_wander"] = tabulate(walked, meaning=WANDER_MEANING, spread=spread)
-    return made
+        shown["drift_wander"] = tabulate(walked, meaning=WANDER_MEANING, spread=spread)
+    return shown
 
 
 def _possible_reasons(numbers: Mapping[str, Any]) -> str:
     """Compare no-load errors with a contact's field, and describe how much of the force bias softening explains."""
     field, late = numbers["field"], numbers.get("late", {})
-    off = ", ".join(
+    offsets = ", ".join(
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
     )
     text = (
         f"A contact changes the field by {field['contact_uT']:.3g} µT rms over channels; the noise of a no-load "
         f"reading is {field['noload_noise_uT']:.2g} µT. In the last window, the no-load reading in use differs from "
-        f"one taken just before the contact by {off}."
+        f"one taken just before the contact by {offsets}."
     )
     if "force_left_pct" in late:
         left_pct = late["force_left_pct"]
@@ -726,7 +726,7 @@ def _spread(numbers: Mapping[str, Any]) -> str:
 
 def _protocol(numbers: Mapping[str, Any]) -> str:
     several = {"indentation": "indentations", "pass": "passes"}[numbers["unit"]]
-    train, test, every, left = (
+    train, test, every, left_out = (
         f"{numbers[name]:,} {numbers['unit'] if numbers[name] == 1 else several}"
         for name in ("train_n", "test_n", "every_n", "left_out_units_n")
     )
@@ -735,7 +735,7 @@ def _protocol(numbers: Mapping[str, Any]) -> str:
         "the no-load reading has its own networks. Contacts: number of contacts of the skin before the test."
     )
     return text + (
-        f" The last {left} do not fill a test window, and are not used." if numbers["left_out_units_n"] else ""
+        f" The last {left_out} do not fill a test window, and are not used." if numbers["left_out_units_n"] else ""
     )
 
 

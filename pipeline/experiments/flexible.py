@@ -98,8 +98,8 @@ def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dic
     def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
         return float(np.median(np.concatenate([one[depth_mm] for one in captures if depth_mm in one])))
 
-    both = set().union(*flexible) & set().union(*rigid)
-    return statistic([median_uT(flexible, depth) / median_uT(rigid, depth) for depth in sorted(both)])
+    common_mm = set().union(*flexible) & set().union(*rigid)
+    return statistic([median_uT(flexible, depth) / median_uT(rigid, depth) for depth in sorted(common_mm)])
 
 
 def gaps(data: SceneData) -> dict[str, Any]:

@@ -132,9 +132,9 @@ def earth_in_board_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, 
 
 
 def _score(log: Log, added_uT: Float[np.ndarray, "f ch"], networks: Sequence[Estimator]) -> dict[str, Any]:
-    found = estimate_after(log.quiet_n, log.t_s, (log.b_uT + added_uT).astype(np.float32), networks)
-    scores = score_contacts(found, log.true)
-    return {"contacts_n": contacts_n(found.contact)} | {name: scores[name] for name in SCORES if name in scores}
+    estimated = estimate_after(log.quiet_n, log.t_s, (log.b_uT + added_uT).astype(np.float32), networks)
+    scores = score_contacts(estimated, log.true)
+    return {"contacts_n": contacts_n(estimated.contact)} | {name: scores[name] for name in SCORES if name in scores}
 
 
 # --- Tables and figures ---

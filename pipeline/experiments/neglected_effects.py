@@ -107,7 +107,7 @@ def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
     """Compare simulations of the whole protocol with a term and without it."""
     n, relaxation = len(subject.plan), RELAXATION
     rows = []
-    for name, terms, how in (
+    for name, terms, description in (
         ("ageing", Terms(ageing=AGEING), f"at the last of {n} contacts, a no-load reading before each"),
         (
             "relaxation",
@@ -120,7 +120,7 @@ def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
         rest_uT = np.abs(simulated.rest_T[-1] - plain.rest_T[-1]).max() / micro
         force_pct = _error_pct(plain.force_N[-1], simulated.force_N[-1])
         field_pct = _error_pct(plain.change_T, simulated.change_T)
-        rows.append(Effect(name, _status(name, subject), field_pct, float(rest_uT), force_pct, how))
+        rows.append(Effect(name, _status(name, subject), field_pct, float(rest_uT), force_pct, description))
     return rows
 
 
@@ -128,8 +128,8 @@ def _temperature(subject: Subject, plain: Response) -> Effect:
     factor = aging.relative_remanence(np.array([WARMER_K]))[0]
     rest_uT = float(np.abs((factor - 1) * plain.rest_T).max() / micro)
     field_pct = _error_pct(plain.change_T, factor * plain.change_T)
-    how = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
-    return Effect("temperature", _status("temperature", subject), field_pct, rest_uT, 0.0, how)
+    description = f"{WARMER_K:g} K warmer, a no-load reading before each contact"
+    return Effect("temperature", _status("temperature", subject), field_pct, rest_uT, 0.0, description)
 
 
 def _friction(subject: Subject) -> Effect:
@@ -138,17 +138,17 @@ def _friction(subject: Subject) -> Effect:
     dragged = drag_tip(subject.board, subject.skin, tip_m, tilt=subject.plan.tilt[:FEW], how=FRICTION)
     field_pct = _error_pct(pressed.reshape(dragged.change_T.shape), dragged.change_T)
     force_pct = 100 * float(np.abs(dragged.force_N).max() / forces(subject.skin, tip_m[..., 2].ravel()).max())
-    how = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
-    return Effect("friction", _status("friction", subject), field_pct, 0.0, force_pct, how)
+    description = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"
+    return Effect("friction", _status("friction", subject), field_pct, 0.0, force_pct, description)
 
 
 def _earth(plain: Response) -> Effect:
     """Add a steady field to the no-load reading and to the contact, and subtract the former from the latter."""
     rest_T = plain.rest_T[:, None] + EARTH_T
-    seen_T = (rest_T + plain.change_T) - rest_T
-    how = "a steady field, as long as the board does not turn; a no-load reading before each contact"
+    measured_T = (rest_T + plain.change_T) - rest_T
+    description = "a steady field, as long as the board does not turn; a no-load reading before each contact"
     rest_uT = float(np.abs(EARTH_T).max() / micro)
-    return Effect("the earth's field", "left out", _error_pct(plain.change_T, seen_T), rest_uT, 0.0, how)
+    return Effect("the earth's field", "left out", _error_pct(plain.change_T, measured_T), rest_uT, 0.0, description)
 
 
 def _hold(subject: Subject) -> list[Effect]:
@@ -159,10 +159,10 @@ def _hold(subject: Subject) -> list[Effect]:
     pokes_m = subject.tip_m[:FEW].reshape(-1, 3)
     held_T, free_T = (changes_of_field(subject.board, skin, pokes_m)[1] for skin in (subject.skin, free))
     force_pct = _error_pct(forces(free, deepest_m), forces(subject.skin, deepest_m))
-    how = (
+    description = (
         f"an endless layer that slides freely, its force linear elasticity's; {FEW} indentations, force at the deepest"
     )
-    return [Effect("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, how)]
+    return [Effect("the base's hold", "kept", _error_pct(free_T, held_T), 0.0, force_pct, description)]
 
 
 def _free_edge(subject: Subject) -> list[Effect]:
@@ -173,14 +173,18 @@ def _free_edge(subject: Subject) -> list[Effect]:
     poke_m = np.array([[*subject.skin.seat_m, depth_m]])
     [(_, before, after)] = moved_dipoles(subject.skin, poke_m)
     edge_m = min(subject.skin.sides_m) / 2
-    away_m, then_m = (part[0][:, :2] - subject.skin.seat_m for part in (before, after))
-    far = np.argmax(np.hypot(*away_m.T))
-    grown_m2 = float((then_m[far] ** 2).sum() - (away_m[far] ** 2).sum())
-    stretched_m = np.column_stack([then_m * (1 + grown_m2 / 2 / (3 * edge_m**2)) + subject.skin.seat_m, after[0][:, 2]])
+    offset_m, moved_m = (part[0][:, :2] - subject.skin.seat_m for part in (before, after))
+    far = np.argmax(np.hypot(*offset_m.T))
+    growth_m2 = float((moved_m[far] ** 2).sum() - (offset_m[far] ** 2).sum())
+    stretched_m = np.column_stack(
+        [moved_m * (1 + growth_m2 / 2 / (3 * edge_m**2)) + subject.skin.seat_m, after[0][:, 2]]
+    )
     endless_T = change_of_field(before, after, subject.board.chips_m)
     ended_T = change_of_field(before, (stretched_m, after[1]), subject.board.chips_m)
-    how = f"a free disc of {2 * edge_m / milli:g} mm, plane stress, poked in its middle to {depth_m / milli:.2g} mm"
-    return [Effect("the skin's free edge", "left out", _error_pct(endless_T, ended_T), 0.0, None, how)]
+    description = (
+        f"a free disc of {2 * edge_m / milli:g} mm, plane stress, poked in its middle to {depth_m / milli:.2g} mm"
+    )
+    return [Effect("the skin's free edge", "left out", _error_pct(endless_T, ended_T), 0.0, None, description)]
 
 
 def _inside(subject: Subject) -> list[Effect]:
@@ -207,8 +211,8 @@ def _inside(subject: Subject) -> list[Effect]:
     }  # fmt: skip
     complete_T, pokes = _change(subject, complete), f"{len(PLACES_M)} pokes of {depth_m / milli:.2g} mm"
     return [
-        Effect(term, "kept", _error_pct(_change(subject, moved), complete_T), 0.0, force_pct, f"{how}; {pokes}")
-        for term, (moved, force_pct, how) in cases.items()
+        Effect(term, "kept", _error_pct(_change(subject, moved), complete_T), 0.0, force_pct, f"{description}; {pokes}")
+        for term, (moved, force_pct, description) in cases.items()
     ]
 
 
@@ -266,10 +270,10 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
     moments_A_m2 = [magnet.moments(each_T, rest.volumes_m3) for each_T in (j_T, with_own_T)]
     skins = [replace(subject.skin, nodes_m=nodes_m, moments_A_m2=each_A_m2) for each_A_m2 in moments_A_m2]
     changes_T = [changes_of_field(subject.board, skin, pokes_m)[1] for skin in skins]
-    how = (
+    description = (
         f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
     )
-    return Effect("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, how)
+    return Effect("the powder's own field", "left out", _error_pct(*changes_T), None, 0.0, description)
 
 
 def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
@@ -280,8 +284,10 @@ def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
         for _, skin in list_captures(simulation, MAIN)
     ]
     share_pct = 100 * sum(count_beyond_verified(skin, depth_m) for skin in skins) / (len(depth_m) * len(skins))
-    how = f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
-    return Effect("depths past 0.6 of the thickness", "kept", None, None, None, how)
+    description = (
+        f"{share_pct:.3g} % of the stops of {len(skins)} skins are past 0.6 of the thickness: nothing published there"
+    )
+    return Effect("depths past 0.6 of the thickness", "kept", None, None, None, description)
 
 
 def _simulate(subject: Subject, terms: Terms, seed: int) -> Response:
@@ -302,8 +308,8 @@ def neglected_effects(settings: Settings, results: Path) -> None:
     simulation, seed = simulation_settings(settings), settings.seed
     effects = measure(simulation, seed=seed)
     io.write_json(results, [asdict(effect) for effect in effects])
-    left = ", ".join(effect.term for effect in effects if effect.done == "left out")
-    say(f"{settings.scene}: neglected by the main protocol, and measured: {left}")
+    neglected = ", ".join(effect.term for effect in effects if effect.done == "left out")
+    say(f"{settings.scene}: neglected by the main protocol, and measured: {neglected}")
 
 
 MEANING = (

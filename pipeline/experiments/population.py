@@ -244,12 +244,12 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
     middle = own[off_mm == off_mm.min()]
     press_i, first = np.unique(rows.indentation[middle], return_index=True)
     ratio = rows.target[middle[first], 2] / WEIGHT_N
-    off = np.full(len(ratio), np.inf)  # a gauge may read 0 N or less, which has no logarithm
-    off[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
-    if np.isinf(off).all():
+    log_ratio = np.full(len(ratio), np.inf)  # a gauge may read 0 N or less, which has no logarithm
+    log_ratio[ratio > 0] = np.abs(np.log(ratio[ratio > 0]))
+    if np.isinf(log_ratio).all():
         what = f"none of the {len(ratio)} presses near the middle has a force above 0 N"
         raise SchemaError(f"skin {rows.skin[own[0]]}: {what}. Check the sign of its forces.")
-    press = middle[rows.indentation[middle] == press_i[off.argmin()]]
+    press = middle[rows.indentation[middle] == press_i[log_ratio.argmin()]]
     return known_weight(frame.field(rows.db_uT[press]).mean(axis=0), float(rows.target[press, 2].mean()), rng)
 
 
@@ -299,8 +299,8 @@ def estimate(
         way = {"map": evaluation.by_map, "universal": evaluation.combined, "network": evaluation.by_network}
         return [way[name](one[name]) for one in powers for name in WAYS]
 
-    found = iter(model.calibrate(data).with_labels(labels).estimate_by(in_each_way, read_uT))
-    return [{name: next(found) for name in WAYS} for _ in powers]
+    estimates = iter(model.calibrate(data).with_labels(labels).estimate_by(in_each_way, read_uT))
+    return [{name: next(estimates) for name in WAYS} for _ in powers]
 
 
 @dataclass(frozen=True)
@@ -315,15 +315,15 @@ def calibrate_ways(model: PriorModel, skins: Sequence[TestSkin], size: Calibrati
     """Choose likelihood powers and weight shares on simulated skins that are not scored."""
     covered = {way: np.zeros((len(BOARD_POWERS), len(skins))) for way in WAYS}
     # Errors of log F, by power: of the weight, and the mean of all other presses.
-    off = {way: np.zeros((len(BOARD_POWERS), 2, len(skins))) for way in WAYS}
+    log_force_errors = {way: np.zeros((len(BOARD_POWERS), 2, len(skins))) for way in WAYS}
     candidates = [dict.fromkeys(WAYS, power) for power in BOARD_POWERS]
     for j, skin in enumerate(skins):
         for i, by_way in enumerate(estimate(model, skin, size, candidates)):
-            for way, found in by_way.items():
-                covered[way][i, j] = _coverage(found, skin)
-                off[way][i, :, j] = _off_log_N(found, skin)
+            for way, estimated in by_way.items():
+                covered[way][i, j] = _coverage(estimated, skin)
+                log_force_errors[way][i, :, j] = _off_log_N(estimated, skin)
     chosen_i = {way: int(np.abs(covered[way].mean(axis=1) - 0.9).argmin()) for way in WAYS}
-    shares = {way: weight_share(*off[way][i]) for way, i in chosen_i.items()}
+    shares = {way: weight_share(*log_force_errors[way][i]) for way, i in chosen_i.items()}
     return Calibration({way: BOARD_POWERS[i] for way, i in chosen_i.items()}, shares)
 
 
@@ -341,30 +341,30 @@ def score_skin(
     """
     rows = []
     (by_way,) = estimate(model, skin, size, [calibration.power])
-    for way, found in by_way.items():
-        force_N, true_N = found.force_N[:-1], skin.true[:, 2]
-        weight_off, _ = _off_log_N(found, skin)
+    for way, estimated in by_way.items():
+        force_N, true_N = estimated.force_N[:-1], skin.true[:, 2]
+        weight_off, _ = _off_log_N(estimated, skin)
         weighed_N = force_N * np.exp(calibration.weight_share[way] * weight_off)
         scaled_N = force_N * (force_N @ true_N) / (force_N @ force_N)
         rows.append(
             {"way": way, "pokes_n": size.presses_n, "labels_n": size.labels_n, "board": skin.board}
-            | score(skin.true, np.column_stack([found.place_mm[:-1], force_N]))
+            | score(skin.true, np.column_stack([estimated.place_mm[:-1], force_N]))
             | {"mse_f_weight_N2": float(((weighed_N - true_N) ** 2).mean())}
             | {"mse_f_factor_N2": float(((scaled_N - true_N) ** 2).mean())}
-            | {"coverage_pct": 100 * _coverage(found, skin)}
+            | {"coverage_pct": 100 * _coverage(estimated, skin)}
         )
     return rows
 
 
-def _off_log_N(found: Estimate, skin: TestSkin) -> tuple[float, float]:
+def _off_log_N(estimated: Estimate, skin: TestSkin) -> tuple[float, float]:
     """Return the error of log F for the weight, and its mean over test presses."""
     felt = skin.true[:, 2] > LOG_FORCE_MIN_N
-    weight = np.log(skin.weight.force_N / found.force_N[-1])
-    return float(weight), float(np.log(skin.true[felt, 2] / found.force_N[:-1][felt]).mean())
+    weight = np.log(skin.weight.force_N / estimated.force_N[-1])
+    return float(weight), float(np.log(skin.true[felt, 2] / estimated.force_N[:-1][felt]).mean())
 
 
-def _coverage(found: Estimate, skin: TestSkin) -> float:
-    tested = Estimate(*(getattr(found, name)[:-1] for name in Estimate.__annotations__))
+def _coverage(estimated: Estimate, skin: TestSkin) -> float:
+    tested = Estimate(*(getattr(estimated, name)[:-1] for name in Estimate.__annotations__))
     return coverage(tested, skin.true[:, :2])
 
 
@@ -406,11 +406,11 @@ def score_all(
 
 def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
     """Summarise scores over boards; the score of a board is the mean over its skins."""
-    found = []
+    summaries = []
     for key, own in rows.groupby(list(keys), sort=False):
         boards = own.groupby("board").mean(numeric_only=True).drop(columns=list(set(keys) - {"way"}))
-        found.append(dict(zip(keys, key, strict=True)) | summarise(boards, boards=True))
-    return found
+        summaries.append(dict(zip(keys, key, strict=True)) | summarise(boards, boards=True))
+    return summaries
 
 
 def population(settings: Settings, section: PopulationSettings, folds: Path, indentations: Path, results: Path) -> None:

@@ -189,8 +189,8 @@ def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Se
         points.append(score(plain.predict(view(back_uT)), method=f"{name}, {DIRECT}", pokes=NONE, labels_n=n))
         own = np.concatenate([row[::EVERY_N] for row in pokes[:n]])
         weight = np.concatenate([np.ones(len(known)), np.full(len(own), len(known) / len(own))]).astype(np.float32)
-        more = np.concatenate([known, view(rows.db_uT[own])]), np.concatenate([target, rows.target[own]])
-        fitted = fit(method, *more, draws(AS_ROWS, n), weight=weight)
+        extended = np.concatenate([known, view(rows.db_uT[own])]), np.concatenate([target, rows.target[own]])
+        fitted = fit(method, *extended, draws(AS_ROWS, n), weight=weight)
         points.append(score(fitted.predict(test), method=f"{name}, {AS_ROWS}", pokes=NONE, labels_n=n))
     return points
 
@@ -201,13 +201,13 @@ def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) ->
     Each pair has the same weight, however strong the poke; the ridge penalty is chosen on the pairs.
     """
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
-    kept = np.isfinite(old_uT).all(axis=1)
-    if not kept.any():
+    paired = np.isfinite(old_uT).all(axis=1)
+    if not paired.any():
         what = f"no labelled poke is within {SAME_MM} mm of one on the known boards"
         remedy = "Record known boards at the same places, or remove the experiment from the scene."
         raise ParamsError(f"fold {fold.name}: {what}. {remedy}")
-    length_uT = np.linalg.norm(new_uT[kept], axis=1, keepdims=True)
-    new, old = new_uT[kept] / length_uT, old_uT[kept] / length_uT
+    length_uT = np.linalg.norm(new_uT[paired], axis=1, keepdims=True)
+    new, old = new_uT[paired] / length_uT, old_uT[paired] / length_uT
     moved = direct(new, old, choose_ridge(new, old))(data.rows.db_uT[fold.test].astype(float))
     return moved.astype(np.float32)
 
@@ -219,14 +219,14 @@ def pairs_uT(
 
     Channels are interpolated linearly in log F between a board's forces at a place, and are constant beyond them.
     """
-    found = np.full((len(pokes), rows.db_uT.shape[1]), np.nan)
+    old_uT = np.full((len(pokes), rows.db_uT.shape[1]), np.nan)
     boards = [_poke_means(rows, train[rows.board[train] == board]) for board in np.unique(rows.board[train])]
     for i, row in enumerate(pokes):
         x_mm, y_mm, force_N = rows.target[row].mean(axis=0, dtype=np.float64)
         fields_uT = [_interpolate(*known, (x_mm, y_mm), float(force_N)) for known in boards]
         if fields_uT := [one for one in fields_uT if one is not None]:
-            found[i] = np.mean(fields_uT, axis=0)
-    return found
+            old_uT[i] = np.mean(fields_uT, axis=0)
+    return old_uT
 
 
 def _poke_means(rows: Rows, own: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray]:
@@ -242,12 +242,12 @@ def _interpolate(
     target: Float[np.ndarray, "p 3"], db_uT: Float[np.ndarray, "p ch"], place_mm: tuple[float, float], force_N: float
 ) -> Float[np.ndarray, " ch"] | None:
     distance_mm = np.hypot(*(target[:, :2] - place_mm).T)
-    here = np.flatnonzero((distance_mm <= SAME_MM) & (target[:, 2] > 0))
-    if not len(here):
+    nearby = np.flatnonzero((distance_mm <= SAME_MM) & (target[:, 2] > 0))
+    if not len(nearby):
         return None
-    here = here[np.argsort(target[here, 2])]
-    log_N = np.log(target[here, 2])
-    return np.array([np.interp(np.log(force_N), log_N, channel) for channel in db_uT[here].T])
+    nearby = nearby[np.argsort(target[nearby, 2])]
+    log_N = np.log(target[nearby, 2])
+    return np.array([np.interp(np.log(force_N), log_N, channel) for channel in db_uT[nearby].T])
 
 
 def score_adversarial(
@@ -276,8 +276,8 @@ def train_until_converged(
     """
     for attempt_i in range(MAX_ATTEMPTS_N):
         weights = train_adversarial(domains, recipe, weight, rng_for(seed, RNG, "network", fold, attempt_i))
-        off = Predictor(weights, recipe.architecture, "cpu")(domains.known) - domains.target
-        collapsed = bool(np.min(1 - np.nanmean(off**2, axis=0) / np.nanvar(domains.target, axis=0)) < COLLAPSED)
+        errors = Predictor(weights, recipe.architecture, "cpu")(domains.known) - domains.target
+        collapsed = bool(np.min(1 - np.nanmean(errors**2, axis=0) / np.nanvar(domains.target, axis=0)) < COLLAPSED)
         if not collapsed:
             break
     return weights, {"collapsed": collapsed, "collapsed_before_n": attempt_i}
@@ -361,11 +361,11 @@ def estimate_inversion(
     start_s = time.process_time()
     known = chart(fit_unlabelled(pool.db_uT, rest_uT, setup), setup)
     ready_s = time.process_time()
-    found = search(known, test_uT)
+    estimated = search(known, test_uT)
     seconds = Seconds("", ready_s - start_s, (time.process_time() - ready_s) / len(test_uT))
-    yield INVERSION, found.place_mm, found.force_N, seconds
+    yield INVERSION, estimated.place_mm, estimated.force_N, seconds
     middle_mm = search(known, pool.db_uT).place_mm.mean(axis=0) if len(pool.db_uT) else np.zeros(2)
-    yield CENTRED, found.place_mm - middle_mm, found.force_N, seconds
+    yield CENTRED, estimated.place_mm - middle_mm, estimated.force_N, seconds
 
 
 def unlabelled_controls() -> dict[Key, Key]:
@@ -426,10 +426,10 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
         return search(fitted, frame.field(board.tested_uT)).residual
 
     charts = {board: fit_board(own) for board, own in boards.items()}
-    found = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}
-    residuals = {board: own.left for board, own in found.items()}
+    inverted = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}
+    residuals = {board: own.left for board, own in inverted.items()}
     true_mm = {board: data.rows.target[first[board].test[::TESTED_EVERY_N], :2].astype(float) for board in boards}
-    off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in found.items()}
+    off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in inverted.items()}
     limits = limits_of(residuals, fraction)
     strangers: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     names = list(boards)
@@ -454,33 +454,33 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
 
 def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
     """Return for each board the limit that this fraction of the readings of all other boards exceeds."""
-    others = {board: [own for other, own in value.items() if other != board] for board in value}
-    return {board: float(np.quantile(np.concatenate(own), 1 - fraction)) for board, own in others.items()}
+    other_values = {board: [own for other, own in value.items() if other != board] for board in value}
+    return {board: float(np.quantile(np.concatenate(own), 1 - fraction)) for board, own in other_values.items()}
 
 
-def alarm_statistics(left: ByBoard, right: ByBoard, limits: Mapping[str, float]) -> dict[str, Any]:
+def alarm_statistics(residuals: ByBoard, own_residuals: ByBoard, limits: Mapping[str, float]) -> dict[str, Any]:
     """Summarise over boards: readings that raise the alarm, the area under the ROC curve, the median residual."""
     by_board = {
-        "alarm_pct": [100 * float((own > limits[board]).mean()) for board, own in left.items()],
-        "auc": [roc_area(right[board], own) for board, own in left.items()],
-        "left_median": [float(np.median(own)) for own in left.values()],
+        "alarm_pct": [100 * float((own > limits[board]).mean()) for board, own in residuals.items()],
+        "auc": [roc_area(own_residuals[board], own) for board, own in residuals.items()],
+        "left_median": [float(np.median(own)) for own in residuals.values()],
     }
     return {name: statistic(values, boards=True) for name, values in by_board.items()}
 
 
 def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]], fraction: float) -> dict[str, Any]:
     """Summarise over boards the errors of flagged readings (over the boards that have any) and of all others."""
-    found: dict[str, list[float]] = {}
+    scores_by_name: dict[str, list[float]] = {}
     for board, limit in limits_of(value, fraction).items():
         flagged = value[board] > limit
-        found.setdefault("flagged_pct", []).append(100 * float(flagged.mean()))
+        scores_by_name.setdefault("flagged_pct", []).append(100 * float(flagged.mean()))
         for name, rows in (("flagged", flagged), ("others", ~flagged)):
             if rows.any():
-                off = np.abs(off_mm[board][rows])
-                within = (off <= ACCURACY_LIMIT_MM).all(axis=1)
-                found.setdefault(f"accuracy_pct_{name}", []).append(100 * float(within.mean()))
-                found.setdefault(f"mse_xy_mm2_{name}", []).append(float((off**2).mean()))
-    return {name: statistic(values, boards=True) for name, values in found.items()}
+                errors_mm = np.abs(off_mm[board][rows])
+                within = (errors_mm <= ACCURACY_LIMIT_MM).all(axis=1)
+                scores_by_name.setdefault(f"accuracy_pct_{name}", []).append(100 * float(within.mean()))
+                scores_by_name.setdefault(f"mse_xy_mm2_{name}", []).append(float((errors_mm**2).mean()))
+    return {name: statistic(values, boards=True) for name, values in scores_by_name.items()}
 
 
 def flag_by_universal(
@@ -491,9 +491,9 @@ def flag_by_universal(
     for board, fold in first_folds(folds).items():
         rows, test = known.data.rows, fold.test[::TESTED_EVERY_N]
         calibration = calibrate(nominal.model, known.presses[board].rest_uT.ravel(), pool_of(known, fold))
-        ((_, both),) = estimate(calibration.with_labels(0), known.frame.field(rows.db_uT[test]), ASSUMED)
-        off_mm[board] = both.place_mm - known.frame.place(rows.target[test, :2].astype(float))
-        sd_mm[board], misfit[board] = both.sd_mm.max(axis=1), both.misfit
+        ((_, combined),) = estimate(calibration.with_labels(0), known.frame.field(rows.db_uT[test]), ASSUMED)
+        off_mm[board] = combined.place_mm - known.frame.place(rows.target[test, :2].astype(float))
+        sd_mm[board], misfit[board] = combined.sd_mm.max(axis=1), combined.misfit
     method = METHODS[1] + WAYS["nominal"]
     by = {"standard deviation of the place": sd_mm, "misfit of the map": misfit}
     return [{"method": method, "by": name} | score_flagged(value, off_mm, fraction) for name, value in by.items()]
@@ -552,7 +552,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     unlabelled = [row for row in numbers["methods"] if row["method"].startswith(("universal", INVERSION))]
     aligned = [row for row in numbers["methods"] if row not in unlabelled]
     alarm = numbers["alarm"]
-    right = {"stranger": "none: the right skin", "law": OF_RIGHT} | alarm["right"]
+    right_row = {"stranger": "none: the right skin", "law": OF_RIGHT} | alarm["right"]
     unpaired = f" {numbers['unpaired_n']} labelled pokes had no pair." if numbers["unpaired_n"] else ""
     return {
         "rivals": tabulate(
@@ -570,7 +570,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
                     "n": str(row["auc"]["n"]),
                     "source": source,
                 }
-                for row in (right, *alarm["strangers"])
+                for row in (right_row, *alarm["strangers"])
             ],
             meaning=ALARM.format(asked=alarm["asked_pct"], limit=show(alarm["limit"])),
         ),

@@ -137,10 +137,10 @@ def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ER
 
     The number of nodes is proportional to the run time, but is the same in every run.
     """
-    tried = {row.setting: row for row in rows if row.method == CANDIDATES}
-    passing = [row for row in tried.values() if row.error is not None and row.error < error_max]
+    candidates = {row.setting: row for row in rows if row.method == CANDIDATES}
+    passing = [row for row in candidates.values() if row.error is not None and row.error < error_max]
     best = min(passing, key=lambda row: (row.work_n, row.error), default=None)
-    in_use = tried.get(rule_name(used))
+    in_use = candidates.get(rule_name(used))
     return Choice(
         setting=best.setting if best else None,
         nodes_n=best.work_n if best else None,
@@ -393,11 +393,11 @@ def _run_with_new_counter(run: Run, calls_max_n: int) -> Forces:
 def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str | None]:
     # Returns the relative rms error, or the reason why there is none.
     try:
-        found = run(counter)
+        relaxed = run(counter)
     except Failed as failure:
         return None, str(failure)
     with np.errstate(over="ignore", invalid="ignore"):
-        error = float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+        error = float(np.linalg.norm(relaxed - truth) / np.linalg.norm(truth))
     return (error, None) if error < DIVERGED else (None, f"diverged: error {error:.0e} of the force")
 
 
@@ -523,9 +523,9 @@ def paths(trial: Trial, skin: Skin) -> NodePath:
         away_m = skin.nodes_m[:, :2] - poke_m[:2]
         r_m = np.hypot(*away_m.T)
         outward_m, up_m, angle_rad = np.sqrt(r_m**2 + deformed.grown_m2) - r_m, np.zeros_like(r_m), np.zeros_like(r_m)
-        here = r_m < reach_m
+        within = r_m < reach_m
         for part, spline in zip((outward_m, up_m, angle_rad), deformed.splines, strict=True):
-            part[here] = spline.ev(r_m[here], skin.nodes_m[here, 2])
+            part[within] = spline.ev(r_m[within], skin.nodes_m[within, 2])
         cos, sin = (away_m / np.where(r_m > 0, r_m, 1.0)[:, None]).T
         nodes_m[poke_i] += np.stack([outward_m * cos, outward_m * sin, up_m], axis=1)
         turns_rad[poke_i] += angle_rad[:, None] * np.stack([-sin, cos, np.zeros_like(cos)], axis=1)
@@ -562,7 +562,7 @@ def _deformation_splines(
     z_m = press.thickness_m * np.linspace(0, 1, HEIGHTS_N)
     r0_m, z0_m = (part.ravel() for part in np.meshgrid(r_m, z_m, indexing="ij"))
     steps_m = deformation.depth_steps(depths_m, press)
-    found = {}
+    by_depth = {}
     for step_m, end in zip(steps_m, deformation.follow(r0_m, z0_m, steps_m, press=press), strict=True):
         changes = [
             part.reshape(RADII_N, HEIGHTS_N)
@@ -570,10 +570,10 @@ def _deformation_splines(
         ]
         edge_m = reach_m + float(changes[0][-1].mean())
         grown_m2 = edge_m**2 - reach_m**2 if press.base == "slipping" else 0.0
-        found[float(step_m)] = _DeformationSplines(
+        by_depth[float(step_m)] = _DeformationSplines(
             tuple(RectBivariateSpline(r_m, z_m, change) for change in changes), grown_m2
         )
-    return found, reach_m
+    return by_depth, reach_m
 
 
 COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # only for drawing a skin, whose nodes are then replaced
@@ -673,11 +673,11 @@ def runtime(settings: Settings, section: RunTime, results: Path) -> None:
 
 def _trials(simulation: SimulationSettings, tried: Quadratures, seed: int) -> list[Trial]:
     """Return the skins on the boards with the nearest chips, which need the finest quadrature."""
-    drawn = [
+    boards_and_skins = [
         (draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board), skin)
         for board, skin in list_captures(simulation, MAIN)
     ]
-    nearest = sorted(drawn, key=lambda pair: -pair[0].chips_m[0, 2])[: tried.skins_n]
+    nearest = sorted(boards_and_skins, key=lambda pair: -pair[0].chips_m[0, 2])[: tried.skins_n]
     return [
         draw_trial(board, simulation.skin, spreads=simulation.spreads, seed=seed, name=skin, pokes=tried)
         for board, skin in nearest

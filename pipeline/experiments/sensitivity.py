@@ -48,22 +48,22 @@ def analyse_levels(
     db_uT: Float32[np.ndarray, "n p r ch"], weight_N: Float64[np.ndarray, " p"]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Analyse the readings under weights that increase in equal steps; return numbers, and data for the figures."""
-    fitted, held = np.split(db_uT.astype(np.float64), [len(db_uT) // 2])
-    along_uT = held @ direction(fitted)
+    fitted, held_out = np.split(db_uT.astype(np.float64), [len(db_uT) // 2])
+    along_uT = held_out @ direction(fitted)
     response_uT, step_N = along_uT.mean(axis=(0, 2)), float(weight_N[1] - weight_N[0])
     by_direction = {
         "one_reading": ordered_share(along_uT),
         "five_readings": ordered_share(along_uT.mean(axis=2, keepdims=True)),
     }
     by_length = {
-        "one_reading": ordered_share(np.linalg.norm(held, axis=3)),
-        "five_readings": ordered_share(np.linalg.norm(held.mean(axis=2, keepdims=True), axis=3)),
+        "one_reading": ordered_share(np.linalg.norm(held_out, axis=3)),
+        "five_readings": ordered_share(np.linalg.norm(held_out.mean(axis=2, keepdims=True), axis=3)),
     }
     steps_N = _known({name: smallest_step_N(share, step_N) for name, share in by_direction.items()})
     numbers = {
         "levels_n": len(weight_N),
         "fillings_n": len(db_uT),
-        "held_out_n": len(held),
+        "held_out_n": len(held_out),
         "readings_per_stop_n": db_uT.shape[2],
         "step_N": step_N,
         "told_pct": 100 * RESOLVED_SHARE,
@@ -103,8 +103,8 @@ def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarr
     levels_n = response_uT.shape[1]
     shares = []
     for steps_n in range(1, levels_n):
-        more, less = response_uT[:, steps_n:, :, None], response_uT[:, :-steps_n, None, :]
-        shares.append(float((more > less).mean() + 0.5 * (more == less).mean()))
+        heavier, lighter = response_uT[:, steps_n:, :, None], response_uT[:, :-steps_n, None, :]
+        shares.append(float((heavier > lighter).mean() + 0.5 * (heavier == lighter).mean()))
     return np.array(shares)
 
 
@@ -126,7 +126,7 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
     mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
     noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # of one rise
     gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # per step
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "holds": False,
         "falls_n": 0,
         "pairs_n": 0,
@@ -138,11 +138,11 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
         steps_n = max(int(np.ceil(needed)), 1)
         falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
         step_N = steps_n * float(weight_N[1] - weight_N[0])
-        found |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
+        result |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
     if noise_uT > 0:  # for a linear rise, with the standard error of the mean
         z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
-        found["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
-    return found
+        result["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
+    return result
 
 
 def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
@@ -226,16 +226,16 @@ def _rises(rise: Mapping[str, Any]) -> str:
     ranks = f"rank correlation {rise['spearman']:.4f}"
     if "step_N" not in rise:
         return f"{UNDECIDED}: no step is above the noise; {ranks}"
-    here = "rises" if rise["holds"] else "does not rise"
+    verb = "rises" if rise["holds"] else "does not rise"
     rises_n = rise["pairs_n"] - rise["falls_n"]
     return (
-        f"{FEW_BOARDS}; {here} on this one: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
+        f"{FEW_BOARDS}; {verb} on this one: {rises_n} of {rise['pairs_n']} pairs {rise['step_N']:.3g} N apart, {ranks}"
     )
 
 
-def _falls(found: Mapping[str, Any], numbers: Mapping[str, Any]) -> str:
-    expected = f", {found['expected_falls_n']:.1f} expected from noise" if "expected_falls_n" in found else ""
-    return f"{found['falls_n']} of {numbers['levels_n'] - 1}{expected}"
+def _falls(neighbours: Mapping[str, Any], numbers: Mapping[str, Any]) -> str:
+    expected = f", {neighbours['expected_falls_n']:.1f} expected from noise" if "expected_falls_n" in neighbours else ""
+    return f"{neighbours['falls_n']} of {numbers['levels_n'] - 1}{expected}"
 
 
 def _show(steps_N: Mapping[str, float], name: str, numbers: Mapping[str, Any]) -> str:

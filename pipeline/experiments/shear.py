@@ -49,11 +49,11 @@ def shear(settings: Settings, section: Shear, indentations: Path, results: Path)
     trained = train_jobs(data, jobs, "shear")
     write_timings(settings.scene, "shear", jobs, trained)
     scores = [
-        (one.fold, score5(rows.target[one.test], done.predicted)) for one, done in zip(jobs, trained, strict=True)
+        (job.fold, score5(rows.target[job.test], result.predicted)) for job, result in zip(jobs, trained, strict=True)
     ]
     names = {fold.name for fold in by_line}
     numbers = summarise_shear(
-        [one for one in scores if one[0] not in names], [one for one in scores if one[0] in names],
+        [job for job in scores if job[0] not in names], [job for job in scores if job[0] in names],
         target=rows.target, lines_n=len(np.unique(rows.indentation)), passes_n=len(np.unique(rows.pass_i)),
         seeds_n=section.training.seeds_n,
     )  # fmt: skip
@@ -74,12 +74,12 @@ def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int
     folds = []
     for skin in np.unique(rows.skin):
         own = np.flatnonzero(rows.skin == skin)
-        drawn = draw_sides(
+        splits = draw_sides(
             group[own], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
             state=seed_for(seed, "shear", by, str(skin)), what=f"{by}s of skin {skin}", where="experiment shear",
         )  # fmt: skip
         folds += [
-            Fold("shear", f"{skin}-{by}{i}", own[train], own[test], NO_POOL) for i, (train, test) in enumerate(drawn)
+            Fold("shear", f"{skin}-{by}{i}", own[train], own[test], NO_POOL) for i, (train, test) in enumerate(splits)
         ]
     return folds
 

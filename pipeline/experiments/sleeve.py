@@ -115,7 +115,7 @@ def lay_out(
 
 def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]:
     """Split rows into those of the first indentations of each capture and those of the last ones."""
-    held = np.zeros(len(rows), bool)
+    held_out = np.zeros(len(rows), bool)
     for capture in np.unique(rows.capture):
         own = rows.capture == capture
         indentations = np.unique(rows.indentation[own])  # in order of time
@@ -123,8 +123,8 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
         if not 0 < test_n < len(indentations):
             what = f"{test_n} of the {len(indentations)} pokes of {capture} would be held out: one side is empty"
             raise ParamsError(f"experiment sleeve: {what}. Poke more often.")
-        held |= own & (rows.indentation >= indentations[-test_n])
-    return np.flatnonzero(~held), np.flatnonzero(held)
+        held_out |= own & (rows.indentation >= indentations[-test_n])
+    return np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
 
 def predict_by_neighbours(
@@ -201,8 +201,8 @@ def draw_errors(
     area: Area, true: Float[np.ndarray, "f 3"], error_mm: Shaped[np.ndarray, " f"], indentation: Int[np.ndarray, " f"]
 ) -> dict[str, Any]:
     """List every test indentation with the mean error of its readings, and the chips and borders under the skin."""
-    _, first, which = np.unique(indentation, return_index=True, return_inverse=True)
-    mean_mm = np.bincount(which, error_mm) / np.bincount(which)
+    _, first, indentation_i = np.unique(indentation, return_index=True, return_inverse=True)
+    mean_mm = np.bincount(indentation_i, error_mm) / np.bincount(indentation_i)
     (x_mm, y_mm), (chips_x_mm, chips_y_mm) = true[first, :2].T, area.chips_mm.T
     columns = {"x_mm": x_mm, "y_mm": y_mm, "error_mm": mean_mm, "chips_x_mm": chips_x_mm, "chips_y_mm": chips_y_mm}
     rounded: dict[str, Any] = {name: np.round(values.astype(float), 2).tolist() for name, values in columns.items()}

@@ -126,7 +126,7 @@ class Split:
 
 def touched_rows(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
     """Select the rows with enough force; raise `ParamsError` for a recording whose places have no numbers."""
-    places = tuple(sorted(int(found[1]) for name in account if (found := PLACE_COUNT.fullmatch(name))))
+    places = tuple(sorted(int(match[1]) for name in account if (match := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):
         what = f"one or two numbered places are needed; got {list(places)}"
         remedy = "Only layout eflash7 has such places: run this experiment in a scene of its own."
@@ -236,11 +236,11 @@ def score_unlike_one(
     known_uT: Float32[np.ndarray, "a ch"], known: Directions, tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Scores:
     """Score rows by the detectors of experiment contacts that need no network, and by the residual of one place."""
-    alone = [relative_residual(known, (place,), tested_uT) for place in known]
+    residuals = [relative_residual(known, (place,), tested_uT) for place in known]
     return {
         "direction and length": neighbour_distance(shape(known_uT), shape(tested_uT)),
         "direction above noise": direction_distance(known_uT, tested_uT),
-        "left over by one place": np.min(alone, axis=0),
+        "left over by one place": np.min(residuals, axis=0),
     }
 
 
@@ -258,13 +258,13 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
         for part in [*(one.test for one in blocks), *double]
     ]
     singles_n = len(blocks)
-    found = {
+    result = {
         "by_time": statistic(right_pct[:singles_n]) | {"chance_pct": 100 / singles_n},
         "by_place": {str(one.test.places[0]): pct for one, pct in zip(blocks, right_pct, strict=False)},
     }
     if not double:
-        return found
-    return found | {"one_of_two": statistic(right_pct[singles_n:]) | {"chance_pct": 200 / singles_n}}
+        return result
+    return result | {"one_of_two": statistic(right_pct[singles_n:]) | {"chance_pct": 200 / singles_n}}
 
 
 def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
@@ -272,8 +272,8 @@ def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[s
     by_time = [_force_error(blocks, one.test, rng) for one in blocks]
     left_out = [_force_error([other for other in blocks if other is not one], one.test, rng) for one in blocks]
     spread = [{"mse_f_N2": float(one.test.force_N.var(dtype=np.float64))} for one in blocks]
-    ways = {"by_time": by_time, "place_left_out": left_out, "variance": spread}
-    return {way: statistic([row["mse_f_N2"] for row in rows]) for way, rows in ways.items()}
+    errors_by_split = {"by_time": by_time, "place_left_out": left_out, "variance": spread}
+    return {way: statistic([row["mse_f_N2"] for row in rows]) for way, rows in errors_by_split.items()}
 
 
 def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generator) -> dict[str, float]:
@@ -302,16 +302,16 @@ def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.nda
     residuals = {
         places: float(np.median(relative_residual(known, places, db_uT))) for places in combinations(sorted(known), 2)
     }
-    alone = {place: float(np.median(relative_residual(known, (place,), db_uT))) for place in known}
-    best_place = min(alone, key=lambda place: alone[place])
-    others = [share for places, share in residuals.items() if places != pair]
+    single_residuals = {place: float(np.median(relative_residual(known, (place,), db_uT))) for place in known}
+    best_place = min(single_residuals, key=lambda place: single_residuals[place])
+    other_residuals = [share for places, share in residuals.items() if places != pair]
     return {
         "places": list(pair), "rows_n": len(db_uT), "left_over_pct": 100 * residuals[pair],
-        "weaker_alone_pct": 100 * max(alone[place] for place in pair),
-        "stronger_alone_pct": 100 * min(alone[place] for place in pair),
-        "best_alone_pct": 100 * alone[best_place], "best_alone": best_place,
-        "other_pairs_pct": 100 * float(np.mean(others)), "rank": 1 + sum(share < residuals[pair] for share in others),
-        "pairs_n": len(residuals),
+        "weaker_alone_pct": 100 * max(single_residuals[place] for place in pair),
+        "stronger_alone_pct": 100 * min(single_residuals[place] for place in pair),
+        "best_alone_pct": 100 * single_residuals[best_place], "best_alone": best_place,
+        "other_pairs_pct": 100 * float(np.mean(other_residuals)),
+        "rank": 1 + sum(share < residuals[pair] for share in other_residuals), "pairs_n": len(residuals),
     }  # fmt: skip
 
 
@@ -328,27 +328,27 @@ def evaluate_detection(
     limits = thresholds(scored([one.aside.db_uT for one in blocks]), section.false_alarm_fraction)
     single = scored([one.test.db_uT for one in blocks])
     sums = scored(sum_pairs(blocks, rng_for(seed, "touches", "sums")))
-    found = {
+    result = {
         "false_alarm_asked_pct": 100 * section.false_alarm_fraction,
         "false_alarm_pct": above_pct(single, limits),
         "sums_called_two_pct": above_pct(sums, limits),
         "unseen_place_called_two_pct": unseen_places_called_two(blocks, section.false_alarm_fraction),
     }
     if not double:
-        return found
-    both = scored([one.db_uT for one in double])
-    return found | {"detected_pct": above_pct(both, limits), "auc": roc_areas(single, both)}
+        return result
+    double_scores = scored([one.db_uT for one in double])
+    return result | {"detected_pct": above_pct(double_scores, limits), "auc": roc_areas(single, double_scores)}
 
 
 def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
     """Add test rows of single touches for every pair of places, as experiment contacts does."""
     tested = [one.test.db_uT for one in blocks]
-    drawn = [
+    pairs = [
         (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])
         for i, a_uT in enumerate(tested)
         for b_uT in tested[i + 1 :]
     ]
-    return [a_uT + b_uT for a_uT, b_uT in drawn]
+    return [a_uT + b_uT for a_uT, b_uT in pairs]
 
 
 def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: float) -> dict[str, float]:
@@ -379,12 +379,12 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate places and forces of one touch, the superposition of two, and their detection."""
     if "not_computed" in numbers:
         return {"touches": _not_computed(numbers, source)}
-    found = {"touches": _single(numbers), "touches_detection": _detection(numbers["detection"])}
+    shown = {"touches": _single(numbers), "touches_detection": _detection(numbers["detection"])}
     if numbers["superposition"]["pairs"]:
-        found["touches_superposition"] = _superposition(numbers["superposition"])
-    for table in found.values():
+        shown["touches_superposition"] = _superposition(numbers["superposition"])
+    for table in shown.values():
         table["source"] = source
-    return found
+    return shown
 
 
 def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:

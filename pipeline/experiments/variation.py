@@ -150,8 +150,8 @@ def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float
     t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
     order = rank(readings.indentation[early])
     warmer_K = float(temperature_degC[order == order[-1]].mean() - temperature_degC[order == 0].mean())
-    found = {"shown_s": float(t_s[-1] - t_s[0]), "warmer_K": warmer_K}
-    return {name: value for name, value in found.items() if np.isfinite(value)}
+    values = {"shown_s": float(t_s[-1] - t_s[0]), "warmer_K": warmer_K}
+    return {name: value for name, value in values.items() if np.isfinite(value)}
 
 
 def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
@@ -179,7 +179,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     lines = []
     for place in numbers["places"]:
         time, skins = place["time"], place["skins"]
-        at = {"place, mm": f"{place['x_mm']:g}, {place['y_mm']:g}", "depth, mm": f"{numbers['depth_mm']:g}"}
+        place_cells = {"place, mm": f"{place['x_mm']:g}, {place['y_mm']:g}", "depth, mm": f"{numbers['depth_mm']:g}"}
         over = f"over {time['contacts_n']:,} contacts of {numbers['worn_skin']}, {time['visits_n']} visits"
         rows = [
             (f"{over}: field as read", time["raw_change_uT"], time["raw_change_pct"]),
@@ -190,7 +190,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
             rows.append((over, skins["spread_uT"], skins["spread_pct"]))
         for what, rms_uT, pct in rows:
             values = {"difference, µT": f"{rms_uT:.3g}", "difference, % of the change": f"{pct:.3g}"}
-            lines.append(at | {"what": what} | values | {"source": source})
+            lines.append(place_cells | {"what": what} | values | {"source": source})
     meaning = f"{MEANING} {describe_pace(numbers, source)}"
     if "shown_s" in numbers and "warmer_K" in numbers:
         meaning += (

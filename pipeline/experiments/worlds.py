@@ -88,22 +88,22 @@ class World:
 def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
     """List the worlds, beginning with the default (the scene's settings)."""
     spreads, hold = simulation.spreads, simulation.skin.hold
-    found = [World(DEFAULT, 1.0, simulation)]
-    found += [World("residual", size, simulation, size) for size in section.residual.sizes if size > 0]
+    listed = [World(DEFAULT, 1.0, simulation)]
+    listed += [World("residual", size, simulation, size) for size in section.residual.sizes if size > 0]
     for sd in section.skin_modulus:
         if sd != spreads.skin_modulus:
             changed = spreads.model_copy(update={"skin_modulus": sd})
-            found.append(World("skin_modulus", sd, simulation.model_copy(update={"spreads": changed})))
+            listed.append(World("skin_modulus", sd, simulation.model_copy(update={"spreads": changed})))
     for times in section.amplitude_and_gap:
         if times != 1:
-            both = {name: times * getattr(spreads, name) for name in ("skin_amplitude", "board_gap")}
-            changed = spreads.model_copy(update=both)
-            found.append(World("amplitude_and_gap", times, simulation.model_copy(update={"spreads": changed})))
+            scaled = {name: times * getattr(spreads, name) for name in ("skin_amplitude", "board_gap")}
+            changed = spreads.model_copy(update=scaled)
+            listed.append(World("amplitude_and_gap", times, simulation.model_copy(update={"spreads": changed})))
     for friction in section.friction:
         if hold is not None and friction != hold.friction:
             skin = simulation.skin.model_copy(update={"hold": hold.model_copy(update={"friction": friction})})
-            found.append(World("friction", friction, simulation.model_copy(update={"skin": skin})))
-    return found
+            listed.append(World("friction", friction, simulation.model_copy(update={"skin": skin})))
+    return listed
 
 
 def draw_smooth_error(
@@ -241,14 +241,14 @@ def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
         for card in cards
         if card["fold"].startswith(f"{world.name}.") and card["recipe_name"] == HEADLINE
     ]
-    table, found = tidy(own), {}
+    table, scores = tidy(own), {}
     for row, experiment in EXPERIMENTS.items():
         rows = select(table, question=experiment)
         boards = by_skin(rows).groupby("board")[list(METRICS)].mean() if row == "single" else None
         boards = whole(rows).groupby("board")[list(METRICS)].mean() if boards is None else boards
         scored = over_pairs(rows) if row == "single" else over_boards(rows)
-        found[row] = {name: scored[name] for name in METRICS if name in scored} | {"by_board": records(boards)}
-    return {"factor": world.factor, "value": world.value, **found}
+        scores[row] = {name: scored[name] for name in METRICS if name in scored} | {"by_board": records(boards)}
+    return {"factor": world.factor, "value": world.value, **scores}
 
 
 def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dict[str, Any]:

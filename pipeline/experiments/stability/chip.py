@@ -63,9 +63,9 @@ def _failed(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]
     for case, dropped in (("50 dropped readings of one chip", one_chip), ("every chip dropped", every_chip)):
         b_uT = np.where(dropped[..., None], faults.FAILED_B_uT, intact_uT.reshape(*dropped.shape, 3))
         b_uT = b_uT.reshape(intact_uT.shape)
-        found = faults.failed_reads(b_uT, np.where(dropped, faults.FAILED_TEMPERATURE_degC, 25.0))
+        marked = faults.failed_reads(b_uT, np.where(dropped, faults.FAILED_TEMPERATURE_degC, 25.0))
         case += ": 8028.16, 5194.00, 12943.36 uT, -880.49 degC"
-        cases.append(_marked(case, found, dropped, should="every such reading marked, and no other"))
+        cases.append(_marked(case, marked, dropped, should="every such reading marked, and no other"))
     return cases
 
 
@@ -83,12 +83,12 @@ def _stuck(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int) -> list[Case]:
     ]  # fmt: skip
 
 
-def _marked(case: str, found: Bool[np.ndarray, "f k"], expected: Bool[np.ndarray, "f k"], *, should: str) -> Case:
-    hits_n, false_n = int((found & expected).sum()), int((found & ~expected).sum())
+def _marked(case: str, marked: Bool[np.ndarray, "f k"], expected: Bool[np.ndarray, "f k"], *, should: str) -> Case:
+    hits_n, false_n = int((marked & expected).sum()), int((marked & ~expected).sum())
     observed = (
         f"{hits_n} of {int(expected.sum())} readings marked, and {false_n} of the {int((~expected).sum())} others"
     )
-    return condition_case(AREA, case, should=should, happened=observed, holds=bool((found == expected).all()))
+    return condition_case(AREA, case, should=should, happened=observed, holds=bool((marked == expected).all()))
 
 
 def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) -> list[Case]:

@@ -144,11 +144,12 @@ def _overflowing_neighbour(job: TrainingJob, rows: TrainingData) -> Case:
     sound, broken = (_tuned(job, _start(job, rows, scale)) for scale in (1.0, 1e30))
     alone = _train(sound, rows)
     beside, overflowing = train_stack([sound, broken], rows)
-    off = _distance(alone.weights, beside.weights)
-    observed = f"{_outcome(overflowing)}; its neighbour: {_outcome(beside)}, {off:g} from what it becomes alone"
+    change = _distance(alone.weights, beside.weights)
+    observed = f"{_outcome(overflowing)}; its neighbour: {_outcome(beside)}, {change:g} from what it becomes alone"
+    holds = _is_sound(beside) and overflowing.stopped_step == STEPS_N
     return error_case(AREA, "a network that overflows beside one that does not", should="its neighbour: as if alone",
                       happened=observed, limit=ROUNDING,
-                      error=off if _is_sound(beside) and overflowing.stopped_step == STEPS_N else np.inf)  # fmt: skip
+                      error=change if holds else np.inf)  # fmt: skip
 
 
 def _collapsed(job: TrainingJob, rows: TrainingData) -> Case:

@@ -53,28 +53,28 @@ def time_cases() -> list[Case]:
 
 def _step(case: str, dt_over_fastest: float, should: str) -> Case:
     dt_s = dt_over_fastest * float(STIFF.tau_s[0])
-    found, error = advance(signals.STATE, 1.3, dt_s, STIFF), signals.step_error(dt_s, STIFF)
-    observed = f"relative error {error:.1e}, {np.count_nonzero(np.isfinite(found))} of {len(found)} values finite"
+    state, error = advance(signals.STATE, 1.3, dt_s, STIFF), signals.step_error(dt_s, STIFF)
+    observed = f"relative error {error:.1e}, {np.count_nonzero(np.isfinite(state))} of {len(state)} values finite"
     return error_case("time", case, should=should, happened=observed, error=error, limit=signals.ROUNDING)
 
 
 def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
     """Run cases on extreme variants of a scene's first skin on its first board."""
-    drawn = draw_board(board, spreads, seed=seed, name="b0")
+    drawn_board = draw_board(board, spreads, seed=seed, name="b0")
 
     def skin_of(spread: Spreads = spreads, name: str = "b0_s0", **changes: float) -> Skin:
         return draw_skin(skin.model_copy(update=changes), spread, seed=seed, name=name, rule=COARSE)
 
     usual = skin_of()
     return [
-        *modulus(drawn, usual, *(skin_of(modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))),
+        *modulus(drawn_board, usual, *(skin_of(modulus_kPa=modulus_kPa) for modulus_kPa in (0.0, 1e6))),
         *thickness(usual),
-        *depth(drawn, usual),
-        *place(drawn, usual),
-        *amplitude(drawn, usual, skin_of(saturation_T=0.0), skin_of(saturation_T=5 * skin.saturation_T)),
-        single_precision(drawn, draw_skin(skin, spreads, seed=seed, name="b0_s0")),
+        *depth(drawn_board, usual),
+        *place(drawn_board, usual),
+        *amplitude(drawn_board, usual, skin_of(saturation_T=0.0), skin_of(saturation_T=5 * skin.saturation_T)),
+        single_precision(drawn_board, draw_skin(skin, spreads, seed=seed, name="b0_s0")),
         same_seed(usual, skin_of(), skin_of(name="b0_s1")),
-        memory(drawn, usual),
+        memory(drawn_board, usual),
     ]
 
 
@@ -99,7 +99,7 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
     pushed_N = np.column_stack([np.zeros((len(hard_N), 2)), hard_N])
     read_N, clipped_n = read_force(pushed_N, noise_N=0.0, rng=rng_for(0, "stability"))
     soft_off_T, hard_off_T = float(np.abs(soft_T - free_T).max()), float(np.abs(hard_T - firm_T).max())
-    held = clipped_n == len(hard_N) and bool((read_N[:, 2] == FORCE_RANGE_N[2]).all())
+    clipped = clipped_n == len(hard_N) and bool((read_N[:, 2] == FORCE_RANGE_N[2]).all())
     return [
         condition_case(AREA, "a skin of no stiffness, E = 0",
                        should="no force, so no slide: dB of the layer's flow alone",
@@ -109,7 +109,7 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
                        should="dB of a tip that never slips; force held at the sensor's range, and counted",
                        happened=f"dB differs by {hard_off_T:g} T; {hard_N.max():.3g} N read as "
                                 f"{read_N[:, 2].max():g} N, {clipped_n} of {len(hard_N)} counted as clipped",
-                       holds=hard_off_T == 0 and held),
+                       holds=hard_off_T == 0 and clipped),
     ]  # fmt: skip
 
 

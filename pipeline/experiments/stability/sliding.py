@@ -136,14 +136,15 @@ def force_control(skin: Skin) -> list[Case]:
     sizes = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
     force_N = slide.force_at(depth_m, **sizes)
-    off = float(np.abs(slide.depth_at(force_N, **sizes) - depth_m).max() / skin.thickness_m)
+    error = float(np.abs(slide.depth_at(force_N, **sizes) - depth_m).max() / skin.thickness_m)
     beyond_N = force_N.max() * np.array([1.0, 2.0, 1e6])
     held_m, counted_n = slide.depth_at(beyond_N, **sizes), slide.count_clipped(beyond_N, **sizes)
     deepest = held_m / (slide.DEEPEST * skin.thickness_m)
     return [
         error_case(AREA, f"pressed to {slide.DEEPEST:g} of the thickness by force, and let go",
                    should="the depth of each force is the depth that gives it, down and up, without a remainder",
-                   happened=f"{force_N.max():.3g} N at most; {off:.1e} of the thickness off", error=off, limit=1e-6),
+                   happened=f"{force_N.max():.3g} N at most; {error:.1e} of the thickness off", error=error,
+                   limit=1e-6),
         condition_case(AREA, "a force that no allowed depth gives", should="held at the deepest, and counted",
                        happened=f"{beyond_N[-1]:.2g} N held at {deepest[-1]:.6f} of the deepest; {counted_n} counted",
                        holds=bool(np.abs(deepest - 1).max() < ROUNDING and counted_n == 2)),

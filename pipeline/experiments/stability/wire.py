@@ -76,8 +76,8 @@ def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
 
 def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
     """Decode a damaged stream, and count lost frames, false frames and bytes."""
-    kept, account = decode_portions(damage.portions, wire, frames.temperature_degC.shape[1])
-    sent, got = (Counter(records(decoded)) for decoded in (_clean(encode(frames, wire), wire, frames), kept))
+    decoded_frames, account = decode_portions(damage.portions, wire, frames.temperature_degC.shape[1])
+    sent, got = (Counter(records(decoded)) for decoded in (_clean(encode(frames, wire), wire, frames), decoded_frames))
     missing_n, false_n = (sent - got).total(), (got - sent).total()
     skipped_n = sum(n for name, n in account.items() if name.startswith("skipped_"))
     unaccounted_n = account["bytes_n"] - account["frame_bytes_n"] - skipped_n

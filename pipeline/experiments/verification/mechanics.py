@@ -173,8 +173,8 @@ def _disc_deflection_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) 
     free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
     k = np.linspace(1e-3, 25, 1500) / h_m
     surface = layer.bonded_compliance if base == "bonded" else layer.slipping_compliance
-    held = disc_m * j1(k * disc_m) / k * (1 - surface(k * h_m)) * j0(k * r_m)
-    return float(free - np.trapezoid(held, k))
+    base_effect = disc_m * j1(k * disc_m) / k * (1 - surface(k * h_m)) * j0(k * r_m)
+    return float(free - np.trapezoid(base_effect, k))
 
 
 def scaling(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: float) -> list[Check]:
@@ -221,10 +221,10 @@ def straight_drag(
     path_m: Float[np.ndarray, " t"], limit_N: float, *, stiffness_N_per_m: float, coefficient: float
 ) -> Check:
     places_m, normal_N = np.column_stack([path_m, np.zeros_like(path_m)]), np.full_like(path_m, limit_N / coefficient)
-    found = shear.drag_force(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
+    drag = shear.drag_force(places_m, normal_N, stiffness_N_per_m=stiffness_N_per_m, friction=coefficient)
     truth_N = np.minimum(stiffness_N_per_m * path_m, limit_N)
     return Check("friction", "Q = min(k s, mu F) along a straight drag", "itself, by hand",
-                 float(np.abs(found.force_N[:, 0] - truth_N).max() / limit_N), "1", 1e-12, "rounding of 30 steps"
+                 float(np.abs(drag.force_N[:, 0] - truth_N).max() / limit_N), "1", 1e-12, "rounding of 30 steps"
                  )  # fmt: skip
 
 
@@ -370,7 +370,7 @@ def check_indentations(
     board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, rule: Quadrature, depths_m: tuple[float, ...], seed: int
 ) -> list[Check]:
     """Check dB of indentations on a scene's first skin, and the symmetries of the design without spreads."""
-    drawn, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
+    first_board, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
 
     def skin_of(rule: Quadrature, design: SkinDesign = skin, spreads: Spreads = spreads) -> Skin:
         return draw_skin(design, spreads, seed=seed, name="b0_s0", rule=rule)
@@ -381,18 +381,19 @@ def check_indentations(
         skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
     )
     dense = skin_of(DENSE)
-    # The rig's compliance depends on direction, so the symmetries hold only without compliance.
-    even = (
+    # The rig's compliance depends on direction, so the symmetries hold only for a rigid rig.
+    rigid = (
         skin
         if skin.hold is None
         else skin.model_copy(update={"hold": skin.hold.model_copy(update={"give_um": (0.0, 0.0)})})
     )
     return [
-        *quadrature(drawn, skin_of(rule), fine, rules=(rule, cells, layers), pokes_m=each_depth(_grid_m(), depths_m)),
-        approximations(drawn, dense, min(depths_m), "shallowest"),
-        approximations(drawn, dense, max(depths_m), "deepest"),
-        *symmetries(draw_board(board, exact, seed=seed, name="b0"), skin_of(COARSE, even, exact), skin.polarity),
-        amplitude(drawn, skin_of(COARSE), skin_of(COARSE, stronger),
+        *quadrature(first_board, skin_of(rule), fine, rules=(rule, cells, layers),
+                    pokes_m=each_depth(_grid_m(), depths_m)),
+        approximations(first_board, dense, min(depths_m), "shallowest"),
+        approximations(first_board, dense, max(depths_m), "deepest"),
+        *symmetries(draw_board(board, exact, seed=seed, name="b0"), skin_of(COARSE, rigid, exact), skin.polarity),
+        amplitude(first_board, skin_of(COARSE), skin_of(COARSE, stronger),
                   pokes_m=each_depth(PLACES_M, (0.3 * skin.thickness_mm * milli,))),
     ]  # fmt: skip
 

@@ -39,9 +39,9 @@ def check_field(skin: SkinDesign, seed: int) -> list[Check]:
 
 def boxes(seed: int, side_m: float = 0.5 * milli) -> list[Check]:
     rng = rng_for(seed, "verification", "box")
-    away = rng.standard_normal((2000, 3))
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
-    places_m = side_m * away * np.geomspace(NEAR_CELLS, FAR_CELLS, len(away))[:, None]
+    directions = rng.standard_normal((2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    places_m = side_m * directions * np.geomspace(NEAR_CELLS, FAR_CELLS, len(directions))[:, None]
     inside_m = side_m * rng.uniform(-0.49, 0.49, (500, 3))
     found_T, truth_T = magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m)
     relative = np.linalg.norm(found_T - truth_T, axis=1) / np.linalg.norm(truth_T, axis=1)
@@ -306,8 +306,8 @@ def _differing(ours: bytes, theirs: bytes) -> float:
 
 
 def _missed(decoded: Frames, values: np.ndarray) -> float:
-    found = _txyz(decoded)
-    return float(np.abs(found - values).max()) if found.shape == values.shape else np.inf
+    decoded_values = _txyz(decoded)
+    return float(np.abs(decoded_values - values).max()) if decoded_values.shape == values.shape else np.inf
 
 
 POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 indentations in 30 s

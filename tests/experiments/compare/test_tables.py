@@ -69,7 +69,7 @@ def test_single_board_of_equal_forces_has_no_growth_or_refit():
 
 def test_tables_of_frames_and_parameters():
     found = tables(NUMBERS, "recorded")
-    assert found["compare_frames"]["in one sentence"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
+    assert found["compare_frames"]["orientation"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
     assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
     assert {"gap, mm", "slide to the middle, µm/mm", "Young's modulus, MPa"} <= set(found["compare_parameters"].columns)
 
