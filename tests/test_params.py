@@ -89,11 +89,11 @@ def test_missing_required_experiment_is_an_error(experiment, others):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"train_n": 2}, "train_n is at most every_n, 1"),
-        ({"test_n": 2}, "test_n is at most every_n, 1"),
+        ({"train_n": 2}, "train_n must be at most every_n"),
+        ({"test_n": 2}, "test_n must be at most every_n"),
         ({"regular_n": 5}, "regular_n is required if policies contains regular, and not allowed otherwise"),
         ({"policies": ["regular"]}, "regular_n is required if policies contains regular, and not allowed otherwise"),
-        ({"policies": ["each", "each"]}, "policies names each policy once"),
+        ({"policies": ["each", "each"]}, "policies must name each policy only once"),
     ],
 )
 def test_contradictory_drift_windows_are_an_error(changes, message):

@@ -84,7 +84,8 @@ def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarra
     touched = depths_mm - STEP_MM + skin.depth_zero_m / milli > 0
     if not touched.any():
         what = (
-            f"depths_mm of at most {depths_mm.max():g} do not reach it, {-skin.depth_zero_m / milli:.2g} mm below zero"
+            f"its surface is {-skin.depth_zero_m / milli:.2g} mm below depth 0, and depths_mm are at most "
+            f"{depths_mm.max():g}"
         )
         raise ParamsError(f"skin {skin.name}: {what}. Poke deeper.")
     return touched
@@ -195,7 +196,7 @@ def _line(depth: str, row: Mapping[str, Any], network: Mapping[str, Any], source
 
 def _meaning(numbers: Mapping[str, Any]) -> str:
     labels, above_n = numbers["labels"], numbers["above_the_skin_n"]
-    above = f" {above_n} pokes that do not touch the skin are left out." if above_n else ""
+    above = f" {above_n} pokes that do not touch the skin are excluded." if above_n else ""
     return (
         "Bound (Cramér-Rao): the smallest error of an unbiased estimate from the change of field of one row "
         f"({numbers['readings_n']} reading minus the mean of {numbers['noload_frames_n']} no-load readings), averaged "

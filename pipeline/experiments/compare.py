@@ -438,11 +438,11 @@ ABOUT_PARAMETERS = (
     "is a measurement."
 )
 ABOUT_GRIP = (
-    "A tip slides the skin no further than the friction under the tip allows: k |u| <= mu F, with springs k, slide u, "
-    "friction mu and force F. k / mu = {grip_N_mm:g} N/mm is used (k is from a recorded sideways force, mu is assumed: "
-    "`skin.hold` in nominal.yaml). For each value of k / mu all other parameters are fitted again. Recordings begin "
-    "above half a newton, where the skin hardly slides any further: the field of a light touch therefore depends on "
-    "the assumed friction. Without a limit by friction, the skin would jump at contact."
+    "A tip slides the skin no further than the friction under the tip allows: k |u| <= mu F, with spring constant k, "
+    "slide u, friction coefficient mu and force F. k / mu = {grip_N_mm:g} N/mm is used (k is from a recorded sideways "
+    "force, mu is assumed: `skin.hold` in nominal.yaml). For each value of k / mu all other parameters are fitted "
+    "again. Recordings begin above half a newton, where the skin hardly slides any further: the field of a light touch "
+    "therefore depends on the assumed friction. Without this limit, the skin would jump at first contact."
 )
 ABOUT_FRAMES = (
     "Cosines between recorded and simulated dB over all pokes together, with the nominal skin: in the orientations "
@@ -521,7 +521,7 @@ def _friction_rows(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
     for board, own in by_board.items():
         for row in own.get("grips", []):
             line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}"}
-            line["two thirds slide at, N"] = f"{row['grip_N']:.2g}"
+            line["force at two thirds of the slide, N"] = f"{row['grip_N']:.2g}"
             line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
             grown = row.get("growth")
             line[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}" if grown else NONE
@@ -566,7 +566,7 @@ def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: st
             styles = iter(("-.", ":", "--", (0, (1, 3))))
             for grip, length_uT in own["curve_uT"].items():
                 line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
-                friction = "no limit by friction" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
+                friction = "no friction limit" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
                 label = f"simulated, {friction}" + (" (used)" if grip == used else "")
                 axes.plot(drawn["curve_N"], length_uT, color=COLOURS[1], label=label, **line)
             axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)

@@ -381,11 +381,11 @@ MEANING = (
     "Two contacts at once are modelled as the sum of two changes of field that were recorded on one held-out skin, so "
     "their noise is that of two readings. Networks trained on single contacts predict one place and one force (columns "
     "`prediction` and `along the line`). Detected: the score of a detector is above its threshold. Thresholds are set "
-    "so that a given share of single contacts of training skins exceeds them; row `single contacts` gives the share of "
-    "the held-out boards' single contacts above them, the false alarms. The networks behind `residual` and `networks "
-    "disagree` were trained on the contacts that set the thresholds, so these two thresholds may be too low. At 0 mm "
-    "both pokes are at one place: this shows the effect of strength and noise alone. [low, high] is the 95 % "
-    "confidence interval over held-out boards (Student's t). The paper gives no number (section 7: future work)."
+    "so that a given fraction of single contacts of training skins exceeds them; row `single contacts` gives the "
+    "percentage of the held-out boards' single contacts above them, the false alarms. The networks behind `residual` "
+    "and `networks disagree` were trained on the contacts that set the thresholds, so these two thresholds may be too "
+    "low. At 0 mm both pokes are at one place: this shows the effect of strength and noise alone. [low, high] is the "
+    "95 % confidence interval over held-out boards (Student's t). The paper gives no number (section 7: future work)."
 )
 TWO_TIPS = (
     "Two real tips cannot be closer than their width; smaller distances are possible only for sums of two readings."
@@ -427,7 +427,7 @@ def _draw_places(axes: Any, along: Mapping[str, Sequence[float]]) -> None:
     axes.plot(ends_mm, ends_mm, color=COLOURS[2], label="stronger contact")
     axes.plot(ends_mm, [0, 0], color=COLOURS[1], linestyle="--", label="weaker contact")
     axes.set(xlabel="distance of the contacts / mm", ylabel="predicted place along their line / mm")
-    axes.set_title("Predicted place (box: middle half; whiskers: 90 %)", loc="left", fontsize=10)
+    axes.set_title("Predicted place (box: middle 50 %; whiskers: 90 %)", loc="left", fontsize=10)
     axes.set_ylim(top=1.45 * ends_mm[1])
     axes.legend(frameon=False, loc="upper left", fontsize=9)
 
@@ -481,6 +481,7 @@ def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFra
     table.attrs["meaning"] = (
         "Compares the sum of the changes of field of two single contacts with the change of field of both contacts on "
         "one skin, where the second contact displaces material that the first has already displaced (mean of both "
-        "orders; rms over chips and pairs). That one contact lowers the surface under the other is neglected."
+        "orders; rms over chips and pairs). The effect that one contact lowers the surface under the other is "
+        "neglected."
     )
     return table

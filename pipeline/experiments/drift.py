@@ -81,13 +81,13 @@ class Drift(SectionWithTraining):
     @model_validator(mode="after")
     def _check_windows_and_policies(self) -> "Drift":
         if self.test_n > self.every_n:
-            raise ValueError(f"test_n is at most every_n, {self.every_n}, so that windows do not overlap")
+            raise ValueError(f"test_n must be at most every_n ({self.every_n}), so that windows do not overlap")
         if self.train_n > self.every_n:
-            raise ValueError(f"train_n is at most every_n, {self.every_n}, after which the first test follows")
+            raise ValueError(f"train_n must be at most every_n ({self.every_n}), after which the first test follows")
         if ("regular" in self.policies) != (self.regular_n is not None):
             raise ValueError("regular_n is required if policies contains regular, and not allowed otherwise")
         if len(set(self.policies)) < len(self.policies):
-            raise ValueError(f"policies names each policy once, not {list(self.policies)}")
+            raise ValueError(f"policies must name each policy only once; got {list(self.policies)}")
         return self
 
 
@@ -631,7 +631,7 @@ FINDINGS_MEANING = (
     "same seed on the same skin); for the force bias this interval is widened to two standard errors over indentations "
     "where these are larger. Several training runs on one skin show how much training runs vary, not how much boards "
     "do. Measured: values by no-load policy; brackets are the 95 % interval over boards, or over these training runs "
-    "where there are too few boards."
+    "if there are too few boards."
 )
 
 

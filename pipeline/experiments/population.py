@@ -510,7 +510,7 @@ def _meaning(numbers: Mapping[str, Any]) -> str:
         f"{numbers['skins_asked_n']} skins; tested on {numbers['rows_asked_n']:,} rows of later passes. Unlabelled "
         f"pokes: one at each of the {numbers['pool_n']} places of the grid, at any of its depths, or the first of "
         "these; the labelled pokes are among them. One known weight: among the first passes' presses nearest to the "
-        f"middle, the one whose force is nearest to {numbers['weight_N']:g} N is used; its force is known to "
+        f"middle, the one whose force is nearest to {numbers['weight_N']:g} N is used; its force is known to within "
         f"{100 * numbers['weight_sd']:g} %. One factor per skin: the best factor, computed from all true forces; no "
         "other common factor can do better. Likelihood powers, and the share of the weight's error by which all "
         "forces are corrected, were chosen on further skins of the population; on those, 90 % intervals cover: "

@@ -527,7 +527,7 @@ UNLABELLED = (
     "board. Physics inversion: eight parameters of the physical model (the law), and place and force of each poke, are "
     "fitted by least squares, starting from nominal parameters; the nominal stiffness and slide are typical values "
     "of recorded boards, including these boards. Each tested reading is then looked up in the fitted model. Centred: "
-    "places are shifted so that the mean of the pokes is the middle, which maps and networks assume too. The stiffness "
+    "places are shifted so that the mean of the pokes is the middle; maps and networks assume the same. The stiffness "
     "of the model is nominal, so its forces are in nominal units. Another skin's: the pokes of the next board, "
     "together with the held-out board's own field at rest."
 )

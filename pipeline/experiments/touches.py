@@ -198,7 +198,7 @@ def stack_touches(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"]
 
 
 def unit_directions(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
-    """Return directions dB / (|dB| + noise), which are short for weak readings."""
+    """Return directions dB / (|dB| + noise), which are short vectors for weak readings."""
     return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
 
 
@@ -225,7 +225,7 @@ def relative_residual(
 ) -> Float64[np.ndarray, " f"]:
     """Fit non-negative amplitudes of these places' directions to each row; return the residual relative to |dB|.
 
-    How hard each place was pressed is not recorded, so this is the smallest residual for any strengths.
+    How hard each place was pressed is not recorded, so this is the smallest residual over all possible strengths.
     """
     basis = np.stack([known[place] for place in places], axis=1)
     rows_uT = db_uT.astype(np.float64)
@@ -268,7 +268,7 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
 
 
 def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
-    """Fit force to fields of single touches; test on later rows of the same recordings, and on recordings left out."""
+    """Fit force to fields of single touches; test on later rows of the same recordings, and on recordings held out."""
     by_time = [_force_error(blocks, one.test, rng) for one in blocks]
     left_out = [_force_error([other for other in blocks if other is not one], one.test, rng) for one in blocks]
     spread = [{"mse_f_N2": float(one.test.force_N.var(dtype=np.float64))} for one in blocks]
@@ -318,7 +318,7 @@ def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.nda
 def evaluate_detection(
     blocks: Sequence[Split], double: Sequence[Touched], section: Touches, seed: int
 ) -> dict[str, Any]:
-    """Detect two touches at a given share of false alarms, with two controls: sums, and touches at unknown places."""
+    """Detect two touches at a given fraction of false alarms; controls are sums, and touches at unknown places."""
     known_uT, place_numbers = stack_touches([one.train for one in blocks])
     known = directions(known_uT, place_numbers)
 

@@ -58,7 +58,7 @@ class Residual(Strict):
     sizes: Sizes
     length_mm: Annotated[float, Field(gt=0, le=50)]
     length_log_N: Annotated[float, Field(gt=0, le=10)]
-    own_share: Annotated[float, Field(ge=0, le=1)]  # of its variance; the rest is the same on all skins
+    own_share: Annotated[float, Field(ge=0, le=1)]  # fraction of its variance; the rest is the same on all skins
 
 
 class Worlds(Strict):
@@ -127,7 +127,7 @@ def with_residual(
 ) -> Float[np.ndarray, "n ch"]:
     """Add the simulation's error to a skin's changes of field; its rms over indentations is `size` times |dB|.
 
-    Part of the error is the same for all skins; the rest is drawn for the skin, by its name.
+    Part of the error is the same for all skins; the rest is drawn for this skin.
     """
     if size == 0:
         return change_uT
@@ -275,7 +275,7 @@ MEANING = (
     "of the simulation: a smooth random error that is added to the fields, relative to |dB|. Its largest size is the "
     "error on recorded boards (scene lab, 1 - explained); it is correlated over {residual_length_mm:g} mm, and "
     "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
-    "error. {folds_n} boards are held out in turn; one network per row, fold and world; {steps_n} steps."
+    "error. {folds_n} boards are held out in turn; one network per row, fold and world, trained for {steps_n} steps."
 )
 DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # the defaults of the other factors are in the numbers
 

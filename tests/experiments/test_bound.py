@@ -131,7 +131,7 @@ def test_pokes_above_the_skin_are_marked():
     skin = draw_skin(SCENE.skin, SCENE.spreads, seed=1, name="b0_s0", rule=SCENE.main_boards.quadrature.in_si())
     depths_mm = np.array([0.2, 0.6])
     assert reach_skin(replace(skin, depth_zero_m=-0.3e-3), depths_mm).tolist() == [False, True]
-    with pytest.raises(ParamsError, match="depths_mm of at most 0.6 do not reach it"):
+    with pytest.raises(ParamsError, match="depths_mm are at most 0.6"):
         reach_skin(replace(skin, depth_zero_m=-0.7e-3), depths_mm)
 
 
@@ -163,4 +163,4 @@ def test_network_is_compared_with_the_bound():
 def test_pokes_without_contact_are_noted():
     assert "left out" not in tables(NUMBERS, "simulated")["bound"].attrs["meaning"]
     meaning = tables(NUMBERS | {"above_the_skin_n": 65}, "simulated")["bound"].attrs["meaning"]
-    assert "65 pokes that do not touch the skin are left out" in meaning
+    assert "65 pokes that do not touch the skin are excluded" in meaning

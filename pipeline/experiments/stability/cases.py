@@ -1,6 +1,6 @@
 """A row of the stability table: an extreme case, with the expected and the actual behaviour.
 
-The other modules of this package run cases on any inputs: the experiment uses those of a scene, tests draw others.
+The other modules of this package run cases on any inputs: the experiment uses those of a scene, tests use random ones.
 """
 
 import tracemalloc

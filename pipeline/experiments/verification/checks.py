@@ -1,6 +1,6 @@
 """A row of the verification table, and the error measures that its checks use.
 
-The other modules of this package run checks on any inputs: the experiment uses those of a scene, tests draw others.
+The other modules of this package run checks on any inputs: the experiment uses those of a scene, tests use random ones.
 """
 
 from dataclasses import dataclass

@@ -79,7 +79,7 @@ def test_figure_labels():
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
         assert word in texts_of(drawn["compare_arrows.svg"])
     assert "recorded: power 0.30" in texts_of(drawn["compare_growth.svg"])
-    for word in ("k / μ 8.75 N/mm (used)", "no limit by friction", "recorded"):
+    for word in ("k / μ 8.75 N/mm (used)", "no friction limit", "recorded"):
         assert word in texts_of(drawn["compare_touch.svg"])
     assert figures(NUMBERS, DRAWN, "recorded") == drawn
 
