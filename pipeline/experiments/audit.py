@@ -189,7 +189,7 @@ def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.rando
         found = f"undecidable: fields within the noise{_first_names(weak_skins)}"
         return Check("copies", sides.where, rule, found, holds=False)
     likenesses = most_alike(test, train, rng=rng)
-    closest = max(likenesses, key=lambda one: one.share)
+    closest = max(likenesses, key=lambda likeness: likeness.share)
     found = (
         f"{len(likenesses)} of {len(np.unique(captures))} captures compared; "
         f"{closest.capture} like {closest.train_skin}: {100 * closest.share:.1f} % of {closest.compared_n} indentations"

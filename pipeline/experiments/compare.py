@@ -117,7 +117,7 @@ def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
         rows = [_of_simulation(own, simulation) for own in by_board.values() if _has_simulation(own, simulation)]
         values = {name: [own[name] for own in rows] for name in ("cosine_mean", "explained_median")}
         grown = [own["growth"] for own in rows if "growth" in own]
-        values["growth_difference"] = [one["simulated"] - one["recorded"] for one in grown]
+        values["growth_difference"] = [growths["simulated"] - growths["recorded"] for growths in grown]
         if rows:
             summary[simulation] = {name: statistic(each, boards=True) for name, each in values.items() if each}
     return summary
@@ -154,8 +154,8 @@ def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]
 def pool_skins(captures: Sequence[Readings]) -> dict[str, RecordedPresses]:
     """Pool the captures of each skin; skins are named by their board, or by board and skin where it has several."""
     skins: dict[str, list[Readings]] = {}
-    for one in captures:
-        skins.setdefault(f"{one.board}/{one.skin}", []).append(one)
+    for capture in captures:
+        skins.setdefault(f"{capture.board}/{capture.skin}", []).append(capture)
     boards = [name.partition("/")[0] for name in skins]
     names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
     return {names[name]: pool(own) for name, own in skins.items()}
@@ -357,7 +357,7 @@ def find_frames(
             as_written = np.diagonal(cosine[..., 0]).copy()
         candidates = product((False, True), TURNS)
         candidate_frames += [_best_chips(labels, flipped, common, cosine, as_written) for flipped, common in candidates]
-    return max(candidate_frames, key=lambda one: one.worth)
+    return max(candidate_frames, key=lambda frames: frames.worth)
 
 
 def _best_chips(
@@ -561,8 +561,8 @@ def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: st
     with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]
         for axes, (board, own) in zip(panels, boards.items(), strict=True):
-            look = {"color": COLOURS[0], "marker": MARKERS[0], "linestyle": "", "markersize": 3, "alpha": 0.5}
-            axes.plot(own["force_N"], own["length_uT"]["recorded"], label="recorded", **look)
+            style = {"color": COLOURS[0], "marker": MARKERS[0], "linestyle": "", "markersize": 3, "alpha": 0.5}
+            axes.plot(own["force_N"], own["length_uT"]["recorded"], label="recorded", **style)
             styles = iter(("-.", ":", "--", (0, (1, 3))))
             for grip, length_uT in own["curve_uT"].items():
                 line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
@@ -591,8 +591,8 @@ def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -
                 row[0].set_ylabel(f"{board}\n{side}")
                 for axes, db_uT, place_mm in zip(row, own["arrows_uT"][side], own["places_mm"], strict=False):
                     sides_mm = np.array(db_uT)[:, :2] * ARROW_MM / longest_uT
-                    look = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.014}
-                    axes.quiver(*chips_mm.T, *sides_mm.T, color=colour, **look)
+                    style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.014}
+                    axes.quiver(*chips_mm.T, *sides_mm.T, color=colour, **style)
                     axes.plot(*place_mm, marker="x", color="black")
                     for (x_mm, y_mm), (*_, z_uT) in zip(chips_mm, db_uT, strict=True):
                         axes.text(x_mm, y_mm - 1.2, f"{z_uT:+.0f}", fontsize=6, ha="center", va="top")
@@ -611,8 +611,8 @@ def _draw_growth(boards: Mapping[str, Any], by_board: Mapping[str, Any], source:
             for side, colour, marker in zip(("recorded", "simulated"), COLOURS, MARKERS, strict=False):
                 slope = by_board[board].get("growth", {}).get(side)
                 label = side if slope is None else f"{side}: power {slope:.2f}"
-                look = {"color": colour, "marker": marker, "linestyle": "", "markersize": 3, "alpha": 0.6}
-                axes.plot(own["force_N"], own["length_uT"][side], label=label, **look)
+                style = {"color": colour, "marker": marker, "linestyle": "", "markersize": 3, "alpha": 0.6}
+                axes.plot(own["force_N"], own["length_uT"][side], label=label, **style)
             axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
             axes.legend(frameon=False, fontsize=8)
         figure.suptitle(f"Change of field against force ({source})", x=0.01, ha="left", fontsize=11)

@@ -102,7 +102,7 @@ def contacts(
         numbers["superposition"] = superposition(
             simulation_settings(settings), section.separations_mm, seed=settings.seed
         )
-    along = {s: [value for one in plot_data for value in one["along"][s]] for s in plot_data[0]["along"]}
+    along = {s: [value for board_data in plot_data for value in board_data["along"][s]] for s in plot_data[0]["along"]}
     write_results(results, numbers, {"along": along})
 
 
@@ -178,11 +178,11 @@ def draw_pairs(
         what = f"no two held-out places of one skin are {separation_mm:g} mm apart, within {TOLERANCE_MM:g} mm"
         raise ParamsError(f"contacts: {what}. Correct contacts.separations_mm of the scene.")
     chosen = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
-    one, other = (np.array([rng.choice(side) for side in both]) for both in zip(*chosen, strict=True))
+    first, second = (np.array([rng.choice(side) for side in both]) for both in zip(*chosen, strict=True))
     force_N, length_uT = rows.target[:, 2], np.linalg.norm(rows.db_uT, axis=1)
     strength = length_uT if np.isnan(force_N[own]).any() else force_N
-    swap = strength[one] > strength[other]
-    return Pairs(np.where(swap, other, one), np.where(swap, one, other))
+    swap = strength[first] > strength[second]
+    return Pairs(np.where(swap, second, first), np.where(swap, first, second))
 
 
 def _pairs_at_distance(
@@ -394,9 +394,13 @@ TWO_TIPS = (
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate predictions and detections by distance, and the error of superposition."""
-    rows = [_table_row(numbers["same_place"], numbers), *(_table_row(one, numbers) for one in numbers["by_separation"])]
+    rows = [
+        _table_row(numbers["same_place"], numbers),
+        *(_table_row(result, numbers) for result in numbers["by_separation"]),
+    ]
     false_alarm = {"distance of the contacts, mm": "single contacts"} | {
-        f"detected by {name}, %": show_digits(one["realised"], 1) for name, one in numbers["false_alarm_pct"].items()
+        f"detected by {name}, %": show_digits(result["realised"], 1)
+        for name, result in numbers["false_alarm_pct"].items()
     }
     table = pd.DataFrame([*rows, false_alarm]).fillna("–").assign(source=source)
     asked = next(iter(numbers["false_alarm_pct"].values()))["asked"]

@@ -153,7 +153,7 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
 def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
     """Cut all captures into the same windows, and gather the rows of each window under every policy."""
     check_one_per_skin(captures)
-    units = [rank(getattr(one, UNIT_COLUMN[section.unit])) for one in captures]
+    units = [rank(getattr(capture, UNIT_COLUMN[section.unit])) for capture in captures]
     units_n = [1 + int(own.max()) for own in units]
     windows = make_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
     policies: dict[str, Policy] = {policy: partial(noload_field, policy, section) for policy in section.policies}
@@ -231,11 +231,16 @@ def score_windows(predictions: Sequence[WindowPredictions]) -> pd.DataFrame:
     Metrics of force are absent if no force is known.
     """
     rows = []
-    for one in predictions:
-        row: dict[str, Any] = {"policy": one.policy, "board": one.board, "skin": one.skin, "seed_i": one.seed_i}
-        row |= {"window_i": one.window_i, "contacts_n": one.contacts_n, "noload_off_uT": one.noload_off_uT}
-        row |= score(one.true, one.predicted)
-        error_N = (one.predicted.astype(float) - one.true)[:, FORCE]
+    for window in predictions:
+        row: dict[str, Any] = {
+            "policy": window.policy,
+            "board": window.board,
+            "skin": window.skin,
+            "seed_i": window.seed_i,
+        }
+        row |= {"window_i": window.window_i, "contacts_n": window.contacts_n, "noload_off_uT": window.noload_off_uT}
+        row |= score(window.true, window.predicted)
+        error_N = (window.predicted.astype(float) - window.true)[:, FORCE]
         if not np.isnan(error_N).all():
             row["bias_f_N"] = float(np.nanmean(error_N))
         rows.append(row)
@@ -306,10 +311,10 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
 
     All predictions are for one window, each for one skin by one network.
     """
-    skin = np.concatenate([np.full(len(one.indentation), one.skin) for one in predictions])
-    indentation = np.concatenate([one.indentation for one in predictions])
+    skin = np.concatenate([np.full(len(window.indentation), window.skin) for window in predictions])
+    indentation = np.concatenate([window.indentation for window in predictions])
     true_N, predicted_N = (
-        np.concatenate([getattr(one, side)[:, FORCE].astype(float) for one in predictions])
+        np.concatenate([getattr(window, side)[:, FORCE].astype(float) for window in predictions])
         for side in ("true", "predicted")
     )
     known = ~np.isnan(true_N)
@@ -364,7 +369,7 @@ def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float |
     """Return `force_left` of a window relative to training, mean over skins; None if unknown for any skin."""
     own = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
     ratios_pct = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
-    return None if None in ratios_pct else float(np.mean([one for one in ratios_pct if one is not None]))
+    return None if None in ratios_pct else float(np.mean([value for value in ratios_pct if value is not None]))
 
 
 def force_left(early: Readings, late: Readings) -> float | None:
@@ -373,10 +378,10 @@ def force_left(early: Readings, late: Readings) -> float | None:
     Returns None if no place and depth with a known force was visited both early and late.
     """
     sides = []
-    for one in (early, late):
-        stop = np.stack([one.x_mm, one.y_mm, one.depth_mm], axis=1).round(DECIMALS)
-        known = ~np.isnan(stop).any(axis=1) & ~np.isnan(one.Fz_N)
-        sides.append((stop[known], one.Fz_N[known].astype(float)))
+    for readings in (early, late):
+        stop = np.stack([readings.x_mm, readings.y_mm, readings.depth_mm], axis=1).round(DECIMALS)
+        known = ~np.isnan(stop).any(axis=1) & ~np.isnan(readings.Fz_N)
+        sides.append((stop[known], readings.Fz_N[known].astype(float)))
     stops, where = np.unique(np.concatenate([stop for stop, _ in sides]), axis=0, return_inverse=True)
     stop_i = np.split(where.ravel(), [len(sides[0][0])])
     n = [np.bincount(own, minlength=len(stops)) for own in stop_i]
@@ -397,8 +402,8 @@ def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
     The change is relative to the no-load reading before that contact, whatever the policy. The noise is estimated from
     differences between successive no-load readings, where drift is small.
     """
-    changes_uT = [subtract(one.b_uT, one.noload_uT)[~np.isnan(one.x_mm)] for one in captures]
-    steps_uT = [np.diff(one.noload_uT[_first_rows(one)].astype(float), axis=0) for one in captures]
+    changes_uT = [subtract(capture.b_uT, capture.noload_uT)[~np.isnan(capture.x_mm)] for capture in captures]
+    steps_uT = [np.diff(capture.noload_uT[_first_rows(capture)].astype(float), axis=0) for capture in captures]
     pairs_n = sum(len(own) for own in steps_uT)
     noise_uT = rms(np.concatenate(steps_uT)) / float(np.sqrt(2)) if pairs_n else 0.0
     return {"contact_uT": rms(np.concatenate(changes_uT)), "noload_noise_uT": noise_uT}
@@ -409,13 +414,13 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
 
     Returns an empty dict if the recordings have no times, or only one indentation.
     """
-    timed = [one for one in captures if np.isfinite(one.t_s).all()]
-    steps_s = [step_s for one in timed for step_s in np.diff(one.t_s[_first_rows(one)])]
+    timed = [capture for capture in captures if np.isfinite(capture.t_s).all()]
+    steps_s = [step_s for capture in timed for step_s in np.diff(capture.t_s[_first_rows(capture)])]
     if not steps_s:
         return {}
     return {
         "contact_every_s": float(np.median(steps_s)),
-        "lasts_s": max(float(one.t_s[-1] - one.t_s[0]) for one in timed),
+        "lasts_s": max(float(capture.t_s[-1] - capture.t_s[0]) for capture in timed),
     }
 
 
@@ -463,7 +468,7 @@ def score_wandering(
     after_n = 1 + int(rank(captures[0].indentation)[trained_on].max())
     rows: dict[str, list[dict[str, Any]]] = {}
     for step_uT in section.wander_uT:
-        walked = [add_walk(one, step_uT, after_n=after_n, seed=seed) for one in captures]
+        walked = [add_walk(capture, step_uT, after_n=after_n, seed=seed) for capture in captures]
         parts = {part.first_row_i: part for part in cut_windows(walked, section, selection)[1]}
         scores: dict[str, list[dict[str, float]]] = {}
         off_uT: dict[str, list[float]] = {}
@@ -647,13 +652,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     meaning = f"{_protocol(numbers)} {describe_pace(numbers, source)} {FIGURE_5}"
     findings = [
         {
-            "finding (paper)": one["finding"],
-            "holds": one["verdict"],
-            "over these training runs": one["of_trainings"],
-            "measured": one["measured"],
+            "finding (paper)": finding["finding"],
+            "holds": finding["verdict"],
+            "over these training runs": finding["of_trainings"],
+            "measured": finding["measured"],
             "source": source,
         }
-        for one in numbers["findings"]
+        for finding in numbers["findings"]
     ]
     shown = {
         "drift": tabulate(lines, meaning=meaning, spread=spread),

@@ -123,7 +123,9 @@ def _scores(
     # The middle of the last five readings is two rows before the last; for a scored row, it is in the same press.
     middle = np.flatnonzero(rows) - WINDOW_N // 2
     true = {"one": presses.true[rows], "mean5": presses.true[rows], "mean5_of_middle": presses.true[middle]}
-    scores = {name: pd.DataFrame([score(true[name], one[rows]) for one in predictions[name]]) for name in METHODS}
+    scores = {
+        name: pd.DataFrame([score(true[name], predicted[rows]) for predicted in predictions[name]]) for name in METHODS
+    }
     methods = (scores[name].assign(board=board, skin="") for name in ("mean5", "one"))
     return {name: summarise(own) for name, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*methods)}}
 
@@ -173,21 +175,21 @@ METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the errors of each method by duration of the press, and over all presses; the paper gives no numbers."""
-    rows = [(f"{one['duration_s']:.2g}", one) for one in numbers["by_duration"]]
+    rows = [(f"{result['duration_s']:.2g}", result) for result in numbers["by_duration"]]
     rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
     table = pd.DataFrame(
         {
             "press lasts about, s": label,
-            "presses": one["presses_n"],
-            "readings": one["n"],
+            "presses": result["presses_n"],
+            "readings": result["n"],
             "estimated from": title,
-            **{column: _show(one[method].get(name)) for name, column in METRICS.items()},
+            **{column: _show(result[method].get(name)) for name, column in METRICS.items()},
             "lag / ms": _show(_lag(numbers, method)) if label == "all" else "",
-            LESS: _less(one) if method == "mean5" else "",
+            LESS: _less(result) if method == "mean5" else "",
             "paper": paper.DYNAMICS if label == "all" and method == "one" else "",
             "source": source,
         }
-        for label, one in rows
+        for label, result in rows
         for method, title in TITLES.items()
     )
     table.attrs["meaning"] = MEANING
@@ -219,11 +221,11 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         return {"dynamics.svg": svg(figure)}
 
 
-def _less(one: Mapping[str, Any]) -> str:
+def _less(result: Mapping[str, Any]) -> str:
     """Judge whether the mean of the last five readings has less force error than each reading alone."""
-    if "paired" not in one or "mse_f_N2" not in one["paired"]["mean5_minus_one"]:
+    if "paired" not in result or "mse_f_N2" not in result["paired"]["mean5_minus_one"]:
         return "–"  # no force is known, or the results are from an older version
-    difference = one["paired"]["mean5_minus_one"]["mse_f_N2"]
+    difference = result["paired"]["mean5_minus_one"]["mse_f_N2"]
     return f"{verdict(negate(difference))}: {show_difference(difference)}"
 
 

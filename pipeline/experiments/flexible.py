@@ -96,7 +96,7 @@ def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dic
     """Return the ratio of the median |dB| of flexible boards to that of rigid ones, summarised over common depths."""
 
     def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
-        return float(np.median(np.concatenate([one[depth_mm] for one in captures if depth_mm in one])))
+        return float(np.median(np.concatenate([capture[depth_mm] for capture in captures if depth_mm in capture])))
 
     common_mm = set().union(*flexible) & set().union(*rigid)
     return statistic([median_uT(flexible, depth) / median_uT(rigid, depth) for depth in sorted(common_mm)])
@@ -125,12 +125,16 @@ def draw_forces(
 
     The readings are the same before and after adaptation.
     """
-    first = {name: [one for one in predictions if one.variant == name and one.seed_i == 0] for name in (BEFORE, AFTER)}
-    shown = rng.permutation(sum(len(one.true) for one in first[BEFORE]))[:DRAWN_N]
+    first = {
+        name: [prediction for prediction in predictions if prediction.variant == name and prediction.seed_i == 0]
+        for name in (BEFORE, AFTER)
+    }
+    shown = rng.permutation(sum(len(prediction.true) for prediction in first[BEFORE]))[:DRAWN_N]
     return {
         name: {
-            f"{side}_N": np.round(np.concatenate([getattr(one, side)[:, FORCE] for one in own])[shown], FORCE_DECIMALS)
-            .astype(float).round(FORCE_DECIMALS).tolist()
+            f"{side}_N": np.round(
+                np.concatenate([getattr(prediction, side)[:, FORCE] for prediction in own])[shown], FORCE_DECIMALS
+            ).astype(float).round(FORCE_DECIMALS).tolist()
             for side in ("true", "predicted")
         }
         for name, own in first.items()

@@ -192,10 +192,10 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
     `runs` are by board, one array per estimator (network seed); `sd_seeds` is the standard deviation over the
     estimators of one board, averaged over boards.
     """
-    deviations = {board: [one[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for one in own] for board, own in runs.items()}
-    all_runs = np.concatenate([one for own in deviations.values() for one in own], axis=1)
+    deviations = {board: [run[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for run in own] for board, own in runs.items()}
+    all_runs = np.concatenate([run for own in deviations.values() for run in own], axis=1)
     rows = pd.DataFrame(
-        [{"board": board, "error_pct": 100 * np.abs(one).mean()} for board, own in deviations.items() for one in own]
+        [{"board": board, "error_pct": 100 * np.abs(run).mean()} for board, own in deviations.items() for run in own]
     )
     error = add_seed_sd(summarise(rows.groupby("board").mean(), boards=True), rows, "board")["error_pct"]
     return {

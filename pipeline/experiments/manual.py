@@ -106,9 +106,9 @@ def summarise_manual(
     counts = {
         "pokes_n": round(np.mean(pokes_n)),
         "lines_n": round(np.mean(lines_n)),
-        "skins_n": len({one.skin for one in predictions}),
-        "boards_n": len({one.board for one in predictions}),
-        "seeds_n": len({one.seed_i for one in predictions}),
+        "skins_n": len({prediction.skin for prediction in predictions}),
+        "boards_n": len({prediction.board for prediction in predictions}),
+        "seeds_n": len({prediction.seed_i for prediction in predictions}),
     }
     differences = {
         f"{AFTER}_minus_{other}": compare_variants(predictions, AFTER, other)

@@ -232,8 +232,8 @@ def _pool(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.Generat
     order = rng.permutation(len(first))
     _, chosen = np.unique(place_i.ravel()[order], return_index=True)
     taken = [own[rows.indentation[own] == rows.indentation[own[first[i]]]] for i in rng.permutation(order[chosen])]
-    target = np.array([rows.target[one].mean(axis=0) for one in taken], float)
-    db_uT = np.array([rows.db_uT[one].mean(axis=0) for one in taken], float)
+    target = np.array([rows.target[press].mean(axis=0) for press in taken], float)
+    db_uT = np.array([rows.db_uT[press].mean(axis=0) for press in taken], float)
     return LabelledPresses(frame.place(target[:, :2]), target[:, 2], frame.field(db_uT))
 
 
@@ -261,8 +261,8 @@ def known_weight(db_uT: Float[np.ndarray, " ch"], force_N: float, rng: np.random
 def rest_by_skin(indentations: Path) -> dict[str, np.ndarray]:
     """Return the mean no-load field of each skin's first pass, in the chips' axes."""
     return {
-        one.skin: one.noload_uT[one.pass_i == one.pass_i.min()].mean(axis=0, dtype=float)
-        for one in read_captures(indentations)
+        capture.skin: capture.noload_uT[capture.pass_i == capture.pass_i.min()].mean(axis=0, dtype=float)
+        for capture in read_captures(indentations)
     }
 
 
@@ -475,8 +475,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         axes = figure.subplots()
         for i, way in enumerate(("network", "universal")):
             own = rows[rows["way"] == way]
-            wrong_pct = [100 - one["mean"] for one in own["accuracy_pct"]]
-            sd = [one.get("sd", 0.0) for one in own["accuracy_pct"]]
+            wrong_pct = [100 - stat["mean"] for stat in own["accuracy_pct"]]
+            sd = [stat.get("sd", 0.0) for stat in own["accuracy_pct"]]
             style = {"color": COLOURS[i], "marker": MARKERS[i], "capsize": 3}
             axes.errorbar(own["skins_n"], wrong_pct, sd, label=NAMES[way], **style)
         axes.set(xscale="log", xlabel="simulated skins that the network was trained on", ylim=(0, None))

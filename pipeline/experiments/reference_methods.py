@@ -123,8 +123,8 @@ def reference_methods(
 
 def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
     """Return the fold of the next board in the same draw; its pool has the pokes of another skin."""
-    same = [one for one in folds if one.draw_i == fold.draw_i]
-    names = [one.name for one in same]
+    same = [candidate for candidate in folds if candidate.draw_i == fold.draw_i]
+    names = [candidate.name for candidate in same]
     return same[(names.index(fold.name) + 1) % len(same)]
 
 

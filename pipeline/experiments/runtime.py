@@ -445,7 +445,7 @@ def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
 
     def call() -> Changes:
         rest, poked = (skin.nodes_m, skin.moments_A_m2), zip(path.nodes_m, moments, strict=True)
-        return np.stack([change_of_field(rest, now, trial.board.chips_m) for now in poked])
+        return np.stack([change_of_field(rest, moved, trial.board.chips_m) for moved in poked])
 
     return Prepared(len(skin.nodes_m), call)
 
@@ -459,7 +459,7 @@ def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
 
     def call() -> Changes:
         poked = zip(path.nodes_m, moments, strict=True)
-        return np.stack([field_of(now, trial.board.chips_m) - rest_T for now in poked])
+        return np.stack([field_of(moved, trial.board.chips_m) - rest_T for moved in poked])
 
     return Prepared(len(skin.nodes_m), call)
 

@@ -73,8 +73,10 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Pat
     ]
     trained = train_jobs(data, jobs, "sleeve")
     write_timings(settings.scene, "sleeve", jobs, trained)
-    predictions = {name: [one.predicted for job, one in zip(jobs, trained, strict=True) if job.recipe_name == name]
-               for name in section.training.recipes}  # fmt: skip
+    predictions = {
+        name: [result.predicted for job, result in zip(jobs, trained, strict=True) if job.recipe_name == name]
+        for name in section.training.recipes
+    }
     predictions |= predict_by_neighbours(data, section, train, test)
     true, indentation = data.rows.target[test], data.rows.indentation[test]
     scored = {name: score_places(true, own, indentation, area) for name, own in predictions.items()}
@@ -139,16 +141,16 @@ def predict_by_neighbours(
     ]  # fmt: skip
     rows = TrainingData(data.rows.db_uT, data.rows.target, data.rows.skin)
     done = run_classical_jobs(tasks, rows, InProcessExecutor(), lambda line: say(f"{data.scene} sleeve: {line}"))
-    return {task.name: [one.predicted] for task, one in zip(tasks, done, strict=True)}
+    return {task.name: [result.predicted] for task, result in zip(tasks, done, strict=True)}
 
 
 def rate_hz(captures: Sequence[Readings]) -> float:
     """Measure the frame rate from the times of successive readings of an indentation."""
     steps_n, steps_s = 0, 0.0
-    for one in captures:
-        same = (np.diff(one.indentation) == 0) & (np.diff(one.reading_i) == 1)
+    for capture in captures:
+        same = (np.diff(capture.indentation) == 0) & (np.diff(capture.reading_i) == 1)
         steps_n += int(same.sum())
-        steps_s += float(np.diff(one.t_s)[same].sum())
+        steps_s += float(np.diff(capture.t_s)[same].sum())
     if not steps_s > 0:
         what = "two or more readings of an indentation at known times are needed"
         raise ParamsError(f"experiment sleeve: {what}; got {steps_n} steps of time. Record more than one reading.")
@@ -190,7 +192,7 @@ def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
     """Return the mean, standard deviation (absent for one run) and number of each metric over training runs."""
     stats: Stats = {}
     for name in scores[0]:
-        values = np.array([one[name] for one in scores])
+        values = np.array([of_seed[name] for of_seed in scores])
         stats[name] = {"mean": float(values.mean()), "n": len(values)}
         if len(values) > 1:
             stats[name]["sd"] = float(values.std(ddof=1))
@@ -268,11 +270,11 @@ def _draw_boards(axes: Any, drawn: Mapping[str, Any]) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _line(name: str, one: Mapping[str, Any], source: str) -> dict[str, str]:
-    line = {"method": name, "source": source} | scores(one, COLUMNS | PLACES)
+def _line(name: str, method_scores: Mapping[str, Any], source: str) -> dict[str, str]:
+    line = {"method": name, "source": source} | scores(method_scores, COLUMNS | PLACES)
     for part, title in PARTS.items():
-        line[title] = show(one[part]["median_error_mm"]) if part in one else "–"
-    return line | {"paper": NO_NUMBER, "seeds": str(one["accuracy_pct"]["n"])}
+        line[title] = show(method_scores[part]["median_error_mm"]) if part in method_scores else "–"
+    return line | {"paper": NO_NUMBER, "seeds": str(method_scores["accuracy_pct"]["n"])}
 
 
 def _set_up(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:

@@ -76,8 +76,8 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
     single, double = recordings.single, recordings.double
     counts = {
         "force_min_N": selection.force_min_N,
-        "single": {"recordings_n": len(single), "rows_n": sum(len(one.db_uT) for one in single)},
-        "double": {"recordings_n": len(double), "rows_n": sum(len(one.db_uT) for one in double)},
+        "single": {"recordings_n": len(single), "rows_n": sum(len(recording.db_uT) for recording in single)},
+        "double": {"recordings_n": len(double), "rows_n": sum(len(recording.db_uT) for recording in double)},
         "left_out": recordings.left_out,
     }
     for name, reason in recordings.left_out.items():
@@ -86,9 +86,9 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
         write_results(results, counts | {"not_computed": recordings.problem}, {})
         say(f"{settings.scene}: warning: touches not computed: {recordings.problem}")
         return
-    blocks = [split_by_time(one, section) for one in single]
+    blocks = [split_by_time(recording, section) for recording in single]
     numbers = counts | {
-        "tested_rows_n": sum(len(one.test.db_uT) for one in blocks),
+        "tested_rows_n": sum(len(recording.test.db_uT) for recording in blocks),
         "place": evaluate_places(blocks, double),
         "force": evaluate_forces(blocks, rng_for(settings.seed, "touches", "force")),
         "superposition": evaluate_superposition(blocks, double),
@@ -163,25 +163,28 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
     A recording needs `ROWS_MIN_N` touched rows; each place of a pair must also have been recorded alone. If a place was
     recorded alone twice, only the first recording is used, so that two periods of time are not mixed.
     """
-    ordered = sorted(recordings, key=lambda one: (len(one.places), one.places, one.name))  # single places first
+    # Single places come first.
+    ordered = sorted(recordings, key=lambda recording: (len(recording.places), recording.places, recording.name))
     left_out = {
-        one.name: f"{len(one.db_uT)} touched rows, fewer than {ROWS_MIN_N}"
-        for one in ordered
-        if len(one.db_uT) < ROWS_MIN_N
+        recording.name: f"{len(recording.db_uT)} touched rows, fewer than {ROWS_MIN_N}"
+        for recording in ordered
+        if len(recording.db_uT) < ROWS_MIN_N
     }
-    usable = [one for one in ordered if one.name not in left_out]
+    usable = [recording for recording in ordered if recording.name not in left_out]
     single: dict[int, Touched] = {}
     double = []
-    for one in usable:
-        unknown = sorted(set(one.places) - single.keys()) if len(one.places) == 2 else []
+    for recording in usable:
+        unknown = sorted(set(recording.places) - single.keys()) if len(recording.places) == 2 else []
         if unknown:
-            left_out[one.name] = f"place {' and '.join(map(str, unknown))} not recorded alone"
-        elif len(one.places) == 2:
-            double.append(one)
-        elif one.places[0] in single:
-            left_out[one.name] = f"place {one.places[0]} already recorded alone, by {single[one.places[0]].name}"
+            left_out[recording.name] = f"place {' and '.join(map(str, unknown))} not recorded alone"
+        elif len(recording.places) == 2:
+            double.append(recording)
+        elif recording.places[0] in single:
+            left_out[recording.name] = (
+                f"place {recording.places[0]} already recorded alone, by {single[recording.places[0]].name}"
+            )
         else:
-            single[one.places[0]] = one
+            single[recording.places[0]] = recording
     problem = None
     if len(single) < 2:
         problem = f"places recorded alone: {len(single)}; at least 2 are needed. Add their recordings to this scene."
@@ -252,15 +255,15 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
 
     Also test whether the place predicted for two touches is one of their two places.
     """
-    known_uT, place_numbers = stack_touches([one.train for one in blocks])
+    known_uT, place_numbers = stack_touches([block.train for block in blocks])
     right_pct = [
         100 * float(np.isin(predict_places(known_uT, place_numbers, part.db_uT), part.places).mean())
-        for part in [*(one.test for one in blocks), *double]
+        for part in [*(block.test for block in blocks), *double]
     ]
     singles_n = len(blocks)
     result = {
         "by_time": statistic(right_pct[:singles_n]) | {"chance_pct": 100 / singles_n},
-        "by_place": {str(one.test.places[0]): pct for one, pct in zip(blocks, right_pct, strict=False)},
+        "by_place": {str(block.test.places[0]): pct for block, pct in zip(blocks, right_pct, strict=False)},
     }
     if not double:
         return result
@@ -269,15 +272,18 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
 
 def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
     """Fit force to fields of single touches; test on later rows of the same recordings, and on recordings held out."""
-    by_time = [_force_error(blocks, one.test, rng) for one in blocks]
-    left_out = [_force_error([other for other in blocks if other is not one], one.test, rng) for one in blocks]
-    spread = [{"mse_f_N2": float(one.test.force_N.var(dtype=np.float64))} for one in blocks]
+    by_time = [_force_error(blocks, block.test, rng) for block in blocks]
+    left_out = [
+        _force_error([other_block for other_block in blocks if other_block is not block], block.test, rng)
+        for block in blocks
+    ]
+    spread = [{"mse_f_N2": float(block.test.force_N.var(dtype=np.float64))} for block in blocks]
     errors_by_split = {"by_time": by_time, "place_left_out": left_out, "variance": spread}
     return {way: statistic([row["mse_f_N2"] for row in rows]) for way, rows in errors_by_split.items()}
 
 
 def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generator) -> dict[str, float]:
-    train = [one.train for one in known]
+    train = [block.train for block in known]
     target = np.full((sum(len(part.force_N) for part in train), 3), np.nan, np.float32)
     target[:, 2] = np.concatenate([part.force_N for part in train])
     fitted = fit(LINEAR, np.concatenate([part.db_uT for part in train]), target, rng, weight=None)
@@ -342,7 +348,7 @@ def evaluate_detection(
 
 def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
     """Add test rows of single touches for every pair of places, as experiment contacts does."""
-    tested = [one.test.db_uT for one in blocks]
+    tested = [block.test.db_uT for block in blocks]
     pairs = [
         (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])
         for i, a_uT in enumerate(tested)
@@ -354,13 +360,13 @@ def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32
 def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: float) -> dict[str, float]:
     """Return the percentage of single touches that are called two if their place is unknown; mean over places."""
     called = []
-    for one in blocks:
-        others = [other for other in blocks if other is not one]
-        known_uT, place_numbers = stack_touches([other.train for other in others])
+    for block in blocks:
+        others = [other_block for other_block in blocks if other_block is not block]
+        known_uT, place_numbers = stack_touches([other_block.train for other_block in others])
         known = directions(known_uT, place_numbers)
-        aside = score_unlike_one(known_uT, known, stack_touches([other.aside for other in others])[0])
+        aside = score_unlike_one(known_uT, known, stack_touches([other_block.aside for other_block in others])[0])
         limits = thresholds(aside, false_alarm_fraction)
-        called.append(above_pct(score_unlike_one(known_uT, known, one.test.db_uT), limits))
+        called.append(above_pct(score_unlike_one(known_uT, known, block.test.db_uT), limits))
     return {name: float(np.mean([row[name] for row in called])) for name in called[0]}
 
 
@@ -395,8 +401,8 @@ def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:
         chance = f"{two['chance_pct']:.1f}"
         rows.append(_row("two touches, in their own recordings: predicted place is one of the two", two, "%", chance))
     variance = f"{force['variance']['mean']:.3g} (variance)"
-    for way, words in (("by_time", BY_TIME), ("place_left_out", "at a place left out of training")):
-        rows.append(_row(f"force of one touch, squared error, {words}", force[way], "N²", variance))
+    for way, split in (("by_time", BY_TIME), ("place_left_out", "at a place left out of training")):
+        rows.append(_row(f"force of one touch, squared error, {split}", force[way], "N²", variance))
     table = pd.DataFrame(rows)
     single, double = numbers["single"], numbers["double"]
     table.attrs["meaning"] = (

@@ -139,7 +139,7 @@ def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, 
     size_uT = rms(np.array(list(mean_uT.values())))
     numbers: dict[str, Any] = {"skins": list(mean_uT), "mean_db_uT": size_uT}
     if len(mean_uT) > 1:
-        spread_uT = rms(np.array([one - other for one, other in combinations(mean_uT.values(), 2)]))
+        spread_uT = rms(np.array([first - second for first, second in combinations(mean_uT.values(), 2)]))
         numbers |= {"spread_uT": spread_uT, "spread_pct": 100 * spread_uT / size_uT}
     return numbers, {skin: np.round(line, DECIMALS).tolist() for skin, line in mean_uT.items()}
 

@@ -295,11 +295,11 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
     """Plot the rows of table 2 against each factor."""
     with drawing(11.0, 7.6) as figure:
         panels = figure.subplots(len(DRAWN), len(FACTORS), sharey="row", squeeze=False)
-        for column, (factor, words) in enumerate(FACTORS.items()):
+        for column, (factor, label) in enumerate(FACTORS.items()):
             found = _along(numbers, factor)
             for row, metric in enumerate(DRAWN):
                 _draw(panels[row][column], found, metric, default=_default(numbers, factor))
-            panels[-1][column].set_xlabel(words, fontsize=8)
+            panels[-1][column].set_xlabel(label, fontsize=8)
         for row, metric in enumerate(DRAWN):
             panels[row][0].set_ylabel(COLUMNS[metric].replace(", ", " / "))
         handles = panels[0][0].get_legend_handles_labels()
