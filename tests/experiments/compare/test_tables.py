@@ -50,7 +50,7 @@ def test_simulations_are_compared_with_bounds():
     assert table["memory, % (5 to 8)"].tolist()[1] == "6.5 / 7.0"
     assert table["held at the deepest"].tolist() == ["3", "0", "0", "–"]
     assert set(table["source"]) == {"recorded"}
-    for words in ("memory is set to 6.5 %", "both boards of scene lab", "not explained"):
+    for words in ("memory is set to 6.5 %", "both boards of scene lab", "does not explain"):
         assert words in table.attrs["meaning"]
 
 
