@@ -187,8 +187,8 @@ def emulate(
 
     faults = [parse_fault(text) for text in fault or ()]
     script = read_script(source)
-    for each in faults:
-        script = inject(script, each)
+    for spec in faults:
+        script = inject(script, spec)
     emulated, stop = make_port(port), threading.Event()
     typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
     started_s = time.monotonic()
@@ -230,11 +230,11 @@ def live(
         raise ParamsError(f"live: use only one of {', '.join(given)}.")
     models = read_models(model or ())
     with ExitStack() as stack:
-        shown = "a board"
+        description = "a board"
         if source := replay or emulate:
             script = read_script(source)
-            port, shown = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
-        sessions = open_sessions(port or [found.port for found in find_boards()], models, shown, fault_policy)
+            port, description = [stack.enter_context(playing(script))], f"{script.source}: {source}, played"
+        sessions = open_sessions(port or [found.port for found in find_boards()], models, description, fault_policy)
         serve(sessions, host=host, http_port=http_port, say=typer.echo)
 
 

@@ -54,8 +54,8 @@ def imported(*names: str) -> list[str]:
 
     Imports under `if TYPE_CHECKING:` do not count.
     """
-    found = set(names).union(*map(_graph().find_upstream_modules, names))
-    return sorted({name.rsplit(".", i)[0] for name in found for i in range(name.count(".") + 1)})
+    modules = set(names).union(*map(_graph().find_upstream_modules, names))
+    return sorted({name.rsplit(".", i)[0] for name in modules for i in range(name.count(".") + 1)})
 
 
 @cache

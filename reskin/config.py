@@ -45,7 +45,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
         # A misspelt key makes another key missing: report the unknown key first.
         details = error.errors(include_url=False)
         first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
-        missing = [one for one in details if one["type"] == "missing" and one["loc"][:-1] == first["loc"][:-1]]
+        missing = [item for item in details if item["type"] == "missing" and item["loc"][:-1] == first["loc"][:-1]]
         reported = missing if first in missing else [first]
         names = [".".join(_path_in_file(detail["loc"], value)) for detail in reported]
         name = ", ".join(names) or "the file"

@@ -11,7 +11,7 @@ TRUTH = ("force_mean_N", "force_var_N2")  # of the scored rows, so that scores o
 
 
 def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
-    """Score predictions of (x_mm, y_mm, F_N) by the names in `METRICS` and `TRUTH`.
+    """Score predictions of (x_mm, y_mm, F_N); the keys of the result are in `METRICS` and `TRUTH`.
 
     MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages). R^2 of the force is
     1 - MSE_F / (variance of the true forces); a constant prediction of their mean scores 0. The force has no scores if
@@ -37,7 +37,7 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Shift predicted places by one constant offset, so that their mean error is zero.
 
-    Each rig's origin was set by hand; this shows how much of the error is due to registration. It uses the true
+    Each rig's origin was set manually; this shows how much of the error is due to registration. It uses the true
     places, so it is a diagnostic, not a result.
     """
     shifted = predicted.astype(float)

@@ -66,7 +66,7 @@ def departures(environment: Mapping[str, str]) -> list[str]:
     ['ATEN_CPU_CAPABILITY=default']
     """
     pinned_to = {name: {value} for name, value in PINNED.items()}
-    features = " ".join(BEYOND_AVX2)  # all or only the first of them, depending on the processor
+    features = " ".join(BEYOND_AVX2)  # `pinned` lists all of them, or only the first
     pinned_to["NPY_DISABLE_CPU_FEATURES"] = {features[:end].rstrip() for end in range(len(features) + 1)}
     values = {name: environment.get(name, "") for name in VARIABLES}
     changed = [f"{name}={value}" for name, value in values.items() if value and value not in pinned_to.get(name, set())]

@@ -151,7 +151,7 @@ class ConstantChannels:
         self._readings_n = 0
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Process the next readings, without failed ones."""
+        """Process the next readings; failed reads must have been removed."""
         chips = _by_chip(b_uT)
         if not len(chips):
             return

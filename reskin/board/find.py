@@ -112,7 +112,7 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     if not formats:
         return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
     decoded = [(decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in formats]
-    # Text may have temperatures first or last. Temperatures vary less than fields, so the least variation is right.
+    # Text may have temperatures first or last. Temperatures vary less than fields, so choose the least variation.
     frames, wire, chips_n = min(decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64)))
     with np.errstate(over="ignore"):  # a frame may contain any finite number
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]

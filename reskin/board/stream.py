@@ -110,9 +110,9 @@ def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
         streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
         for stream in streams.values():
             stream.feed(data)
-        found = [wire for wire, stream in streams.items() if 2 * stream.account()["frame_bytes_n"] > len(data)]
-        if found:
-            return [(wire, chips_n) for wire in found]
+        matches = [wire for wire, stream in streams.items() if 2 * stream.account()["frame_bytes_n"] > len(data)]
+        if matches:
+            return [(wire, chips_n) for wire in matches]
     return []
 
 
@@ -154,10 +154,10 @@ def _find_runs(
                 break
         window = octets[position : position + SEARCH_FRAMES_N * record.itemsize]
         reaches_end = position + len(window) == len(octets)
-        skip_n, found = _search(window, at_boundary, final and reaches_end, record)
+        skip_n, is_found = _search(window, at_boundary, final and reaches_end, record)
         position += skip_n
-        at_boundary = found or (at_boundary and skip_n == 0)
-        if found:
+        at_boundary = is_found or (at_boundary and skip_n == 0)
+        if is_found:
             runs.append((position, 1))
             position += record.itemsize
         elif reaches_end:

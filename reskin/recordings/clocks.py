@@ -195,7 +195,8 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
     top_i = int(score.argmax())
     elsewhere = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
     margin = score[top_i] - score[elsewhere].max(initial=0.0)
-    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]  # a wrong dwell counts twice
+    # Overlapped dwell time that does not match; a wrong dwell counts twice.
+    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
             f"{where}: the field fits the dwells at two times almost equally well, with matches that differ by "

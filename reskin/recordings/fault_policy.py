@@ -151,9 +151,9 @@ class FaultLog:
                     f"{self._where}: found fault {fault.replace('_', ' ')} {count_n} x, the first at {place}. Repair "
                     f"the board and record again, or change faults: {fault} in params.yaml."
                 )
-            found = self.records.setdefault(fault, FaultRecord(0, first, last, action))
-            found.count_n += count_n
-            found.first, found.last = float(np.fmin(found.first, first)), float(np.fmax(found.last, last))
+            record = self.records.setdefault(fault, FaultRecord(0, first, last, action))
+            record.count_n += count_n
+            record.first, record.last = float(np.fmin(record.first, first)), float(np.fmax(record.last, last))
         return mask if action == "drop" else np.zeros_like(mask)
 
     def apply(self, faults: Faults, t_s: Float64[np.ndarray, " f"]) -> CheckedRows:
@@ -234,11 +234,11 @@ class FaultLog:
         """Return the count, action and (if known) span of each fault that was found."""
         account: dict[str, int] = {}
         done = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
-        for fault, found in self.records.items():
-            account[f"fault_{fault}_{done[found.action]}_n"] = found.count_n
-            if not math.isnan(found.last):
-                account[f"fault_{fault}_first_{self._unit}"] = round(found.first * self._per_unit)
-                account[f"fault_{fault}_last_{self._unit}"] = round(found.last * self._per_unit)
+        for fault, record in self.records.items():
+            account[f"fault_{fault}_{done[record.action]}_n"] = record.count_n
+            if not math.isnan(record.last):
+                account[f"fault_{fault}_first_{self._unit}"] = round(record.first * self._per_unit)
+                account[f"fault_{fault}_last_{self._unit}"] = round(record.last * self._per_unit)
         return account
 
 

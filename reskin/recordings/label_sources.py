@@ -131,11 +131,11 @@ def parse_places(text: str) -> Places | None:
     [(0.0, 8.0), (2.0, 8.0), (4.0, 8.0)]
     """
     number = r"(-?\d{1,4}(?:\.\d{1,3})?)"
-    found = re.fullmatch(rf"(?:line:(\d{{1,4}})|grid:(\d{{1,4}})x(\d{{1,4}})):{number}(?:@{number},{number})?", text)
-    if found is None:
+    match = re.fullmatch(rf"(?:line:(\d{{1,4}})|grid:(\d{{1,4}})x(\d{{1,4}})):{number}(?:@{number},{number})?", text)
+    if match is None:
         return None
-    along_n, up_n = (int(found[1]), 1) if found[1] else (int(found[2]), int(found[3]))
-    step_mm, x_mm, y_mm = float(found[4]), float(found[5] or 0), float(found[6] or 0)
+    along_n, up_n = (int(match[1]), 1) if match[1] else (int(match[2]), int(match[3]))
+    step_mm, x_mm, y_mm = float(match[4]), float(match[5] or 0), float(match[6] or 0)
     if not 0 < along_n * up_n <= PLACES_MAX_N or step_mm <= 0:
         raise ParamsError("--labels", "places", f"1 to {PLACES_MAX_N}, with a step above 0", text, "Try: grid:9x9:2")
     xy_mm = [(x_mm + step_mm * i, y_mm + step_mm * j) for j in range(up_n) for i in range(along_n)]
@@ -174,7 +174,7 @@ def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
 
 
 def _follow(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
-    """Yield a file's content and then what is appended, each with whether it is new; wait for a missing file."""
+    """Yield a file's content, then what is appended, each with whether it is new; wait for a missing file."""
     is_new = not file.exists()
     while not stop.is_set() and not file.exists():
         stop.wait(TABLE_POLL_s)
@@ -329,14 +329,14 @@ class Prompts:
     def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
         """Read the label of a press; None at the end, a label without contact for a skipped place."""
         for line in typed:
-            found = REPLY.fullmatch(line)
+            match = REPLY.fullmatch(line)
             if line in ENDS:
                 return None
             if line == "s":
                 return Label(False)
-            if found and int(found[1] or place_i) < len(self.places.xy_mm):
-                x_mm, y_mm = self.places.xy_mm[int(found[1] or place_i)]
-                return Label(True, x_mm, y_mm, Fz_N=float(found[2] or math.nan))
+            if match and int(match[1] or place_i) < len(self.places.xy_mm):
+                x_mm, y_mm = self.places.xy_mm[int(match[1] or place_i)]
+                return Label(True, x_mm, y_mm, Fz_N=float(match[2] or math.nan))
             last = len(self.places.xy_mm) - 1
             self.say(f"  {line[:20]!r} is neither a place from 0 to {last} nor a force such as 0.8N")
         return None

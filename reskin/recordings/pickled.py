@@ -74,10 +74,10 @@ def decode(pickled: bytes, where: str) -> Any:
     """
     stack = _Stack([], {})
     try:
-        for opcode, arg, at in pickletools.genops(pickled):
+        for opcode, arg, byte_i in pickletools.genops(pickled):
             if opcode.name not in STEPS:
                 raise CaptureError(
-                    f"{where} @{at}: the pickle has opcode {opcode.name}, which plain values and NumPy numbers "
+                    f"{where} @{byte_i}: the pickle has opcode {opcode.name}, which plain values and NumPy numbers "
                     f"do not need. {REMEDY}"
                 )
             STEPS[opcode.name](stack, arg)
@@ -118,9 +118,9 @@ class _Stack:
 
     def since_mark(self) -> list[Any]:
         """Pop the values since the last mark, and the mark; return the values."""
-        at = max(i for i, value in enumerate(self.values) if value is MARK)
-        taken = self.values[at + 1 :]
-        del self.values[at:]
+        mark_i = max(i for i, value in enumerate(self.values) if value is MARK)
+        taken = self.values[mark_i + 1 :]
+        del self.values[mark_i:]
         return taken
 
     def extend(self, values: list[Any]) -> None:

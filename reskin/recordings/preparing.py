@@ -87,8 +87,9 @@ def layouts_of(recording: Path) -> list[str]:
     """List the layouts in which a recording can be read."""
     if (recording / headers.HEADER_FILE).is_file():
         return ["capture"]
-    if found := [layout for layout in get_args(ReaderLayout) if _is_readable(recording, layout)]:
-        return [layout for layout in found if layout != "table"] or found  # read as a plain table, it may lose labels
+    if layouts := [layout for layout in get_args(ReaderLayout) if _is_readable(recording, layout)]:
+        # Read as a plain table, a recording of another layout may lose labels.
+        return [layout for layout in layouts if layout != "table"] or layouts
     formats = stream.matching_formats(io.read_bytes(recording)) if recording.is_file() else []
     return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in formats})
 
@@ -132,15 +133,15 @@ def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
 def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Marks) -> Prepared:
     """Prepare a capture folder that `reskin record` wrote; `probe` is a probe log to add to it."""
     _need(recording, folder=True)
-    found = read_header(recording)
-    for option, given, in_header in (("--board", names.board, found.board), ("--skin", names.skin, found.skin)):
+    header = read_header(recording)
+    for option, given, in_header in (("--board", names.board, header.board), ("--skin", names.skin, header.skin)):
         if in_header not in (given, UNNAMED):
             raise CaptureError(
                 f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct one of them."
             )
     # A recorder that was killed has not hashed its files into the header.
-    files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in found.files}
-    marks_before = found.clock.marks
+    files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in header.files}
+    marks_before = header.clock.marks
     if probe is not None:
         _need(probe)
         marks_before = () if headers.PROBE_FILE in files else marks_before  # they belong to the replaced log
@@ -149,12 +150,12 @@ def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Mark
         raise CaptureError(f"{recording}: the capture has no labels. Add --probe PROBE.csv, or record with --labels.")
     for name, file in files.items():
         _need(file)
-        if file.parent == recording and found.files.get(name, io.sha256(file)) != io.sha256(file):
+        if file.parent == recording and header.files.get(name, io.sha256(file)) != io.sha256(file):
             raise CaptureError(f"{file}: the file has changed since it was recorded (another hash). Record it again.")
     _check_names(names)
-    clock = found.clock.model_copy(update={"marks": (*marks_before, *marks)})
-    named = {"capture": names.name or found.capture, "board": names.board, "skin": names.skin}
-    return found.model_copy(update=named | {"clock": clock}), files
+    clock = header.clock.model_copy(update={"marks": (*marks_before, *marks)})
+    named = {"capture": names.name or header.capture, "board": names.board, "skin": names.skin}
+    return header.model_copy(update=named | {"clock": clock}), files
 
 
 def _check_names(names: CaptureNames) -> None:

@@ -50,7 +50,7 @@ NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
 def record_capture(
     port: str, folder: Path, *, info: CaptureInfo, settings: PortSettings, report: Report, watch: Watch
 ) -> CaptureResult:
-    """Record a port as a native capture, until it ends or the labels of the source in `info`, if any, end."""
+    """Record a port as a native capture, with labels if `info` has a source of labels; stop when either ends."""
     part, header = begin_capture(folder, info, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
     stop, headers, label_thread = threading.Event(), [header], None
     try:

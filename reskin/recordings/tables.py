@@ -104,8 +104,8 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
     cells = [line.split(separator) for line in text.removesuffix("\n").split("\n")]
     for line_i, row in enumerate(cells):
         if len(row) != len(cells[0]):
-            found = f"{len(row)} columns in line {line_i + 1}, but {len(cells[0])} in line 1"
-            raise CaptureError(f"{where}: {found}. Was the file cut or edited?")
+            problem = f"{len(row)} columns in line {line_i + 1}, but {len(cells[0])} in line 1"
+            raise CaptureError(f"{where}: {problem}. Was the file cut or edited?")
     return cells
 
 
@@ -114,8 +114,8 @@ def to_numbers(
 ) -> Float64[np.ndarray, "f c"]:
     """Parse cells as finite numbers; `names` are the column names, `first_line_n` is the line of `cells[0]`."""
     if cells and len(cells[0]) != len(names):
-        found = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
-        raise CaptureError(f"{where}: {found}. Is the layout right, and the number of chips?")
+        problem = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
+        raise CaptureError(f"{where}: {problem}. Is the layout right, and the number of chips?")
     if not cells:
         raise CaptureError(f"{where}: the file has no row of numbers. Copy the recording again.")
     try:

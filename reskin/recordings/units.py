@@ -10,7 +10,7 @@ from reskin.recordings.tables import FIRST_ROW
 
 # MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
 FULL_SCALE_uT = 32768 * 9.680
-# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT. Numbers in mT or T are below this.
+# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT. In mT or T, the number is below this.
 WEAKEST_uT = 20.0
 # The strongest known skin, 13000 uT, would be 130 G. Values below this limit, in steps finer than any step of the chip,
 # are in gauss.
@@ -76,9 +76,9 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
     if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
         rule = f"one, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
         got, remedy = f"{extent_mm:.4g}", "Convert m or um to mm."
-        far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
-        if 0 < far.sum() <= FAR_SHARE_MAX * len(far):
-            i = int(far.argmax())
+        is_far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
+        if 0 < is_far.sum() <= FAR_SHARE_MAX * len(is_far):
+            i = int(is_far.argmax())
             line_n, place = (
                 first_line_n + int(np.flatnonzero(known)[i]),
                 ", ".join(f"{value:g}" for value in known_mm[i]),

@@ -19,7 +19,7 @@ CONTRAST_MIN = 0.3
 
 
 class Change(NamedTuple):
-    """Fields lag by `before` rows up to label row `row` (counted from 0), and by `after` rows from this row on."""
+    """Fields lag by `before` rows in the label rows above `row` (counted from 0), and by `after` rows from it on."""
 
     row: int
     before: int

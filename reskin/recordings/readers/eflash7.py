@@ -169,8 +169,8 @@ def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray
     """Mark the rows with zeros for all chips, which the recorder writes without a reading; raise for too many."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
-        found = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
-        raise CaptureError(f"{where}: {found}. Was the sensor unplugged? Record again.")
+        problem = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
+        raise CaptureError(f"{where}: {problem}. Was the sensor unplugged? Record again.")
     return zero
 
 

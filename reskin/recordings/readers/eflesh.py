@@ -145,12 +145,12 @@ def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
     """Raise unless the clocks agree row by row (rows are paired in order) and times increase."""
-    apart = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
-    if len(apart):
-        where = f"{header.capture}/{STATES} line {apart[0] + 1}"
-        apart_s = states_s[apart[0]] - sensor_s[apart[0]]
+    disagreeing = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
+    if len(disagreeing):
+        where = f"{header.capture}/{STATES} line {disagreeing[0] + 1}"
+        difference_s = states_s[disagreeing[0]] - sensor_s[disagreeing[0]]
         raise CaptureError(
-            f"{where}: time is {apart_s:.3f} s from that of {SENSOR}, not within {CLOCKS_APART_MAX_s} s. Is a row "
+            f"{where}: time is {difference_s:.3f} s from that of {SENSOR}, not within {CLOCKS_APART_MAX_s} s. Is a row "
             "missing in one of the files?"
         )
     back = np.flatnonzero(np.diff(sensor_s) <= 0)

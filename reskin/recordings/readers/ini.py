@@ -41,10 +41,10 @@ def collect(recording: Path) -> dict[str, Path]:
     if not recording.is_file() or recording.name.startswith("truths_"):
         raise CaptureError(f"{recording}: not the text file of readings. Add b20_NAME.txt, not truths_NAME.txt.")
     names = [f"truths_{recording.name.partition('_')[2]}", f"truths_{recording.name}"]
-    found = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
-    if not found:
+    truths = [recording.with_name(name) for name in names if recording.with_name(name).is_file()]
+    if not truths:
         raise CaptureError(f"{recording}: no {' or '.join(names)} beside it. Fetch or rename the truths file.")
-    return {READINGS: recording, TRUTHS: found[0]}
+    return {READINGS: recording, TRUTHS: truths[0]}
 
 
 def count_chips(files: Mapping[str, Path]) -> int:
@@ -174,12 +174,12 @@ def _check_lateness(
         return
     rows_n = abs(change.after - change.before)
     lost = f"{rows_n} row{'s' if rows_n > 1 else ''} of {'readings' if change.after < change.before else 'truths'}"
-    found = f"{change.before} rows before about row {change.row + 1}, by {change.after} from there on"
+    lags = f"{change.before} rows before about row {change.row + 1}, by {change.after} from there on"
     remedy = (
         f"{lost} seem to be missing there. Cut both files before that row, or put back what is missing, and add the "
         "recording again."
     )
-    raise CaptureError(f"{header.capture}/{READINGS}: the fields lag behind their truths by {found}. {remedy}")
+    raise CaptureError(f"{header.capture}/{READINGS}: the fields lag behind their truths by {lags}. {remedy}")
 
 
 def _corner_rows(pass_i: Int32[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:

@@ -135,8 +135,8 @@ def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.nda
     seen: set[float] = set()
     for row_i in begins:
         if indent[row_i] in seen:
-            found = f"indent {indent[row_i]:g} begins again in line {FIRST_LINE_N + row_i}"
-            raise CaptureError(f"{where}: {found}; its rows must be one block. Was the file joined twice?")
+            problem = f"indent {indent[row_i]:g} begins again in line {FIRST_LINE_N + row_i}"
+            raise CaptureError(f"{where}: {problem}; its rows must be one block. Was the file joined twice?")
         seen.add(indent[row_i])
     return np.repeat(np.arange(len(begins)), np.diff(begins, append=len(indent)))
 
@@ -155,5 +155,5 @@ def _check_table(table: _Table, where: str) -> None:
     begins = np.flatnonzero(np.diff(table.press, prepend=-1))
     moved = np.flatnonzero((table.place_mm != table.place_mm[begins][table.press]).any(axis=1))
     if len(moved):
-        found = f"the place changes within an indent, in line {FIRST_LINE_N + moved[0]}"
-        raise CaptureError(f"{where}: {found}. Number each press as its own indent.")
+        problem = f"the place changes within an indent, in line {FIRST_LINE_N + moved[0]}"
+        raise CaptureError(f"{where}: {problem}. Number each press as its own indent.")

@@ -90,9 +90,9 @@ def _check_kept(account: dict[str, int], where: str) -> None:
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
-        found = f"only {kept_n} of {read_n} lines are whole: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
+        problem = f"only {kept_n} of {read_n} lines are whole: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
         raise CaptureError(
-            f"{where}: {found}. At least {100 * KEPT_SHARE_MIN:g} % must be: check the wiring, and log again."
+            f"{where}: {problem}. At least {100 * KEPT_SHARE_MIN:g} % must be: check the wiring, and log again."
         )
 
 
@@ -172,10 +172,10 @@ def _faults(
     for block in np.array_split(read, max(1, len(read) // faults.GRID_ROWS_N)):
         deviating = np.flatnonzero(faults.reset_chips(b_uT[block], None))
         if len(deviating):
-            found = f"the step of chip {', '.join(map(str, deviating))} differs from that of the other chips"
+            problem = f"the step of chip {', '.join(map(str, deviating))} differs from that of the other chips"
             raise CaptureError(
-                f"{where}: from row {block[0] + first_row} on, {found}. A chip lost its settings: reset the board and "
-                "log again."
+                f"{where}: from row {block[0] + first_row} on, {problem}. A chip lost its settings: reset the board "
+                "and log again."
             )
     return failed, np.asarray(faults.stuck_chips(b_uT).any(axis=1)) & ~failed
 

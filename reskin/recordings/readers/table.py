@@ -194,9 +194,9 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
         return
     rest_uT, pressed_uT = (float(np.median(chips_uT[rows].max(axis=1))) for rows in (~contact, contact))
     if rest_uT < SUBTRACTED_RATIO * pressed_uT:
-        found = f"the fields are {rest_uT:.3g} uT at most in no-load rows, {pressed_uT:.3g} uT in contact"
+        problem = f"the fields are {rest_uT:.3g} uT at most in no-load rows, {pressed_uT:.3g} uT in contact"
         raise CaptureError(
-            f"{where}: {found}. A baseline seems to have been subtracted: write the raw fields of both phases."
+            f"{where}: {problem}. A baseline seems to have been subtracted: write the raw fields of both phases."
         )
 
 
@@ -212,8 +212,8 @@ def _number_presses(
         if (counts > 1).any():
             twice = firsts[counts > 1][0]
             line_n = FIRST_LINE_N + rows[begins[np.flatnonzero(number[begins] == twice)[1]]]
-            found = f"indentation {twice:g} begins again in line {line_n}"
-            raise CaptureError(f"{where}: {found}; its rows must be one block. Was the file joined twice?")
+            problem = f"indentation {twice:g} begins again in line {line_n}"
+            raise CaptureError(f"{where}: {problem}; its rows must be one block. Was the file joined twice?")
         begins_at = np.zeros(len(contact), bool)
         begins_at[rows[begins]] = True
         return np.maximum(np.cumsum(begins_at) - 1, 0)
@@ -233,5 +233,5 @@ def _find_passes(
         if name in numbers
     ]
     _, kind = np.unique(np.round(np.stack(of_press, axis=1), 3), axis=0, return_inverse=True)
-    found = find_passes(np.stack([kind, kind], axis=1).astype(float), np.ones(len(kind), bool))
-    return found.astype(int)[press]
+    pass_of_press = find_passes(np.stack([kind, kind], axis=1).astype(float), np.ones(len(kind), bool))
+    return pass_of_press.astype(int)[press]
