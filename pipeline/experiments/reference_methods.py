@@ -427,7 +427,7 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
 
     charts = {board: fit_board(own) for board, own in boards.items()}
     inverted = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}
-    residuals = {board: own.left for board, own in inverted.items()}
+    residuals = {board: own.residual for board, own in inverted.items()}
     true_mm = {board: data.rows.target[first[board].test[::TESTED_EVERY_N], :2].astype(float) for board in boards}
     off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in inverted.items()}
     limits = limits_of(residuals, fraction)
