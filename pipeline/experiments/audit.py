@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int
 
 from pipeline.settings import Settings
 from pipeline.stage import say
-from pipeline.training.choice import fingerprint, settings_of, trimmed
+from pipeline.training.choice import fingerprint, settings_of, without_budget
 from pipeline.training.jobs import SceneData, read_data
 from reskin import io
 from reskin.config import Strict, parse
@@ -437,7 +437,7 @@ class Choice(Strict, extra="allow"):
 
 def settings_checks(data: SceneData, choice: Path, models: Path) -> list[Check]:
     """Compare the headline recipes that were trained with the record of the study."""
-    recipes = {variant: trimmed(_headline(models / variant)) for variant in data.settings.models}
+    recipes = {variant: without_budget(_headline(models / variant)) for variant in data.settings.models}
     held_out = np.unique(np.concatenate([fold.test for fold in data.folds]))
     return audit_choice(
         io.read_json(choice), recipes, source=data.settings["source"], seed=data.settings.seed,

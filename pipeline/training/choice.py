@@ -44,9 +44,9 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
-    collapsed = [trimmed(card["recipe"]) for card in triplet if _has_collapsed(card)]
+    collapsed = [without_budget(card["recipe"]) for card in triplet if _has_collapsed(card)]
     with_pokes = [card for card in tuned if settings_of(card)["unlabelled_weight"] > 0]
-    eligible = [card for card in with_pokes if trimmed(card["recipe"]) not in collapsed]
+    eligible = [card for card in with_pokes if without_budget(card["recipe"]) not in collapsed]
     _, chosen_multi, _ = _choose(multi, multi, "train_multi")
     best, chosen_adapt, errors = _choose(tuned, eligible, "adapt")
     chosen_adapt["error"] = errors[best["recipe_name"]]
@@ -55,7 +55,7 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
         chosen_adapt["control"] = errors[control[0]]
     chosen_triplet = {
         "recipe_name": settings_of(best)["base"],
-        "settings": trimmed(best["recipe"]),
+        "settings": without_budget(best["recipe"]),
         "by": "MSE_xy of the networks adapted from it",
         "candidates": _candidates(triplet),
     }
@@ -83,7 +83,7 @@ def settings_of(card: Card) -> dict[str, Any]:
     return settings
 
 
-def trimmed(settings: Mapping[str, Any]) -> dict[str, Any]:
+def without_budget(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings without the budget, which is not a setting of the method."""
     return {name: value for name, value in settings.items() if name not in BUDGET}
 
@@ -101,7 +101,7 @@ def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, 
     candidates = _candidates(cards)
     errors = _errors(cards, candidates)
     best = min(stable, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
-    chosen = {"recipe_name": best["recipe_name"], "settings": trimmed(settings_of(best))}
+    chosen = {"recipe_name": best["recipe_name"], "settings": without_budget(settings_of(best))}
     return best, chosen | {"by": "MSE_xy, mean over all budgets of steps", "candidates": candidates}, errors
 
 
@@ -135,7 +135,7 @@ def _check_budgets(cards: Cards, stage: str) -> None:
 
 def _key(card: Card) -> dict[str, Any]:
     """Return the settings without their budget; for an adaptation, with those of the network that it starts from."""
-    return trimmed(card["recipe"]) | (trimmed(settings_of(card)) if "tuning" in card else {})
+    return without_budget(card["recipe"]) | (without_budget(settings_of(card)) if "tuning" in card else {})
 
 
 def _budget(card: Card) -> tuple[int, int]:

@@ -91,12 +91,12 @@ class ModelCard(TypedDict):
     git: NotRequired[str]
 
 
-class _Named(Protocol):
+class _HasName(Protocol):
     @property
     def name(self) -> str: ...
 
 
-class _Timed(Protocol):
+class _HasTimes(Protocol):
     @property
     def seconds(self) -> float: ...
     @property
@@ -315,7 +315,7 @@ def collapse_record(result: TrainingResult) -> dict[str, Any]:
     return {"collapsed": result.collapsed, "collapsed_before_n": result.collapsed_before_n}
 
 
-def write_timings(scene: str, stage: str, jobs: Sequence[_Named], results: Sequence[_Timed]) -> None:
+def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Sequence[_HasTimes]) -> None:
     """Write the seconds that each training run and one prediction took, outside the outputs of stages."""
     seconds = [
         {"name": job.name, "train_s": result.seconds, "one_reading_s": result.one_reading_s}
