@@ -135,7 +135,7 @@ def _temperature(subject: Subject, plain: Response) -> Effect:
 def _friction(subject: Subject) -> Effect:
     tip_m = subject.tip_m[:FEW]
     _, pressed = changes_of_field(subject.board, subject.skin, tip_m.reshape(-1, 3))
-    dragged = drag_tip(subject.board, subject.skin, tip_m, tilt=subject.plan.tilt[:FEW], how=FRICTION)
+    dragged = drag_tip(subject.board, subject.skin, tip_m, tilt=subject.plan.tilt[:FEW], friction=FRICTION)
     field_pct = _error_pct(pressed.reshape(dragged.change_T.shape), dragged.change_T)
     force_pct = 100 * float(np.abs(dragged.force_N).max() / forces(subject.skin, tip_m[..., 2].ravel()).max())
     description = f"coefficient {FRICTION.coefficient:g}, {FEW} indentations of the protocol: nothing moves sideways"

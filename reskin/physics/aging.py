@@ -59,7 +59,7 @@ class Memory(Strict):
 
 
 def field_memory(
-    change_T: Float[np.ndarray, "n p k 3"], how: Memory
+    change_T: Float[np.ndarray, "n p k 3"], memory: Memory
 ) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n p k 3"]]:
     """Return the hysteresis of the field in T, given dB at each stop of each indentation.
 
@@ -74,9 +74,9 @@ def field_memory(
     """
     running_mean_T = change_T.cumsum(axis=1) / np.arange(1, change_T.shape[1] + 1)[:, None, None]
     before_T, added_T = np.zeros_like(change_T[:, 0]), np.zeros_like(change_T)
-    for share, tau_s in zip(how.share, how.tau_s, strict=True):
-        contact_decay, rest_decay = np.exp(-how.contact_s / tau_s), np.exp(-how.rest_s / tau_s)
-        crept_T = -np.expm1(-how.contact_s / tau_s) * share * running_mean_T
+    for share, tau_s in zip(memory.share, memory.tau_s, strict=True):
+        contact_decay, rest_decay = np.exp(-memory.contact_s / tau_s), np.exp(-memory.rest_s / tau_s)
+        crept_T = -np.expm1(-memory.contact_s / tau_s) * share * running_mean_T
         # q before each indentation: q at the end of the previous one, after its decay during the rest.
         left_T = np.zeros_like(before_T)
         for i in range(len(change_T) - 1):
@@ -86,10 +86,10 @@ def field_memory(
     return before_T, added_T
 
 
-def relaxed_share(how: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
+def relaxed_share(relaxation: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
     """Return the force at the middle of an indentation's readings, relative to the force of an elastic skin."""
     elastic = np.array([0.0, 1.0, 1.0])
-    return float(relax(np.cumsum([0.0, how.approach_s, how.hold_s]), elastic, prony)[-1])
+    return float(relax(np.cumsum([0.0, relaxation.approach_s, relaxation.hold_s]), elastic, prony)[-1])
 
 
 def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: Prony) -> Float[np.ndarray, " p"]:
@@ -138,10 +138,10 @@ class Temperature(Strict):
     chip_sensitivity_per_K: Annotated[float, Field(ge=0, le=0.01)]  # standard deviation between chips
 
 
-def temperature_rise_K(time_s: Float[np.ndarray, "..."], how: Temperature) -> Float[np.ndarray, "..."]:
+def temperature_rise_K(time_s: Float[np.ndarray, "..."], temperature: Temperature) -> Float[np.ndarray, "..."]:
     """Return the temperature rise since the start: warming (1 - exp(-t / tau)) + swing sin(2 pi t / period)."""
-    warming = -how.warming_K * np.expm1(-time_s / how.warming_s)
-    return warming + how.swing_K * np.sin(2 * np.pi * time_s / how.swing_s)
+    warming = -temperature.warming_K * np.expm1(-time_s / temperature.warming_s)
+    return warming + temperature.swing_K * np.sin(2 * np.pi * time_s / temperature.swing_s)
 
 
 def relative_remanence(rise_K: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:

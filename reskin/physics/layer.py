@@ -188,12 +188,12 @@ def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
     return Waves(WAVES_KH / thickness_m, pressure_m2 * window * WAVES_W / thickness_m, thickness_m, base)
 
 
-def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], of: Waves) -> Displacement:
+def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pressure: Waves) -> Displacement:
     """Sum the displacements due to waves of pressure: u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0."""
-    top = float(np.max(r_m, initial=0.0) * of.k_per_m[-1])
+    top = float(np.max(r_m, initial=0.0) * pressure.k_per_m[-1])
     table = _bessel_table(1 << max(8, int(np.ceil(top)).bit_length()))
-    rows = np.stack([of.k_per_m, of.thickness_m * of.k_per_m, of.amplitude_m])
-    out_m, hoop, up_m, squeeze, r_z, z_r = _sum_waves(r_m, z_m, rows, of.base == "slipping", table)
+    rows = np.stack([pressure.k_per_m, pressure.thickness_m * pressure.k_per_m, pressure.amplitude_m])
+    out_m, hoop, up_m, squeeze, r_z, z_r = _sum_waves(r_m, z_m, rows, pressure.base == "slipping", table)
     return Displacement(r_m=out_m, z_m=up_m, r_r=squeeze - hoop, r_z=r_z, z_r=z_r, z_z=-squeeze, hoop=hoop)
 
 

@@ -275,7 +275,7 @@ def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> 
 
 
 def shear_displacement(
-    of: ShearMap,
+    shear_map: ShearMap,
     places_m: Float[np.ndarray, "s 3"],
     centre_m: Float[np.ndarray, "2"],
     *,
@@ -284,15 +284,17 @@ def shear_displacement(
 ) -> ShearDisplacement:
     """Return the linear displacement and half curl due to a force at `centre_m`; `modulus_Pa` is Young's, 3 G."""
     lowest_m, highest_m = places_m[:, 2].min(initial=0.0), places_m[:, 2].max(initial=0.0)
-    if not (0 <= lowest_m and highest_m <= RIM_MAX * of.z_m[-1]):
+    if not (0 <= lowest_m and highest_m <= RIM_MAX * shear_map.z_m[-1]):
         rule, got = f"0 to {RIM_MAX} times the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
         raise ParamsError("drag", "height of nodes", rule, got, "Press less deep.")
     shear_m2 = _over_modulus(force_N, modulus_Pa)
-    return ShearDisplacement(*_at_places(of.parts, (of.r_m[1], of.z_m[1]), places_m, centre_m, shear_m2))
+    return ShearDisplacement(
+        *_at_places(shear_map.parts, (shear_map.r_m[1], shear_map.z_m[1]), places_m, centre_m, shear_m2)
+    )
 
 
 def shear_in_steps(
-    of: ShearMap,
+    shear_map: ShearMap,
     places_m: Float[np.ndarray, "s 3"],
     centre_m: Float[np.ndarray, "2"],
     *,
@@ -307,19 +309,19 @@ def shear_in_steps(
     of the nodes at rest, it would differ by 13 to 90 %.
     """
     shear_m2 = _over_modulus(force_N, modulus_Pa)
-    steepest = of.steepest_per_m2 * float(np.hypot(*shear_m2))
+    steepest = shear_map.steepest_per_m2 * float(np.hypot(*shear_m2))
     if not steepest <= STEEPEST:
         rule, remedy = f"at most {STEEPEST} everywhere", "Drag with less friction, or less far before it slips."
         raise ParamsError("drag", "half of the curl", rule, f"{steepest:.3g}", remedy)
     steps_n = max(1, int(np.ceil(steepest / STEP)))
-    part_N, ahead_m = force_N / steps_n, shear_m2 / of.stiffness_m / steps_n
+    part_N, ahead_m = force_N / steps_n, shear_m2 / shear_map.stiffness_m / steps_n
     moved_m, half_curl = np.zeros_like(places_m), np.zeros_like(places_m)
     for step_i in range(steps_n):
         nodes_m, step_centre_m = places_m + moved_m, centre_m + step_i * ahead_m
-        first = shear_displacement(of, nodes_m, step_centre_m, force_N=part_N, modulus_Pa=modulus_Pa)
+        first = shear_displacement(shear_map, nodes_m, step_centre_m, force_N=part_N, modulus_Pa=modulus_Pa)
         half_m = nodes_m + first.displacement_m / 2
         middle_m = step_centre_m + ahead_m / 2
-        middle = shear_displacement(of, half_m, middle_m, force_N=part_N, modulus_Pa=modulus_Pa)
+        middle = shear_displacement(shear_map, half_m, middle_m, force_N=part_N, modulus_Pa=modulus_Pa)
         moved_m += middle.displacement_m
         half_curl += middle.half_curl  # in simple shear, half curls add up like displacement gradients
     return ShearDisplacement(moved_m, half_curl)

@@ -99,7 +99,7 @@ def simulate_response(
         rest_T, change_T = changes_of_field(board, skin, flat_m)
     else:
         rest_T, _ = changes_of_field(board, skin, flat_m[:0])
-        dragged = drag_tip(board, skin, tip_m, tilt=tilt, how=terms.friction)
+        dragged = drag_tip(board, skin, tip_m, tilt=tilt, friction=terms.friction)
         force_N[:, :, :2], change_T = dragged.force_N, dragged.change_T
     force_N[:, :, 2] = forces(skin, flat_m[:, 2]).reshape(n, stops_n)
     change_T = change_T.reshape(n, stops_n, *rest_T.shape)
@@ -121,7 +121,7 @@ def simulate_response(
 
 
 def drag_tip(
-    board: Board, skin: Skin, tip_m: Float[np.ndarray, "n p 3"], *, tilt: Float[np.ndarray, "n 2"], how: Friction
+    board: Board, skin: Skin, tip_m: Float[np.ndarray, "n p 3"], *, tilt: Float[np.ndarray, "n 2"], friction: Friction
 ) -> TangentialResponse:
     """Move a dragged or tilted tip through the stops of each indentation, with Coulomb friction.
 
@@ -131,8 +131,8 @@ def drag_tip(
     scaled by what remains. Under a slipping tip, nothing remains, and the skin loses its displacement due to the press.
     """
     if skin.hold is not None:
-        skin = replace(skin, hold=replace(skin.hold, friction=how.coefficient))
-    responses = [_drag_once(board, skin, *each, how.coefficient) for each in zip(tip_m, tilt, strict=True)]
+        skin = replace(skin, hold=replace(skin.hold, friction=friction.coefficient))
+    responses = [_drag_once(board, skin, *each, friction.coefficient) for each in zip(tip_m, tilt, strict=True)]
     return TangentialResponse(*map(np.stack, zip(*responses, strict=True)))
 
 

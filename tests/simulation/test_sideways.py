@@ -29,7 +29,7 @@ def line(*x_mm, y_mm=1.0):
 
 
 def drag(tip_m, coefficient=0.8, tilt=STRAIGHT):
-    return drag_tip(BOARD, SKIN, tip_m, tilt=tilt, how=Friction(coefficient=coefficient))
+    return drag_tip(BOARD, SKIN, tip_m, tilt=tilt, friction=Friction(coefficient=coefficient))
 
 
 def press_T(tip_m):
@@ -117,8 +117,8 @@ def test_drag_equals_press_and_many_small_shears():
 
 def test_higher_skin_equals_deeper_press():
     high = type(SKIN)(**{**SKIN.__dict__, "depth_zero_m": 0.1e-3})
-    there = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, how=Friction(coefficient=0.5))
-    deeper = drag_tip(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, how=Friction(coefficient=0.5))
+    there = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
+    deeper = drag_tip(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
     np.testing.assert_allclose(there.force_N, deeper.force_N, rtol=1e-9)
     np.testing.assert_allclose(there.change_T, deeper.change_T, atol=1e-9 * np.abs(deeper.change_T).max())
 
@@ -131,7 +131,7 @@ HELD = EVEN.skin.model_copy(
 def test_held_skin_is_in_series_with_its_springs():
     one = draw_skin(HELD, EVEN.spreads, seed=0, name="b0_s0")
     tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3  # through the middle: no rotation
-    force_N = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, how=Friction(coefficient=0.8)).force_N[0, 1]
+    force_N = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, friction=Friction(coefficient=0.8)).force_N[0, 1]
     sizes = {"thickness_m": one.thickness_m, "tip_radius_m": one.tip_radius_m, "base": one.base}
     thinned = (1 - DEPTH_M / one.thickness_m) ** -1.5
     layer_N_per_m = thinned * one.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
@@ -140,7 +140,7 @@ def test_held_skin_is_in_series_with_its_springs():
     slid = one.nodes_m + (force_N[0] / 7e3, 0.0, 0.0)
     as_one_T = change_of_field((one.nodes_m, one.moments_A_m2), (slid, one.moments_A_m2), BOARD.chips_m)
     pressed_T = changes_of_field(BOARD, one, tip_m[0, 1:])[1][0]
-    dragged_T = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, how=Friction(coefficient=0.8)).change_T[0, 1]
+    dragged_T = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, friction=Friction(coefficient=0.8)).change_T[0, 1]
     far = [2, 4]  # chips beside the line
     np.testing.assert_allclose((dragged_T - pressed_T)[far], as_one_T[far], atol=0.5 * np.abs(as_one_T[far]).max())
 
@@ -149,6 +149,8 @@ def test_stiff_springs_equal_a_fixed_base():
     tip_m, hold = line(0.0, 0.02), HELD.hold.model_copy(update={"springs_N_mm": 1e6})
     stiff = draw_skin(HELD.model_copy(update={"hold": hold}), EVEN.spreads, seed=0, name="b0_s0")
     free = replace(stiff, hold=None, modulus_Pa=stiff.modulus_Pa * (1 - DEPTH_M / stiff.thickness_m) ** -1.5)
-    ours, theirs = (drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, how=Friction(coefficient=10.0)) for one in (stiff, free))
+    ours, theirs = (
+        drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, friction=Friction(coefficient=10.0)) for one in (stiff, free)
+    )
     np.testing.assert_allclose(ours.force_N, theirs.force_N, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(ours.change_T, theirs.change_T, atol=1e-3 * np.abs(theirs.change_T).max())

@@ -72,7 +72,7 @@ def path(skin: Skin, ends_m, forces_N, stops_n: int) -> np.ndarray:
 
 
 def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> float:
-    found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=coefficient))
+    found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=coefficient))
     assert not found.change_T[0, [0, -1]].any()
     return float(sizes_uT(np.diff(found.change_T[0], axis=0)).max())
 
@@ -87,7 +87,7 @@ def test_press_and_drag_share_one_friction(start_m, angle_rad, force_N, friction
     way_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
     end_m = np.subtract(start_m, way_m)  # at least a millimetre inside the skin's edge
     tip_m = path(skin, (start_m, end_m), (force_N, force_N), STOPS_N // 4)
-    found = drag_tip(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), how=Friction(coefficient=friction))
+    found = drag_tip(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), friction=Friction(coefficient=friction))
     limit_N = friction * forces(skin, tip_m[0, :, 2])
     assert (np.hypot(*found.force_N[0].T) <= limit_N * (1 + 1e-9)).all()
     assert (skin.hold.springs_N_per_m * np.hypot(*found.slide_m[0].T) <= limit_N * (1 + 1e-9)).all()
@@ -98,7 +98,7 @@ def test_press_and_drag_share_one_friction(start_m, angle_rad, force_N, friction
 def test_frictionless_tip_moves_no_skin():
     board, skin = draw_board_and_skin("b0")
     tip_m = path(skin, ((0.0, 0.0), (1e-3, 0.0)), (0.5, 0.5), STOPS_N // 4)
-    slippery = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.0))
+    slippery = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=0.0))
     assert not slippery.force_N.any()
     assert not slippery.slide_m.any()
     assert slippery.change_T.any()
@@ -110,7 +110,7 @@ def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
     deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # across two depths of the shear tables
     place_m = np.column_stack([np.r_[0.0, np.full(41, 4e-5)], np.zeros(42)])
     tip_m = np.column_stack([place_m, np.r_[deeper_m[0], deeper_m]])[None]
-    found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), how=Friction(coefficient=0.8))
+    found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=0.8))
     steps_uT = sizes_uT(np.diff(found.change_T[0, 1:], axis=0))
     assert steps_uT.max() < 1.5 * np.median(steps_uT)
 

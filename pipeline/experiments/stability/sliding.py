@@ -152,7 +152,7 @@ def force_control(skin: Skin) -> list[Case]:
 
 
 def _drag(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float) -> TangentialResponse:
-    return drag_tip(board, skin, path_m[None], tilt=np.zeros((1, 2)), how=Friction(coefficient=mu))
+    return drag_tip(board, skin, path_m[None], tilt=np.zeros((1, 2)), friction=Friction(coefficient=mu))
 
 
 def _path(
