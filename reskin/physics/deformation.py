@@ -227,9 +227,9 @@ def _tabulate(
 ) -> DeformationMap:
     size = tip_radius_m / thickness_m
     depth_m = thickness_m * depth_scale(size) * LADDER[:rungs_n]
-    at = np.log(size) / SIZE_STEP
-    tables_i = int(np.floor(at)) - 1 + np.arange(STENCIL_N)
-    weights = _lagrange(tables_i.astype(float), at)
+    position = np.log(size) / SIZE_STEP
+    tables_i = int(np.floor(position)) - 1 + np.arange(STENCIL_N)
+    weights = _lagrange(tables_i.astype(float), position)
     parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
     coarse = sum(weight * part for weight, part in zip(weights, parts, strict=True))
     # Contiguous, because otherwise each indentation would copy the part that it uses.
@@ -295,15 +295,15 @@ def _follow_ladder(
     # Lengths are in thicknesses. Each step starts from the step before, so that a table for deeper indentations only
     # has more steps.
     size = _size(table_i)
-    at = rest = undeformed(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
+    material = rest = undeformed(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
     parts = np.zeros((rungs_n, 3, len(rest.r_m)))
     for rung_i in range(1, rungs_n):
         depth = depth_scale(size) * float(LADDER[rung_i])
-        at = displace(at, _pressure_change(table_i, rung_i, base), depth, IndentedLayer(1.0, size, base))
-        if not np.abs(np.linalg.det(at.f) * at.hoop - 1).max() <= DET_F_ERROR_MAX:
+        material = displace(material, _pressure_change(table_i, rung_i, base), depth, IndentedLayer(1.0, size, base))
+        if not np.abs(np.linalg.det(material.f) * material.hoop - 1).max() <= DET_F_ERROR_MAX:
             rule = f"such that the volume of the material is conserved within {DET_F_ERROR_MAX:.0%}"
             raise ParamsError("poke", "depth", rule, f"{depth:.3g} of the thickness", "Poke less deep.")
-        parts[rung_i] = at.r_m - rest.r_m, at.z_m - rest.z_m, np.tan(rotation_angle(at.f) / 2)
+        parts[rung_i] = material.r_m - rest.r_m, material.z_m - rest.z_m, np.tan(rotation_angle(material.f) / 2)
     return np.moveaxis(parts, 1, 2).reshape(rungs_n, len(heights), len(COARSE_R), 3)
 
 
@@ -358,9 +358,9 @@ def _move(nodes, moments, height_i, table, tip):
         cos, sin = dx * over_r, dy * over_r
         outward, up, tan = sqrt(r * r + grown_m2) - r, 0.0, 0.0
         if r < reach_m:
-            at = r / reach_m * steps_n
-            low = min(int(at), steps_n - 1)
-            near, far, share = table[height_i[s], low], table[height_i[s], low + 1], at - low
+            position = r / reach_m * steps_n
+            low = min(int(position), steps_n - 1)
+            near, far, share = table[height_i[s], low], table[height_i[s], low + 1], position - low
             outward = thickness_m * (near[0] + share * (far[0] - near[0]))
             up = thickness_m * (near[1] + share * (far[1] - near[1]))
             tan = near[2] + share * (far[2] - near[2])  # tangent of half the angle

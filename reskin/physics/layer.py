@@ -311,9 +311,9 @@ def _sum_waves(r_m, z_m, waves, slipping, table):
         steep, of_kh = amplitude * k, _slipping_factors(kh) if slipping else _bonded_factors(kh)
         for s in range(len(r_m)):
             g, slope, bend = _slipping_wave(k * z_m[s], kh, of_kh) if slipping else _bonded_wave(k * z_m[s], kh, of_kh)
-            at = k * r_m[s] / BESSEL_STEP
-            low = int(at)
-            j0_, j1_ = _between(table, low, at - low)
+            position = k * r_m[s] / BESSEL_STEP
+            low = int(position)
+            j0_, j1_ = _between(table, low, position - low)
             sums[0, s] += amplitude * slope * j1_
             sums[1, s] += steep * slope / 2
             sums[2, s] -= amplitude * g * j0_

@@ -347,7 +347,7 @@ def _at_places(parts, steps, places, centre, force):
     # Interpolate the parts bilinearly, then combine them for the direction of the force.
     r_n, z_n, _ = parts.shape
     moved, half_curl = np.zeros_like(places), np.zeros_like(places)
-    at, (fx, fy) = np.empty(6), force
+    values, (fx, fy) = np.empty(6), force
     for i in range(len(places)):
         x, y = places[i, 0] - centre[0], places[i, 1] - centre[1]
         r = sqrt(x * x + y * y)
@@ -359,8 +359,8 @@ def _at_places(parts, steps, places, centre, force):
         for p in range(6):
             near = parts[j, k, p] + share_z * (parts[j, k + 1, p] - parts[j, k, p])
             far = parts[j + 1, k, p] + share_z * (parts[j + 1, k + 1, p] - parts[j + 1, k, p])
-            at[p] = near + share_r * (far - near)
-        a, b, c, d, e, s = at
+            values[p] = near + share_r * (far - near)
+        a, b, c, d, e, s = values
         # On the axis, the parts that depend on the direction are zero, so the direction has no effect.
         cos, sin = (x / r, y / r) if r > 0 else (1.0, 0.0)
         along, across = fx * cos + fy * sin, fx * sin - fy * cos

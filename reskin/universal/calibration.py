@@ -164,21 +164,21 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
         raise SchemaError(
             f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
         )
-    found, metadata = io.read_tensors(file, digest_needed=True)
+    tensors, metadata = io.read_tensors(file, digest_needed=True)
     if metadata.get("format") != FORMAT:
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
-    got = {name: values.shape for name, values in sorted(found.items())}
+    got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
     expected = {"rest_uT": (CHANNELS_N,)} | {name: (counts_n.get(name, 0), *shape) for name, shape in SHAPES.items()}
     if got != expected or max(counts_n["pokes_uT"], counts_n["even_uT"]) > FULL_SET_N:
         rule = f"rest_uT, {', '.join(SHAPES)} of {CHANNELS_N} channels and at most {FULL_SET_N} unlabelled presses"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
-    fields_uT = {name: check_readings(values) for name, values in found.items() if values.shape[1:] == (CHANNELS_N,)}
+    fields_uT = {name: check_readings(values) for name, values in tensors.items() if values.shape[1:] == (CHANNELS_N,)}
     labels_n = len(fields_uT["labelled_uT"])
     place_mm, force_N = check_labels(
-        found["labelled_mm"].astype(float), found["labelled_N"].astype(float), labels_n, reach_mm
+        tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, reach_mm
     )
-    rest_uT = check_readings(found["rest_uT"])[0]
+    rest_uT = check_readings(tensors["rest_uT"])[0]
     labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"])
     return CalibrationData(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], labels)
 
@@ -252,14 +252,14 @@ def variance_inflations(powers_n: int, folds: Sequence[HeldOut]) -> list[float]:
     """Return for each power the factor by which squared errors of held-out labels exceed the estimated variances."""
     inflations = []
     for i in range(powers_n):
-        off = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
-        inflations.append(variance_inflation(np.concatenate([np.zeros((0, 2)), *off])))
+        errors_sd = [np.abs(estimates[i].place_mm - true_mm) / estimates[i].sd_mm for estimates, true_mm in folds]
+        inflations.append(variance_inflation(np.concatenate([np.zeros((0, 2)), *errors_sd])))
     return inflations
 
 
-def variance_inflation(off: Float[np.ndarray, "m 2"]) -> float:
+def variance_inflation(errors_sd: Float[np.ndarray, "m 2"]) -> float:
     """Return the variance inflation for errors in standard deviations.
 
     It is the square of the mean absolute error, relative to that of a normal distribution: outliers are not squared.
     """
-    return ((PRIOR_N + float(off.sum()) / NORMAL_MEAN) / (PRIOR_N + off.size)) ** 2
+    return ((PRIOR_N + float(errors_sd.sum()) / NORMAL_MEAN) / (PRIOR_N + errors_sd.size)) ** 2

@@ -98,22 +98,24 @@ class _JointFit:
     db_uT: Float[np.ndarray, "n ch"]
     rest_uT: Float[np.ndarray, " ch"]
 
-    def solve(self, found: SearchResult) -> Law:
+    def solve(self, start_points: SearchResult) -> Law:
         n = len(self.db_uT)
         low = [*(LEAST.get(name, -np.inf) for name in PARAMETERS), *[-REACH_MM, -REACH_MM, np.log(REACH_N[0])] * n]
         high = [*[np.inf] * len(PARAMETERS), *[REACH_MM, REACH_MM, np.log(REACH_N[1])] * n]
-        at = np.column_stack([found.place_mm, np.log(found.force_N)]).ravel()
-        start = np.clip(np.concatenate([_values(self.law), at]), low, high)
-        best = least_squares(
+        coordinates = np.column_stack([start_points.place_mm, np.log(start_points.force_N)]).ravel()
+        start = np.clip(np.concatenate([_values(self.law), coordinates]), low, high)
+        result = least_squares(
             self.residuals, start, self.slopes, bounds=(low, high), ftol=1e-3, max_nfev=EVALUATIONS_MAX_N,
             x_scale=np.concatenate([_values(STEP), np.tile([1.0, 1.0, 0.5], n)]),
         )  # fmt: skip
-        return with_parameters(self.law, PARAMETERS, best.x[: len(PARAMETERS)])
+        return with_parameters(self.law, PARAMETERS, result.x[: len(PARAMETERS)])
 
     def residuals(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
-        parameters, at = values[: len(PARAMETERS)], values[len(PARAMETERS) :].reshape(-1, 3)
+        parameters, coordinates = values[: len(PARAMETERS)], values[len(PARAMETERS) :].reshape(-1, 3)
         law = with_parameters(self.law, PARAMETERS, parameters)
-        simulated_uT = simulate_uT(law, self.setup, at[:, :2], np.exp(at[:, 2])).reshape(self.db_uT.shape)
+        simulated_uT = simulate_uT(law, self.setup, coordinates[:, :2], np.exp(coordinates[:, 2])).reshape(
+            self.db_uT.shape
+        )
         changes = (simulated_uT - self.db_uT) / np.linalg.norm(self.db_uT, axis=1, keepdims=True)
         rest = (at_rest_uT(law, self.setup).ravel() - self.rest_uT) / OFFSET_uT
         priors = PRIOR_WEIGHT * (parameters - _values(NOMINAL)) / _values(PRIOR)

@@ -241,9 +241,9 @@ def means(
 
     deviance: -2 log likelihood, up to a constant. best: index of the most likely hypothesis for each reading.
     """
-    found = np.empty((len(deviance), 5))
-    _means(deviance, best, tuple(lattice), 0.5 * power, found)
-    return found[:, :2], found[:, 2:4], found[:, 4]
+    moments = np.empty((len(deviance), 5))
+    _means(deviance, best, tuple(lattice), 0.5 * power, moments)
+    return moments[:, :2], moments[:, 2:4], moments[:, 4]
 
 
 def products(
@@ -254,9 +254,9 @@ def products(
 
     map_power: power of the map's likelihoods. power: power of the product; it affects standard deviations only.
     """
-    found = np.empty((len(deviance), 5))
-    _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), found)
-    return found[:, :2], found[:, 2:4], found[:, 4]
+    moments = np.empty((len(deviance), 5))
+    _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), moments)
+    return moments[:, :2], moments[:, 2:4], moments[:, 4]
 
 
 @njit(cache=True, error_model="numpy")

@@ -136,13 +136,13 @@ def fit_residual(
     many known boards.
     """
     board_i = np.repeat(np.arange(len(errors)), [len(board) for board in errors])
-    at_mm, log_N, off = np.concatenate(place_mm), np.log(np.concatenate(force_N)), np.concatenate(errors)
+    at_mm, log_N, error = np.concatenate(place_mm), np.log(np.concatenate(force_N)), np.concatenate(errors)
     board_cov = np.where(board_i[:, None] == board_i, 1.0, SHARED)
-    cov = board_cov * kernel(at_mm, at_mm, log_N, log_N) + NOISE * np.eye(len(off))
-    between, channels_n = off.T @ off, off.shape[1]
+    cov = board_cov * kernel(at_mm, at_mm, log_N, log_N) + NOISE * np.eye(len(error))
+    between, channels_n = error.T @ error, error.shape[1]
     isotropic = np.eye(channels_n) / channels_n
     channel_cov = EVEN * isotropic + (1 - EVEN) * between / np.trace(between)
-    return Residual(at_mm, log_N, np.linalg.solve(cov, off), channel_cov, noise=NOISE / 2)
+    return Residual(at_mm, log_N, np.linalg.solve(cov, error), channel_cov, noise=NOISE / 2)
 
 
 def kernel(
@@ -398,13 +398,17 @@ def condition_on_labels(
     magnitude_uT, log_N = np.linalg.norm(mean_uT, axis=1), np.log(force_N)
     k = kernel(place_mm, place_mm, log_N, log_N) + skin.residual.noise * np.eye(len(place_mm))
     root = np.linalg.cholesky(k)
-    off = (db_uT - mean_uT) / magnitude_uT[:, None] - expected
+    deviation = (db_uT - mean_uT) / magnitude_uT[:, None] - expected
     slope = slope_uT / magnitude_uT[:, None, None]
     # Errors are correlated between presses (k) and between channels (error_cov): whiten both.
-    white = solve_triangular(root, np.concatenate([off[..., None], slope], axis=2).reshape(len(off), -1), lower=True)
-    white = np.linalg.solve(np.linalg.cholesky(skin.error_cov), white.reshape(*off.shape, -1))
-    posterior = _condition(skin, white[..., 1:].reshape(-1, len(skin.mean)), white[..., 0].ravel(), np.ones(off.size))
-    solved = np.linalg.solve(k, off - slope @ posterior.mean)
+    white = solve_triangular(
+        root, np.concatenate([deviation[..., None], slope], axis=2).reshape(len(deviation), -1), lower=True
+    )
+    white = np.linalg.solve(np.linalg.cholesky(skin.error_cov), white.reshape(*deviation.shape, -1))
+    posterior = _condition(
+        skin, white[..., 1:].reshape(-1, len(skin.mean)), white[..., 0].ravel(), np.ones(deviation.size)
+    )
+    solved = np.linalg.solve(k, deviation - slope @ posterior.mean)
     return replace(posterior, labelled=LabelledErrors(place_mm, log_N, solved, np.linalg.inv(k)))
 
 
@@ -428,14 +432,14 @@ def interpolate(
     """Interpolate means and slopes linearly in place and log F; return them and the expected relative errors."""
     tables = skin.tables
     axes = tables.axis_mm, tables.axis_mm, np.log(tables.force_N)
-    at = np.column_stack([place_mm, np.log(force_N)])
-    low, share = np.empty(at.shape, int), np.empty(at.shape)
+    points = np.column_stack([place_mm, np.log(force_N)])
+    low, share = np.empty(points.shape, int), np.empty(points.shape)
     for i, axis in enumerate(axes):
-        step = np.clip((at[:, i] - axis[0]) / (axis[1] - axis[0]), 0, len(axis) - 1)
+        step = np.clip((points[:, i] - axis[0]) / (axis[1] - axis[0]), 0, len(axis) - 1)
         low[:, i] = np.minimum(step.astype(int), len(axis) - 2)
         share[:, i] = step - low[:, i]
     channels_n, parameters_n = tables.rest_slope_uT.shape
-    mean_uT, slope_uT = np.zeros((len(at), channels_n)), np.zeros((len(at), channels_n, parameters_n))
+    mean_uT, slope_uT = np.zeros((len(points), channels_n)), np.zeros((len(points), channels_n, parameters_n))
     for corner in np.ndindex(2, 2, 2):
         weight = np.prod(np.where(corner, share, 1 - share), axis=1)
         i, j, k = (low + corner).T

@@ -105,15 +105,15 @@ def from_tensors(tensors: Mapping[str, np.ndarray]) -> list[Weights]:
 def _encode(
     weights: Weights, rest: Float32[np.ndarray, " ch"], presses_uT: Float[np.ndarray, "c ch"]
 ) -> Float32[np.ndarray, " o"]:
-    each = np.empty((len(presses_uT), 2 * len(rest) + 1), np.float32)
-    each[:, len(rest) + 1 :] = rest
-    for press_uT, values in zip(presses_uT, each, strict=True):
+    features = np.empty((len(presses_uT), 2 * len(rest) + 1), np.float32)
+    features[:, len(rest) + 1 :] = rest
+    for press_uT, values in zip(presses_uT, features, strict=True):
         _fill_inputs(press_uT, values)
     for name in ("set1", "set2"):
         weight, bias = _linear(weights, name)
-        each = np.maximum(each @ weight.T + bias, 0)
+        features = np.maximum(features @ weight.T + bias, 0)
     weight, bias = _linear(weights, "code")
-    pooled = np.append(each.sum(axis=0) / max(len(each), 1), np.float32(len(each) / FULL_SET_N))
+    pooled = np.append(features.sum(axis=0) / max(len(features), 1), np.float32(len(features) / FULL_SET_N))
     return np.maximum(weight @ pooled.astype(np.float32) + bias, 0)
 
 

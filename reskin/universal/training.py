@@ -269,14 +269,14 @@ def add_error(
     wave = rng.standard_normal((skins_n, 3, ERROR_WAVES_N), np.float32)
     wave[:, :2] /= rng.uniform(*ERROR_MM, (skins_n, 1, 1))
     wave[:, 2] /= ERROR_LOG_N
-    at = np.concatenate([place_mm, log_N[..., None]], axis=-1)
+    coordinates = np.concatenate([place_mm, log_N[..., None]], axis=-1)
     phase = rng.uniform(0, 2 * np.pi, (skins_n, 1, ERROR_WAVES_N)).astype(np.float32)
     amplitude = rng.standard_normal((skins_n, ERROR_WAVES_N, channels_n), np.float32)
-    unit = np.cos(at @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # its variance is 1
+    unit = np.cos(coordinates @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # its variance is 1
     chips = db_uT.reshape(*db_uT.shape[:2], -1, len(NOISE_uT))
-    of_chip = np.repeat(np.linalg.norm(chips, axis=-1), len(NOISE_uT), axis=-1) / np.sqrt(np.float32(len(NOISE_uT)))
-    of_all = np.linalg.norm(db_uT, axis=-1, keepdims=True) / np.sqrt(np.float32(channels_n))
-    return db_uT + rms * unit * 0.5 * (of_chip + of_all)
+    chip_scale = np.repeat(np.linalg.norm(chips, axis=-1), len(NOISE_uT), axis=-1) / np.sqrt(np.float32(len(NOISE_uT)))
+    total_scale = np.linalg.norm(db_uT, axis=-1, keepdims=True) / np.sqrt(np.float32(channels_n))
+    return db_uT + rms * unit * 0.5 * (chip_scale + total_scale)
 
 
 def residual_uT(skins: Population, residual: Residual) -> Float32[np.ndarray, "s m ch"]:
