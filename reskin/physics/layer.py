@@ -177,7 +177,7 @@ def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius
             raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit.")
     limit_m = min(thickness_m, tip_radius_m)
     if not (np.isfinite(depth_m) & (depth_m < limit_m)).all():
-        rule = f"finite and below {1e3 * limit_m:.3g} mm, the smaller of thickness and tip radius"
+        rule = f"finite and below {1e3 * limit_m:.3g} mm, the lesser of thickness and tip radius"
         raise ParamsError("poke", "depth", rule, f"{1e3 * np.max(depth_m):.3g} mm", "Poke less deep.")
 
 

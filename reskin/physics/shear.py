@@ -165,7 +165,7 @@ def stick_traction(radius_m: float, thickness_m: float) -> Traction:
 
 
 def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
-    """Return k_t / G: the force divided by the traction-weighted mean displacement along the force, divided by G.
+    """Return k_t / G, where k_t is the force divided by the traction-weighted mean displacement along the force.
 
     By Parseval's theorem, it is 8 pi / integral of q^2 (w' + 2v) dk at the surface. For a half-space, w' + 2v = 3; this
     part of the integral has a closed form, and the kernel describes the effect of the base.
