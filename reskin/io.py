@@ -28,8 +28,8 @@ COUNTS_KEY = b"reskin.account"
 DIGEST = "digest"  # in the metadata of a safetensors file
 HEADER_AT = 8  # a safetensors file begins with the length of its header, in this many bytes
 REMEDY = (
-    "It was cut or changed. If `dvc repro` wrote it: delete it, then `reskin check-cache` and `dvc repro`. "
-    "If not: copy it again."
+    "It was cut or changed. If `dvc repro` wrote it, delete it, then run `reskin check-cache` and `dvc repro`. "
+    "Otherwise copy it again."
 )
 MACHINE_ERRNOS = {
     errno.EACCES,

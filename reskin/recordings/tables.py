@@ -115,7 +115,7 @@ def to_numbers(
     """Parse cells as finite numbers; `names` are the column names, `first_line_n` is the line of `cells[0]`."""
     if cells and len(cells[0]) != len(names):
         problem = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
-        raise CaptureError(f"{where}: {problem}. Is the layout right, and the number of chips?")
+        raise CaptureError(f"{where}: {problem}. Are the layout and the number of chips right?")
     if not cells:
         raise CaptureError(f"{where}: the file has no row of numbers. Copy the recording again.")
     try:

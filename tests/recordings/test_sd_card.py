@@ -140,12 +140,13 @@ def log_with_faults(failed_n, stuck_n, frames_n=60):
 def test_log_with_too_many_faults_is_refused(log):
     log.write_text(render(*log_with_faults(40, 0)))
     with pytest.raises(
-        CaptureError, match="only 20 of 60 lines are whole: 40 had failed I2C reads, 0 stuck chips. At least 50 % must"
+        CaptureError, match="only 20 of 60 lines are fault-free: 40 had failed I2C reads, 0 stuck chips. At least 50 %"
     ):
         read_log(log)
     log.write_text(render(*log_with_faults(5, 50)))
     with pytest.raises(
-        CaptureError, match=r"\d+ of 60 lines are whole: 5 had failed I2C reads, \d+ stuck chips. .*heck the wiring"
+        CaptureError,
+        match=r"\d+ of 60 lines are fault-free: 5 had failed I2C reads, \d+ stuck chips. .*heck the wiring",
     ):
         read_log(log)
     log.write_text(render(*log_with_faults(30, 0)))

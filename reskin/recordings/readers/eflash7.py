@@ -182,7 +182,7 @@ def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"],
     if untouched.sum() < STILL_ROWS_MIN_N:
         line_n = FIRST_LINE_N + int(moved.argmax())
         raise CaptureError(
-            f"{where}: fewer than {STILL_ROWS_MIN_N} rows before the first touch: fields change by more than "
+            f"{where}: fewer than {STILL_ROWS_MIN_N} rows come before the first touch: fields change by more than "
             f"{STILL_uT:g} uT in line {line_n}. Start the recording earlier before the first touch."
         )
     return untouched

@@ -90,9 +90,10 @@ def _check_kept(account: dict[str, int], where: str) -> None:
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
-        problem = f"only {kept_n} of {read_n} lines are whole: {failed_n} had failed I2C reads, {stuck_n} stuck chips"
+        counts = f"{failed_n} had failed I2C reads, {stuck_n} stuck chips"
         raise CaptureError(
-            f"{where}: {problem}. At least {100 * KEPT_SHARE_MIN:g} % must be: check the wiring, and log again."
+            f"{where}: only {kept_n} of {read_n} lines are fault-free: {counts}. At least "
+            f"{100 * KEPT_SHARE_MIN:g} % must be. Check the wiring, and log again."
         )
 
 
