@@ -106,7 +106,7 @@ def test_unrecorded_quantities_are_nan(tmp_path: Path) -> None:
 
 def test_pass_that_begins_in_contact_has_no_noload(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, ONE_PASS[2:6] * 3))
-    assert "truths.txt line 1: this pass begins without" in message
+    assert "truths.txt line 1: this pass does not begin with a fault-free row" in message
 
 
 def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ def test_stuck_chip_loses_its_rows(tmp_path: Path) -> None:
     for row_i in range(20, 64):
         edit(tmp_path / ini.READINGS, row_i + 1, f"{chip_line(row_i, 0)} {chip_line(20, 1)} {chip_line(row_i, 2)}")
     # Detected from the 20th equal reading on; the corner rows of the last passes are all stuck.
-    assert "truths.txt line 41: this pass begins without" in error_of(tmp_path)
+    assert "truths.txt line 41: this pass does not begin with a fault-free row" in error_of(tmp_path)
 
 
 def test_recording_of_failed_reads_is_refused(tmp_path: Path) -> None:

@@ -220,7 +220,7 @@ def test_subtracted_baseline_is_named(tmp_path):
     rest = (rows["phase"] == "noload").to_numpy()
     rows[columns] = (fields_uT - fields_uT[rest].mean(axis=0)) / 5
     rows.to_csv(tmp_path / plain.CSV, index=False)
-    assert "A baseline seems to be subtracted already" in error_of(tmp_path)
+    assert "A baseline seems to have been subtracted" in error_of(tmp_path)
     rows[columns] = fields_uT / 1000
     rows.to_csv(tmp_path / plain.CSV, index=False)
     assert "Convert mT or G to uT" in error_of(tmp_path)
