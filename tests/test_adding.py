@@ -155,7 +155,7 @@ def test_failed_removal_changes_nothing(root, lab_file):
 
 def test_leftovers_of_a_killed_add_are_an_error(root, lab_file):
     (root / "data/raw/small/board1_skin1_readings").mkdir(parents=True)
-    assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed there")
+    assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed")
 
 
 def test_errors_name_the_users_file(root, tmp_path):
