@@ -78,7 +78,7 @@ def test_unchecked_loss_is_detected(monkeypatch):
         return True
 
     monkeypatch.setattr(train.Monitor, "check", unchecked)
-    cases = [learning._explodes(JOB, ROWS, 1e10), learning._beside_one_that_overflows(JOB, ROWS)]
+    cases = [learning._exploding_weights(JOB, ROWS, 1e10), learning._overflowing_neighbour(JOB, ROWS)]
     assert failed(cases) == {case.case for case in cases}
 
 
@@ -95,7 +95,7 @@ def test_coupled_networks_are_detected(monkeypatch):
         return features + 0 * features.sum(0, keepdim=True)
 
     monkeypatch.setattr(network.Stack, "features", mixed)
-    assert not learning._beside_one_that_overflows(JOB, ROWS).holds
+    assert not learning._overflowing_neighbour(JOB, ROWS).holds
 
 
 def test_batches_that_ignore_the_seed_are_detected(monkeypatch):
