@@ -92,7 +92,7 @@ class ScriptReader:
     def __init__(self, script: Script, *, frames_n: int = 20) -> None:
         self._script, self._frames_n, self._i = script, frames_n, 0
 
-    def start(self, *, there: bool) -> None:
+    def start(self, *, must_exist: bool) -> None:
         """Nothing has to be opened."""
 
     def stop(self) -> None:
