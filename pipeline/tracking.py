@@ -33,7 +33,8 @@ METRICS_MAX_N = 1000  # in one call to MLflow
 TIMEOUT_S = 2.0
 LOCK_TIMEOUT_S = 5.0  # UIs and other writers lock the store for a much shorter time
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for all writing; a local server takes 0.1 s per run
-NOT_METRICS = {"provenance", "runtime", "described", "variants"}  # costs, and values that other MLflow runs contain
+# Run times and provenance, and values that other MLflow runs contain.
+NOT_METRICS = {"provenance", "runtime", "described", "variants"}
 
 # A point of a sweep or experiment: the name of its curve, its step (a number of pokes, skins, ...), and means by name.
 Point = tuple[str, int, Mapping[str, float]]

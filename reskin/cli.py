@@ -60,7 +60,7 @@ LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), or what `record` 
 
 
 def main() -> None:
-    """Run the command; print errors that a user can fix without a traceback."""
+    """Run the command; print user errors without a traceback."""
     try:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `finally` and `with` clean up
         with explaining("reskin"):

@@ -68,7 +68,7 @@ class UniversalSection(TrainingSettings):
 def universal(
     settings: Settings, section: UniversalSection, indentations: Path, folds: Path, models: Path, scores: Path
 ) -> None:
-    """Score the universal model on every held-out board, with every number of labels, on the rows of few_labels.
+    """Score the universal model on every held-out board for every number of labels, on the test rows of `few_labels`.
 
     The map alone and the map with networks are scored. Each is built once from the other boards of the rig and once
     from simulated skins.

@@ -40,9 +40,9 @@ class Lines:
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
     """Index the chosen pokes along the grid lines of each skin, in both directions.
 
-    Only skins and commanded places are used. The index is the rank of a coordinate among all distinct coordinates of
-    the skin's chosen pokes, so a place that is missing on one line leaves a gap. Lines with a single place have no
-    order and are left out.
+    Of the labels, only the skin and the commanded place are used. The index is the rank of a coordinate among all
+    distinct coordinates of the skin's chosen pokes, so a place that is missing on one line leaves a gap. Lines with a
+    single place have no order and are left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):

@@ -100,7 +100,7 @@ def read_script(source: str) -> Script:
 
 
 def read_capture(folder: Path) -> Script:
-    """Read a recorded stream, or the log of an SD card, whose readings are encoded as binary frames."""
+    """Read a recorded stream or an SD card log; the readings of a log are encoded as binary frames."""
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)

@@ -82,7 +82,7 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
 
 @dataclass
 class FaultRecord:
-    """How often a fault occurred, its first and last positions (s of the stream, or rows from 1), and the action taken.
+    """Number of times a fault occurred, its first and last position (stream time in s, or row), and the action taken.
 
     The positions are NaN until a time is known: the last bytes before a recorder was killed may have no time.
     """

@@ -35,7 +35,7 @@ class _Frozen(BaseModel):
 
 
 class Clock(_Frozen):
-    """Source of the frames' times: `arrivals.csv`, a constant rate, or the recording's own files, if any (`recording`).
+    """Source of frame times: the file arrivals.csv, a constant rate, or the recording's own files (`recording`).
 
     `marks` are pairs (stream time, probe time) in seconds, each for one event that both clocks recorded; without marks,
     ingest aligns the clocks by the contacts.

@@ -61,7 +61,10 @@ def lattice_mm() -> Float[np.ndarray, " a"]:
 def tabulate(
     centre: Law, spreads: Mapping[str, float], setup: Setup, forces_N: Float[np.ndarray, " q"] = FORCES_N
 ) -> Tables:
-    """Simulate all places and forces for a central law and for a change of each parameter (50,000 presses, 30 s)."""
+    """Simulate all places and forces for the central law and for a small change of each parameter.
+
+    These are 50,000 presses; it takes about 30 s.
+    """
     axis_mm = lattice_mm()
     places_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     place_mm = np.repeat(places_mm, len(forces_N), axis=0)

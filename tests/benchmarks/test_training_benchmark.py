@@ -148,7 +148,10 @@ def plain_grid(
 
 
 def engine_cpu_s(rows: TrainingData) -> float:
-    """Train one stack in this process; return CPU seconds scaled to the grid, which load hardly changes."""
+    """Train one stack in this process; return its CPU time, scaled to the whole grid.
+
+    CPU time hardly depends on the machine's load.
+    """
     jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, 0.0)]
     start_s = time.process_time()
     train_stack(jobs[: STACK_N["cpu"]], rows)

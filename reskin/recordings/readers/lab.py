@@ -42,7 +42,7 @@ Account = dict[str, int]
 
 @dataclass(frozen=True)
 class _Table:
-    """The columns of one file; `press` numbers the blocks of equal `indent` in the order of the file."""
+    """The columns of one file; `press` is the index of each block of rows with equal `indent`, in file order."""
 
     press: Int[np.ndarray, " f"]
     contact: Bool[np.ndarray, " f"]
