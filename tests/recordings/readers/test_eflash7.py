@@ -126,7 +126,7 @@ def with_line_changed(line_n: int, old: str, new: str) -> list[str]:
         (with_line_changed(5, "100.3", "100.1"), "timestamp does not increase in line 5"),
         (with_line_changed(8, "-0.9", "-356"), "in line 8. Convert grams"),
         (with_line_changed(8, "-0.9", "nan"), "fz in line 8"),
-        (ONE[5:], "fewer than 5 rows before the first touch"),
+        (ONE[5:], "fewer than 5 rows come before the first touch"),
         ([ONE[11].replace("101.1", f"{90 + i}") for i in range(9)] + ONE, "10 of 22 rows are zeros, more than 25%"),
     ],
 )
