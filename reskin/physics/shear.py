@@ -98,7 +98,7 @@ DEPTH_STEP_M = 10e-6  # between tabulated depths; per step, the stiffness change
 
 @dataclass(frozen=True)
 class Traction:
-    """An axisymmetric traction q, given by weights of its transform: q^(k) / Q = sum_i weights_i cos(k x_i)."""
+    """An axisymmetric traction q, whose transform is a weighted sum of cosines: sum_i weights_i cos(k x_i), times Q."""
 
     radius_m: float
     x_m: Float[np.ndarray, " q"]

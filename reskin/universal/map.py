@@ -39,7 +39,7 @@ STEP = 0.4  # step of the finite differences for slopes, in units of the spreads
 
 @dataclass(frozen=True)
 class Tables:
-    """Field changes of the central law by place (board's frame) and force, and their slopes by parameter."""
+    """Field changes for the central parameter values, by place (board's frame) and force, and their derivatives."""
 
     names: tuple[str, ...]
     spreads: Float[np.ndarray, " t"]

@@ -33,8 +33,9 @@ FILES = (READINGS,)
 FIRST_LINE_N = 2  # line of the first row of numbers in the file
 # The force on the skin is the opposite of that on the gauge. Evidence along x: on both public boards, pokes shift the
 # skin by 48 um along the labels' +x (fitted to fields alone by experiment `compare`), and the mean Fx is negative in
-# all six files, so the negated force pushes along +x. Along y, both are too small to decide; but for right-handed axes
-# with z into the skin, as the sign of Fz requires, the y axis of the force must be that of the labels.
+# all six files, so the negated force pushes along +x. Along y, the shift and the mean force are too small to
+# decide. But the sign of Fz requires that z points into the skin; if the axes are right-handed, the force's y axis then
+# has the direction of the labels' y axis.
 ON_SKIN = -1.0
 
 Account = dict[str, int]
