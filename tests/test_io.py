@@ -165,7 +165,7 @@ def test_broken_safetensors_are_an_error(tmp_path):
 
 
 def flip_bits(file: Path) -> Iterator[int]:
-    """Flip each bit in turn and yield the index of its byte."""
+    """Flip one bit of each byte in turn, and yield the index of the byte."""
     content_before = file.read_bytes()
     for i in range(len(content_before)):
         content = bytearray(content_before)

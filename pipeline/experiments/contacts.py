@@ -199,7 +199,7 @@ def _pairs_at_distance(
 
 
 def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Split training rows into those that detectors know and those that set the thresholds.
+    """Split training rows into those that detectors are fitted to and those that set their thresholds.
 
     The latter are the last board, or the last skin of a single board, or the last pass of a single skin; the third
     return value is `board`, `skin` or `pass`.

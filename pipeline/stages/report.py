@@ -178,7 +178,7 @@ def write_index(reports: Path) -> None:
 
 
 def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
-    """Write every training run of a scene and its report to MLflow once; warn if the server does not answer."""
+    """Log training runs and report of a scene to MLflow, unless they are there; warn if it cannot be reached."""
     scene, name = planned_scene(settings), settings.scene
     folders = {stage: models / stage for stage in scene.model_stages}
     experiment = f"{name} (dvc exp)" if is_experiment() else name  # kept separate from the checkout's own results

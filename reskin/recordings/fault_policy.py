@@ -121,7 +121,7 @@ class CheckedRows(NamedTuple):
 
 
 class FaultLog:
-    """Apply a policy to the faults of a recording, and count them; `unit` is the unit of positions in accounts."""
+    """Apply a policy to the faults of a recording, and count them; `unit` is the unit of a fault's position."""
 
     def __init__(self, policy: FaultPolicy, where: str, unit: Literal["ms", "row"]) -> None:
         self.records: dict[str, FaultRecord] = {}

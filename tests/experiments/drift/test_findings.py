@@ -89,7 +89,7 @@ def test_repeated_networks_do_not_narrow_the_interval():
     assert again[OFFSET]["measured"] == once[OFFSET]["measured"]
 
 
-def test_one_contradicting_metric_contradicts():
+def test_one_contradicting_metric_contradicts_a_finding():
     falls = PAPER["initial"] | {"mse_f_N2": 0.02 - 0.004 * np.arange(4) + np.array([[0.0], [1e-5], [2e-5], [3e-5]])}
     assert verdicts(PAPER | {"initial": falls})[HIGHER_AND_FASTER] == CONTRADICTED
     unclear = PAPER["initial"] | {"mse_f_N2": PAPER["regular"]["mse_f_N2"] + np.array([[-1.0], [1.0], [0.3], [0.1]])}
