@@ -38,7 +38,10 @@ Echo = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Difference:
-    """A value that differs between two runs. Names look like `table2.multi.accuracy_pct.mean` or `sweep_pokes[65].mse_xy_mm2.sd`."""
+    """A value that differs between two runs.
+
+    Names look like `table2.multi.accuracy_pct.mean` or `sweep_pokes[65].mse_xy_mm2.sd`.
+    """
 
     name: str
     committed: Leaf

@@ -289,7 +289,7 @@ def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate our table 2 beside the paper's, in its order; the control and the constant force are only ours."""
+    """Tabulate our table 2 beside the paper's, in the paper's order; it has no control and no constant force."""
     rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     constant = numbers.get("constant_force", {}).get("table2")
     if constant:
@@ -399,7 +399,7 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List what was read and lost in the main captures and in other protocols, whose counts of 0 are omitted."""
+    """List counts of read and lost data, for the main captures and for other protocols (without counts of 0)."""
     others = numbers.get("capture_by_protocol", {})
     lines = [
         {"protocol": protocol, "what": what, "count": str(count), "source": source}
@@ -417,7 +417,10 @@ def _counts(account: Mapping[str, Any]) -> dict[str, int]:
 
 
 def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Compare descriptions of skins, by title; if some are simulated and some recorded, add the ratio nearest to 1."""
+    """Tabulate descriptions of skins, with one column per description, by title.
+
+    If some skins are simulated and some recorded, a column has the ratio simulated / recorded that is nearest to 1.
+    """
     both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
     lines = []
     for name, title in QUANTITIES.items():
@@ -456,7 +459,10 @@ def table_2_summary(numbers: Numbers) -> pd.DataFrame:
 
 
 def labels_summary(rows: Rows) -> pd.DataFrame:
-    """Tabulate scores on held-out boards with fewest and most labels: calibrated methods, then the first method."""
+    """Tabulate scores on held-out boards with the fewest and the most labels.
+
+    The methods are those that are calibrated to the skin, then the first method.
+    """
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
     counts = {row["labels_n"] for row in rows}
@@ -484,8 +490,8 @@ def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
     known = models(numbers)
     lines = []
     for row in numbers["paired"]:
-        of, over = known[row["of"]].paper, known[row["over"]].paper
-        printed = {m: f"{of[m][0] - over[m][0]:+.4g}" for m in of if m in over and of != over}
+        first, second = known[row["of"]].paper, known[row["over"]].paper
+        printed = {m: f"{first[m][0] - second[m][0]:+.4g}" for m in first if m in second and first != second}
         cells = beside(row, printed, show_difference, paper="paper: difference of means")
         lines.append({"difference": _difference_of(row, known), "source": source} | cells)
     return tabulate(lines, spread=PAIRED)
@@ -531,7 +537,7 @@ def _checks(rows: Rows, titles: Mapping[str, str], source: str) -> pd.DataFrame:
 
 
 class Table1(Strict):
-    """Table 1 of the paper: the source that it cites for each column, and the cells of each row."""
+    """Table 1 of the paper: the source that the paper cites for each column, and the cells of each row."""
 
     columns: dict[str, str]
     rows: dict[str, tuple[str, ...]]
@@ -566,7 +572,7 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
 
 
 def measured(numbers: Numbers) -> dict[str, str]:
-    """Write our cells of table 1, by row: results or settings of the scene."""
+    """Write our cells of table 1, which are results or settings of the scene; return them by row."""
     source = numbers["provenance"]["source"]
     simulated = source == "simulated"
     described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})
