@@ -29,8 +29,8 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
 
     Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures, one
     for each protocol of a scene, and `ingest` over recorded captures. An experiment that has its own protocol in
-    simulated scenes, but may also run in recorded scenes (`drift`), iterates over pairs of a
-    scene and its folder of captures.
+    simulated scenes, but may also run in recorded scenes (`drift`), iterates over pairs of a scene and its folder of
+    captures.
     """
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():

@@ -230,7 +230,7 @@ class Origin:
     read: Callable[[str], bytes]
 
     def find(self, wanted: str) -> str | None:
-        """Return the path that shares the most trailing parts with `wanted`; None if no file has that name."""
+        """Return the path that shares the most trailing parts with path `wanted`; None if no file has the same name."""
 
         def common_n(path: str) -> int:
             parts = zip(reversed(PurePosixPath(path).parts), reversed(PurePosixPath(wanted).parts), strict=False)

@@ -192,9 +192,9 @@ def adjusted_p_values(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[s
 def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
     """Compute the p-value of a claim about differences over boards; None if too few boards were compared.
 
-    A claim about every number of training skins has one p-value per number. It holds only if all parts hold, so its
-    p-value is the largest of them. If some parts significantly contradict the claim, its p-value is the smallest
-    p-value of these parts, with Bonferroni's correction for the number of all parts.
+    A claim about every number of training skins has one p-value per number of skins. The claim holds only if it holds
+    for every number, so the p-value of the claim is the largest one. If the results for some numbers significantly
+    contradict the claim, its p-value is the smallest p-value of these, with Bonferroni's correction for all numbers.
     """
     if isinstance(ours, Sequence):
         parts = [contrast["accuracy_pct"] for contrast in ours]
@@ -214,7 +214,7 @@ def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
 
 
 def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
-    """Add the adjusted p-value to the judgement of a claim; without significance, the claim becomes undecided."""
+    """Add the adjusted p-value to the judgement of a claim; a verdict that is not significant becomes undecided."""
     verdict = judgement.verdict
     if verdict in (SUPPORTED, CONTRADICTED) and p_adjusted > SIGNIFICANT:
         verdict = UNDECIDED
@@ -344,7 +344,7 @@ def look_up(numbers: Mapping[str, Any], name: str) -> Any:
 
 
 def mean_of(value: Any) -> float | None:
-    """Return the mean of a summary or of a pair (mean, sd), or a plain number; None for anything else."""
+    """Return a number as a float: the mean of a summary or of a pair (mean, sd), or a plain number; else None."""
     if isinstance(value, Mapping):
         return value.get("mean")
     if isinstance(value, tuple):
@@ -362,7 +362,7 @@ def _paper_in_interval(printed: Any, ours: Any) -> str:
 
 
 def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
-    """Return a note on the size of our experiment and of the paper's."""
+    """Return a note that compares the size of our experiment with the paper's; empty if the row names no sizes."""
     if row.reach is None or ours is None:
         return []
     ours_n, paper_n = resolve(numbers, row.reach.ours), look_up(numbers, row.reach.paper)

@@ -242,10 +242,10 @@ def draw_study(
     limit: float | None = None,
     rings: Mapping[str, tuple[str, str, str]] | None = None,
 ) -> str:
-    """Draw error against median time on logarithmic axes, with one panel per study and the failures below.
+    """Draw error against median time on logarithmic axes, with one panel per study; list failures below the panels.
 
     Each method has its own colour and marker, and a line joins its Pareto front. `limit` is drawn as a line. `rings`
-    maps a label to the study, method and setting of the point to ring. Rows that were not timed are left out.
+    maps a label to the study, method and setting of a point that gets a ring. Rows that were not timed are left out.
     """
     studies = list(dict.fromkeys(row["study"] for row in rows))
     methods = [name for name in dict.fromkeys(row["method"] for row in rows) if name != REFERENCE]

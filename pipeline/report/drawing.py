@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 MARKS_MAX_N = 150  # a line or scatter with more marks gets no titles, which would make the file too large
-USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")  # tags of marks: of many, of few
+# Matplotlib writes the marks of an artist as <use> tags if there are many, and as <path> tags if there are few.
+USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")
 GROUP = re.compile(r"<g[ >]|</g>")
 # Titles by id of an SVG group: one title per mark, in order, or one title for a line without marks.
 Titles = Mapping[str, list[str]]
@@ -148,7 +149,7 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 def svg(figure: Any) -> str:
     """Write a figure as SVG text whose marks show their values on hover.
 
-    It contains no date and no version, so the same data give the same bytes.
+    The text contains no date and no version, so that equal data give equal bytes.
     """
     buffer, titles = io.StringIO(), name_marks(figure)
     _lay_out(figure)

@@ -219,8 +219,8 @@ def sweep_sensors(rows: Rows, source: str) -> str:
 def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     """Compute means and the lengths of their error bars (down, up), which show the interval over boards.
 
-    With few boards, bars reach from the smallest to the largest value. Without boards, as in the paper, their length is
-    one sd. All bars are clipped to possible values.
+    With few boards, bars reach from the smallest to the largest value. For statistics that are not over boards,
+    such as the paper's, bars extend one standard deviation to each side. All bars are clipped to possible values.
     """
     means = np.array([row[metric]["mean"] for row in scores])
     ends = np.array([_ends(row[metric]) for row in scores]).clip(*RANGES[metric])

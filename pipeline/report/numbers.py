@@ -133,7 +133,7 @@ def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, An
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
-    """Summarise networks of the leave-one-board-out experiment with registered positions, and for each board."""
+    """Summarise networks of experiment lobo: scores with registered positions over boards, and scores by board."""
     by_board = {
         str(board): {
             "trained_on_skins_n": int(group["trained_on_skins_n"].iloc[0]),
@@ -164,7 +164,7 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise every recipe of every experiment with models: over pairs, over repeats on one skin, or over boards."""
+    """Summarise every recipe of experiments of kind `models`: over pairs, over repeats on one skin, or over boards."""
     numbers: dict[str, dict[str, Any]] = {}
     names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
     models = table[table["question"].isin(names)]
@@ -385,7 +385,7 @@ def _stage_cost(cost: Row) -> dict[str, float]:
 
 
 def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split the numbers of a run into numbers.json, equal for every repeat of the run, and provenance.json."""
+    """Split the numbers of a run into numbers.json, which is equal for repeats of the run, and provenance.json."""
     own = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
     costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
     studies: dict[str, Any] = {}

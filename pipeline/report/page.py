@@ -22,7 +22,7 @@ from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
 
-Captions = dict[str, str]  # by name of a table or figure
+Captions = dict[str, str]  # captions by the name of the table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
 NO_NUMBER = ("–", "see file", "")  # cells of the checklist that contain no number
 FURTHER = "further"  # key of the section of tables and figures that no other section names
@@ -124,7 +124,7 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     """Render the page of one run (commit, machine, versions, times), which the scene's page embeds.
 
-    numbers: joined with their provenance. costs: text of the other files in the page's folder, by file name.
+    numbers: numbers.json joined with provenance.json. costs: text of the other files in the folder, by file name.
     """
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)
@@ -166,7 +166,7 @@ def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str]) -> Entry:
 
 
 def template(name: str) -> Template:
-    """Load a template from this folder."""
+    """Load a Jinja template from the folder of this module."""
     environment = Environment(loader=PackageLoader("pipeline.report", "."), autoescape=True, undefined=StrictUndefined)
     environment.tests["number_text"] = NUMBER.fullmatch
     environment.filters["unbroken"] = unbroken

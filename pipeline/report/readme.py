@@ -112,7 +112,8 @@ def _summary(numbers: Numbers) -> str:
 def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     """Write the named tables of a scene below a heading with its provenance."""
     provenance = numbers["provenance"]
-    # Tables are made only for the shown experiments: committed results of others may not fit the current code.
+    # Tables are made only for the experiments that are shown, because the current code may be unable to read the
+    # committed results of other experiments.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
     heading = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "

@@ -152,7 +152,7 @@ CASES = {
     "area": "area", "case": "case", "should": "expected", "happened": "observed", "error": "error", "limit": "allowed",
 }  # fmt: skip
 TABLE_1 = Path(__file__).with_suffix(".yaml")  # table 1 of the paper
-LOCALISATION = "Localisation (within 1 mm, new skin)"  # our additional row
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # the row that we add to table 1
 OURS = "ours, measured"
 NOT_GIVEN = "–"
 
@@ -289,7 +289,7 @@ def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate our table 2 beside the paper's, in the paper's order; it has no control and no constant force."""
+    """Tabulate our table 2 beside the paper's, in the paper's order; only ours has control and constant force."""
     rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     constant = numbers.get("constant_force", {}).get("table2")
     if constant:

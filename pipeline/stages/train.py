@@ -65,7 +65,7 @@ def train_triplet(settings: Settings, section: Training, indentations: Path, fol
 def adapt(
     settings: Settings, section: Adaptations, indentations: Path, folds: Path, pretrained: Path, models: Path
 ) -> None:
-    """Adapt the networks of train_triplet to each held-out skin with its unlabelled indentations (paper section 5)."""
+    """Adapt the networks of train_triplet to each held-out skin with its unlabelled indentations (section 5)."""
     preload_training()
     data = read_data(settings, indentations, folds)
     networks = read_pretrained(pretrained)

@@ -66,7 +66,7 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
 def to_record(
     chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int, physics: str
 ) -> dict[str, Any]:
-    """Record the choice with its boards and skins, for the audit of the scenes that use it.
+    """Record the choice with its boards and skins, for the audit of the scenes that use the chosen settings.
 
     `physics` is the fingerprint of the simulated skin's settings.
     """
@@ -173,7 +173,7 @@ DIGITS = 4  # significant digits; rounding errors are smaller, and changes of th
 def fingerprint(sections: Mapping[str, Any]) -> str:
     """Return a digest of the fields and forces of two skins under fixed indentations, and of the rig and chip settings.
 
-    A refactoring does not change it; a change of the physics or of a setting does.
+    A refactoring does not change the digest; a change of the physics or of a setting does.
     """
     design = parse(SkinDesign, sections["skin"], "skin")
     spreads = parse(Spreads, sections["spreads"], "spreads")

@@ -104,7 +104,7 @@ class _HasTimes(Protocol):
 
 
 def preload_training() -> None:
-    """Start the workers' imports while the stage reads its data."""
+    """Start the workers' fork server, which imports the training module while the stage reads its data."""
     prepare_workers(TRAINING_MODULE)
 
 
@@ -231,7 +231,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> None:
-    """Write models, cards and predictions to folder `models`; and times, which differ between equal runs, elsewhere."""
+    """Write models, cards and predictions to folder `models`, and times to a file that is not a stage output."""
     code = code_version_of(imported(module_name(stage)))
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
     with io.replacing(models) as folder:
@@ -302,7 +302,7 @@ def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> Mo
 
 
 def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
-    """Score predictions for the test rows: for all of them, and for each skin and board."""
+    """Score predictions for test rows: for all rows as labelled and registered, and for each skin."""
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 
 
