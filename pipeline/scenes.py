@@ -126,7 +126,8 @@ class Scene(Strict, extra="allow"):
             if missing := set(experiment.needs) - set(self.experiments):
                 raise ValueError(f"experiment {experiment.name} needs {', '.join(sorted(missing))} in the same scene")
         split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
-        split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()  # adaptation draws pokes
+        # Adaptation draws its pokes from the first `pool_passes_n` passes.
+        split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
         wrong = [
             *_differences(
                 "the scene",

@@ -43,14 +43,14 @@ def merge(root: Path) -> str:
         if REGISTRY in unmerged:
             write_registry(root, merge_registries(*_registries(root, unmerged[REGISTRY])))
         plan.use(root, _scenes(root, unmerged.get(PLAN)))  # the plan also depends on captures
-        both = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
+        changed_stages = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
     deleted = {name for name in unmerged if name.startswith(REPORTS) and "2" not in unmerged[name]}
     for name in unmerged:
         if name.startswith(REPORTS):
             command = ["rm", "--quiet"] if name in deleted else ["checkout", "--ours"]
             _git(root, *command, "--", name)
     _git(root, "add", "--all", "--", *(name for name in unmerged if name not in deleted), PLAN)
-    changed = f" {len(both)} stages that both sides ran may run again." if both else ""
+    changed = f" {len(changed_stages)} stages that both sides ran may run again." if changed_stages else ""
     captures_n = sum(map(len, read_registry(root).captures.values()))
     return f"resolved {', '.join(unmerged)}: {captures_n} captures.{changed} Now: git commit, dvc pull, dvc repro"
 
@@ -141,11 +141,11 @@ def _unmerged(root: Path) -> dict[str, dict[str, str]]:
     return unmerged
 
 
-def _git(root: Path, *words: str) -> str:
+def _git(root: Path, *arguments: str) -> str:
     """Run git in the checkout, and return its output."""
     if not which("git"):
         raise ParamsError("reskin merge needs git: install it.")
-    completed = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+    completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
     if completed.returncode:
-        raise ParamsError(f"git {words[0]} failed: {' '.join(completed.stderr.split())[-300:]}")
+        raise ParamsError(f"git {arguments[0]} failed: {' '.join(completed.stderr.split())[-300:]}")
     return completed.stdout

@@ -70,9 +70,9 @@ def _bring_recordings(root: Path, clone: Path, names: Sequence[str]) -> None:
             shutil.copytree(root / RAW / name, clone / RAW / name, dirs_exist_ok=True)
 
 
-def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool = False) -> None:
+def _run(clone: Path, environment: Mapping[str, str], *arguments: str, quiet: bool = False) -> None:
     stdout = subprocess.DEVNULL if quiet else None
-    command = [sys.executable, "-m", *words]
+    command = [sys.executable, "-m", *arguments]
     with subprocess.Popen(command, cwd=clone, env=environment, stdout=stdout, process_group=0) as process:
         try:
             process.wait()
@@ -81,12 +81,12 @@ def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool =
             raise
     if process.returncode:
         raise SchemaError(
-            f"`{' '.join(words)}` failed in a clone of the last commit (exit status {process.returncode})."
+            f"`{' '.join(arguments)}` failed in a clone of the last commit (exit status {process.returncode})."
         )
 
 
-def _git(root: Path, *words: str) -> str:
-    completed = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+def _git(root: Path, *arguments: str) -> str:
+    completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
     if completed.returncode:
-        raise SchemaError(f"git {words[0]} failed: {completed.stderr.strip()[-300:]}")
+        raise SchemaError(f"git {arguments[0]} failed: {completed.stderr.strip()[-300:]}")
     return completed.stdout

@@ -304,8 +304,8 @@ def _median_times(timed: Seconds, prefix: str) -> dict[str, float]:
 def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Add up the counts of captures (keys that end in `_n`); `lost_bytes_n` is the total number of skipped bytes."""
     total = Counter({"captures_n": 0})
-    for account in accounts:
-        total.update({"captures_n": 1} | {name: count for name, count in account.items() if name.endswith("_n")})
+    for counts in accounts:
+        total.update({"captures_n": 1} | {name: count for name, count in counts.items() if name.endswith("_n")})
     skipped = [count for name, count in total.items() if name.startswith("skipped_") and name.endswith("_bytes_n")]
     return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)
 
@@ -325,10 +325,10 @@ def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
                 before.setdefault(experiment, {})[predictor] = scores
                 continue
             for row in rows.to_dict("records"):
-                own = hover.setdefault(str(row["fold"]), {name: row[name] for name in ("hover_uT", "touch_uT")})
-                own[predictor] = {name: row[name] for name in ("accuracy_pct", "mse_xy_mm2")}
+                skin_scores = hover.setdefault(str(row["fold"]), {name: row[name] for name in ("hover_uT", "touch_uT")})
+                skin_scores[predictor] = {name: row[name] for name in ("accuracy_pct", "mse_xy_mm2")}
                 if predictor == "hover":
-                    own["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
+                    skin_scores["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
     return ({"before_touch": before} if before else {}) | ({"hover": hover} if hover else {})
 
 
@@ -386,7 +386,7 @@ def _stage_cost(cost: Row) -> dict[str, float]:
 
 def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
     """Split the numbers of a run into numbers.json, which is equal for repeats of the run, and provenance.json."""
-    own = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
+    run_provenance = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
     costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
     studies: dict[str, Any] = {}
     for name, value in numbers["runtime"].items():
@@ -396,18 +396,18 @@ def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
         elif name != "stages":
             studies[name] = value
     settings = {name: numbers["provenance"][name] for name in SETTINGS}
-    return {**numbers, "provenance": settings, "runtime": studies}, {**own, "runtime": costs}
+    return {**numbers, "provenance": settings, "runtime": studies}, {**run_provenance, "runtime": costs}
 
 
 def join(numbers: Row, provenance: Row) -> dict[str, Any]:
     """Join numbers.json and provenance.json of a run: the inverse of `split`."""
-    own = {name: value for name, value in provenance.items() if name != "runtime"}
+    run_provenance = {name: value for name, value in provenance.items() if name != "runtime"}
     costs = provenance["runtime"]
     runtime = {**numbers["runtime"], **costs}
     for name, value in runtime.items():
         if isinstance(value, list):
             runtime[name] = [row | times for row, times in zip(numbers["runtime"][name], costs[name], strict=True)]
-    return {**numbers, "provenance": {**numbers["provenance"], **own}, "runtime": runtime}
+    return {**numbers, "provenance": {**numbers["provenance"], **run_provenance}, "runtime": runtime}
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:

@@ -253,10 +253,10 @@ def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
     """List the scores on each held-out board by number of labelled indentations."""
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "held-out board": board}
-        | {title: f"{own[metric]:.3g}" for metric, title in COLUMNS.items() if metric in own}
+        | {title: f"{board_scores[metric]:.3g}" for metric, title in COLUMNS.items() if metric in board_scores}
         | {"source": source}
         for row in rows
-        for board, own in row.get("by_board", {}).items()
+        for board, board_scores in row.get("by_board", {}).items()
     ]
     return tabulate(lines, spread="Positions are as labelled. The networks and draws of a board are averaged.")
 
@@ -330,15 +330,15 @@ def _single(numbers: Numbers, source: str) -> pd.DataFrame:
 def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
     """List how well the position of a hovering tip is predicted, by skin, beside the scores of contacts."""
     skins, lines = numbers.get("single_skins", {}), []
-    for skin, own in numbers["hover"].items():
+    for skin, hover in numbers["hover"].items():
         contact = skins.get(skin, _means(numbers["single_temporal"]))
         line = {"skin": skin, "source": source, "contacts, within 1 mm, %": f"{contact['accuracy_pct']:.3g}"}
         line |= {
-            f"no contact, within 1 mm, % ({model})": f"{own[by]['accuracy_pct']:.3g}" if by in own else "–"
-            for by, model in (("hover", "2 nearest contacts"), ("hover_network", "network"))
+            f"no contact, within 1 mm, % ({model})": f"{hover[key]['accuracy_pct']:.3g}" if key in hover else "–"
+            for key, model in (("hover", "2 nearest contacts"), ("hover_network", "network"))
         }
-        line |= {"|dB| without contact, µT": f"{own['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{own['touch_uT']:.3g}"}
-        lines.append(line | {"tip sensed without contact": "yes" if own["seen"] else "no"})
+        line |= {"|dB| without contact, µT": f"{hover['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{hover['touch_uT']:.3g}"}
+        lines.append(line | {"tip sensed without contact": "yes" if hover["seen"] else "no"})
     return tabulate(lines, meaning=HOVER_MEANING)
 
 
@@ -403,17 +403,18 @@ def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
     others = numbers.get("capture_by_protocol", {})
     lines = [
         {"protocol": protocol, "what": what, "count": str(count), "source": source}
-        for protocol, account in {"main": numbers["capture"], **others}.items()
-        for what, count in _counts(account).items()
+        for protocol, counts in {"main": numbers["capture"], **others}.items()
+        for what, count in _counts(counts).items()
         if protocol == "main" or count
     ]
     meaning = {"meaning": "Main: the captures that folds are made of. For other protocols, counts of 0 are not listed."}
     return tabulate(lines, **(meaning if others else {}))
 
 
-def _counts(account: Mapping[str, Any]) -> dict[str, int]:
-    counts = {name: count for name, count in account.items() if name != "left_out"}
-    return counts | {f"left out of training: {name}": count for name, count in account["left_out"].items()}
+def _counts(protocol_counts: Mapping[str, Any]) -> dict[str, int]:
+    """Return the counts of a protocol in one level: those of entry `left_out` get a prefix."""
+    counts = {name: count for name, count in protocol_counts.items() if name != "left_out"}
+    return counts | {f"left out of training: {name}": count for name, count in protocol_counts["left_out"].items()}
 
 
 def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
@@ -421,7 +422,7 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
 
     If some skins are simulated and some recorded, a column has the ratio simulated / recorded that is nearest to 1.
     """
-    both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
+    both_sources = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
     lines = []
     for name, title in QUANTITIES.items():
         values = {column: described["over_skins"].get(name) for column, described in columns.items()}
@@ -431,7 +432,7 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
             column: f"{value['mean']:.3g} [{value['least']:.3g} … {value['most']:.3g}] ({value['n']})" if value else "–"
             for column, value in values.items()
         }
-        if both:
+        if both_sources:
             means = [(columns[column]["source"], value["mean"]) for column, value in values.items() if value]
             ratios = [
                 a / b

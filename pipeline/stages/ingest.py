@@ -89,19 +89,19 @@ def _cache_key(capture: Path, common_inputs: bytes) -> str:
 def describe(settings: Settings, indentations: Path, description: Path) -> None:
     """Describe the recordings of a scene: fields, noise, resolution and forces, summarised over its skins."""
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in settings.captures_in(indentations)]
-    accounts = {
+    ingest_counts = {
         readings.capture: io.read_ingest_counts(indentations / f"{readings.capture}.parquet") for readings in captures
     }
     described = {readings.capture: describe_capture(readings) for readings in captures}
     described |= {
         name: without_rest(described[name])
-        for name, account in accounts.items()
-        if account.get("baseline_subtracted_rows_n")
+        for name, capture_counts in ingest_counts.items()
+        if capture_counts.get("baseline_subtracted_rows_n")
     }
     summary = over_skins([(readings.skin, described[readings.capture]) for readings in captures])
     readings_n = sum(map(len, captures))
     counts = {"captures_n": len(captures), "readings_n": readings_n}
-    counts["indentations_n"] = sum(account.get("indentations_n", 0) for account in accounts.values())
+    counts["indentations_n"] = sum(capture_counts.get("indentations_n", 0) for capture_counts in ingest_counts.values())
     io.write_json(description, {"counts": counts, "source": captures[0].source, "over_skins": summary})
     say(f"{settings.scene}: {indentations}: {readings_n} readings of {len(captures)} captures described")
 

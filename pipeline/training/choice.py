@@ -98,7 +98,7 @@ def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, 
     collapsed = [_key(card) for card in cards if _has_collapsed(card)]
     stable = [card for card in eligible if _key(card) not in collapsed]
     if not stable:
-        raise ParamsError(f"{WHERE}: all {what} have a collapsed training run. Try lower rates.")
+        raise ParamsError(f"{WHERE}: all {what} have a collapsed training run. Try lower learning rates.")
     candidates = _candidates(cards)
     errors = _errors(cards, candidates)
     best = min(stable, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
@@ -130,9 +130,9 @@ def _check_budgets(cards: Cards, stage: str) -> None:
     all_budgets = set().union(*budgets_by_name.values())
     for name, budgets in budgets_by_name.items():
         if budgets != all_budgets:
-            what, got = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(all_budgets)}"
+            what, tried = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(all_budgets)}"
             remedy = "Try every candidate with every number of steps."
-            raise ParamsError(f"{WHERE}: {what} differ between candidates: {got}. {remedy}")
+            raise ParamsError(f"{WHERE}: {what} differ between candidates: {tried}. {remedy}")
 
 
 def _key(card: Card) -> dict[str, Any]:
