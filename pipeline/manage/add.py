@@ -182,4 +182,4 @@ def _track(folder: Path, root: Path) -> None:
             repo.add([str(folder)])
     except (DvcException, OSError) as error:
         reason = " ".join(str(error).split())[-300:]
-        raise CaptureError(f"dvc add {folder.relative_to(root)} failed: {reason}. See the messages of DVC above.") from None
+        raise CaptureError(f"dvc add {folder.relative_to(root)} failed: {reason}. See DVC's messages above.") from None

@@ -301,10 +301,10 @@ def _median_times(timed: Seconds, prefix: str) -> dict[str, float]:
     }
 
 
-def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+def add_up(ingest_counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     """Add up the counts of captures (keys that end in `_n`); `lost_bytes_n` is the total number of skipped bytes."""
     total = Counter({"captures_n": 0})
-    for counts in accounts:
+    for counts in ingest_counts:
         total.update({"captures_n": 1} | {name: count for name, count in counts.items() if name.endswith("_n")})
     skipped = [count for name, count in total.items() if name.startswith("skipped_") and name.endswith("_bytes_n")]
     return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)

@@ -111,7 +111,7 @@ class Inputs:
     studies: dict[str, Any]
     described: dict[str, Any]
     before_touch: list[pa.Table]
-    accounts: list[dict[str, Any]]
+    ingest_counts: list[dict[str, Any]]
     dropped: dict[str, int]
 
 
@@ -133,7 +133,7 @@ def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, res
             for model_stage in scene.model_stages
             if model_stage == "train_single"
         ],
-        accounts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
+        ingest_counts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
         dropped=split_of_scene["dropped"],
     )
 
@@ -152,7 +152,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
             "trained": ", ".join(sorted({card["git"] for card in inputs.cards})), "versions": versions(),
             "device": f"{machine()}, networks on {trained_on()}", "seconds": round(total_cost_s(costs.values()), 1),
         },
-        "capture": add_up(inputs.accounts) | {"left_out": dict(inputs.dropped)},
+        "capture": add_up(inputs.ingest_counts) | {"left_out": dict(inputs.dropped)},
         **learning_numbers(scores, headline=HEADLINE),
         **before_touch_numbers(inputs.before_touch),
         "trainings": count_trainings(inputs.cards, inputs.points, analyses),
