@@ -194,9 +194,7 @@ def read_pretrained(models: Path) -> PretrainedNetworks:
 def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> dict[int, Pretrained]:
     """Return the networks of recipe `base` and one fold, by number of the seed."""
     selected = {
-        seed_i: network
-        for (recipe, name, seed_i), network in pretrained.items()
-        if (recipe, name) == (base, fold.name)
+        seed_i: network for (recipe, name, seed_i), network in pretrained.items() if (recipe, name) == (base, fold.name)
     }
     if not selected:
         raise SchemaError(f"fold {fold.name}: no networks of recipe {base} to adapt. Run: dvc repro train_triplet")
