@@ -23,7 +23,7 @@ from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
-CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # workers may still be starting; their imports take seconds
+CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # the workers' imports take seconds
 HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
 CODE = (".py", ".json", ".safetensors")  # suffixes of the compared files; settings are sent with each call

@@ -18,13 +18,13 @@ FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
 NEAR = 0.2  # readings count for one of these forces if their force differs from it by at most this fraction
 ENOUGH_N = 20  # minimum number of readings for a statistic
 LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
-STEP_READINGS_N = 2000  # number of first readings from which the chips' resolution is found
+STEP_READINGS_N = 2000  # the chips' resolution is found from this many readings
 PRESSED_N = 0.5  # N; below this force, the field change of a weak chip is mostly noise
 
 
 def describe(readings: Readings) -> dict[str, float]:
     """Summarise the readings of one capture: values by quantity; quantities with too few readings are omitted."""
-    # A row with a force but no place is not a contact; a row with neither is an unlabelled contact.
+    # A reading with a force but no place is not a contact; a reading with neither is an unlabelled contact.
     touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
     change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
     return {
@@ -83,7 +83,7 @@ def _wander(readings: Readings) -> dict[str, float]:
 
 
 def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
-    """Return the standard deviation of the noise of one reading, for x and y and for z; the chips' median."""
+    """Return the standard deviation of one reading's noise (median over chips), for x and y together and for z."""
     # The tip does not move during a stop of an indentation, so deviations from the stop's mean are noise. The variance
     # of the noise is pooled over all stops.
     stops = [column[touched] for column in (readings.indentation, readings.x_mm, readings.y_mm)]
@@ -97,7 +97,7 @@ def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, flo
 
 
 def _steps(readings: Readings) -> dict[str, float]:
-    """Return the chips' resolution, one digital step, for x and y and for z; the chips' median."""
+    """Return the size of one digital step (median over chips), for x and y together and for z."""
     lsb_uT = find_lsb(readings.b_uT[:STEP_READINGS_N])
     known = {"step_xy_uT": lsb_uT[:, 0], "step_z_uT": lsb_uT[:, 1]}
     return {name: float(np.nanmedian(steps)) for name, steps in known.items() if np.isfinite(steps).any()}
@@ -118,7 +118,7 @@ def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
 
 
 def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
-    """Return the median field change at each force in `FORCES_N`, and at the weakest chip relative to the strongest."""
+    """Return the median field change at each force in `FORCES_N`, and the ratio of weakest to strongest chip."""
     size_uT = np.linalg.norm(change_uT, axis=1)
     numbers = {}
     for level_N in FORCES_N:

@@ -68,7 +68,7 @@ class Reach(Strict):
 
 
 class Row(Strict):
-    """One result of the paper: the section, the number or words, and the path of our result in numbers.json.
+    """A row of the checklist: one result of the paper, and the path of our result in numbers.json.
 
     The rule says how our result is judged:
 

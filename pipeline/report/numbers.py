@@ -112,7 +112,7 @@ def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, flo
 
 
 def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join the errors of methods with their training times on this machine; methods without times get none."""
+    """Join the errors of methods with their training times on this machine; untimed methods have no times."""
     joined: dict[str, Any] = {}
     if "baselines" in numbers:
         joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]

@@ -175,7 +175,7 @@ def template(name: str) -> Template:
 
 def unbroken(text: str) -> str:
     """Use non-breaking spaces between a number and its deviation, and within an interval and its unit."""
-    return UNBROKEN.sub(lambda found: found[0].replace(" ", NO_BREAK), text)
+    return UNBROKEN.sub(lambda match: match[0].replace(" ", NO_BREAK), text)
 
 
 def read_sections() -> list[Section]:
