@@ -224,7 +224,7 @@ def read_revision(root: Path, scene: str, revision: str) -> Report:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    """Run git in the checkout and return its output; empty if it fails."""
+    """Run git in the checkout and return its output; an empty string if git fails."""
     completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
     return "" if completed.returncode else completed.stdout
 

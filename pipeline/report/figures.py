@@ -25,7 +25,7 @@ SKIN_MM = (-2.0, 18.0)  # extent of the skin around the grid: "20mm x 20mm" (pap
 CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
 CHIP_MM = 3.0
 RANGES = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # metrics in figures, with their possible range
-LINEAR_BELOW_N = 65  # the axis of pokes is linear below this, because a logarithmic axis cannot show 0
+LINEAR_BELOW_N = 65  # pokes; the axis is linear below this number, because a logarithmic axis cannot show 0
 BARS = (
     "Bars: 95 % interval over boards. Two or three boards: lowest to highest value.\n"
     "One board: sd over seeds. Paper: printed sd. Bars are cut at impossible values."

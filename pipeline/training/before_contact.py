@@ -41,7 +41,7 @@ class Scan:
 
 
 def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
-    """Stack the no-load fields and the numbers in the pass of all contacts, in the order of the scene's rows."""
+    """Stack the no-load field and the number in the pass of every contact, in the order of the scene's rows."""
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]

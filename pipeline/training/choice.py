@@ -6,7 +6,8 @@ and the errors are averaged over budgets, so that no setting wins by training lo
 run are not chosen. Settings of adaptation are chosen together with the triplet weight of the network that they start
 from, because the triplet term by itself only increases the error.
 
-The record of a choice contains a fingerprint of the simulated skin. Audits compare it with that of the current code.
+The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with that of
+the current code.
 """
 
 import hashlib
