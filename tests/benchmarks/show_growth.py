@@ -1,7 +1,7 @@
-"""Write docs/growth.md and its figure from the measurements of time_growth in docs/measured/growth.json.
+"""Write docs/growth.md and its figure from docs/measured/growth.json, which time_growth.py measures.
 
-Run `python -m tests.benchmarks.show_growth`. The page has two exponents: the slope in the log-log figure, which
-includes fixed costs, and the exponent of the growing part alone.
+Run `python -m tests.benchmarks.show_growth`. The page reports two exponents of cost against size: the slope in the
+log-log figure, which includes fixed costs, and the exponent of the growing part alone.
 """
 
 import json
@@ -20,8 +20,8 @@ from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 
 FIGURE = "docs/img/growth.svg"
 MANY_N = 100_000
-GROWTH_MIN = 1.25  # growth from one count to the next that exceeds the noise of a busy machine
-# The reason for each exponent; a stage that is missing here raises a KeyError.
+GROWTH_MIN = 1.25  # cost ratio of two successive counts above which growth is distinguished from timing noise
+# Why the cost of each stage has its exponent. A stage that is missing here raises a KeyError.
 CAUSES = {
     "ingest_simulated": "one capture after another, independently: bytes to Parquet",
     "describe": "one skin after another; medians over skins sort them",
@@ -41,7 +41,7 @@ Points = list[tuple[int, float]]
 
 
 def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: str) -> dict[str, Points]:
-    """Collect one quantity of each stage by count."""
+    """Return the points (row[count], quantity `what`) of each stage in `row[part]`."""
     found: dict[str, Points] = {}
     for row in rows:
         for name, values in row[part].items():
@@ -51,19 +51,22 @@ def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: st
 
 
 def memory_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Points]:
-    """Collect the peak memory of stages; that of a program started here would include memory of this process."""
+    """Return the points (number of skins, peak MB) of each stage.
+
+    DVC commands are omitted: their measured peak memory includes memory of the measuring process.
+    """
     found = points_of(rows, "skins_n", "stages", "peak_MB")
     return {name: points for name, points in found.items() if not name.startswith("dvc") and name != "whole"}
 
 
 def slopes(points: Points) -> list[float]:
-    """Return the slope in the figure from each count to the next."""
+    """Return the slope of the log-log curve between each pair of successive points."""
     steps = pairwise(points)
     return [log(after / before) / log(n / m) for (m, before), (n, after) in steps if before > 0 and after > 0]
 
 
 def exponent(points: Points) -> float | None:
-    """Solve the last three points for p in a + b n^p; None if fixed and growing costs cannot be separated."""
+    """Return the p with which a + b n^p passes through the last three points; None if the cost hardly grows."""
     if len(points) < 3:
         return None
     (k, first), (m, second), (n, third) = points[-3:]
@@ -88,7 +91,7 @@ def rows_of(points: Mapping[str, Points]) -> Iterable[dict[str, str]]:
 
 
 def draw(panels: Mapping[str, tuple[str, Mapping[str, Points]]]) -> str:
-    """Plot quantities against counts, log-log: one panel per quantity, one colour and marker per stage."""
+    """Return a log-log figure (SVG) of cost against count: a panel per quantity, a colour and marker per stage."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.6, 3.1 * len(panels)), layout="constrained")
         for axes, (title, (count, points)) in zip(

@@ -1,7 +1,7 @@
 """Time to simulate the paper's 18 skins x 10,140 indentations as raw captures, by the stage in two processes.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_simulate_benchmark.py`. Only the number of captures is
-asserted.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_simulate_benchmark.py`. The test asserts only the number of
+captures.
 """
 
 import json
