@@ -1,7 +1,7 @@
-"""Finite elements (scikit-fem) of a layer and of a plate: references for the layer, its shear and rigid sliding.
+"""Finite-element solutions (scikit-fem) of a layer and of a plate: references for the deformation of the skin.
 
-The elements are Taylor-Hood: displacement of order 2, pressure of order 1. Axisymmetric loads and loads along x need
-only the (r, z) plane. The shear modulus is 1.
+The elements are Taylor-Hood elements: displacement of order 2, pressure of order 1. For axisymmetric loads and for
+loads along x, the solution in the (r, z) plane suffices. The shear modulus is 1.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementQuad2, ElementVector, LinearForm, MeshQuad, asm
 from skfem.helpers import ddot, dot, sym_grad, trace
 
-SLIP_SHARE = 1e-3  # Coulomb's law is smoothed below this fraction of the largest slip
+SLIP_SHARE = 1e-3  # friction is proportional to slip below this fraction of the largest slip (smoothed Coulomb law)
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Solution:
-    """The motion in the layer, at its base and top, and the load-weighted mean displacement of the loaded component."""
+    """Motion inside the layer, at its base and at its top, and the load-weighted mean displacement along the load."""
 
     inside: Motion
     base: Motion
@@ -39,7 +39,7 @@ class Solution:
 
 
 def axisymmetric_strains(u, r):
-    """Return the normal strains and the shear strains of the displacements u_r, u_z."""
+    """Return the normal strains and the shear strains of an axisymmetric displacement (u_r, u_z)."""
     (r_r, r_z), (z_r, z_z) = u.grad
     return (r_r, u[0] / r, z_z), (r_z + z_r,)
 
@@ -52,12 +52,12 @@ def along_x_strains(u, r):
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer with cells of one size out to `fine_m`, then growing to half a thickness at `end_m`."""
+    """A layer meshed in the (r, z) plane: uniform cells up to radius `fine_m`, growing cells up to `end_m`."""
 
     thickness_m: float
     fine_m: float
     end_m: float
-    cells_n: int  # over the thickness
+    cells_n: int  # number of cells over the thickness
     strains: Callable = axisymmetric_strains
 
     @cached_property
@@ -85,7 +85,8 @@ class Layer:
         return asm(BilinearForm(work), self.basis), coupling
 
     def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solution:
-        """Solve for a load(r) on one component at the top, with fixed components and springs(r) on u_r at edges."""
+        """Solve for load(r) on component `part_i` at the top; per edge, `held` fixes components, `drag` adds springs on
+        u_r."""
         (work, dilation), at = self.matrices, self.basis
         load_vector = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), at.boundary("top"))
         for edge, of in drag.items():
@@ -101,7 +102,7 @@ class Layer:
         return Solution(*motions, load_vector @ parts[0] / total.sum())
 
     def with_friction(self, load: Callable, friction: float, *, steps_n: int = 4, **edges) -> Solution:
-        """Solve for a pressure on top with Coulomb friction at the base, by fixed-point iteration.
+        """Solve for the pressure load(r) at the top and Coulomb friction at the base, by fixed-point iteration.
 
         The traction is t = -friction p u / (|u| + u0), with p and u of the previous iteration: the layer sticks where p
         is large and slides elsewhere.
@@ -121,10 +122,10 @@ def _motion(at: Basis, displacement: np.ndarray, pressure: np.ndarray) -> Motion
 
 
 def plate(sides_m, place_m, patch_motion_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
-    """Displace a patch of a plate in plane stress on a uniform bed of springs.
+    """Solve for a plate in plane stress on a uniform bed of springs, a patch of which is displaced.
 
-    `stiffness` is E t over the drag per area, in units of the plate's area. Return the centre of the patch, the mean
-    motion and the mean rotation.
+    `stiffness` is Young's modulus times thickness, divided by the spring stiffness per area and by the area of the
+    plate. Returns the centre of the patch, and the mean displacement and the mean rotation of the plate.
     """
     area_m2, (nu, young) = np.prod(sides_m), (0.5, stiffness * np.prod(sides_m))
     mesh = MeshQuad.init_tensor(*(np.linspace(-side_m / 2, side_m / 2, cells_n + 1) for side_m in sides_m))

@@ -94,8 +94,8 @@ def write_scaling(measured: Measurements, folder: Path) -> None:
         "`quick` in full": (quick, quick_rest_s),
     }
 
-    def total_s(sweeps: Sequence[Sweep], rest_s: float, workers_n: int, measurements: Measurements) -> float:
-        return rest_s + sum(simulate(sweep, workers_n, measurements, spread) for sweep in sweeps)
+    def total_s(sweeps: Sequence[Sweep], rest_s: float, workers_n: int, assumed: Measurements) -> float:
+        return rest_s + sum(simulate(sweep, workers_n, assumed, spread) for sweep in sweeps)
 
     alone = {name: total_s(*case, 1, replace(measured, connect_s=0.0)) for name, case in cases.items()}
     faster = {
@@ -128,17 +128,19 @@ def explain(
     counts = ", ".join(str(sweep.tasks_n) for sweep in sorted(paper, key=lambda sweep: -sweep.tasks_n))
     mean_s, sd_s = np.mean(measured.task_s), np.std(measured.task_s)
     lines = [
-        f"Measured: a sweep of {len(measured.task_s) + 1} tasks takes {one_s:.1f} s in one process and {two_s:.1f} s in two "
-        f"({one_s / two_s:.2f} times as fast), at a load of {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores; "
+        f"Measured: a sweep of {len(measured.task_s) + 1} tasks takes {one_s:.1f} s in one process and "
+        f"{two_s:.1f} s in two ({one_s / two_s:.2f} times as fast), at a load of "
+        f"{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores; "
         f"a task takes {mean_s:.2f} s of CPU (sd {100 * sd_s / mean_s:.0f} %).",
         f"Measured for Dask: {1e3 * measured.call_s:.1f} ms per task, {measured.connect_s:.1f} s to connect a stage, "
-        f"{measured.task_bytes / 1e3:.1f} kB per task and {measured.rows_bytes / 1e6:.1f} MB of rows per worker. Assumed: "
-        "a network of 1 Gbit/s, shared by all workers.",
+        f"{measured.task_bytes / 1e3:.1f} kB per task and {measured.rows_bytes / 1e6:.1f} MB of rows per worker. "
+        "Assumed: a network of 1 Gbit/s, shared by all workers.",
         f"The number of tasks limits the speed-up: stages of `paper` have {counts} tasks and run one after another.",
         f"The remaining work is counted as one process: {rest_s:.0f} s of {rest_s + work_s:.0f} s, which limits the "
         f"speed-up of `paper` to {(rest_s + work_s) / rest_s:.0f}.",
         f"Dask is no limit: with 256 workers it costs {cost['`paper` in full']:.1f} % of the time of `paper`. One "
-        f"scheduler can serve about {largest.task_s / measured.call_s:,.0f} workers with tasks of {largest.task_s:.0f} s.",
+        f"scheduler can serve about {largest.task_s / measured.call_s:,.0f} workers with tasks of "
+        f"{largest.task_s:.0f} s.",
     ]
     return [f"- {line}" for line in lines]
 

@@ -87,8 +87,7 @@ def test_latency_from_last_byte_to_screen(tmp_path, boards):
 
 @contextmanager
 def running_boards(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[list[Session], str]]:
-    """Start a process per board and a server for the page of all boards; yield when all boards have a no-load
-    reading."""
+    """Start a process per board and serve their page; yield as soon as every board has a no-load reading."""
     sessions, players = [], []
     try:
         for i, (chips_n, rate_hz) in enumerate(boards):

@@ -66,8 +66,7 @@ def best(call: Callable[[], object], clock: Callable[[], float]) -> float:
 
 
 def measure_rates() -> dict[str, float]:
-    """Measure matrix products and copied bytes per CPU second of one thread, and bytes written to disk per wall
-    second."""
+    """Measure products and copied bytes per CPU second of one thread, and bytes written to disk per second."""
     torch.set_num_threads(1)
     one, other = torch.rand(2, 1024, 1024)
     many, block = np.ones(2**26, np.float32), os.urandom(2**26)

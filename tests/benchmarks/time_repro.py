@@ -37,8 +37,7 @@ def size_MB(folder: Path) -> float:
 
 
 def measure(folder: Path, times: int) -> Iterator[dict[str, object]]:
-    """Clone the last commit; return the seconds to create the environment, and the seconds of the stages in each
-    run."""
+    """Clone the last commit; return the seconds to create the environment and to run all stages, repeatedly."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
     environment = run(["make", ".venv/.installed"], folder)
     environment_MB = size_MB(folder / ".venv")

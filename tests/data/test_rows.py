@@ -1,4 +1,4 @@
-"""Tests of the rows that models receive: field change, passes, indentation numbers and order of captures."""
+"""Tests of the rows on which models are trained: field change, passes, indentation numbers, order of captures."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,8 @@ def test_passes_continue_across_captures_of_a_skin():
 
 
 def test_indentation_numbers_are_unique_in_the_scene():
-    press = np.array([7, 7, 2, 2, 9, 9], np.int32)  # both captures use the same numbers, which do not start at 0
+    # both captures use these indentation numbers, which do not start at 0
+    press = np.array([7, 7, 2, 2, 9, 9], np.int32)
     lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
     rows = gather([readings("c1", indentation=press, x_mm=lost), readings("c0", indentation=press)], ALL)
     naive, seen = [], []
@@ -44,7 +45,7 @@ def test_indentation_numbers_are_unique_in_the_scene():
     assert rows.indentation[rows.capture == "c0"].max() < rows.indentation[rows.capture == "c1"].min()
 
 
-def test_capture_order_does_not_matter():
+def test_rows_do_not_depend_on_the_order_of_captures():
     one, other = readings("c0"), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, 2, np.float32))
     expected, actual = gather([one, other], ALL), gather([other, one], ALL)
     assert (expected.board == actual.board).all()

@@ -42,7 +42,7 @@ DRAWN = {
 }  # fmt: skip
 
 
-def test_simulations_are_compared_with_bounds():
+def test_table_compares_simulations_with_bounds():
     table = tables(NUMBERS, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
@@ -67,7 +67,7 @@ def test_single_board_of_equal_forces_has_no_growth_or_refit():
     assert "simulated" in texts_of(figures(numbers, DRAWN, "recorded")["compare_growth.svg"])
 
 
-def test_tables_of_frames_and_parameters():
+def test_tables_of_axes_and_parameters():
     found = tables(NUMBERS, "recorded")
     assert found["compare_frames"]["orientation"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
     assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
