@@ -85,8 +85,7 @@ class Layer:
         return asm(BilinearForm(work), self.basis), coupling
 
     def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solution:
-        """Solve for load(r) on component `part_i` at the top; per edge, `held` fixes components, `drag` adds springs on
-        u_r."""
+        """Solve for load(r) on component `part_i` at the top, with fixed components and springs(r) on u_r per edge."""
         (work, dilation), at = self.matrices, self.basis
         load_vector = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), at.boundary("top"))
         for edge, of in drag.items():

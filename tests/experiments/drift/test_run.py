@@ -27,8 +27,7 @@ EVERY_s, WARMING_K_PER_s = 0.5, 0.01
 
 
 def capture(name: str, board: str = "b0", skin: str = "s0", gain: float = 1.0, pokes_n: int | None = None) -> Readings:
-    """Return a capture with two readings per contact: field change linear in place and force, drifting no-load
-    field."""
+    """Return a capture: two readings per contact, field change linear in place and force, drifting no-load field."""
     places = np.tile(points_mm(), (len(DEPTHS_MM) * PASSES_N, 1))[:pokes_n]
     depth_mm = np.tile(np.repeat(DEPTHS_MM, 65), PASSES_N)[:pokes_n]
     n = len(places)
