@@ -20,8 +20,7 @@ from tests.faults.harness import NOT_RUN, SCENE, Checkout, Result, Row, fault, j
 
 
 def _report(checkout: Checkout, first: Result, again: Result | None) -> Row:
-    """Judge stage publish: it must succeed soon, with one warning; a later `reskin publish` (`again`) must send all
-    runs."""
+    """Judge stage publish: it must succeed soon, with one warning; a later `reskin publish` must send all runs."""
     row, warned_n = judge(checkout, first, again or NOT_RUN, fails=False), first.output.count("warning:")
     row.lost, row.next_run = "nothing", "as for a server that refuses"
     if again:

@@ -65,8 +65,7 @@ class Finger:
         self._force_N, self._depth_mm = np.append(0, force_N), np.append(0, DEPTHS_MM)
 
     def force_at(self, closed_mm: float, stiffness_N_mm: float) -> float:
-        """Return the force in N at which skin and spring (in series) are in equilibrium for this closure of the
-        gripper."""
+        """Return the force in N at which skin and spring, in series, are in equilibrium at this closure."""
         total_mm = self._depth_mm + self._force_N / stiffness_N_mm
         return float(np.interp(max(closed_mm, 0.0), total_mm, self._force_N))
 

@@ -20,8 +20,7 @@ REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_fini
 
 
 def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generator]:
-    """Return a random script with faults, its undamaged frames as bytes, which of them are finite, and the
-    generator."""
+    """Return a random script with faults, its undamaged frames, which of these are finite, and the generator."""
     rng = rng_for(seed, "byte account")
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)

@@ -1,4 +1,4 @@
-"""Alignment methods compared with SciPy's matrix roots, a known map and leave-one-out errors."""
+"""Tests of alignment methods against SciPy's matrix square roots, a known linear map, and leave-one-out errors."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from reskin.seeds import rng_for
 
 
 def draw_inputs(name: str, n: int = 80, c: int = 4) -> np.ndarray:
-    """Inputs of a skin: correlated channels with different scales and means."""
+    """Return random inputs of a skin: correlated channels with different scales and means."""
     rng = rng_for(0, "alignment", name)
     return rng.standard_normal((n, c)) @ rng.standard_normal((c, c)) * rng.uniform(1, 30, c) + rng.normal(0, 20, c)
 
@@ -23,7 +23,7 @@ def test_matched_channels_have_the_means_and_deviations():
     np.testing.assert_allclose(moved.std(axis=0, ddof=1), TO.std(axis=0, ddof=1))
 
 
-def test_gains_and_offsets_are_undone():
+def test_gains_and_offsets_are_removed():
     gains, offsets = np.array([0.5, 2.0, 1.3, 0.9]), np.array([3.0, -7.0, 0.0, 40.0])
     np.testing.assert_allclose(match_channels(OF, OF * gains + offsets)(OF), OF * gains + offsets)
 
@@ -58,7 +58,7 @@ def test_direct_standardisation_recovers_a_linear_map():
     np.testing.assert_allclose(direct(OF, OF @ known, 1e12).matrix, np.eye(4), atol=1e-6)
 
 
-def test_undetermined_directions_stay():
+def test_undetermined_directions_are_unchanged():
     pairs = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     found = direct(pairs, 3 * pairs, 1e-9)
     np.testing.assert_allclose(found(np.eye(4)), np.diag([3.0, 3.0, 1.0, 1.0]), atol=1e-6)
@@ -73,7 +73,7 @@ def test_ridge_minimises_the_leave_one_out_error(noise):
         total = 0.0
         for i in range(len(of)):
             rest = np.delete(np.arange(len(of)), i)
-            held = ridge * (of**2).sum() / of.shape[1]  # relative to all pairs
+            held = ridge * (of**2).sum() / of.shape[1]  # the penalty is proportional to the number of pairs
             gain = np.linalg.solve(of[rest].T @ of[rest] + held * np.eye(4), of[rest].T @ (to - of)[rest])
             total += float((((to - of)[i] - of[i] @ gain) ** 2).sum())
         return total
