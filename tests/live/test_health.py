@@ -55,7 +55,7 @@ def test_fault_is_named_and_counted(name):
     health = feed(inject_fault(name))
     assert set(health.alarms) == {ALARMS[name]}
     alarm = health.alarms[ALARMS[name]]
-    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset chip stays reset until the end
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset is found only after 400 frames
     assert 1.4 <= alarm.first_s <= 1.5 + duration_s
     assert alarm.last_s <= 1.6 + duration_s
     assert alarm.count_n >= 100
