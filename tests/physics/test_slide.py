@@ -72,7 +72,8 @@ def test_slide_under_quarter_turns_and_radial_pulls(place_m, taken_m):
 def test_displacement_follows_force_and_distance():
     places_m = np.array([[4e-3, 0.0]] * 3)
     found_m = slide.press_displacement_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
-    # 7 um/mm at 4 mm from the middle is 28 um, and half of that at half the load at which the skin sticks.
+    # 7 um/mm at 4 mm from the middle is 28 um at zero force, and half of that at half the force at which this slide
+    # vanishes.
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
 
 
