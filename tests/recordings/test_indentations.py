@@ -75,8 +75,7 @@ def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.
 
 
 def join_naively(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
-    """Reference: compare every frame with every dwell; on the common edge of two dwells, the later one gets the
-    frame."""
+    """Reference: compare every frame with every dwell; a frame on a common edge belongs to the later dwell."""
     noload: dict[int, list[np.ndarray]] = {}
     contact: list[tuple[int, int]] = []
     for frame_i, t_s in enumerate(timed.t_s.tolist()):

@@ -1,4 +1,4 @@
-"""Tests of real recordings from `reskin add` to leave-one-board-out scores; of adding and removing a board."""
+"""Tests of real recordings, from `reskin add` to leave-one-board-out scores; a board is added and removed."""
 
 import json
 import re

@@ -48,8 +48,7 @@ def test_no_false_alarm():
 
 
 def test_every_change_of_labels_is_found_on_recorded_boards(shared_data, tmp_path):
-    """At depth 2, all changes are found; of 18 pairs of recordings, only board 2 depth 3, board 1 depth 1 is
-    inconclusive."""
+    """Both recordings are at depth 2. Of all 18 pairs, one is inconclusive: board 2 depth 3 with board 1 depth 1."""
     boards = {}
     for number in (1, 2):
         shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)

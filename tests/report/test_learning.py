@@ -1,4 +1,4 @@
-"""Tests of the tables on training with many skins, and of the blocks of README and docs that show them."""
+"""Tests of the tables on training with many skins, and of the blocks in README and docs with these tables."""
 
 from itertools import pairwise
 
@@ -72,7 +72,7 @@ def test_paired_table_has_the_papers_difference_of_means():
         "+6 [5, 7]",
         "+0.1 [-2.9, 3.1]",
     ]
-    # 81.03 - 84.43 and 87.00 - 81.03 of the paper's table 2, which has no control.
+    # Differences of means in the paper's table 2: 81.03 - 84.43 and 87.00 - 81.03; the paper has no control.
     assert table["accuracy, % (paper: difference of means)"].tolist() == ["+59.19", "-3.4", "+5.97", "–"]
     assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["-5.72", "+0.023", "-0.242", "–"]
     assert "95 % interval over n boards" in to_markdown(table)
@@ -216,7 +216,7 @@ def test_each_experiment_has_its_table_with_source():
     assert not expected & set(make_tables(nothing))
 
 
-def test_readme_has_claims_below_table_2():
+def test_readme_has_the_claims_below_table_2():
     described = {
         "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
     }

@@ -1,4 +1,4 @@
-"""Tests of the numbers and contrasts of the experiments on many skins, calculated by hand."""
+"""Tests of the numbers and contrasts of experiments on many skins, against values calculated by hand."""
 
 import json
 
@@ -15,7 +15,7 @@ from pipeline.statistics import tidy
 from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
-BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # gain by adaptation on each skin, percentage points
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # gain by adaptation on each skin, in percentage points
 
 
 BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
@@ -56,8 +56,8 @@ CARDS = [
 ]  # fmt: skip
 
 
-def numbers(made: list[dict] = CARDS, **points: list[dict]) -> dict:
-    return learning_numbers(tidy(made, points), headline="paper")
+def numbers(cards: list[dict] = CARDS, **points: list[dict]) -> dict:
+    return learning_numbers(tidy(cards, points), headline="paper")
 
 
 def paired(of: str, over: str) -> dict:
@@ -85,7 +85,7 @@ def over(*boards: float) -> dict:
 
 def test_paired_differences_by_board():
     assert [(one["of"], one["over"]) for one in numbers()["paired"]] == [one for one in PAIRS if "single" not in one]
-    # gains of 2 and 4 points on the skins of b0, of 6 and 8 on those of b1
+    # gains of 2 and 4 percentage points on the skins of b0, of 6 and 8 on the skins of b1
     assert paired("adapted", "triplet")["accuracy_pct"] == over(3.0, 7.0)
     by_board = paired("adapted", "triplet")["by_board"]
     assert {board: own["accuracy_pct"] for board, own in by_board.items()} == {"b0": 3.0, "b1": 7.0}
@@ -95,14 +95,14 @@ def test_paired_differences_by_board():
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 
 
-def test_multi_minus_single_uses_shared_skins():
+def test_multi_minus_single_uses_skins_of_both():
     single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
     (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
     assert {board: own["accuracy_pct"] for board, own in one["by_board"].items()} == {"b1": 80.0 - 30.0}
     assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
-def test_missing_experiment_is_absent():
+def test_missing_experiment_has_no_numbers():
     assert numbers([]) == {"variants": {}}
     assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
     without = numbers([*board_cards("lobo", 80.0), *board_cards("triplet", 78.0)])
@@ -110,11 +110,11 @@ def test_missing_experiment_is_absent():
     assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
     alone = numbers(adapted_cards("paper", 78.0, 1.0))
     assert alone.keys() == {"table2", "adapt", "variants"}
-    assert alone["adapt"] == {"pokes_n": 390}  # with no control
+    assert alone["adapt"] == {"pokes_n": 390}  # there is no control
     assert "null" not in json.dumps(numbers())
 
 
-def test_other_recipes_appear_only_in_variants():
+def test_other_recipes_are_only_in_variants():
     alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
     assert numbers() == alone | {"variants": numbers()["variants"]}
     assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
@@ -132,7 +132,7 @@ def test_sweep_over_pokes_is_sorted():
     assert sweep[0]["accuracy_pct"] == {"mean": 73.0, "n": 1, "sd_seeds": pytest.approx(8**0.5)}
 
 
-def test_sweep_over_sensors_by_method():
+def test_sweep_over_sensors_has_a_point_per_method_and_count():
     points = [
         point(by_skin, f"b1-{skins_n:02d}skins-draw{draw_i}", method=method, trained_on_skins_n=skins_n)
         for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
@@ -149,7 +149,7 @@ def test_sweep_over_sensors_by_method():
         ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
         ("adapted", 3, 60.5),
     ]  # fmt: skip
-    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)  # two draws for one board
+    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)  # one board, with two draws of skins
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
 
@@ -170,7 +170,7 @@ def test_learning_times_are_medians():
         "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
-    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; the last method was not timed
+    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # median times; the last method was not timed
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 
 
@@ -181,7 +181,7 @@ def test_adaptation_times_by_number_of_pokes():
 
 
 def points(key: str, by_count: dict[int, tuple[float, float]], **keys: str) -> list[dict]:
-    """Return the points of two boards, from their accuracies at each count."""
+    """Return points of two boards; `by_count` has the accuracies of both boards at each count."""
     return [
         point(dict.fromkeys(skins, float(pct)), board, **{key: count}, **keys)
         for count, both in by_count.items()
@@ -205,7 +205,7 @@ def test_poke_contrasts_of_gain_and_plateau():
     assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
 
 
-def test_unreached_contrasts_are_absent():
+def test_contrasts_beyond_the_range_of_a_sweep_are_absent():
     found = contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})}))
     assert found.keys() == {"pokes_first", "pokes_gain"}
     assert found["pokes_gain"]["to_pokes_n"] == 390

@@ -1,4 +1,4 @@
-"""The contact response compared with the formulas of its terms; without terms, nothing changes."""
+"""Tests of the contact response against the formulas of its terms; without terms, all contacts are equal."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ TIP_M = np.tile([[[1e-3, 2e-3, 0.8e-3]]], (200, 1, 1))
 
 @pytest.fixture(scope="module")
 def first() -> tuple[np.ndarray, np.ndarray]:
-    """The field at rest and its change at the first contact, in T, at the chips."""
+    """Return the field at rest and the field change of the first contact, in T, at the chips."""
     rest_T, change_T = changes_of_field(BOARD, SKIN, TIP_M[0])
     return rest_T, change_T[0]
 

@@ -1,4 +1,4 @@
-"""The rig's timeline, clocks, chunks and dwells, and the noise and range of its force sensor."""
+"""Tests of the simulated rig: timeline, clocks, chunks, dwells; noise and range of the force sensor."""
 
 import numpy as np
 import pytest
@@ -89,13 +89,14 @@ def test_log_has_every_stop_of_a_line():
     np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
 
 
-def test_robot_spread():
+def test_robot_misses_places_by_the_given_spread():
     grid, line = plan(), plan(DRAG)
     exact_mm = actual_positions(grid, rig(), rng_for(0, "robot"))
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))
     loose = rig(robot_place_sd_mm=0.1, robot_depth_sd_mm=0.02)
     missed_mm = actual_positions(grid, loose, rng_for(0, "robot")) - exact_mm
-    np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)  # 130 draws: 6 %
+    # 25 %: four standard errors of 6 % for 130 draws
+    np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)
     planned_mm = np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
     along_mm = actual_positions(line, loose, rng_for(0, "robot")) - planned_mm
     np.testing.assert_allclose(along_mm, np.repeat(along_mm[:, :1], 5, axis=1))
@@ -123,11 +124,11 @@ def test_force_beyond_range_is_clipped_and_counted():
 
 def test_noise_has_the_given_deviation():
     read_N, clipped_n = read_clipped(np.zeros((40_000, 3)), noise_N=1 / 160)
-    np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)  # four times 1 / sqrt(2 n)
+    np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)  # four standard errors 1 / sqrt(2 n)
     assert clipped_n == 0
     read_N, clipped_n = read_clipped(np.tile(FORCE_RANGE_N, (1000, 1)), noise_N=1 / 160)
     assert (read_N <= np.float32(FORCE_RANGE_N)).all()
-    assert 1400 < clipped_n < 1600  # half of 3000 within 3.7 sd
+    assert 1400 < clipped_n < 1600  # half of 3000, within 3.7 standard deviations
 
 
 def test_readings_follow_the_generator():
