@@ -64,8 +64,7 @@ def test_millinewton_is_below_the_noise(place_m, name_i):
 
 
 def path(skin: Skin, ends_m, forces_N, stops_n: int) -> np.ndarray:
-    """Return the path of a tip that presses, drags under changing force, and lifts, in equal steps of place and
-    force."""
+    """Return the path of a tip that presses, drags and lifts, in equal steps of place and force."""
     share = np.linspace(0, 3, stops_n + 1)
     place_m = np.stack([np.interp(share, (1, 2), ends) for ends in np.transpose(ends_m)], axis=1)
     force_N = np.interp(share, (0, 1, 2, 3), (0.0, *forces_N, 0.0))
