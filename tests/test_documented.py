@@ -21,7 +21,7 @@ from reskin.simulation.defaults import NOMINAL
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = [ROOT / "params.yaml", NOMINAL, *sorted((ROOT / "pipeline/scenes").glob("*.yaml"))]
-# Sections whose keys are names chosen by the user, with the number of such levels.
+# Sections whose keys are names of entries (such as recipes or boards), not parameters.
 NAMED = {"recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}
 
 # Names of rows, boards, captures and stages, which are not documented individually.

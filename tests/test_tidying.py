@@ -22,8 +22,7 @@ WRITTEN = {
 
 @pytest.fixture
 def root(tmp_path) -> Path:
-    """Return a checkout: scene `one` ran drift and protocol `gone` and now has only lobo; scene `two` is not in the
-    plan."""
+    """Return a checkout: scene `one` ran drift and protocol `gone` and now has only lobo; `two` is not in the plan."""
     folder = checkout(tmp_path / "checkout")
     plan.use(folder, ["one"])
     for path in WRITTEN.values():

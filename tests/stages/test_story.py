@@ -413,7 +413,7 @@ def test_removed_experiment_leaves_no_files(story, run_stages):
     assert "removed sleeve@ci: data/results/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
     run_stages("report@ci")
-    # data/code contains the digests of all stages and changes, so it is excluded.
+    # The folder data/code is excluded, because it contains the digests of all stages, including sleeve.
     assert [*story.glob("data/[!c]*/**/*sleeve*"), *story.glob("reports/ci/**/*sleeve*")] == []
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert "sleeve" not in numbers

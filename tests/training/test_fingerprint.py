@@ -1,4 +1,4 @@
-"""The fingerprint of the simulated skin identifies all settings that change a capture."""
+"""Tests of the fingerprint of the simulated skin: it changes with every setting that changes a capture."""
 
 from copy import deepcopy
 from pathlib import Path
