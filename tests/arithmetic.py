@@ -80,9 +80,9 @@ def main(processors: Sequence[str]) -> None:
     print(here, flush=True)
     different = []
     for name in processors:
-        there = digests_on(name)
-        print(f"{there}  {name}", flush=True)
-        different += [name] * (there != here)
+        emulated = digests_on(name)
+        print(f"{emulated}  {name}", flush=True)
+        different += [name] * (emulated != here)
     if different:
         sys.exit(f"the weights differ from those of this processor on: {', '.join(different)}")
 

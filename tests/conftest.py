@@ -30,29 +30,29 @@ CHECKED_N = 50  # number of calls of a function that are checked in each test
 calls_n: Counter[Any] = Counter()
 
 
-def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
+def check_arrays(decorated: Any = None, *, typechecker: Any) -> Any:
     """Decorate a function or dataclass: in its first calls in each test, check the shapes and dtypes of arrays.
 
     Checking every call would take longer than the calls themselves. Other types are left to mypy.
     """
-    if of is None:
+    if decorated is None:
         return partial(check_arrays, typechecker=typechecker)
-    if inspect.isclass(of):
-        if is_dataclass(of):
-            of.__init__ = check_arrays(of.__init__, typechecker=typechecker)
-        return of
-    if not any(map(_names_an_array, inspect.get_annotations(of).values())):
-        return of
+    if inspect.isclass(decorated):
+        if is_dataclass(decorated):
+            decorated.__init__ = check_arrays(decorated.__init__, typechecker=typechecker)
+        return decorated
+    if not any(map(_names_an_array, inspect.get_annotations(decorated).values())):
+        return decorated
     checked = None
 
-    @wraps(of)
+    @wraps(decorated)
     def checked_at_first(*args: Any, **kwargs: Any) -> Any:
         nonlocal checked
-        calls_n[of] += 1
-        if calls_n[of] > CHECKED_N:
-            return of(*args, **kwargs)
+        calls_n[decorated] += 1
+        if calls_n[decorated] > CHECKED_N:
+            return decorated(*args, **kwargs)
         # decorated at the first call, because decorating all functions would slow down the import
-        checked = checked or jaxtyped(of, typechecker=typechecker)
+        checked = checked or jaxtyped(decorated, typechecker=typechecker)
         return checked(*args, **kwargs)
 
     return checked_at_first

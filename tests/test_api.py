@@ -85,9 +85,9 @@ def test_designs_accept_plain_values_and_refuse_wrong_ones():
 
 def test_no_pokes_give_empty_arrays():
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), np.zeros((0, 3)))
-    some = reskin.simulate_pokes(reskin.draw_skin(), [[8, 8, 1]])
+    with_poke = reskin.simulate_pokes(reskin.draw_skin(), [[8, 8, 1]])
     assert (noload_uT.shape, b_uT.shape, force_N.shape) == ((0, 15), (0, 15), (0,))
-    assert (noload_uT.dtype, b_uT.dtype, force_N.dtype) == tuple(array.dtype for array in some)
+    assert (noload_uT.dtype, b_uT.dtype, force_N.dtype) == tuple(array.dtype for array in with_poke)
 
 
 def test_touch_has_keyword_arguments():

@@ -49,17 +49,17 @@ def test_fields_noise_steps_and_forces_are_recovered():
 
 
 def test_random_walk_at_rest_grows_with_the_root_of_the_contact_count():
-    still = example_readings()
+    without_walk = example_readings()
     steps_uT = 0.5 * rng_for(0, "walk").standard_normal((INDENTATIONS_N, 6))
     drifting = replace(
-        still, noload_uT=REST_uT + np.repeat(np.cumsum(steps_uT, axis=0), READINGS_N, axis=0).astype(np.float32)
+        without_walk, noload_uT=REST_uT + np.repeat(np.cumsum(steps_uT, axis=0), READINGS_N, axis=0).astype(np.float32)
     )
     found = describe(drifting)
     assert found["rest_changes_in_1_uT"] == pytest.approx(0.5, rel=0.05)
     assert found["rest_changes_in_10_uT"] == pytest.approx(0.5 * np.sqrt(10), rel=0.1)
     assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)  # only 4 x 6 changes
     assert "rest_changes_in_1000_uT" not in found
-    assert describe(still)["rest_changes_in_100_uT"] == 0
+    assert describe(without_walk)["rest_changes_in_100_uT"] == 0
 
 
 def test_recording_without_clock_has_no_rate():

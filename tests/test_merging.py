@@ -145,8 +145,8 @@ def test_merge_without_conflict_is_an_error(root):
 
 
 def test_removed_and_replaced_captures_are_not_restored():
-    kept, gone, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
-    base = Registry(captures={"scene": {"kept": kept, "gone": gone, "replaced": old}})
+    kept, removed, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
+    base = Registry(captures={"scene": {"kept": kept, "gone": removed, "replaced": old}})
     theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})
     assert merge.merge_registries(base, base, theirs) == theirs
     assert merge.merge_registries(base, theirs, base) == theirs

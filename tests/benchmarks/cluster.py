@@ -54,8 +54,8 @@ class Sweep:
 
     def task_s(self) -> list[float]:
         """Return the CPU seconds of each task. The first task is omitted because it loads the libraries."""
-        begun = {(name, by): float(at) for _, name, by, at in self.lines("begun")}
-        return [float(at) - begun[name, by] for _, name, by, at in self.lines("ended")][1:]
+        begun = {(name, by): float(cpu_s) for _, name, by, cpu_s in self.lines("begun")}
+        return [float(cpu_s) - begun[name, by] for _, name, by, cpu_s in self.lines("ended")][1:]
 
 
 class Cluster:
@@ -153,10 +153,10 @@ def sweep_on_three_workers(
 
 def kill_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> Sweep:
     with steps.step("a worker is killed during the sweep (SIGKILL)") as note:
-        process, at = cluster.sweep(folder / "killed"), Sweep(folder / "killed")
-        wait_until(lambda: len(at.lines("ended")) >= 3, SWEEP_MAX_s, "three tasks")
+        process, running = cluster.sweep(folder / "killed"), Sweep(folder / "killed")
+        wait_until(lambda: len(running.lines("ended")) >= 3, SWEEP_MAX_s, "three tasks")
         cluster.end("w1")
-        ended_n = len(at.lines("ended"))
+        ended_n = len(running.lines("ended"))
         sweep = wait_for_sweep(process, folder / "killed")
         begun_n = len(sweep.lines("begun"))
         require(sweep.found["sha256"] == expected, "bytes differ")
@@ -170,18 +170,18 @@ def kill_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> 
 def restart_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
     place = folder / "restarted"
     with steps.step("the scheduler is killed during the sweep") as note:
-        process, at = cluster.sweep(place), Sweep(place)
-        wait_until(lambda: len(at.lines("ended")) >= 4, SWEEP_MAX_s, "four tasks")
+        process, running = cluster.sweep(place), Sweep(place)
+        wait_until(lambda: len(running.lines("ended")) >= 4, SWEEP_MAX_s, "four tasks")
         cluster.end("scheduler")
         start_s = time.monotonic()
         process.wait(120)
-        said = (place / "said.txt").read_text().splitlines()[-1]
-        require(process.returncode == 1 and "Finished trainings are cached" in said, said)
-        note(f"after {time.monotonic() - start_s:.1f} s: `{said}`")
+        last_line = (place / "said.txt").read_text().splitlines()[-1]
+        require(process.returncode == 1 and "Finished trainings are cached" in last_line, last_line)
+        note(f"after {time.monotonic() - start_s:.1f} s: `{last_line}`")
         cluster.end_all()
     with steps.step("restart scheduler and workers, repeat the command") as note:
-        finished = {line[1] for line in at.lines("ended")}
-        before_n = len(at.lines("begun"))
+        finished = {line[1] for line in running.lines("ended")}
+        before_n = len(running.lines("begun"))
         cluster.start_all()
         sweep = wait_for_sweep(cluster.sweep(place), place)
         again = [line[1] for line in sweep.lines("begun")[before_n:]]
@@ -239,8 +239,8 @@ def run_slurm_script(steps: Steps, folder: Path, expected: str) -> None:
     environment = {**os.environ, **job, "PATH": f"{srun.parent}:{os.environ['PATH']}"}
     with steps.step("`deploy/slurm/reskin.sbatch` with a substitute for `srun`, two workers") as note:
         words = ["bash", str(ROOT / "deploy/slurm/reskin.sbatch"), *SWEEP, str(place)]
-        with (folder / "slurm.log").open("wb") as said:
-            process = subprocess.Popen(words, env=environment, stdout=said, stderr=said, start_new_session=True)
+        with (folder / "slurm.log").open("wb") as log:
+            process = subprocess.Popen(words, env=environment, stdout=log, stderr=log, start_new_session=True)
             try:
                 code = process.wait(SWEEP_MAX_s)
             finally:

@@ -32,9 +32,9 @@ class Node:
 
     def popen(self, words: Sequence[str], log: Path, folder: Path) -> subprocess.Popen[bytes]:
         """Start a program on this node, in its own process group."""
-        with log.open("ab") as said:
+        with log.open("ab") as output:
             command = ["ip", "netns", "exec", self.namespace, *words]
-            return subprocess.Popen(command, stdout=said, stderr=said, cwd=folder, start_new_session=True)
+            return subprocess.Popen(command, stdout=output, stderr=output, cwd=folder, start_new_session=True)
 
     def received_bytes(self) -> int:
         """Return the number of bytes that this node has received."""

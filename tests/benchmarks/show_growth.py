@@ -77,13 +77,13 @@ def exponent(points: Points) -> float | None:
 
 
 def rows_of(points: Mapping[str, Points]) -> Iterable[dict[str, str]]:
-    for name, own in points.items():
-        (m, before), (n, last) = own[-2:]
-        power, per_item = exponent(own), max(last - before, 0.0) / (n - m)
+    for name, stage_points in points.items():
+        (m, before), (n, last) = stage_points[-2:]
+        power, per_item = exponent(stage_points), max(last - before, 0.0) / (n - m)
         yield {
             "what": name,
-            **{f"{count:,}": short(value) for count, value in own},
-            "slope, last step": f"{slopes(own)[-1]:.2f}",
+            **{f"{count:,}": short(value) for count, value in stage_points},
+            "slope, last step": f"{slopes(stage_points)[-1]:.2f}",
             "exponent beyond the fixed start": "–" if power is None else f"{power:.2f}",
             f"at {MANY_N:,}": short(last + per_item * (MANY_N - n)),
             "why": CAUSES[name],
@@ -97,8 +97,8 @@ def draw(panels: Mapping[str, tuple[str, Mapping[str, Points]]]) -> str:
         for axes, (title, (count, points)) in zip(
             figure.subplots(len(panels), 1, squeeze=False).flat, panels.items(), strict=True
         ):
-            for i, (name, own) in enumerate(points.items()):
-                ns, values = zip(*own, strict=True)
+            for i, (name, stage_points) in enumerate(points.items()):
+                ns, values = zip(*stage_points, strict=True)
                 style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)]}
                 axes.plot(ns, values, label=name, linewidth=1, markersize=4, **style)
             axes.set(xscale="log", yscale="log", xlabel=count)
@@ -110,19 +110,19 @@ def draw(panels: Mapping[str, tuple[str, Mapping[str, Points]]]) -> str:
 
 def main() -> None:
     found = json.loads((MEASURED / "growth.json").read_text())
-    of = {
+    panels = {
         "CPU seconds, simulated skins": ("simulated skins", points_of(found["skins"], "skins_n", "stages", "cpu_s")),
         "peak memory of a process, MB": ("simulated skins", memory_of(found["skins"])),
         "CPU seconds, recorded captures": (
             "recorded captures", points_of(found["captures"], "captures_n", "steps", "cpu_s"),
         ),
     }  # fmt: skip
-    io.write_text(ROOT / FIGURE, draw(of))
+    io.write_text(ROOT / FIGURE, draw(panels))
     parts = [
         f"Code {found['git']}, {found['machine']}.",
         f"![Cost against size, log-log]({FIGURE.removeprefix('docs/')})",
     ]
-    for title, (_, points) in of.items():
+    for title, (_, points) in panels.items():
         parts += [f"**{title}**", table(list(rows_of(points)))]
     before = points_of(found["stage_each"], "captures_n", "steps", "cpu_s")
     parts += ["**CPU seconds, recorded captures, one stage per capture**", table(list(rows_of(before)))]

@@ -113,9 +113,9 @@ def make_origin(folder: Path, address: str) -> Path:
     return origin
 
 
-def transfer_summary(said: str) -> str:
+def transfer_summary(output: str) -> str:
     """Return the summary line in the output of `dvc push` or `dvc pull`."""
-    found = re.search(r"(\d+ files? (?:pushed|fetched)[^\n]*)|Everything is up to date", said)
+    found = re.search(r"(\d+ files? (?:pushed|fetched)[^\n]*)|Everything is up to date", output)
     return found[0] if found else "no message from DVC"
 
 
@@ -125,9 +125,9 @@ def list_stages(ran: Counter[str]) -> str:
 
 def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) -> tuple[Clone, Clone]:
     """Push the data to both DVC remotes and pull them into new clones; check that no stage needs to run there."""
-    at = {"MLFLOW_TRACKING_URI": tracking}
+    variables = {"MLFLOW_TRACKING_URI": tracking}
     with steps.step("Ana: clone, `reskin add` two skins, `dvc repro`") as note:
-        ana = Clone(folder / "ana", origin, at)
+        ana = Clone(folder / "ana", origin, variables)
         for skin_i in (1, 2):
             ana.add(skin_i)
         ran = ana.repro()
@@ -141,7 +141,7 @@ def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) ->
     fresh = []
     for remote in (REMOTE, "folder"):
         with steps.step(f"fresh clone, `dvc pull -r {remote}`") as note:
-            fresh.append(Clone(folder / f"fresh-{remote}", origin, at))
+            fresh.append(Clone(folder / f"fresh-{remote}", origin, variables))
             note(transfer_summary(fresh[-1].dvc("pull", "-r", remote)))
         with steps.step("`dvc repro` in this clone") as note:
             before = fresh[-1].git("status", "--porcelain")

@@ -124,7 +124,7 @@ def test_a_capture_larger_than_memory_is_read(tmp_path: Path) -> None:
     write_capture(tmp_path, LARGE_N, LARGE_TRAVEL_N)
     stream_MB = (tmp_path / STREAM_FILE).stat().st_size / 1e6
     command = [sys.executable, "-c", READ, str(tmp_path)]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-    print(f"\n{stream_MB:.0f} MB, {said[0]} frames under RLIMIT_AS of {ALLOWED_MB} MB: peak {said[2]} MB resident")
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    print(f"\n{stream_MB:.0f} MB, {output[0]} frames under RLIMIT_AS of {ALLOWED_MB} MB: peak {output[2]} MB resident")
     assert not FULL or stream_MB > ALLOWED_MB
-    assert int(said[1]) == LARGE_N
+    assert int(output[1]) == LARGE_N

@@ -22,9 +22,9 @@ POKES_N = 65
 def test_time_of_estimates_and_calibration():
     skin, rng = load_universal(), rng_for(0, "map")
     tables = skin.tables
-    at = rng.integers(len(tables.axis_mm), size=(2, POKES_N))
+    lattice_i = rng.integers(len(tables.axis_mm), size=(2, POKES_N))
     force_i = rng.integers(len(tables.force_N), size=POKES_N)
-    db_uT, force_N = tables.mean_uT[*at, force_i], tables.force_N[force_i]
+    db_uT, force_N = tables.mean_uT[*lattice_i, force_i], tables.force_N[force_i]
     # The fields are not converted to the chips' axes: the time does not depend on that.
     b_uT = db_uT + tables.rest_uT + rng.normal(0, 4, (POKES_N, CHANNELS_N))
     rest_uT = b_uT[:1] - db_uT[:1]
@@ -44,7 +44,7 @@ def test_time_of_estimates_and_calibration():
         f"calibration to {POKES_N} pokes", 1e3, "ms", calibrate, 30, lambda: skin.zero(rest_uT).estimate(b_uT[:1])
     )
     print_time("calibration to one more poke", 1e3, "ms", calibrate_to_one, 50)
-    place_mm = tables.axis_mm[at].T + CENTRE_MM
+    place_mm = tables.axis_mm[lattice_i].T + CENTRE_MM
     for n in (5, 40):
 
         def label(i: int, n: int = n) -> None:

@@ -40,8 +40,8 @@ def time_command(folder: Path, *words: str) -> dict[str, float]:
     """Run a program; return CPU and wall seconds, including child processes, and the largest peak memory."""
     command, start_s = [str(folder / ".venv/bin" / words[0]), *words[1:]], time.monotonic()
     log = folder / "said.txt"
-    with log.open("w") as said:
-        started = subprocess.Popen(command, cwd=folder, env=variables(folder), stdout=said, stderr=subprocess.STDOUT)
+    with log.open("w") as output:
+        started = subprocess.Popen(command, cwd=folder, env=variables(folder), stdout=output, stderr=subprocess.STDOUT)
         _, status, usage = os.wait4(started.pid, 0)
     if status:
         raise AssertionError(f"{' '.join(words)} failed:\n{log.read_text()[-3000:]}")

@@ -62,7 +62,7 @@ def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, obj
     shutil.copytree(ROOT / "reskin", folder / "source/reskin", ignore=bytecode)
     for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff"):
         shutil.copy(ROOT / name, folder / "source")
-    made = run([python, "-m", "venv", str(folder / "venv")], folder)
+    environment = run([python, "-m", "venv", str(folder / "venv")], folder)
     new_python = str(folder / "venv/bin/python")
     built = run([new_python, *PIP, "wheel", "--no-deps", "--wheel-dir", "dist", "./source"], folder)
     wheel = next((folder / "dist").glob("*.whl"))
@@ -72,7 +72,7 @@ def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, obj
     (folder / "empty").mkdir()
     return {
         "python": subprocess.check_output([new_python, "-V"], text=True).split()[1],
-        "venv": made, "wheel": built, "install": installed,
+        "venv": environment, "wheel": built, "install": installed,
         "wheel_MB": round(wheel.stat().st_size / 1e6, 1), "environment_MB": size_MB(folder / "venv"),
         "packages_n": len(packages), "load_1min": round(os.getloadavg()[0], 1),
         "page_s": [seconds_to_page(folder / "venv/bin/reskin", folder / "empty") for _ in range(2)],

@@ -121,8 +121,8 @@ def main() -> None:
             first = first or numbers
             found[name] = {"settings": setting, **differences(first, numbers)}
             print(f"{name}: {json.dumps(found[name])}", flush=True)
-            of = {"git": code_version(), "machine": machine(), "experiments": EXPERIMENTS, "runs": found}
-            arguments.out.write_text(json.dumps(of, indent=1) + "\n")
+            measurements = {"git": code_version(), "machine": machine(), "experiments": EXPERIMENTS, "runs": found}
+            arguments.out.write_text(json.dumps(measurements, indent=1) + "\n")
     show(json.loads(arguments.out.read_text()))
 
 
@@ -144,8 +144,8 @@ def show(found: Mapping[str, Any]) -> None:
 
 def python_version(python: Path) -> str:
     words = "import platform; print(platform.python_version())"
-    said = subprocess.run([str(python), "-c", words], capture_output=True, text=True, check=True)
-    return f"Python {said.stdout.strip()}" if said.stdout.strip() != platform.python_version() else "the same Python"
+    done = subprocess.run([str(python), "-c", words], capture_output=True, text=True, check=True)
+    return f"Python {done.stdout.strip()}" if done.stdout.strip() != platform.python_version() else "the same Python"
 
 
 if __name__ == "__main__":

@@ -34,15 +34,15 @@ def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
 def test_policies_equal_loop_over_readings(runs_n, regular_n):
     noload_uT, indentation = capture(runs_n)
     seen, first, last = [], None, None
-    for i, own in enumerate(indentation.tolist()):
-        if own not in seen:
+    for i, number in enumerate(indentation.tolist()):
+        if number not in seen:
             if len(seen) % regular_n == 0:
                 last = noload_uT[i, 0]
-            seen.append(own)
+            seen.append(number)
         first = noload_uT[0, 0] if first is None else first
         assert initial(noload_uT, indentation)[i].tolist() == [first] * 3
         assert regular(noload_uT, indentation, regular_n=regular_n)[i].tolist() == [last] * 3
-        assert each(noload_uT, indentation)[i].tolist() == [own] * 3
+        assert each(noload_uT, indentation)[i].tolist() == [number] * 3
 
 
 @given(runs_n, st.integers(1, 5))

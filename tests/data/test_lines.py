@@ -158,10 +158,10 @@ def test_hand_lines_equal_nested_loops(pokes):
     indentation = (10 * pass_i + poke_i).astype(np.int32)  # numbering continues from pass to pass
     naive = set()
     for one in set(pass_i.tolist()):
-        own = [i for i in range(len(pokes)) if pass_i[i] == one]
-        first = min(indentation[i] for i in own)
-        if len({indentation[i] for i in own}) > 1:
-            naive.add(frozenset((i, int(indentation[i] - first)) for i in own))
+        pokes_of_pass = [i for i in range(len(pokes)) if pass_i[i] == one]
+        first = min(indentation[i] for i in pokes_of_pass)
+        if len({indentation[i] for i in pokes_of_pass}) > 1:
+            naive.add(frozenset((i, int(indentation[i] - first)) for i in pokes_of_pass))
     lines = hand_lines(pass_i, indentation)
     assert as_set(lines, range(len(pokes))) == naive
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))

@@ -35,10 +35,10 @@ def test_indentation_numbers_are_unique_in_the_scene():
     lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
     rows = gather([readings("c1", indentation=press, x_mm=lost), readings("c0", indentation=press)], ALL)
     naive, seen = [], []
-    for capture, own in zip(rows.capture, [*press, *press[~np.isnan(lost)]], strict=True):
-        if (capture, own) not in seen:
-            seen.append((capture, own))
-        naive.append((capture, own))
+    for capture, number in zip(rows.capture, [*press, *press[~np.isnan(lost)]], strict=True):
+        if (capture, number) not in seen:
+            seen.append((capture, number))
+        naive.append((capture, number))
     same = np.array([[one == other for one in naive] for other in naive])
     assert ((rows.indentation[:, None] == rows.indentation) == same).all()
     assert sorted(set(rows.indentation.tolist())) == list(range(len(seen)))

@@ -244,8 +244,8 @@ def test_label_pool_is_spread_evenly_over_places(seed, pool_n):
     table = poked_rows()
     for fold in draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=2), seed):
         for skin in np.unique(table.skin[fold.pool]):
-            own = fold.pool[table.skin[fold.pool] == skin]
-            first = own[np.unique(table.indentation[own], return_index=True)[1]]
+            pool_of_skin = fold.pool[table.skin[fold.pool] == skin]
+            first = pool_of_skin[np.unique(table.indentation[pool_of_skin], return_index=True)[1]]
             visits = np.bincount((table.target[first, 0] / 2).astype(int), minlength=PLACES_N)
             assert visits.max() <= -(-pool_n // PLACES_N)
 
@@ -341,9 +341,9 @@ def test_folds_round_trip(table, split):
     def listed(folds):
         return [[one.name, one.train.tolist(), one.test.tolist(), one.pool.tolist()] for one in folds]
 
-    drawn = draw_folds(table, ["lobo"], split, 0)
-    document = json.loads(json.dumps(render_folds(["c0"], table, drawn)))
-    assert listed(parse_folds(document, table, "folds.json")) == listed(drawn)
+    folds = draw_folds(table, ["lobo"], split, 0)
+    document = json.loads(json.dumps(render_folds(["c0"], table, folds)))
+    assert listed(parse_folds(document, table, "folds.json")) == listed(folds)
 
 
 def test_saved_folds_list_boards_and_skins():

@@ -73,7 +73,7 @@ def test_docstring_examples():
 
 
 POLICIES = {
-    name: lambda of, choose=choose: choose(of.noload_uT, of.indentation)
+    name: lambda captured, choose=choose: choose(captured.noload_uT, captured.indentation)
     for name, choose in (("initial", initial), ("each", each))
 }
 

@@ -126,10 +126,10 @@ def test_iron_is_placed_over_the_skin_of_the_row():
 
 def test_one_row_of_each_poke_is_kept():
     indentation = np.repeat(np.arange(8), 5)
-    own = np.arange(5, 35)
-    kept = one_row_per_poke(indentation, own, rng_for(0, "kept"))
+    candidates = np.arange(5, 35)
+    kept = one_row_per_poke(indentation, candidates, rng_for(0, "kept"))
     assert indentation[kept].tolist() == [1, 2, 3, 4, 5, 6]
-    assert np.isin(kept, own).all()
+    assert np.isin(kept, candidates).all()
     assert len(set(kept % 5)) > 1  # the kept reading is random
 
 

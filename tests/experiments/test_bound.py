@@ -82,8 +82,8 @@ def test_probability_of_correlated_errors_equals_an_integral(h, k, r):
 
 def test_noise_variance_equals_that_of_sampled_readings():
     board, readings_n, noload_n = draw_board(SCENE.main_boards.design, SCENE.spreads, seed=1, name="b0"), 2, 10
-    still = np.zeros((ROWS_N // 4 * (readings_n + noload_n), 5, 3))
-    b_uT = read_field(still, board, design=CHIP, rng=rng_for(1, "still"))[0].astype(float)
+    no_field = np.zeros((ROWS_N // 4 * (readings_n + noload_n), 5, 3))
+    b_uT = read_field(no_field, board, design=CHIP, rng=rng_for(1, "still"))[0].astype(float)
     dwells_uT = b_uT.reshape(-1, readings_n + noload_n, 15)
     db_uT = dwells_uT[:, :readings_n].mean(axis=1) - dwells_uT[:, readings_n:].mean(axis=1)
     expected = noise_var_uT2(CHIP, 5, readings_n=readings_n, noload_frames_n=noload_n)

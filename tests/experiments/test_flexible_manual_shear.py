@@ -78,9 +78,9 @@ def test_bias_in_percent_of_the_force():
 
 
 def test_score_of_a_board_is_the_mean_over_skins_and_seeds():
-    own = [one for one in PREDICTIONS if one.variant == AFTER]
+    adapted = [one for one in PREDICTIONS if one.variant == AFTER]
     skins = {
-        skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in own if one.skin == skin])
+        skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in adapted if one.skin == skin])
         for skin in BOARD
     }
     boards = [(skins["s0"] + skins["s1"]) / 2, skins["s2"]]
@@ -98,16 +98,18 @@ def test_differences_equal_the_summary_of_cards():
         ]
         for variant in (BEFORE, AFTER)
     }  # fmt: skip
-    of, over = (by_skin(tidy(cards[variant])) for variant in (AFTER, BEFORE))
+    after, before = (by_skin(tidy(cards[variant])) for variant in (AFTER, BEFORE))
     result = compare_variants(PREDICTIONS, AFTER, BEFORE)
     for name in METRICS:
         del result[name]["sd_seeds"]
-    assert result == paired(of, over)
+    assert result == paired(after, before)
 
 
 def scores_by_seed(variant: str, skin: str) -> np.ndarray:
-    own = sorted((one for one in PREDICTIONS if (one.variant, one.skin) == (variant, skin)), key=lambda one: one.seed_i)
-    return np.array([score(one.true, one.predicted)["mse_xy_mm2"] for one in own])
+    by_seed = sorted(
+        (one for one in PREDICTIONS if (one.variant, one.skin) == (variant, skin)), key=lambda one: one.seed_i
+    )
+    return np.array([score(one.true, one.predicted)["mse_xy_mm2"] for one in by_seed])
 
 
 def test_differences_are_paired_by_seed():
@@ -167,10 +169,10 @@ def test_figure_shows_readings_of_both_variants():
     many = [
         VariantPrediction(variant, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for variant in (BEFORE, AFTER)
     ]
-    drawn = draw_forces(many, rng_for(0, "drawn"))
-    assert drawn[BEFORE]["true_N"] == drawn[AFTER]["true_N"] == drawn[AFTER]["predicted_N"]
-    assert len(drawn[BEFORE]["true_N"]) == DRAWN_N
-    assert set(np.round(truth("s0", 900)[:, 2].astype(float), 3)) >= set(drawn[BEFORE]["true_N"])
+    plotted = draw_forces(many, rng_for(0, "drawn"))
+    assert plotted[BEFORE]["true_N"] == plotted[AFTER]["true_N"] == plotted[AFTER]["predicted_N"]
+    assert len(plotted[BEFORE]["true_N"]) == DRAWN_N
+    assert set(np.round(truth("s0", 900)[:, 2].astype(float), 3)) >= set(plotted[BEFORE]["true_N"])
 
 
 def test_flexible_numbers_list_variants_and_bias():

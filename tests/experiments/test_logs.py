@@ -107,8 +107,8 @@ def test_network_errors_do_not_cancel():
 def test_plotted_series_has_the_first_network_and_the_range_of_all():
     t_s, b_uT, force_N = make_log(steps_n=40)
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
-    drawn = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
-    assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in drawn[which]["x_mm"] if x_mm is not None)
+    plotted = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
+    assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in plotted[which]["x_mm"] if x_mm is not None)
                                for which in ("low", "estimated", "high")}  # fmt: skip
     assert "low" not in thin(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
 

@@ -168,7 +168,7 @@ def test_gauss_nodes_integrate_polynomials_exactly():
 def test_path_of_material_follows_the_flow():
     one = trial()
     skin = with_nodes(one, place_nodes(one.skin.thickness_m, COARSE))
-    path, poke_m, some = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
+    path, poke_m, material = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
     away_m = skin.nodes_m[material, :2] - poke_m[:2]
     r_m, z_m, depths_m = (
         np.linalg.norm(away_m, axis=1),

@@ -74,7 +74,9 @@ def _read_only(checkout: Checkout, *, keep: bool) -> Row:
         shutil.copytree(kept, checkout.folder / "reports")
     shutil.rmtree(kept)
     script = f"mount --bind reports reports && mount -o remount,ro,bind reports && exec dvc repro {address('report')}"
-    return judge(checkout, checkout.run(*IN_NAMESPACE, script), checkout.run("dvc", "repro"), may_run=[address("report")])
+    return judge(
+        checkout, checkout.run(*IN_NAMESPACE, script), checkout.run("dvc", "repro"), may_run=[address("report")]
+    )
 
 
 def _truncate(file: Path) -> None:
@@ -149,7 +151,9 @@ def _damage_cached(checkout: Checkout, out: str, pattern: str = "") -> tuple[Pat
     file = _first(checkout.folder / out, pattern) if pattern else checkout.folder / out
     content = file.read_bytes()
     entry = next(
-        each for each in (checkout.folder / ".dvc/cache/files").rglob("*") if each.is_file() and each.read_bytes() == content
+        each
+        for each in (checkout.folder / ".dvc/cache/files").rglob("*")
+        if each.is_file() and each.read_bytes() == content
     )
     entry.unlink()
     entry.write_bytes(content)
@@ -175,7 +179,9 @@ def add_cache_damage(what: str, folder: str, pattern: str, writer: str, reader: 
         row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[writer, reader], finished=cells)
         row.faults += [] if "check-cache" in row.message else ["the remedy is missing"]
         row.faults += (
-            [] if (checked.status, str(file.relative_to(checkout.folder)) in checked.output) == (1, True) else ["not found"]
+            []
+            if (checked.status, str(file.relative_to(checkout.folder)) in checked.output) == (1, True)
+            else ["not found"]
         )
         row.faults += [] if file.read_bytes() == content else ["the changed file is in use"]
         return row
@@ -233,7 +239,9 @@ def add_training_damage(name: str, how: str, damage) -> None:
         whole = {cell: written for cell, written in checkout.trainings().items() if written == cells[cell]}
         first = checkout.run("dvc", "repro")
         fresh_n = sum(checkout.trainings()[cell] != written for cell, written in cells.items())
-        row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[], finished=checkout.trainings(), fails=False)
+        row = judge(
+            checkout, first, checkout.run("dvc", "repro"), may_run=[], finished=checkout.trainings(), fails=False
+        )
         row.lost = f"{len(cells) - len(whole)} training run and the others of its stack; {fresh_n} repeated"
         row.faults += [] if 1 <= fresh_n <= 3 else ["training runs of other stacks are repeated too"]
         row.faults += [] if "is damaged" in row.message else ["no message"]

@@ -235,7 +235,9 @@ def judge(
     after, undisturbed, reused = checkout.lock(), checkout.template.lock(), _whole(finished or {}, checkout.trainings())
     torn_n = len(finished or {}) - len(reused)
     trained = sum(written != reused.get(name) for name, written in checkout.trainings().items())
-    again_trained = [name for name, written in checkout.trainings().items() if name in reused and written != reused[name]]
+    again_trained = [
+        name for name, written in checkout.trainings().items() if name in reused and written != reused[name]
+    ]
     different = [stage for stage in undisturbed if after.get(stage) != undisturbed[stage]]
     unexpected = sorted(set(again.ran) - set(may_run)) if may_run is not None else []
     checks = {

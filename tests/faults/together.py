@@ -42,7 +42,10 @@ def two(checkout: Checkout) -> Row:
 def two_stages(checkout: Checkout) -> Row:
     checkout.reset(TRIPLET, address("sensitivity"))
     start_s = time.monotonic()
-    first, other = checkout.start("dvc", "repro", TRIPLET), Checkout(checkout.folder, checkout.folder.with_suffix(".other"))
+    first, other = (
+        checkout.start("dvc", "repro", TRIPLET),
+        Checkout(checkout.folder, checkout.folder.with_suffix(".other")),
+    )
     checkout.until(lambda: bool(checkout.trainings()), checkout.stage("train_triplet"))
     second = other.run("dvc", "repro", address("sensitivity"))
     one, finished = checkout.end(first, start_s), checkout.trainings()
@@ -145,7 +148,9 @@ def cut_recording(checkout: Checkout) -> Row:
     restored = checkout.run("dvc", "checkout", "--force", f"{RAW}.dvc")
     row = judge(checkout, result, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += (
-        [] if restored.status == 0 and checkout.lock()[INGEST] == expected else [f"not restored: {restored.output[-300:]}"]
+        []
+        if restored.status == 0 and checkout.lock()[INGEST] == expected
+        else [f"not restored: {restored.output[-300:]}"]
     )
     return row
 
@@ -181,7 +186,9 @@ def clock(checkout: Checkout) -> Row:
     return row
 
 
-def _damage_and_restore(checkout: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True) -> Row:
+def _damage_and_restore(
+    checkout: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True
+) -> Row:
     (checkout.folder / file).write_text(content)
     result = checkout.run(*command)
     git(checkout.folder, "restore", file)

@@ -71,7 +71,9 @@ IN_BLACK_HOLE = (  # a network namespace in which packets to the only neighbour 
 def no_route(checkout: Checkout) -> Row:
     command = ("unshare", "--net", "sh", "-c", IN_BLACK_HOLE + shlex.join(checkout.command("publish")))
     return _report(
-        checkout, checkout.run(*command, MLFLOW_TRACKING_URI=f"http://{BLACK_HOLE}:5000", no_proxy="*", NO_PROXY="*"), None
+        checkout,
+        checkout.run(*command, MLFLOW_TRACKING_URI=f"http://{BLACK_HOLE}:5000", no_proxy="*", NO_PROXY="*"),
+        None,
     )
 
 

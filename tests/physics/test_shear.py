@@ -60,10 +60,12 @@ def some_places_m(places_n=40, top=0.95):
     return np.stack([r_m * np.cos(f), r_m * np.sin(f), H_M * rng.uniform(0.05, top, places_n)], axis=1)
 
 
-def displace(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear_displacement):
-    of = shear.tabulate_depth(0.6e-3, **SKIN) if of is None else of
+def displace(
+    force_N, nodes_m, table=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear_displacement
+):
+    table = shear.tabulate_depth(0.6e-3, **SKIN) if table is None else table
     force_N, centre_m = np.asarray(force_N, dtype=float), np.asarray(centre_m, dtype=float)
-    return by(of, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
+    return by(table, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
 
 
 @given(st.floats(0.01, 200), st.floats(0, 1))
@@ -93,8 +95,8 @@ def test_response_of_the_layer_equals_50_digits(kh, share):
 def test_response_solves_the_boundary_value_problem(kh):
     """Reference: equilibrium and Hooke's law for k = G = 1, in the plane of the wave and across this plane."""
 
-    def slopes(_z, at):
-        along, up, shearing, normal, across, across_stress = at
+    def slopes(_z, state):
+        along, up, shearing, normal, across, across_stress = state
         return np.stack([shearing - up, along, normal + 4 * along, -shearing, across_stress, across])
 
     def ends(base, top):
@@ -186,8 +188,8 @@ def test_volume_is_conserved_and_rotation_is_half_the_curl():
     truth = np.stack(
         [grad[:, 2, 1] - grad[:, 1, 2], grad[:, 0, 2] - grad[:, 2, 0], grad[:, 1, 0] - grad[:, 0, 1]], axis=1
     )
-    of = shear.tabulate(traction, H_M)
-    found = displace([YOUNG_PA / 3, 0], places_m, of, centre_m=(0, 0)).half_curl
+    table = shear.tabulate(traction, H_M)
+    found = displace([YOUNG_PA / 3, 0], places_m, table, centre_m=(0, 0)).half_curl
     np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # error of the differences and of the table
 
 
@@ -277,13 +279,13 @@ def test_displacement_is_linear(one_N, other_N, times):
 def test_rotating_force_and_nodes_rotates_the_displacement(force_N, angle_rad):
     nodes_m, (c, s) = some_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    still, turned = (
+    unrotated, turned = (
         displace(force_N, nodes_m, centre_m=(0, 0)),
         displace(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
     )
     # rounding may move a node at the edge of a table cell to the next cell, which has the same value there
-    np.testing.assert_allclose(turned.displacement_m, still.displacement_m @ turn.T, atol=1e-10)
-    np.testing.assert_allclose(turned.half_curl, still.half_curl @ turn.T, atol=1e-9)
+    np.testing.assert_allclose(turned.displacement_m, unrotated.displacement_m @ turn.T, atol=1e-10)
+    np.testing.assert_allclose(turned.half_curl, unrotated.half_curl @ turn.T, atol=1e-9)
 
 
 def test_mirror_symmetry_along_the_force():
@@ -314,8 +316,8 @@ def test_base_and_far_nodes_do_not_move():
 
 def test_displacement_beyond_the_reach_is_below_half_a_percent():
     for depth_m in DEPTHS_M:
-        of = shear.tabulate_depth(float(depth_m), **SKIN)
-        assert np.abs(of.parts[-1, :, :3]).max() < 0.005 * of.parts[..., 0].max()
+        table = shear.tabulate_depth(float(depth_m), **SKIN)
+        assert np.abs(table.parts[-1, :, :3]).max() < 0.005 * table.parts[..., 0].max()
 
 
 @settings(max_examples=10, deadline=None)  # each example computes a table in 20 ms
@@ -351,20 +353,22 @@ def test_rotation_equals_polar_decomposition_in_simple_shear(amount, towards_rad
 
 def test_mean_displacement_of_the_traction_is_force_over_stiffness():
     traction = hertzian()
-    of, r_m = shear.tabulate(traction, H_M), np.linspace(0, 1, 2000) * traction.radius_m
-    surface_per_m = np.interp(r_m, of.r_m, of.parts[:, -1, 0])
+    table, r_m = shear.tabulate(traction, H_M), np.linspace(0, 1, 2000) * traction.radius_m
+    surface_per_m = np.interp(r_m, table.r_m, table.parts[:, -1, 0])
     q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
     mean_per_m = np.trapezoid(2 * np.pi * r_m * q_per_m2 * surface_per_m, r_m)
-    assert mean_per_m == pytest.approx(1 / of.stiffness_m, rel=1e-3)  # tolerance: waves shorter than 0.3 mm are missing
+    assert mean_per_m == pytest.approx(
+        1 / table.stiffness_m, rel=1e-3
+    )  # tolerance: waves shorter than 0.3 mm are missing
 
 
-def shear_in_many_steps(force_N, nodes_m, of, steps_n):
+def shear_in_many_steps(force_N, nodes_m, table, steps_n):
     """Reference: apply the force in many small steps; each step moves nodes and traction. The contact starts at 0."""
-    at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / of.stiffness_m
+    at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / table.stiffness_m
     for step_i in range(steps_n):
         centre_m = ahead_m * (step_i + 0.5) / steps_n
-        half_m = at_m + displace(np.array(force_N) / steps_n, at_m, of, centre_m).displacement_m / 2
-        at_m = at_m + displace(np.array(force_N) / steps_n, half_m, of, centre_m).displacement_m
+        half_m = at_m + displace(np.array(force_N) / steps_n, at_m, table, centre_m).displacement_m / 2
+        at_m = at_m + displace(np.array(force_N) / steps_n, half_m, table, centre_m).displacement_m
     return at_m - nodes_m
 
 
@@ -372,10 +376,10 @@ def test_midpoint_steps_equal_many_small_steps():
     nodes_m, over = [0.5, 0.5, 1] * some_places_m(200), []
     # friction coefficients 0.8, 0.4, 0.8; the code takes 1, 1, 2 steps
     for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):
-        of = shear.tabulate_depth(depth_m, **SKIN)
-        truth_m = shear_in_many_steps([force_N, 0], nodes_m, of, 48)
+        table = shear.tabulate_depth(depth_m, **SKIN)
+        truth_m = shear_in_many_steps([force_N, 0], nodes_m, table, 48)
         found_m, one_shot_m = (
-            displace([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m
+            displace([force_N, 0], nodes_m, table, (0, 0), by=by).displacement_m
             for by in (shear.shear_in_steps, shear.shear_displacement)
         )
         over.append(np.abs(found_m - truth_m).max() / np.abs(truth_m).max())
@@ -406,11 +410,11 @@ def test_displacement_of_moved_nodes_rotates_with_the_force():
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
 def test_steepest_gradient_of_the_table(traction):
-    of, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
-    r_m, f = (part.ravel() for part in np.meshgrid(of.r_m[:200], np.linspace(0, np.pi, 13)))
+    table, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
+    r_m, f = (part.ravel() for part in np.meshgrid(table.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)
-    largest = np.linalg.norm(displace(force_N, places_m, of, (0, 0)).half_curl, axis=1).max()
-    assert of.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: next to a point of the table
+    largest = np.linalg.norm(displace(force_N, places_m, table, (0, 0)).half_curl, axis=1).max()
+    assert table.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: next to a point of the table
 
 
 def test_nodes_above_the_surface_move_with_it():
@@ -423,13 +427,16 @@ def test_nodes_above_the_surface_move_with_it():
     ("depth_m", "force_N", "loss"), [(0.6e-3, 0.5, 0.03), (0.6e-3, 0.59, 0.05), (0.8e-3, 1.0, 0.08)]
 )
 def test_midpoint_steps_conserve_volume(depth_m, force_N, loss):
-    of, step_m = shear.tabulate_depth(depth_m, **SKIN), 20e-6
+    table, step_m = shear.tabulate_depth(depth_m, **SKIN), 20e-6
     sides_m = np.linspace(-3.5e-3, 3.5e-3, 36), np.linspace(0, 2.5e-3, 8), np.linspace(0.05, 0.95, 10) * H_M
     places_m = np.stack(np.meshgrid(*sides_m), axis=-1).reshape(-1, 3)
     losses = []
     for by in (shear.shear_displacement, shear.shear_in_steps):
         ends = [
-            [displace([force_N, 0], places_m + sign * e, of, (0, 0), by=by).displacement_m for e in step_m * np.eye(3)]
+            [
+                displace([force_N, 0], places_m + sign * e, table, (0, 0), by=by).displacement_m
+                for e in step_m * np.eye(3)
+            ]
             for sign in (1, -1)
         ]
         grad = np.moveaxis(np.array(ends[0]) - np.array(ends[1]), 0, -1) / (2 * step_m)

@@ -263,8 +263,8 @@ def test_filler_and_amplitude_scale_the_moments():
     # Nodes of a single layer are at half height, where the field is zero at crossings of seams but not at nodes.
     exact = np.linalg.norm(skin(rule=SPARSE).moments_A_m2, axis=1)
     for spread, within in ((no_spread(skin_amplitude=0.1), False), (no_spread(skin_filler=0.1), True)):
-        drawn = [np.linalg.norm(skin(spread, f"s{i}", SPARSE).moments_A_m2, axis=1) for i in range(60)]
-        factors = np.log(np.array(drawn) / exact)
+        moments = [np.linalg.norm(skin(spread, f"s{i}", SPARSE).moments_A_m2, axis=1) for i in range(60)]
+        factors = np.log(np.array(moments) / exact)
         assert np.std(factors) == pytest.approx(0.1, rel=0.3)  # three standard errors for 60 skins
         assert (np.std(factors, axis=1).min() > 0.01) == within
 
@@ -342,8 +342,8 @@ def test_held_skin_slides_rigidly():
     assert 0.2 < share < 0.9
     nearest = np.argmin(np.linalg.norm(free_m[0][:, :2] - poke_m[0, :2], axis=1))
     np.testing.assert_allclose(apart_m[nearest, :2], share * taken_m, atol=2e-6)
-    still = held_skin(give_um=(0.0, 0.0), away_um_mm=0.0)
-    np.testing.assert_array_equal(change(poke_m[0], still), change(poke_m[0], free))
+    without_slide = held_skin(give_um=(0.0, 0.0), away_um_mm=0.0)
+    np.testing.assert_array_equal(change(poke_m[0], without_slide), change(poke_m[0], free))
 
 
 def test_force_needed_on_a_skin_held_by_springs():

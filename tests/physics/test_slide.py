@@ -121,8 +121,8 @@ def test_zero_slide_leaves_the_flow_on_a_slipping_base():
     table = deformation.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
     moved = deformation.move_dipoles(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
     place_m = np.array([[3e-3, -2e-3]])
-    still = slide.rigid_motion(place_m, slide.press_displacement_m(place_m, np.array([0.2]), **STILL), SQUARE)
-    after = slide.apply(still, 0, moved.after)
+    without_slide = slide.rigid_motion(place_m, slide.press_displacement_m(place_m, np.array([0.2]), **STILL), SQUARE)
+    after = slide.apply(without_slide, 0, moved.after)
     for found, expected in zip(after, moved.after, strict=True):
         assert np.array_equal(found, expected)
     chips_m = np.array([[0.0, 0.0, -1e-3]])
@@ -151,30 +151,34 @@ TIP = {"thickness_m": H_M, "tip_radius_m": 2e-3}
 
 @given(st.floats(0, 0.71 * H_M), st.floats(1e5, 1e7))
 def test_depth_inverts_force(depth_m, modulus_Pa):
-    of = TIP | {"modulus_Pa": modulus_Pa}
-    found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **of), **of)
+    layer_settings = TIP | {"modulus_Pa": modulus_Pa}
+    found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **layer_settings), **layer_settings)
     assert abs(found_m[0] - depth_m) < 1e-6 * H_M
 
 
 def test_force_limits():
-    of = TIP | {"modulus_Pa": 2e5}
+    layer_settings = TIP | {"modulus_Pa": 2e5}
     np.testing.assert_allclose(  # incompressible: 4/3 E / (1 - 1/4) sqrt(R) d^(3/2)
-        slide.force_at(np.array([0.0, 1e-9]), **of), [0, 16 / 9 * 2e5 * np.sqrt(2e-3) * 1e-9**1.5], rtol=2e-3
+        slide.force_at(np.array([0.0, 1e-9]), **layer_settings),
+        [0, 16 / 9 * 2e5 * np.sqrt(2e-3) * 1e-9**1.5],
+        rtol=2e-3,
     )
     at_m = np.array([0.75 * H_M])
-    assert slide.force_at(at_m, **of)[0] == pytest.approx(8 * layer.force(at_m, **of, base="slipping")[0])
-    assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(slide.DEEPEST * H_M)
-    assert slide.count_clipped(np.array([1.0, 1e6]), **of) == 1
-    assert slide.force_at(np.array([-1e-6]), **of)[0] == 0  # the tip is above the skin
+    assert slide.force_at(at_m, **layer_settings)[0] == pytest.approx(
+        8 * layer.force(at_m, **layer_settings, base="slipping")[0]
+    )
+    assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(slide.DEEPEST * H_M)
+    assert slide.count_clipped(np.array([1.0, 1e6]), **layer_settings) == 1
+    assert slide.force_at(np.array([-1e-6]), **layer_settings)[0] == 0  # the tip is above the skin
     for wrong_m in (H_M, np.nan):
         with pytest.raises(ParamsError, match="poke: depth must be finite and below"):
-            slide.force_at(np.array([wrong_m]), **of)
+            slide.force_at(np.array([wrong_m]), **layer_settings)
     with pytest.raises(ParamsError, match="modulus must be above"):
-        slide.depth_at(np.array([1.0]), **(of | {"modulus_Pa": 0.0}))
+        slide.depth_at(np.array([1.0]), **(layer_settings | {"modulus_Pa": 0.0}))
 
 
 def test_sharp_tip_is_limited_by_its_radius():
-    of = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
-    assert slide.depth_at(np.array([0.1]), **of)[0] < 0.5e-3
-    assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(0.999 * 0.5e-3)
-    assert slide.count_clipped(np.array([1e-3, 1e6]), **of) == 1
+    layer_settings = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
+    assert slide.depth_at(np.array([0.1]), **layer_settings)[0] < 0.5e-3
+    assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(0.999 * 0.5e-3)
+    assert slide.count_clipped(np.array([1e-3, 1e6]), **layer_settings) == 1

@@ -63,13 +63,13 @@ def test_thick_layers_on_both_bases_have_equal_forces():
 
 
 def test_slipping_base_is_1_8_times_softer():
-    at = {**SKIN, "modulus_Pa": 190e3}
-    held, sliding = (layer.force(np.array([1.2e-3]), **at, base=base) for base in ("bonded", "slipping"))
+    press = {**SKIN, "modulus_Pa": 190e3}
+    held, sliding = (layer.force(np.array([1.2e-3]), **press, base=base) for base in ("bonded", "slipping"))
     assert held / sliding == pytest.approx(1.8, abs=0.05)  # the factor 1.8 is known to two digits
 
 
 @given(st.floats(0.05, 0.55))
 @settings(max_examples=20, deadline=None)
 def test_skin_on_a_bonded_base_is_always_stiffer(relative_depth):
-    depth_m, at = np.array([relative_depth * 2e-3]), {**SKIN, "modulus_Pa": 190e3}
-    assert layer.force(depth_m, **at, base="bonded") > layer.force(depth_m, **at, base="slipping")
+    depth_m, press = np.array([relative_depth * 2e-3]), {**SKIN, "modulus_Pa": 190e3}
+    assert layer.force(depth_m, **press, base="bonded") > layer.force(depth_m, **press, base="slipping")

@@ -47,10 +47,10 @@ def simulated_uT(design, shared_data, tmp_path_factory) -> np.ndarray:
     readings = _readings(LAB[0], shared_data, tmp_path_factory)
     labels_mm = np.column_stack([readings.x_mm, readings.y_mm])[::100] - MIDDLE_MM
     pokes_m = np.column_stack([labels_mm @ TURNED * milli, np.full(65, DEPTH_M)])
-    still = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
+    no_spread = Spreads(**(dict.fromkeys(SPREADS, 0.0) | {"skin_filler_length_mm": 3.0}))
     values = nominal("skin") | {"hold": None}  # without `hold`, which was fitted to these recordings
-    skin = draw_skin(parse(SkinDesign, values, "test"), still, seed=0, name="nominal")
-    _, changes_T = changes_of_field(draw_board(design, still, seed=0, name="nominal"), skin, pokes_m)
+    skin = draw_skin(parse(SkinDesign, values, "test"), no_spread, seed=0, name="nominal")
+    _, changes_T = changes_of_field(draw_board(design, no_spread, seed=0, name="nominal"), skin, pokes_m)
     return changes_T / micro
 
 

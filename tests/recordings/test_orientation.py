@@ -54,7 +54,7 @@ def test_every_change_of_labels_is_found_on_recorded_boards(shared_data, tmp_pat
         shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)
         readings, _ = lab.read(tmp_path, make_header(layout="lab", chips_n=5), DEFAULT_POLICY)
         boards[number] = presses_of([readings])
-    for own, other in ((1, 2), (2, 1)):
-        assert other_orientation(boards[own], boards[other]) is None
+    for new, other in ((1, 2), (2, 1)):
+        assert other_orientation(boards[new], boards[other]) is None
         for way in DEPARTURES:
-            assert other_orientation(relabel(boards[own], way), boards[other]) == inverse_of(way)
+            assert other_orientation(relabel(boards[new], way), boards[other]) == inverse_of(way)

@@ -159,8 +159,8 @@ def rows_of(places) -> list[dict]:
     ]
 
 
-def dominates(some, other) -> bool:
-    return some != other and all(a <= b for a, b in zip(some, other, strict=True))
+def dominates(one, other) -> bool:
+    return one != other and all(a <= b for a, b in zip(one, other, strict=True))
 
 
 PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=20)

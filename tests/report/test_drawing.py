@@ -42,10 +42,10 @@ def test_titles_increase_with_position(points):
     text = draw(lambda axes: axes.plot(x, y, "s"), xlabel="x", ylabel="y")
     marks = [use for use in ET.fromstring(text).iter(f"{SVG}use") if use.find(f"{SVG}title") is not None]
     shown = [float(mark.find(f"{SVG}title").text.split("\n")[0].removeprefix("x = ")) for mark in marks]
-    at = [float(mark.get("x")) for mark in marks]
+    x_positions = [float(mark.get("x")) for mark in marks]
     assert shown == pytest.approx(x)
     # tolerance: positions in the SVG have two decimals
-    assert np.all(np.diff(np.array(at)[np.argsort(shown, kind="stable")]) >= -0.02)
+    assert np.all(np.diff(np.array(x_positions)[np.argsort(shown, kind="stable")]) >= -0.02)
 
 
 def test_title_of_a_bar_has_both_ends():

@@ -152,7 +152,7 @@ def test_only_sweeps_with_numbers_are_drawn():
 @pytest.mark.parametrize("draw", [sweep_pokes, sweep_sensors])
 def test_sweeps_are_reproducible(draw):
     rows = POKES if draw is sweep_pokes else SENSORS
-    figure, again, other = (draw(some, "simulated") for some in (rows, rows, [*rows[:-1], rows[-1] | row(70.0)]))
+    figure, again, other = (draw(sweep, "simulated") for sweep in (rows, rows, [*rows[:-1], rows[-1] | row(70.0)]))
     assert figure == again != other
     ET.fromstring(figure)
 

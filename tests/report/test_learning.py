@@ -36,9 +36,9 @@ def paired(of: str, over: str, **scores) -> dict:
 
 def between(accuracy_pct: tuple[float, float], error: tuple[float, float]) -> dict:
     """Return paired differences with the given 95 % intervals over boards."""
-    own = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": error, "mse_f_N2": error}
-    by_board = {board: {name: ends[i] for name, ends in own.items()} for i, board in enumerate(("b0", "b1"))}
-    return {name: over_boards(*ends) for name, ends in own.items()} | {"by_board": by_board}
+    differences = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": error, "mse_f_N2": error}
+    by_board = {board: {name: ends[i] for name, ends in differences.items()} for i, board in enumerate(("b0", "b1"))}
+    return {name: over_boards(*ends) for name, ends in differences.items()} | {"by_board": by_board}
 
 
 BOARDS = {f"b{i}": {"trained_on_skins_n": 15} for i in range(6)}
@@ -55,9 +55,9 @@ NUMBERS = {"table2": PAPER_AS_OURS, "lobo": {"by_board": BOARDS}, "paired": PAIR
 
 def test_paired_boards_table_lists_each_board():
     table = paired_boards_table(NUMBERS, "simulated")
-    own = table[table["difference"] == "adapted − multi-sensor + triplet"]
-    assert own["held-out board"].tolist() == ["b0", "b1"]
-    assert own["accuracy, %"].tolist() == ["+5", "+7"]
+    rows = table[table["difference"] == "adapted − multi-sensor + triplet"]
+    assert rows["held-out board"].tolist() == ["b0", "b1"]
+    assert rows["accuracy, %"].tolist() == ["+5", "+7"]
 
 
 def test_paired_table_has_the_papers_difference_of_means():

@@ -22,10 +22,10 @@ BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
 
 
 def scores(by_skin: dict[str, float]) -> dict:
-    own = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
+    skin_scores = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
     mean = {"accuracy_pct": sum(by_skin.values()) / len(by_skin), "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
-    return {"all": mean, "registered": mean, "by_skin": own, "rows_n": 10 * len(own)} | {
-        "board_of": {skin: BOARD_OF[skin] for skin in own}
+    return {"all": mean, "registered": mean, "by_skin": skin_scores, "rows_n": 10 * len(skin_scores)} | {
+        "board_of": {skin: BOARD_OF[skin] for skin in skin_scores}
     }
 
 
@@ -190,7 +190,7 @@ def points(key: str, by_count: dict[int, tuple[float, float]], **keys: str) -> l
 
 
 def gains(contrast: dict) -> dict[str, float]:
-    return {board: own["accuracy_pct"] for board, own in contrast["by_board"].items()}
+    return {board: metrics["accuracy_pct"] for board, metrics in contrast["by_board"].items()}
 
 
 def test_poke_contrasts_of_gain_and_plateau():

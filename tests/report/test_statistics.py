@@ -177,7 +177,7 @@ def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str,
             for side in (cards, others)
         ]
         found.setdefault(board, []).append(sum(sides[0]) / len(sides[0]) - sum(sides[1]) / len(sides[1]))
-    return {board: sum(own) / len(own) for board, own in found.items()}
+    return {board: sum(differences) / len(differences) for board, differences in found.items()}
 
 
 def test_paired_equals_naive_loops():

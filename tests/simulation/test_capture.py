@@ -29,8 +29,8 @@ FRAMES_N = LIFTED_N + MOVING_N + DWELL_N + MOVING_N
 READ = slice(LIFTED_N + MOVING_N + 1, LIFTED_N + MOVING_N + DWELL_N)
 
 
-def capture_of(of=None, protocol="grid", *, board="b0", skin="b0_s0", seed=1):
-    return simulate_capture(of or synthesis(), protocol, board=board, skin=skin, seed=seed)
+def capture_of(scene=None, protocol="grid", *, board="b0", skin="b0_s0", seed=1):
+    return simulate_capture(scene or synthesis(), protocol, board=board, skin=skin, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -68,11 +68,11 @@ def test_frames_and_dwells_of_each_indentation(capture):
 
 
 def test_noiseless_capture_equals_the_field():
-    of = noiseless_scene()
-    b_uT = frames_by_indentation(capture_of(of))
-    board = draw_board(of.boards["rigid"].design, of.spreads, seed=1, name="b0")
-    rule = of.boards["rigid"].quadrature.in_si()
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=rule)
+    scene = noiseless_scene()
+    b_uT = frames_by_indentation(capture_of(scene))
+    board = draw_board(scene.boards["rigid"].design, scene.spreads, seed=1, name="b0")
+    rule = scene.boards["rigid"].quadrature.in_si()
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0", rule=rule)
     pokes_m = np.array([[x - 8, y - 8, depth] for depth in (0.6, 1.2) for x, y in points_mm()]) * 1e-3
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
@@ -94,16 +94,24 @@ def test_labels_are_commanded_and_forces_measured(capture):
         np.tile(points_mm(), (4, 1)),
     )
     assert not log.depth_mm[~log.contact].any()
-    of = synthesis()
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0")
+    scene = synthesis()
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0")
     noise_N = labels_in_contact(capture, "Fz_N") - forces(skin, np.repeat([0.6e-3, 1.2e-3] * 2, 65))
     assert noise_N.std() == pytest.approx(0.006, rel=0.2)  # four standard errors for 260 draws
     assert np.abs(np.concatenate([noise_N, log.Fz_N[~log.contact], log.Fx_N, log.Fy_N])).max() < 6 * 0.006
 
 
 def test_passes_of_an_exact_robot_differ_only_by_noise(capture):
-    still = [1, 2, 3, 4, 8, 9, 10]  # frames without motion: while the tip moves, chips that convert earlier read less
-    b_uT = frames_by_indentation(capture)[:, still]
+    without_motion = [
+        1,
+        2,
+        3,
+        4,
+        8,
+        9,
+        10,
+    ]  # frames without motion: while the tip moves, chips that convert earlier read less
+    b_uT = frames_by_indentation(capture)[:, without_motion]
     differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)
     # standard error for 7000 draws: 0.8 %
     np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)
@@ -136,12 +144,12 @@ def sleeve(**changes):
 
 
 def test_scattered_pokes_are_at_their_labels():
-    of = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
-    one = capture_of(of, "sleeve", board="v0", skin="v0_s0")
+    scene = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
+    one = capture_of(scene, "sleeve", board="v0", skin="v0_s0")
     place_mm = np.column_stack([labels_in_contact(one, "x_mm"), labels_in_contact(one, "y_mm")]).astype(float)
-    board = draw_board(of.boards["sleeve"].design, of.spreads, seed=1, name="v0")
-    rule = of.boards["sleeve"].quadrature.in_si()
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
+    board = draw_board(scene.boards["sleeve"].design, scene.spreads, seed=1, name="v0")
+    rule = scene.boards["sleeve"].quadrature.in_si()
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
     pokes_m = np.column_stack([place_mm - (25.4, 50.8), labels_in_contact(one, "depth_mm")]) * 1e-3
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)

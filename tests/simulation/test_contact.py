@@ -43,10 +43,10 @@ def test_field_fades_per_decade_of_contacts(first):
 
 
 def test_force_softens_and_relaxes_in_every_direction():
-    how, slack = Ageing(settling=0.2, ageing=0.0, fading_per_decade=0.0, wandering_uT=0.0), (0.1, 2.0)
+    ageing, slack = Ageing(settling=0.2, ageing=0.0, fading_per_decade=0.0, wandering_uT=0.0), (0.1, 2.0)
     relaxation = Relaxation(approach_s=slack[0], hold_s=slack[1])
     plain = response(tilt=0.1, friction=Friction(coefficient=0.8))
-    worn = response(tilt=0.1, friction=Friction(coefficient=0.8), ageing=how, relaxation=relaxation)
+    worn = response(tilt=0.1, friction=Friction(coefficient=0.8), ageing=ageing, relaxation=relaxation)
     left = (1 - 0.2 * -np.expm1(-199 / 300)) * relaxed_share(relaxation)
     np.testing.assert_allclose(worn.force_N[199], left * plain.force_N[199], rtol=1e-12)
 

@@ -26,10 +26,12 @@ def response():
     return Response(rest_T, 2e-4 * rng.standard_normal((N, 1, CHIPS_N, 3)), np.zeros((N, 1, 3)), 0)
 
 
-def read(chip=LOUD, rate_hz=400.0, temperature=None, sensitivity_per_K=(0.0, 0.0), of=None):
+def read(chip=LOUD, rate_hz=400.0, temperature=None, sensitivity_per_K=(0.0, 0.0), contact_response=None):
     reader = Readout(BOARD, chip, rate_hz, np.array([0.2e-3, 1.5e-3]), temperature, np.array(sensitivity_per_K))
     line = timeline(Rig(**SECTIONS["rig"]), 1)
-    return read_frames(of or response(), line, reader, noise=rng_for(0, "noise"), warmth_noise=rng_for(0, "warmth"))
+    return read_frames(
+        contact_response or response(), line, reader, noise=rng_for(0, "noise"), warmth_noise=rng_for(0, "warmth")
+    )
 
 
 @pytest.mark.parametrize("rate_hz", [400.0, 1000.0])

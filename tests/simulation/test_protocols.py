@@ -94,9 +94,9 @@ def scattered(name="plan", skin_mm=SLEEVE_MM, **changes):
 
 def test_scattered_places_and_depths_are_uniform():
     plan = scattered()
-    for drawn, low, high in ((plan.x_mm, 4.0, 46.8), (plan.y_mm, 4.0, 97.6), (plan.depth_mm, 0.4, 1.2)):
+    for values, low, high in ((plan.x_mm, 4.0, 46.8), (plan.y_mm, 4.0, 97.6), (plan.depth_mm, 0.4, 1.2)):
         # A correct draw exceeds this tolerance with a probability of 1 in 1000.
-        assert kstest(drawn.ravel(), "uniform", args=(low, high - low)).pvalue > 1e-3
+        assert kstest(values.ravel(), "uniform", args=(low, high - low)).pvalue > 1e-3
     assert abs(np.corrcoef(plan.x_mm.ravel(), plan.y_mm.ravel())[0, 1]) < 4 / np.sqrt(3000)
 
 

@@ -52,8 +52,8 @@ def test_timeline_of_a_dragged_line():
 @given(st.integers(1, 7), st.floats(0, 0.01), st.integers(0, 1000))
 def test_chunks_contain_every_frame_once_and_never_early(chunk_frames_max_n, jitter_s, seed):
     frame_s = (1 + np.arange(500)) / 400.0
-    how = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
-    arrived_n, arrived_s = draw_arrivals(frame_s, how, rng_for(seed, "chunks"))
+    settings_of_rig = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
+    arrived_n, arrived_s = draw_arrivals(frame_s, settings_of_rig, rng_for(seed, "chunks"))
     assert (arrived_n[0], arrived_n[-1]) == (0, 500)
     sizes = np.diff(arrived_n)
     assert sizes.min() >= 1
@@ -64,14 +64,14 @@ def test_chunks_contain_every_frame_once_and_never_early(chunk_frames_max_n, jit
 
 @pytest.mark.parametrize("protocol", [None, DRAG])
 def test_dwells_contain_their_frames(protocol):
-    how, one = rig(), plan(protocol)
+    settings_of_rig, one = rig(), plan(protocol)
     stops_n = one.x_mm.shape[1]
-    frames = timeline(how, stops_n)
-    offset_s, rate = clock = draw_clock(how, rng_for(1, "clock"))
-    log = probe_log(one, np.zeros((len(one), 1 + stops_n, 3)), how, clock)
+    frames = timeline(settings_of_rig, stops_n)
+    offset_s, rate = clock = draw_clock(settings_of_rig, rng_for(1, "clock"))
+    log = probe_log(one, np.zeros((len(one), 1 + stops_n, 3)), settings_of_rig, clock)
     assert abs(offset_s) > 0.01
     assert 0 < abs(rate - 1) < 5e-4
-    frame_s = (1 + np.arange(len(one) * len(frames))) / how.rate_hz
+    frame_s = (1 + np.arange(len(one) * len(frames))) / settings_of_rig.rate_hz
     first_i, after_i = (np.searchsorted(frame_s, (t_s - offset_s) / rate) for t_s in (log.t_start_s, log.t_end_s))
     begins = np.arange(len(one))[:, None] * len(frames) + np.append(frames.noload_i, frames.contact_i)
     np.testing.assert_array_equal(first_i, begins.ravel())

@@ -53,13 +53,13 @@ def test_without_friction_the_drag_is_a_press():
 
 
 def test_direction_of_the_drag_changes_the_field():
-    there, back = drag(line(-2.0, 1.0)), drag(line(4.0, 1.0))
-    np.testing.assert_allclose(there.force_N[0, 1], -back.force_N[0, 1])
+    forward, back = drag(line(-2.0, 1.0)), drag(line(4.0, 1.0))
+    np.testing.assert_allclose(forward.force_N[0, 1], -back.force_N[0, 1])
     alone_T = press_T(line(1.0))[0, 0]
     size_T = np.linalg.norm(alone_T)
-    for one, other in ((there, alone_T), (back, alone_T)):
+    for one, other in ((forward, alone_T), (back, alone_T)):
         assert np.linalg.norm(one.change_T[0, 1] - other) > 0.1 * size_T
-    assert np.linalg.norm(there.change_T[0, 1] - back.change_T[0, 1]) > 0.2 * size_T
+    assert np.linalg.norm(forward.change_T[0, 1] - back.change_T[0, 1]) > 0.2 * size_T
 
 
 def test_mirror_symmetry_of_a_drag():
@@ -102,13 +102,13 @@ def test_drag_equals_press_and_many_small_shears():
     tip_m, modulus_Pa = line(-2.0, 1.0), SKIN.modulus_Pa
     found = drag(tip_m, coefficient=0.4)
     sizes = {"thickness_m": SKIN.thickness_m, "tip_radius_m": SKIN.tip_radius_m, "base": SKIN.base}
-    of = shear.tabulate_depth(DEPTH_M, **sizes)
+    table = shear.tabulate_depth(DEPTH_M, **sizes)
     force_N = found.force_N[0, 1]
-    behind_m = tip_m[0, 1, :2] - force_N / (modulus_Pa / 3 * of.stiffness_m)
+    behind_m = tip_m[0, 1, :2] - force_N / (modulus_Pa / 3 * table.stiffness_m)
     [(_, before, (nodes_m, moments))] = moved_dipoles(SKIN, np.array([[*behind_m, DEPTH_M]]))
     for _ in range(50):
         step = shear.shear_displacement(
-            of, nodes_m.clip(min=0.0), behind_m, force_N=force_N / 50, modulus_Pa=modulus_Pa
+            table, nodes_m.clip(min=0.0), behind_m, force_N=force_N / 50, modulus_Pa=modulus_Pa
         )
         nodes_m, moments = nodes_m + step.displacement_m, Rotation.from_rotvec(step.half_curl).apply(moments)
     truth_T = change_of_field(before, (nodes_m, moments), BOARD.chips_m)
@@ -118,10 +118,10 @@ def test_drag_equals_press_and_many_small_shears():
 
 def test_drag_on_a_higher_skin_equals_a_deeper_drag():
     high = type(SKIN)(**{**SKIN.__dict__, "depth_zero_m": 0.1e-3})
-    there = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
+    on_higher_skin = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
     deeper = drag_tip(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
-    np.testing.assert_allclose(there.force_N, deeper.force_N, rtol=1e-9)
-    np.testing.assert_allclose(there.change_T, deeper.change_T, atol=1e-9 * np.abs(deeper.change_T).max())
+    np.testing.assert_allclose(on_higher_skin.force_N, deeper.force_N, rtol=1e-9)
+    np.testing.assert_allclose(on_higher_skin.change_T, deeper.change_T, atol=1e-9 * np.abs(deeper.change_T).max())
 
 
 HELD = EVEN.skin.model_copy(

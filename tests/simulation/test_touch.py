@@ -30,7 +30,7 @@ STOPS_N = 48  # stops of a path, which is compared with a path of twice as many 
 HALVED = 0.75  # limit on the ratio of the largest steps of dB: 0.5 if dB is smooth, 1 if dB jumps
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
 ways = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # drags so short that the tip sticks
-some = settings(max_examples=8, deadline=None)
+FEW = settings(max_examples=8, deadline=None)
 
 
 def draw_board_and_skin(name: str) -> tuple[Board, Skin]:
@@ -40,8 +40,8 @@ def draw_board_and_skin(name: str) -> tuple[Board, Skin]:
 
 def depths_of_forces_m(skin: Skin, force_N) -> np.ndarray:
     """Return the commanded depths in m for these forces; for zero force, the tip is 20 um above the skin."""
-    of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
-    depth_m = slide.depth_at(np.asarray(force_N, float), **of) - skin.depth_zero_m
+    skin_settings = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
+    depth_m = slide.depth_at(np.asarray(force_N, float), **skin_settings) - skin.depth_zero_m
     return np.where(np.asarray(force_N) > 0, depth_m, -20e-6 - skin.depth_zero_m)
 
 
@@ -49,7 +49,7 @@ def sizes_uT(change_T) -> np.ndarray:
     return 1e6 * np.linalg.norm(change_T.reshape(len(change_T), -1), axis=1)
 
 
-@some
+@FEW
 @given(places, st.integers(0, 10**6))
 def test_millinewton_is_below_the_noise(place_m, name_i):
     board, skin = draw_board_and_skin(f"b{name_i}")
@@ -77,7 +77,7 @@ def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> floa
     return float(sizes_uT(np.diff(found.change_T[0], axis=0)).max())
 
 
-@some
+@FEW
 @given(
     places, st.floats(0, 2 * np.pi), st.floats(0.02, 2.5), st.floats(0, 1.2), st.floats(-0.3, 0.3), st.integers(0, 99)
 )
@@ -157,7 +157,7 @@ def test_friction_matters_for_light_touches_only():
     assert skin.hold is not None
     firm = replace(skin, hold=replace(skin.hold, friction=1e12))
     place_m = np.array([7e-3, 4e-3])
-    at = np.column_stack([np.tile(place_m, (2, 1)), depths_of_forces_m(skin, np.array([1e-3, 6.0]))])
-    light_uT, hard_uT = (sizes_uT(changes_of_field(board, one, at)[1]) for one in (skin, firm))
+    tips_m = np.column_stack([np.tile(place_m, (2, 1)), depths_of_forces_m(skin, np.array([1e-3, 6.0]))])
+    light_uT, hard_uT = (sizes_uT(changes_of_field(board, one, tips_m)[1]) for one in (skin, firm))
     assert light_uT[0] < 0.02 * hard_uT[0]
     assert light_uT[1] == pytest.approx(hard_uT[1], rel=1e-3)

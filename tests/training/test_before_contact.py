@@ -24,13 +24,13 @@ def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
     """Score predictions for a grid scan in four passes; a fraction `memory` of each field change remains afterwards."""
     rng = rng_for(0, "scan")
     order = [np.arange(PLACES_N) if snake else rng.permutation(PLACES_N) for _ in range(PASSES_N)]
-    at = np.concatenate(order)
-    x_mm, y_mm = (2 * (at // 8)).astype(np.float32), (2 * (at % 8)).astype(np.float32)
+    place_i = np.concatenate(order)
+    x_mm, y_mm = (2 * (place_i // 8)).astype(np.float32), (2 * (place_i % 8)).astype(np.float32)
     db_uT = np.stack([x_mm, y_mm, x_mm * y_mm], axis=1) * np.float32(10)
     noise_uT = 0.01 * rng.standard_normal(db_uT.shape)
     noload_uT = (100 + memory * np.roll(db_uT, 1, axis=0) + noise_uT).astype(np.float32)
     one = readings(
-        f=len(at), x_mm=x_mm, y_mm=y_mm, noload_uT=noload_uT, b_uT=noload_uT + db_uT,
+        f=len(place_i), x_mm=x_mm, y_mm=y_mm, noload_uT=noload_uT, b_uT=noload_uT + db_uT,
         pass_i=np.repeat(np.arange(PASSES_N, dtype=np.int32), PLACES_N),
     )  # fmt: skip
     io.write_readings(folder / "c0.parquet", [one], {})
@@ -56,15 +56,17 @@ def test_snake_scan_without_memory_reveals_places_by_their_order(tmp_path):
 
 def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
     """Score predictions from readings while the tip hovers above the next place, which only a magnetic tip affects."""
-    at = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)  # two readings per place: above the place, then in contact
+    place_i = np.tile(np.arange(PLACES_N), PASSES_N).repeat(
+        2
+    )  # two readings per place: above the place, then in contact
     touches = np.tile([False, True], PASSES_N * PLACES_N)
-    place_mm = np.column_stack([2 * (at // 8), 2 * (at % 8)]).astype(np.float32)
+    place_mm = np.column_stack([2 * (place_i // 8), 2 * (place_i % 8)]).astype(np.float32)
     rng = rng_for(0, "hover")
     db_uT = np.column_stack([place_mm, place_mm[:, :1] * place_mm[:, 1:]]) * np.float32(10)
     db_uT = (db_uT * (touches | magnetic)[:, None] + rng.standard_normal(db_uT.shape)).astype(np.float32)
-    corner = np.arange(len(at)) % (2 * PLACES_N) == 0  # the first reading of each pass is beside the skin
+    corner = np.arange(len(place_i)) % (2 * PLACES_N) == 0  # the first reading of each pass is beside the skin
     one = readings(
-        f=len(at), x_mm=np.where(touches, place_mm[:, 0], np.nan).astype(np.float32),
+        f=len(place_i), x_mm=np.where(touches, place_mm[:, 0], np.nan).astype(np.float32),
         y_mm=np.where(touches, place_mm[:, 1], np.nan).astype(np.float32),
         Fz_N=touches.astype(np.float32), noload_uT=np.zeros_like(db_uT), b_uT=db_uT,
         pass_i=np.repeat(np.arange(PASSES_N, dtype=np.int32), 2 * PLACES_N),

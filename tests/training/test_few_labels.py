@@ -86,11 +86,11 @@ def initial_result(job: TrainingJob) -> TrainingResult:
     )
 
 
-def networks_of(at: few.Study) -> list[few.TrainedEntry]:
+def networks_of(tested_study: few.Study) -> list[few.TrainedEntry]:
     """Return all entries of the study with jobs and untrained results, in the order of the steps of the stage."""
     done: list[few.TrainedEntry] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
-        done = [*done, *((entry, job, initial_result(job)) for entry, job in step(at, done))]
+        done = [*done, *((entry, job, initial_result(job)) for entry, job in step(tested_study, done))]
     return done
 
 
@@ -101,8 +101,10 @@ ADAPTED = [job for _, job, _ in NETWORKS if isinstance(job.tuning, Adaptation)]
 LABELLED = [(entry, job) for entry, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
 
 
-def all_tried(at: few.Study, networks: list[few.TrainedEntry]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
-    return [*((entry, job) for entry, job, _ in networks), *few.classical_jobs(at)]
+def all_tried(
+    tested_study: few.Study, networks: list[few.TrainedEntry]
+) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
+    return [*((entry, job) for entry, job, _ in networks), *few.classical_jobs(tested_study)]
 
 
 def test_there_is_one_entry_per_method_fold_and_number_of_labels():
@@ -129,8 +131,10 @@ def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
     return one.few_labels if isinstance(one, ClassicalJob) else one.tuning.row
 
 
-def with_labels(at: few.Study, networks: list[few.TrainedEntry]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
-    return [(entry, one) for entry, one in all_tried(at, networks) if entry.labels_n]
+def with_labels(
+    tested_study: few.Study, networks: list[few.TrainedEntry]
+) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
+    return [(entry, one) for entry, one in all_tried(tested_study, networks) if entry.labels_n]
 
 
 def test_labels_are_whole_indentations_of_the_pool():
@@ -171,18 +175,18 @@ def test_labelled_pokes_are_drawn_for_each_fold():
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
 def test_fewer_labels_are_a_subset_of_more(seed, labels_n):
-    at = study(seed, labels_n=labels_n)
-    tasks = few.classical_jobs(at)
+    tested_study = study(seed, labels_n=labels_n)
+    tasks = few.classical_jobs(tested_study)
     rows = {(entry.fold.name, entry.labels_n): {*task.few_labels} for entry, task in tasks if "ridge" in task.name}
-    for fold in at.folds:
+    for fold in tested_study.folds:
         for less, more in pairwise(sorted(labels_n)):
             assert rows[fold.name, less] < rows[fold.name, more]
 
 
 def test_labels_depend_on_the_seed_but_not_on_order():
     first, again, other, turned = (
-        [sorted(task.few_labels.tolist()) for entry, task in few.classical_jobs(at) if entry.labels_n == 5]
-        for at in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
+        [sorted(task.few_labels.tolist()) for entry, task in few.classical_jobs(tested_study) if entry.labels_n == 5]
+        for tested_study in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
     )
     assert first == again == turned
     assert all(one != changed for one, changed in zip(first, other, strict=True))
@@ -224,8 +228,8 @@ def test_only_listed_networks_are_adapted():
     assert few.adaptation_jobs(study(adapted=[]), networks_of_no_labels(study(adapted=[]))) == []
 
 
-def networks_of_no_labels(at: few.Study) -> list[few.TrainedEntry]:
-    return [(entry, job, initial_result(job)) for entry, job in few.network_jobs(at, [])]
+def networks_of_no_labels(tested_study: few.Study) -> list[few.TrainedEntry]:
+    return [(entry, job, initial_result(job)) for entry, job in few.network_jobs(tested_study, [])]
 
 
 def test_adaptation_does_not_use_labels_of_the_new_board():

@@ -11,11 +11,11 @@ from tests.models.example_jobs import OWN, POKED, ROWS_N, TEST, TRAIN, adaptatio
 
 
 def rows() -> Rows:
-    own = example_data()
-    board = np.array([skin[:2] for skin in own.skin])
+    data = example_data()
+    board = np.array([skin[:2] for skin in data.skin])
     indentation = np.arange(ROWS_N) // 2
     passes = np.zeros(ROWS_N, np.int32)
-    return Rows(np.array(["c"] * ROWS_N), board, own.skin, own.db_uT, own.target, passes, indentation, {})
+    return Rows(np.array(["c"] * ROWS_N), board, data.skin, data.db_uT, data.target, passes, indentation, {})
 
 
 def card(job: TrainingJob, **changes: object) -> dict:

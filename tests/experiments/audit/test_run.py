@@ -82,8 +82,8 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     rows = load_rows(
         [folder / f"indentations/{skin}.parquet" for skin in skins], parsed.section(Selection, "selection")
     )
-    drawn = draw_folds(rows, ("single_random", "lobo"), parsed.section(Split, "split"), parsed.seed)
-    io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
+    folds = draw_folds(rows, ("single_random", "lobo"), parsed.section(Split, "split"), parsed.seed)
+    io.write_json(folder / "folds.json", render_folds(skins, rows, folds))
     data = load_scene_data(folder)
     for arm, section, experiment in (
         ("train_single", parsed.section(Training, "train_single"), "single_random"),
@@ -217,9 +217,9 @@ def change_fold(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None
 
 
 def train_on_a_test_skin(fold: Fold, data: SceneData) -> Fold:
-    own = data.rows.skin[fold.test] == "b0_s0"
+    on_skin = data.rows.skin[fold.test] == "b0_s0"
     pool = fold.pool[data.rows.skin[fold.pool] != "b0_s0"]
-    return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[own]), fold.test[~own], pool)
+    return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[on_skin]), fold.test[~on_skin], pool)
 
 
 def train_on_a_test_reading(fold: Fold, data: SceneData) -> Fold:
@@ -309,6 +309,6 @@ def test_adaptation_of_a_wrong_network_or_to_wrong_pokes_is_detected(scene, chan
     data = load_scene_data(scene)
     fold = next(fold for fold in data.folds_of("lobo") if fold.name == card["fold"])
     sides = {"tested": fold.test, "trained": fold.train}
-    own = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
-    io.write_json(file, card | {"tuning": change(card["tuning"], own)})
+    by_side = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
+    io.write_json(file, card | {"tuning": change(card["tuning"], by_side)})
     assert_leak(scene, f"{file.stem}: {sentence}")

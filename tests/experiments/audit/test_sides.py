@@ -46,8 +46,8 @@ def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.nd
 
 
 def held_out(labels: Labels, experiment: str = "lobo", board: str = "b0") -> Sides:
-    own = labels.board == board
-    return Sides(experiment, board, np.flatnonzero(~own), NONE, np.flatnonzero(own))
+    on_board = labels.board == board
+    return Sides(experiment, board, np.flatnonzero(~on_board), NONE, np.flatnonzero(on_board))
 
 
 def run_audit(fold: Sides, labels: Labels, db_uT: np.ndarray):
@@ -104,15 +104,15 @@ def test_split_leak_is_detected(leak, named):
 
 
 def test_shared_reading_is_detected_within_a_skin():
-    own = np.flatnonzero(LABELS.skin == "b0_s0")
-    fold = Sides("single_random", "repeat0", own[:100], NONE, own[99:])
+    rows = np.flatnonzero(LABELS.skin == "b0_s0")
+    fold = Sides("single_random", "repeat0", rows[:100], NONE, rows[99:])
     assert failing(run_audit(fold, LABELS, DB_uT)) == ["readings", "indentations"]
     assert not passes(run_audit(fold, LABELS, DB_uT))
 
 
 def test_papers_random_readings_are_a_known_leak():
-    own = np.flatnonzero(LABELS.skin == "b0_s0")
-    checks = run_audit(Sides("single_random", "repeat0", own[::2], NONE, own[1::2]), LABELS, DB_uT)
+    rows = np.flatnonzero(LABELS.skin == "b0_s0")
+    checks = run_audit(Sides("single_random", "repeat0", rows[::2], NONE, rows[1::2]), LABELS, DB_uT)
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
     # each indentation has 3 readings: 2 are on one side of the split, 1 on the other
@@ -122,10 +122,10 @@ def test_papers_random_readings_are_a_known_leak():
 
 @pytest.mark.parametrize("experiment", ["single_temporal", "single_indentation", "single_pass"])
 def test_indentations_within_a_skin_must_be_separate(experiment):
-    own = np.flatnonzero(LABELS.skin == "b0_s0")
-    fold = Sides(experiment, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])
+    rows = np.flatnonzero(LABELS.skin == "b0_s0")
+    fold = Sides(experiment, "b0_s0", rows[: 20 * READINGS_N], NONE, rows[20 * READINGS_N :])
     assert failing(run_audit(fold, LABELS, DB_uT)) == []
-    split_indentation = replace(fold, train=own[:61], test=own[61:])
+    split_indentation = replace(fold, train=rows[:61], test=rows[61:])
     assert failing(run_audit(split_indentation, LABELS, DB_uT)) == ["indentations"]
     assert not passes(run_audit(split_indentation, LABELS, DB_uT))
 
@@ -141,10 +141,12 @@ def test_pool_must_be_untested_pokes_of_held_out_skins():
     assert trained[-1].found == "1 of 1 are not held out: b1_s0"
 
 
-def with_copy(db_uT: np.ndarray, labels: Labels, of: str, to: str, *, sd_uT: float, factor: float) -> np.ndarray:
+def with_copy(
+    db_uT: np.ndarray, labels: Labels, source_skin: str, target_skin: str, *, sd_uT: float, factor: float
+) -> np.ndarray:
     rng = rng_for(1, "copy")
-    planted, source = db_uT.copy(), db_uT[labels.skin == of]
-    planted[labels.skin == to] = factor * source + rng.normal(0, sd_uT, source.shape)
+    planted, source = db_uT.copy(), db_uT[labels.skin == source_skin]
+    planted[labels.skin == target_skin] = factor * source + rng.normal(0, sd_uT, source.shape)
     return planted
 
 

@@ -41,13 +41,13 @@ NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 TURN = chip_rotations(SECTION)
 
 
-def simulated_presses(how: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
+def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
     """Return simulated presses at 25 places and two forces, with the parameters `how`, in the axes of scene lab."""
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
-    db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(how, SETUP, place_mm, force_N))
-    rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(how, SETUP))
+    db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(parameters, SETUP, place_mm, force_N))
+    rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(parameters, SETUP))
     return RecordedPresses(
         board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), capture_i=np.repeat([0, 1], 25),
         place_mm=place_mm * (1, -1) + SECTION.labels_middle_mm, force_N=force_N,
@@ -131,12 +131,12 @@ def test_sixteen_orientations_are_distinct():
 def test_flipped_skin_is_a_rotated_checkerboard():
     plain, flipped = (replace(SETUP, skin_flipped=way).rest for way in (False, True))
     turn = compare.quarter_turn(1)
-    there = {
+    moments_by_node = {
         tuple(np.round(node * 1e6).astype(int)): moment
         for node, moment in zip(plain.nodes_m, plain.moments_A_m2, strict=True)
     }
     for node, moment in zip(flipped.nodes_m[::97], flipped.moments_A_m2[::97], strict=True):
-        before = there[tuple(np.round(turn.T @ node * 1e6).astype(int))]
+        before = moments_by_node[tuple(np.round(turn.T @ node * 1e6).astype(int))]
         np.testing.assert_allclose(turn @ before, moment, atol=1e-6 * np.abs(plain.moments_A_m2).max())
 
 
@@ -152,12 +152,12 @@ def test_law_without_slide_and_offsets_equals_the_nominal_skin():
 
 def test_pokes_beyond_the_greatest_depth_are_counted_and_clamped():
     deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
-    of = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
-    (deepest_N,) = layer.force(deepest_m, **of, base="slipping") * 0.28**-1.5
+    layer_settings = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
+    (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    still = replace(TRUE, away_um_mm=0.0)  # no slide, because it would grow with the force
-    held_uT = law.simulate_uT(still, SETUP, np.zeros((4, 2)), force_N)
+    without_slide = replace(TRUE, away_um_mm=0.0)  # no slide, because it would grow with the force
+    held_uT = law.simulate_uT(without_slide, SETUP, np.zeros((4, 2)), force_N)
     # a skin with half the modulus is indented as deeply by half the force
     soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)
     assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
@@ -212,14 +212,14 @@ def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
         board = name.partition("_")[0]
         one, _ = ingest(lab, file, tmp_path_factory.mktemp(name), board=board, capture=name)
         captures.setdefault(board, []).append(one)
-    return {board: pool(own) for board, own in captures.items()}
+    return {board: pool(recordings) for board, recordings in captures.items()}
 
 
 def test_fit_to_a_third_of_the_places_agrees_with_the_fit_to_all(real):
     # A third of the places: 22 of 65 in each of three recordings. Parameters fitted there must agree with those of all
     # places.
-    some = {board: _select(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
-    numbers, drawn = compare_boards(some, SECTION, DESIGN, seed=2021)
+    third = {board: _select(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
+    numbers, figure_data = compare_boards(third, SECTION, DESIGN, seed=2021)
     cosine_min = {"fitted": 0.89, "refitted": 0.85}
     for board, way in itertools.product(real, cosine_min):
         parameters, seen = numbers["by_board"][board]["laws"][way], to_board_axes(real[board], SECTION)
@@ -228,11 +228,13 @@ def test_fit_to_a_third_of_the_places_agrees_with_the_fit_to_all(real):
         assert agreed["cosine_mean"] > cosine_min[way]
         assert agreed["explained_median"] > 0.78
         assert agreed["growth"]["simulated"] == pytest.approx(agreed["growth"]["recorded"], abs=0.12)
-    for board, own in numbers["by_board"].items():
-        assert 0.6 < own["nominal"]["cosine_mean"] < 0.82
-        assert own["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
-        assert own["pokes_n"] == 66
-        assert len(drawn["boards"][board]["arrows_uT"]["recorded"]) == len(drawn["boards"][board]["places_mm"])
+    for board, of_board in numbers["by_board"].items():
+        assert 0.6 < of_board["nominal"]["cosine_mean"] < 0.82
+        assert of_board["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
+        assert of_board["pokes_n"] == 66
+        assert len(figure_data["boards"][board]["arrows_uT"]["recorded"]) == len(
+            figure_data["boards"][board]["places_mm"]
+        )
     assert numbers["over_boards"]["refitted"]["cosine_mean"]["n"] == 2
 
 

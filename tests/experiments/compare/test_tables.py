@@ -75,13 +75,13 @@ def test_tables_of_axes_and_parameters():
 
 
 def test_figure_labels():
-    drawn = figures(NUMBERS, DRAWN, "recorded")
+    svgs = figures(NUMBERS, DRAWN, "recorded")
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
-        assert word in texts_of(drawn["compare_arrows.svg"])
-    assert "recorded: power 0.30" in texts_of(drawn["compare_growth.svg"])
+        assert word in texts_of(svgs["compare_arrows.svg"])
+    assert "recorded: power 0.30" in texts_of(svgs["compare_growth.svg"])
     for word in ("k / μ 8.75 N/mm (used)", "no friction limit", "recorded"):
-        assert word in texts_of(drawn["compare_touch.svg"])
-    assert figures(NUMBERS, DRAWN, "recorded") == drawn
+        assert word in texts_of(svgs["compare_touch.svg"])
+    assert figures(NUMBERS, DRAWN, "recorded") == svgs
 
 
 def test_friction_table_has_the_field_of_a_light_touch():

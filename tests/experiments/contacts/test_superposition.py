@@ -65,6 +65,6 @@ def test_field_is_from_both_contacts():
 
 def test_rotated_moments_keep_their_length():
     _, moments = press_on(SKIN, press_on(SKIN, REST, np.array([0, 0, DEPTH_M])), np.array([3e-3, 0, DEPTH_M]))
-    length, before = (np.linalg.norm(of, axis=1) for of in (moments, SKIN.moments_A_m2))
+    length, before = (np.linalg.norm(vectors, axis=1) for vectors in (moments, SKIN.moments_A_m2))
     # Interpolation between two rotated vectors is along a chord: shorter than the vectors by up to (angle^2) / 8.
     np.testing.assert_allclose(length, before, rtol=0.05)

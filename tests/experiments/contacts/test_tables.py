@@ -43,10 +43,10 @@ def test_recorded_scenes_have_no_superposition_table():
 
 
 def test_figure_labels():
-    drawn = figures(NUMBERS, DRAWN, "recorded")
-    labels = texts_of(drawn["contacts.svg"])
+    svgs = figures(NUMBERS, DRAWN, "recorded")
+    labels = texts_of(svgs["contacts.svg"])
     for label in ("direction", "residual", "stronger contact", "distance of the contacts / mm", "%", "(recorded)"):
         assert label in labels
-    assert figures(NUMBERS, DRAWN, "recorded") == drawn
+    assert figures(NUMBERS, DRAWN, "recorded") == svgs
     nearer = figures(NUMBERS | {"same_place": row(2.0)}, DRAWN, "recorded")
-    assert nearer != drawn  # contacts at one place are plotted too
+    assert nearer != svgs  # contacts at one place are plotted too

@@ -62,14 +62,16 @@ def test_finding_is_undecided_if_boards_disagree(finding):
     # factors of the difference, one per board; the mean over boards agrees with the paper
     signs = (-1.0, 1.2, 0.3, 0.1)
     near = errors(0.2, 0.01)
-    apart = {name: of + np.array(signs)[:, None] * 0.1 * np.arange(1, 5) * of for name, of in near.items()}
-    changed = {"each": apart} if finding == EACH_IS_WORSE else {"initial": apart}
+    disagreeing = {
+        name: values + np.array(signs)[:, None] * 0.1 * np.arange(1, 5) * values for name, values in near.items()
+    }
+    changed = {"each": disagreeing} if finding == EACH_IS_WORSE else {"initial": disagreeing}
     one = findings_by_name(PAPER | {"regular": near} | changed)[finding]
     assert (one["holds"], one["verdict"]) == (False, UNDECIDED)
 
 
 def test_single_network_has_no_verdict():
-    alone = {policy: {name: of[:1] for name, of in own.items()} for policy, own in PAPER.items()}
+    alone = {policy: {name: values[:1] for name, values in metrics.items()} for policy, metrics in PAPER.items()}
     findings = findings_by_name(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
     assert {one["verdict"] for one in findings.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in findings.values()} == {UNDECIDED}
@@ -82,7 +84,10 @@ def test_networks_of_one_board_have_no_verdict_over_boards():
 
 
 def test_repeated_networks_do_not_narrow_the_interval():
-    twice = {policy: {name: np.repeat(of, 2, axis=0) for name, of in own.items()} for policy, own in PAPER.items()}
+    twice = {
+        policy: {name: np.repeat(values, 2, axis=0) for name, values in metrics.items()}
+        for policy, metrics in PAPER.items()
+    }
     late = LATE | {"network_bias_N": list(np.repeat(LATE["network_bias_N"], 2))}
     boards = ("b0", "b0", "b1", "b1", "b2", "b2", "b3", "b3")
     again, once = findings_by_name(twice, late | {"network_board": list(boards)}, boards), findings_by_name(PAPER)
@@ -98,20 +103,20 @@ def test_finding_is_contradicted_if_one_metric_contradicts_it():
 
 
 def test_policies_are_compared_over_all_windows():
-    last_good = {name: of.copy() for name, of in errors(1.0, 0.5).items()}
-    for of in last_good.values():
-        of[:, -1] = 0
+    last_good = {name: values.copy() for name, values in errors(1.0, 0.5).items()}
+    for values in last_good.values():
+        values[:, -1] = 0
     assert verdicts(PAPER | {"initial": last_good})[OFFSET] == SUPPORTED
 
 
 def test_paired_differences_cancel_errors_common_to_both_policies():
     shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # errors that a seed has under both policies
-    regular = {name: of + shared for name, of in PAPER["regular"].items()}
-    each = {name: of + shared for name, of in PAPER["each"].items()}
+    regular = {name: values + shared for name, values in PAPER["regular"].items()}
+    each = {name: values + shared for name, values in PAPER["each"].items()}
     assert verdicts(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE] == SUPPORTED
-    own, other = (of["mse_xy_mm2"].mean(axis=1) for of in (each, regular))
-    low, high = ttest_rel(own, other).confidence_interval(0.95)
-    difference = f"difference {(own - other).mean():+.2g} [{low:+.2g}, {high:+.2g}] mm²"
+    before_each, other = (values["mse_xy_mm2"].mean(axis=1) for values in (each, regular))
+    low, high = ttest_rel(before_each, other).confidence_interval(0.95)
+    difference = f"difference {(before_each - other).mean():+.2g} [{low:+.2g}, {high:+.2g}] mm²"
     assert difference in findings_by_name(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE]["measured"]
 
 
@@ -138,7 +143,9 @@ def test_without_forces_only_place_errors_are_judged():
 
 def test_untestable_findings_are_omitted():
     assert findings_by_name({"initial": errors(1, 1)}, None) == {}
-    one_window = {policy: {name: of[:, :1] for name, of in own.items()} for policy, own in PAPER.items()}
+    one_window = {
+        policy: {name: values[:, :1] for name, values in metrics.items()} for policy, metrics in PAPER.items()
+    }
     assert set(findings_by_name(one_window, None)) == {OFFSET, EACH_IS_WORSE}
 
 

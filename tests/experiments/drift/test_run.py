@@ -100,8 +100,8 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     assert numbers["lasts_s"] == pytest.approx(389 * EVERY_s)
     assert len(numbers["findings"]) == 4
     assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings", "drift_wander"}
-    drawn = drift_pages.figures(numbers, results["drawn"], "simulated")
-    assert set(drawn) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
+    svgs = drift_pages.figures(numbers, results["drawn"], "simulated")
+    assert set(svgs) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
     # A random walk with steps of 0 uT equals the last window; readings before every contact remove any walk.
     for policy, (still, _) in numbers["wander"].items():
         last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}

@@ -102,20 +102,20 @@ def test_single_network_has_no_spread():
 def test_unknown_forces_are_not_shown():
     unknown = numbers(force=False)
     assert "MSE_xy, mm² (before every contact)" in tables(unknown, "recorded")["drift"]
-    assert list(drawn := figures(unknown, {}, "recorded")) == ["drift.svg"]
-    assert "MSE_xy / mm²" in drawn["drift.svg"]
+    assert list(svgs := figures(unknown, {}, "recorded")) == ["drift.svg"]
+    assert "MSE_xy / mm²" in svgs["drift.svg"]
 
 
 def test_figure_labels():
-    drawn = figures(numbers(), DRAWN, "simulated")
-    for text in drawn.values():
+    svgs = figures(numbers(), DRAWN, "simulated")
+    for text in svgs.values():
         ET.fromstring(text)
         assert "(simulated)" in text
     for label in ("accuracy / %", "MSE_F / N²", "contacts of the skin before the test", "every 390 indentations"):
-        assert label in drawn["drift.svg"]
-    assert "bars: the standard deviation over 2 network seeds" in drawn["drift.svg"]
+        assert label in svgs["drift.svg"]
+    assert "bars: the standard deviation over 2 network seeds" in svgs["drift.svg"]
     for label in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
-        assert label in drawn["drift_force.svg"]
+        assert label in svgs["drift_force.svg"]
 
 
 def test_table_of_the_added_walk_has_a_row_per_step():
@@ -152,5 +152,5 @@ def test_each_policy_has_a_fixed_colour():
 
 def test_figures_are_reproducible():
     points = {"late": DRAWN["late"] | {"predicted_N": [0.1, 0.9, 2.1]}}
-    first, again, other = (figures(numbers(), drawn, "simulated") for drawn in (DRAWN, DRAWN, points))
+    first, again, other = (figures(numbers(), figure_data, "simulated") for figure_data in (DRAWN, DRAWN, points))
     assert first == again != other

@@ -55,7 +55,7 @@ def write(folder: Path, truths: list[tuple[float, float, float]]) -> Path:
 def edit(path: Path, line_n: int, line: str) -> None:
     lines = path.read_text().splitlines()
     lines[line_n - 1] = line
-    path.write_text("".join(f"{each}\n" for each in lines))
+    path.write_text("".join(f"{row}\n" for row in lines))
 
 
 def error_of(folder: Path, header: Header = HEADER) -> str:

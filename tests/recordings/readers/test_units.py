@@ -55,8 +55,8 @@ def test_strong_fields_in_gauss_are_recognised_by_the_lsb() -> None:
 
 @pytest.mark.parametrize("usual_uT", [30.0, 65.0, 3000.0])
 def test_fields_without_lsb_pass_if_as_strong_as_the_earths_field(usual_uT: float) -> None:
-    still = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
-    check_fields(still, "here", first_line_n=1)
+    constant = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
+    check_fields(constant, "here", first_line_n=1)
     smooth = usual_uT + seeds.rng_for(0, "smooth").standard_normal((400, 15))
     check_fields(smooth, "here", first_line_n=1)
     check_fields(smooth.round(2), "here", first_line_n=1)
