@@ -357,9 +357,8 @@ def test_mean_displacement_of_the_traction_is_force_over_stiffness():
     surface_per_m = np.interp(r_m, table.r_m, table.parts[:, -1, 0])
     q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
     mean_per_m = np.trapezoid(2 * np.pi * r_m * q_per_m2 * surface_per_m, r_m)
-    assert mean_per_m == pytest.approx(
-        1 / table.stiffness_m, rel=1e-3
-    )  # tolerance: waves shorter than 0.3 mm are missing
+    # Tolerance: waves shorter than 0.3 mm are missing.
+    assert mean_per_m == pytest.approx(1 / table.stiffness_m, rel=1e-3)
 
 
 def shear_in_many_steps(force_N, nodes_m, table, steps_n):

@@ -56,9 +56,8 @@ def test_snake_scan_without_memory_reveals_places_by_their_order(tmp_path):
 
 def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
     """Score predictions from readings while the tip hovers above the next place, which only a magnetic tip affects."""
-    place_i = np.tile(np.arange(PLACES_N), PASSES_N).repeat(
-        2
-    )  # two readings per place: above the place, then in contact
+    # Two readings per place: above the place, then in contact.
+    place_i = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)
     touches = np.tile([False, True], PASSES_N * PLACES_N)
     place_mm = np.column_stack([2 * (place_i // 8), 2 * (place_i % 8)]).astype(np.float32)
     rng = rng_for(0, "hover")

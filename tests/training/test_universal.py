@@ -137,9 +137,8 @@ def test_errors_of_held_out_labels_widen_intervals(fits_and_misled):
     _, misled = fits_and_misled
     assert (misled_powers < fitting_powers / 2).all()
     assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, powers are unchanged
-    assert (
-        misled_powers < np.array(lower_by_labels(misled, 3, powers))
-    ).all()  # forty wrong labels lower the powers more than three
+    # Forty wrong labels lower the powers more than three.
+    assert (misled_powers < np.array(lower_by_labels(misled, 3, powers))).all()
 
 
 def test_single_label_is_held_out(fits_and_misled):
