@@ -144,7 +144,7 @@ def sweep_on_three_workers(
         sweep.found["received_bytes"] = sum(received.values())
         require(len(sweep.lines("begun")) == TASKS_N, f"begun {len(sweep.lines('begun'))}")
         note(f"{TASKS_N} tasks, by worker {sorted(ran.values())}; received kB by worker "
-            f"{sorted(round(n / 1e3) for n in came.values())}; equal bytes")  # fmt: skip
+            f"{sorted(round(n / 1e3) for n in received.values())}; equal bytes")  # fmt: skip
         reads = Counter(line[1] for line in sweep.lines("read"))
         require(set(reads.values()) <= {1}, f"rows read {reads}")
         note(f"rows ({sweep.found['rows_bytes'] / 1e6:.1f} MB) read once by each of {len(reads)} workers")
