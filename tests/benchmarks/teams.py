@@ -234,16 +234,16 @@ def count_rows(database: str) -> int:
 def run_steps(steps: Steps, folder: Path) -> None:
     """Run all steps of the workflow in a folder."""
     os.environ.update(KEYS, MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR="false")
-    at, ports = [], [servers.free_port() for _ in range(3)]
+    addresses, ports = [], [servers.free_port() for _ in range(3)]
     try:
         with ExitStack() as up:
             with steps.step("start PostgreSQL (new database), MLflow and an S3-compatible server"):
                 database = up.enter_context(servers.postgres(folder / "postgres", ports[0]))
-                at.append(database)
+                addresses.append(database)
                 down = up.enter_context(ExitStack())
                 tracking = down.enter_context(servers.mlflow(folder / "mlflow", database, ports[1]))
                 store = up.enter_context(servers.s3(folder / "s3", ports[2]))
-                at += [tracking, store]
+                addresses += [tracking, store]
                 boto3.client("s3", endpoint_url=store).create_bucket(Bucket=BUCKET)
             ana, ben = share_by_remotes(steps, folder, make_origin(folder, store), tracking)
             merge_two(steps, ana, ben)
@@ -255,9 +255,9 @@ def run_steps(steps: Steps, folder: Path) -> None:
                 note(f"{rows_n} runs, as before")
     finally:
         with steps.step("stop all servers") as note:
-            left = [address.split("@")[-1] for address in at if servers.listens(address)]
+            left = [address.split("@")[-1] for address in addresses if servers.listens(address)]
             require(not left, f"still listening: {left}")
-            note(f"{len(at)} ports are closed")
+            note(f"{len(addresses)} ports are closed")
 
 
 def main() -> None:

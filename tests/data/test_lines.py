@@ -206,7 +206,7 @@ def test_choice_does_not_depend_on_row_order(seed):
     table = grid(depths_n=2)
     order = rng_for(seed, "order").permutation(len(table))
     shuffled = replace(table, target=table.target[order], indentation=table.indentation[order])
-    one, other = (take_pokes(each, all_rows(each), 80, rng_for(seed, "pokes")) for each in (table, shuffled))
+    one, other = (take_pokes(rows, all_rows(rows), 80, rng_for(seed, "pokes")) for rows in (table, shuffled))
     assert set(table.indentation[one].tolist()) == set(shuffled.indentation[other].tolist())
 
 

@@ -275,14 +275,14 @@ CASES = {
 @pytest.mark.parametrize("experiment", CASES)
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
 def test_rows_and_figures_have_their_source(experiment, source):
-    module, numbers, drawn = CASES[experiment]
+    module, numbers, figure_data = CASES[experiment]
     (table,) = module.tables(numbers, source).values()
     assert set(table["source"]) == {source}
-    if drawn:
-        (text,) = module.figures(numbers, drawn, source).values()
+    if figure_data:
+        (text,) = module.figures(numbers, figure_data, source).values()
         assert f"({source})" in texts_of(text)
         ET.fromstring(text)
-        assert [text] == list(module.figures(numbers, drawn, source).values())
+        assert [text] == list(module.figures(numbers, figure_data, source).values())
 
 
 def test_shear_table_has_both_splits():

@@ -65,7 +65,7 @@ def test_opposite_errors_of_networks_do_not_cancel():
 def test_tables_list_every_aim_and_feedback():
     settings = SETTINGS.model_copy(update={"aims_N": (0.5,)})
     networks = {"b0": [lambda db_uT: true_force(db_uT + 50.0)[:, None] + np.zeros(3)]}
-    numbers, drawn = hold_all([finger(noise_uT=1.0)], networks, settings, seed=1)
+    numbers, figure_data = hold_all([finger(noise_uT=1.0)], networks, settings, seed=1)
     assert [(row["aim_N"], row["feedback"], row["press"]) for row in numbers["rows"]] == [
         (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "map", "none"), (0.5, "map", "factor"),
         (0.5, "map", "label"),
@@ -73,4 +73,4 @@ def test_tables_list_every_aim_and_feedback():
     table = gripper.tables(numbers, "simulated")["gripper"]
     assert table["runs"].tolist() == [2] * 5
     assert table["held, % of runs"][0] == "100"
-    assert "0.5 N" in gripper.figures(numbers, drawn, "simulated")["gripper.svg"]
+    assert "0.5 N" in gripper.figures(numbers, figure_data, "simulated")["gripper.svg"]

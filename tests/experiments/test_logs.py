@@ -128,13 +128,13 @@ def test_truth_of_a_reading_is_that_of_its_step():
 
 def test_plotted_series_is_thinned_and_empty_off_contact():
     t_s, b_uT, force_N = make_log(steps_n=40)
-    drawn = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
-    assert len(drawn["t_s"]) <= 1500
-    assert drawn["t_s"][0] == pytest.approx(0.004)
+    plotted = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
+    assert len(plotted["t_s"]) <= 1500
+    assert plotted["t_s"][0] == pytest.approx(0.004)
     for which in ("estimated", "true"):
-        assert drawn[which]["F_N"][0] is None
-        assert None in drawn[which]["x_mm"]
-        assert 8.0 in drawn[which]["x_mm"]
+        assert plotted[which]["F_N"][0] is None
+        assert None in plotted[which]["x_mm"]
+        assert 8.0 in plotted[which]["x_mm"]
 
 
 def plain_board(name, chips_n):
@@ -144,8 +144,8 @@ def plain_board(name, chips_n):
 
 
 def instrument(noise_uT=0.0):
-    own = plain_board("b0", 5)
-    return Instrument(own, plain_board("aside", 1), own.turn, np.full(3, noise_uT))
+    board = plain_board("b0", 5)
+    return Instrument(board, plain_board("aside", 1), board.turn, np.full(3, noise_uT))
 
 
 def pitched_log(noise_uT=0.0):
@@ -254,13 +254,13 @@ def test_table_shows_the_spread_over_networks():
     table = tables(numbers, "simulated")["logs"]
     assert table.set_index("what")["ours"]["accuracy, %"] == "80 ± 2.5"
     assert "over 3 network seeds" in table.attrs["meaning"]
-    drawn = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES, "low": SERIES, "high": SERIES}
-    assert "range over 3 network seeds" in figures(numbers, drawn, "simulated")["logs.svg"]
+    plotted = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES, "low": SERIES, "high": SERIES}
+    assert "range over 3 network seeds" in figures(numbers, plotted, "simulated")["logs.svg"]
 
 
 def test_figure_shows_the_truth_if_known():
-    drawn = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
-    assert ">true<" not in figures(NUMBERS, drawn, "recorded")["logs.svg"]
-    both = figures(NUMBERS, drawn | {"true": SERIES}, "simulated")["logs.svg"]
+    plotted = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
+    assert ">true<" not in figures(NUMBERS, plotted, "recorded")["logs.svg"]
+    both = figures(NUMBERS, plotted | {"true": SERIES}, "simulated")["logs.svg"]
     assert ">true<" in both
     assert "(simulated)" in both

@@ -68,9 +68,9 @@ def test_force_errors_of_ageing_and_relaxation(rows):
 
 
 def test_one_kelvin_changes_the_field_by_0_12_percent(rows):
-    of = synthesis()
-    board = draw_board(of.main_boards.design, of.spreads, seed=1, name="b0")
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.in_si())
+    scene = synthesis()
+    board = draw_board(scene.main_boards.design, scene.spreads, seed=1, name="b0")
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0", rule=scene.main_boards.quadrature.in_si())
     rest_T, _ = changes_of_field(board, skin, np.zeros((0, 3)))
     assert rows["temperature"].field_pct == pytest.approx(100 * (1 / 0.9988 - 1), rel=1e-6)
     assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)

@@ -114,8 +114,8 @@ def test_foreign_fields_have_equal_length_and_another_direction():
         np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))
         assert not np.allclose(change(chips), chips), name
     np.testing.assert_allclose(chips @ np.linalg.matrix_power(QUARTER_TURN, 4), chips)
-    own = Board(chips[:1].reshape(1, -1), chips.reshape(3, -1), chips.reshape(3, -1))
-    exchanged = own.alter(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
+    this_board = Board(chips[:1].reshape(1, -1), chips.reshape(3, -1), chips.reshape(3, -1))
+    exchanged = this_board.alter(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
     np.testing.assert_array_equal(exchanged, chips[:, [0, 2, 1, 3, 4]])
 
 
@@ -146,9 +146,9 @@ def points(method: str, given: str, off_mm: dict[str, float]) -> list[dict[str, 
     board = np.array(["b", "b"])
     found = []
     for name, by_mm in off_mm.items():
-        own = np.char.add(board, name)
+        skin = np.char.add(board, name)
         keys = {"method": method, "name": given, "labels_n": 0, "fold": f"b{name}", "seed_i": 0}
-        found.append(keys | {"scores": score_groups(true, true + [[by_mm, 0, 0], [0, 0, 0]], own, own)})
+        found.append(keys | {"scores": score_groups(true, true + [[by_mm, 0, 0], [0, 0, 0]], skin, skin)})
     return found
 
 

@@ -176,15 +176,15 @@ def test_path_of_material_follows_the_flow():
         one.pokes_m[:, 2] + skin.depth_zero_m,
     )
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
-    there = deformation.follow(r_m, z_m, deformation.depth_steps(tuple(np.unique(depths_m)), press), press=press)[-1]
+    followed = deformation.follow(r_m, z_m, deformation.depth_steps(tuple(np.unique(depths_m)), press), press=press)[-1]
     outward_m = (path.nodes_m[3, material, :2] - poke_m[:2]) * away_m / r_m[:, None]
-    assert np.abs(there.r_m - r_m).max() > 20e-6
+    assert np.abs(followed.r_m - r_m).max() > 20e-6
     # 2 um: error of the spline between the nodes of the flow, while the material moves by up to 1 mm
-    np.testing.assert_allclose(outward_m.sum(axis=1), there.r_m, atol=2e-6)
-    np.testing.assert_allclose(path.nodes_m[3, material, 2], there.z_m, atol=2e-6)
+    np.testing.assert_allclose(outward_m.sum(axis=1), followed.r_m, atol=2e-6)
+    np.testing.assert_allclose(path.nodes_m[3, material, 2], followed.z_m, atol=2e-6)
     turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
-    np.testing.assert_allclose(angle_rad, deformation.rotation_angle(there.f), atol=5e-3)
+    np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
 
 
 def test_error_is_that_of_the_worst_skin():
@@ -251,7 +251,7 @@ def test_distant_boxes_are_dipoles():
 
 def test_each_rule_is_timed_in_one_row(quadratures):
     rows, calls = quadratures
-    expected = {(method, rule_name(rule)) for method, own in TRIED.items() for rule in own}
+    expected = {(method, rule_name(rule)) for method, rules_of_method in TRIED.items() for rule in rules_of_method}
     assert {(row.method, row.setting) for row in rows[1:]} == expected
     assert len(rows) == 1 + len(expected)
     assert [one.key for one in calls] == [row.key for row in rows[1:]]

@@ -56,7 +56,7 @@ def test_fractions_in_the_right_order_equal_the_normal_distribution():
 
 
 def test_gain_and_noise_are_recovered():
-    numbers, drawn = analyse_levels(fillings(), WEIGHT_N)
+    numbers, figure_data = analyse_levels(fillings(), WEIGHT_N)
     assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)  # 0.5 uT in 150 uT
     assert numbers["noise_uT"] == pytest.approx(NOISE_uT, rel=0.05)  # 2080 degrees of freedom: standard error of 1.6 %
     # The smallest resolved weight is 1.645 sqrt(2) noise / gain, rounded up to the next level.
@@ -65,7 +65,7 @@ def test_gain_and_noise_are_recovered():
     assert numbers["smallest_step_mL"]["five_readings"] == pytest.approx(
         2.04, abs=0.01
     )  # 0.02 N / 9.81 m/s^2 is 2.04 g
-    assert len(drawn["response_uT"]) == numbers["levels_n"] == 26
+    assert len(figure_data["response_uT"]) == numbers["levels_n"] == 26
 
 
 def test_direction_is_fitted_to_the_first_half_of_fillings():
@@ -79,7 +79,7 @@ def test_direction_is_fitted_to_the_first_half_of_fillings():
 @given(st.floats(0.1, 10.0))
 def test_fractions_do_not_depend_on_the_scale_of_fields(factor):
     uT = fillings(4)
-    one, other = (analyse_levels((own * uT).astype(np.float32), WEIGHT_N)[0] for own in (1.0, factor))
+    one, other = (analyse_levels((scale * uT).astype(np.float32), WEIGHT_N)[0] for scale in (1.0, factor))
     assert one["smallest_step_N"] == other["smallest_step_N"]
 
 
@@ -198,7 +198,7 @@ def test_monotonicity_is_judged_at_a_stated_step():
 
 
 def test_figure_has_its_source_and_is_reproducible():
-    numbers, drawn = glass(0.0)
-    figure = figures(numbers, drawn, "simulated")["sensitivity.svg"]
+    numbers, figure_data = glass(0.0)
+    figure = figures(numbers, figure_data, "simulated")["sensitivity.svg"]
     assert "(simulated)" in figure
-    assert figure == figures(numbers, drawn, "simulated")["sensitivity.svg"]
+    assert figure == figures(numbers, figure_data, "simulated")["sensitivity.svg"]

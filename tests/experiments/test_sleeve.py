@@ -147,11 +147,11 @@ def test_scores_have_mean_and_standard_deviation_over_seeds():
 def test_each_tested_indentation_is_plotted_once():
     true, predicted, indentation = predictions(n=20)
     order = rng_for(0, "order").permutation(60)
-    drawn = draw_errors(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
-    np.testing.assert_allclose(drawn["x_mm"], true[::3, 0], atol=0.0051)  # rounded to 0.01 mm
-    np.testing.assert_allclose(drawn["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
-    assert len(drawn["chips_x_mm"]) == len(CROSS_MM)
-    assert (drawn["borders_x_mm"], drawn["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
+    plotted = draw_errors(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
+    np.testing.assert_allclose(plotted["x_mm"], true[::3, 0], atol=0.0051)  # rounded to 0.01 mm
+    np.testing.assert_allclose(plotted["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
+    assert len(plotted["chips_x_mm"]) == len(CROSS_MM)
+    assert (plotted["borders_x_mm"], plotted["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
     assert isinstance(AREA, Area)
 
 
@@ -164,7 +164,7 @@ def numbers_and_figure_data(n=40):
     numbers = {
         "chips_n": 16, "rate_hz": 132.98, "area_mm": list(AREA.sides_mm), "pokes_n": 5 * n, "trained_n": 4 * n,
         "tested_n": n, "near_mm": NEAR_MM, **score_places(true, [predicted], indentation, AREA),
-        "variants": {name: score_places(true, own, indentation, AREA) for name, own in others.items()},
+        "variants": {name: score_places(true, variant_predictions, indentation, AREA) for name, variant_predictions in others.items()},
     }  # fmt: skip
     return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
 
@@ -201,14 +201,14 @@ def test_table_compares_the_setup_with_the_papers():
 
 
 def test_map_shows_tested_pokes_chips_and_source():
-    numbers, drawn = numbers_and_figure_data()
-    texts = figures(numbers, drawn, "simulated")
+    numbers, figure_data = numbers_and_figure_data()
+    texts = figures(numbers, figure_data, "simulated")
     assert list(texts) == ["sleeve.svg"]
     marks = [
         len(group.findall(f".//{SVG}use")) for group in ElementTree.fromstring(texts["sleeve.svg"]).iter(f"{SVG}g")
     ]
-    assert len(drawn["x_mm"]) == 40
-    assert len(drawn["chips_x_mm"]) in marks
+    assert len(figure_data["x_mm"]) == 40
+    assert len(figure_data["chips_x_mm"]) in marks
     assert 40 in marks
     text = " ".join(re.findall(r">([^<>]+)</text>", texts["sleeve.svg"]))
     for label in ("(simulated)", "x / mm", "y / mm", "place error", "border between boards"):
@@ -216,8 +216,10 @@ def test_map_shows_tested_pokes_chips_and_source():
 
 
 def test_figure_bytes_depend_only_on_predictions_and_source():
-    numbers, drawn = numbers_and_figure_data()
-    once, again, other = (figures(numbers, drawn, source)["sleeve.svg"] for source in ("simulated", "simulated", "x"))
+    numbers, figure_data = numbers_and_figure_data()
+    once, again, other = (
+        figures(numbers, figure_data, source)["sleeve.svg"] for source in ("simulated", "simulated", "x")
+    )
     assert once == again
     assert once != other
-    assert np.isfinite(drawn["error_mm"]).all()
+    assert np.isfinite(figure_data["error_mm"]).all()

@@ -70,12 +70,12 @@ def test_base_without_damping_is_detected(monkeypatch):
 
 
 def test_slide_without_rotation_and_linear_depth_are_detected(monkeypatch):
-    def straight(force_N, *, thickness_m, **of):
+    def straight(force_N, *, thickness_m, **kwargs):
         curve_m = np.linspace(0, slide.DEEPEST * thickness_m, 2000)
-        return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **of), curve_m)
+        return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **kwargs), curve_m)
 
     rigid = slide.rigid_motion
-    monkeypatch.setattr(slide, "rigid_motion", lambda *of: replace(rigid(*of), spin_rad=np.zeros(len(of[0]))))
+    monkeypatch.setattr(slide, "rigid_motion", lambda *args: replace(rigid(*args), spin_rad=np.zeros(len(args[0]))))
     monkeypatch.setattr(slide, "depth_at", straight)
     assert failed(sliding()) == {
         "the slide of a skin that is poked at its free edge",

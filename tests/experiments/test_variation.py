@@ -70,19 +70,19 @@ def test_unvisited_place_is_an_error(place_mm, depth_mm, listed):
 
 def test_change_over_time_uses_the_last_visit():
     visited = visits([[0, 0], [9, 9], [3, -1], [50, 50]], [[2, 2], [8, 8], [2, 4], [99, 99]], [7, 8, 9, 17])
-    numbers, drawn = over_time(visited, 10)
+    numbers, plotted = over_time(visited, 10)
     assert numbers == {
         "visits_n": 3, "contacts_n": 2, "first_db_uT": 2.0,
         "raw_change_uT": pytest.approx(5**0.5), "raw_change_pct": pytest.approx(50 * 5**0.5),
         "db_change_uT": pytest.approx(2**0.5), "db_change_pct": pytest.approx(50 * 2**0.5),
     }  # fmt: skip
-    assert drawn == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
+    assert plotted == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
 
 
 def test_plotted_visits_include_the_first_and_the_last():
-    _, drawn = over_time(visits([[i] for i in range(500)], [[1]] * 500), 10_000)
-    assert len(drawn["contacts_n"]) == LINES_MAX_N
-    assert (drawn["contacts_n"][0], drawn["contacts_n"][-1]) == (0, 499)
+    _, plotted = over_time(visits([[i] for i in range(500)], [[1]] * 500), 10_000)
+    assert len(plotted["contacts_n"]) == LINES_MAX_N
+    assert (plotted["contacts_n"][0], plotted["contacts_n"][-1]) == (0, 499)
 
 
 @given(st.floats(-500, 500), st.floats(0.5, 3))
@@ -96,18 +96,18 @@ def test_no_load_drift_changes_only_raw_readings(drift_uT, scale):
 
 def test_spread_between_skins_is_the_rms_over_pairs():
     lines = {"s0": [1.0, 2.0], "s1": [4.0, 2.0], "s2": [1.0, 8.0]}
-    numbers, drawn = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
+    numbers, plotted = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
     pairs = [(one, other) for one in lines for other in lines if one < other]
     squares = [(a - b) ** 2 for one, other in pairs for a, b in zip(lines[one], lines[other], strict=True)]
     size_uT = np.sqrt(np.mean([value**2 for line in lines.values() for value in line]))
     assert numbers["spread_uT"] == pytest.approx(np.sqrt(np.mean(squares)))
     assert numbers["spread_pct"] == pytest.approx(100 * np.sqrt(np.mean(squares)) / size_uT)
-    assert drawn == lines
+    assert plotted == lines
 
 
 def test_plotted_line_is_the_mean_over_visits():
-    numbers, drawn = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
-    assert drawn == {"s0": [2, 4]}
+    numbers, plotted = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
+    assert plotted == {"s0": [2, 4]}
     assert "spread_uT" not in numbers
 
 

@@ -73,9 +73,9 @@ def test_worlds_have_the_rows_of_table_2(decide_settings, tmp_path):
     table = show.tables(numbers, "simulated")["worlds"]
     assert table["row"].tolist()[:2] == ["single-sensor", "multi-sensor"]
     assert len(table) == 8
-    drawn = show.figures(numbers, {}, "simulated")["worlds.svg"]
+    svg = show.figures(numbers, {}, "simulated")["worlds.svg"]
     for scene in ("What decides table 2 (simulated", "friction under the tip", "adapted"):
-        assert scene in texts_of(drawn)
+        assert scene in texts_of(svg)
 
 
 def test_worlds_differ_in_one_setting(decide_settings):

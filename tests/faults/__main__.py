@@ -52,9 +52,9 @@ def main() -> None:
 def inject(case, template: Checkout, folder: Path) -> tuple[Row, float]:
     """Inject a fault into a new copy of the finished checkout; return the fault's table row and the seconds taken."""
     shutil.rmtree(folder, ignore_errors=True)
-    at, start_s = copy(template, folder), time.monotonic()
+    checkout, start_s = copy(template, folder), time.monotonic()
     try:
-        row = case(at)
+        row = case(checkout)
     except Exception as error:  # the table shows this error as the outcome
         traceback.print_exc()
         row = Row(

@@ -151,9 +151,9 @@ def _damage_cached(checkout: Checkout, out: str, pattern: str = "") -> tuple[Pat
     file = _first(checkout.folder / out, pattern) if pattern else checkout.folder / out
     content = file.read_bytes()
     entry = next(
-        each
-        for each in (checkout.folder / ".dvc/cache/files").rglob("*")
-        if each.is_file() and each.read_bytes() == content
+        candidate
+        for candidate in (checkout.folder / ".dvc/cache/files").rglob("*")
+        if candidate.is_file() and candidate.read_bytes() == content
     )
     entry.unlink()
     entry.write_bytes(content)

@@ -262,7 +262,7 @@ def judge(
 
 def _whole(trainings: dict[str, int], later: dict[str, int]) -> dict[str, int]:
     """Return only the training runs of stacks that were written completely; the runs of a stack finish together."""
-    members = [Counter(name.rpartition("-")[0] for name in each) for each in (trainings, later)]
+    members = [Counter(name.rpartition("-")[0] for name in runs) for runs in (trainings, later)]
     whole = {stack for stack, files_n in members[0].items() if members[1][stack] == files_n}
     return {name: written for name, written in trainings.items() if name.rpartition("-")[0] in whole}
 

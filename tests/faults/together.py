@@ -102,13 +102,15 @@ def kill_add(checkout: Checkout) -> Row:
         time.sleep(0.002)
     adding.send_signal(signal.SIGKILL)
     checkout.end(adding, start_s)
-    still = checkout.run("dvc", "repro")
+    after_kill = checkout.run("dvc", "repro")
     again = checkout.run(*command)
     shutil.rmtree(checkout.folder / RAW)
     later = checkout.run(*command)
     row = judge(checkout, again, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += (
-        [] if (still.status, still.ran, later.status) == (0, [], 0) else [f"{still.ran}, {later.output[-200:]}"]
+        []
+        if (after_kill.status, after_kill.ran, later.status) == (0, [], 0)
+        else [f"{after_kill.ran}, {later.output[-200:]}"]
     )
     return row
 

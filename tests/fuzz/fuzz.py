@@ -76,8 +76,8 @@ def fuzz_randomly(name: str, seconds: int, keep: Path | None) -> None:
     while time.monotonic() < end_s:
         data = bytearray(seeds[rng.integers(len(seeds))])
         for _ in range(rng.integers(1, 8)):
-            at = int(rng.integers(len(data) + 1))
-            data[at : at + int(rng.integers(3))] = rng.bytes(int(rng.integers(4)))
+            byte_i = int(rng.integers(len(data) + 1))
+            data[byte_i : byte_i + int(rng.integers(3))] = rng.bytes(int(rng.integers(4)))
         Path("crash-last").write_bytes(data)
         feed(name, bytes(data))
         if tried_n % PRINT_EVERY_N == 0:
@@ -90,8 +90,8 @@ def fuzz_randomly(name: str, seconds: int, keep: Path | None) -> None:
 def main(name: str, seconds: int, *keep: str) -> None:
     if name == "all":
         names = sorted(folder.name for folder in CORPUS.iterdir())
-        for each in names:
-            subprocess.run([sys.executable, __file__, each, str(seconds // len(names)), *keep], check=True)
+        for target in names:
+            subprocess.run([sys.executable, __file__, target, str(seconds // len(names)), *keep], check=True)
         return
     try:
         import atheris  # noqa: F401

@@ -40,8 +40,8 @@ def make_poke_script(pokes, rotated_n: int = 0):
 
 def test_universal_model_estimates_places_and_their_standard_deviation(random_pokes):
     skin, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
-    estimates = np.concatenate([each.target[each.contact] for each in readings])
-    sd_mm = np.concatenate([each.sd_mm[each.contact] for each in readings])
+    estimates = np.concatenate([batch.target[batch.contact] for batch in readings])
+    sd_mm = np.concatenate([batch.sd_mm[batch.contact] for batch in readings])
     true = np.repeat(random_pokes[2], POKED_N, axis=0)
     assert len(estimates) == pytest.approx(len(true), abs=20)
     error_mm = np.abs(estimates[: len(true), :2] - true[: len(estimates)])
@@ -58,11 +58,11 @@ def test_chips_in_another_order_are_an_unknown_skin(random_pokes):
 def test_model_adapts_to_collected_presses(random_pokes):
     _, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
     pokes = Presses()
-    for each in readings:
-        pokes.add(each)
+    for batch in readings:
+        pokes.add(batch)
     assert pokes.complete
     change_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
-    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # largest noise: readings have 3 uT
+    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # tolerance in uT: readings have noise of 3 uT
     estimator = UniversalEstimator(load_universal())
     estimator.set_noload(random_pokes[0])
     assert "adapted to 12 presses: standard deviation of a place" in estimator.adapt(pokes.db_uT)
@@ -138,9 +138,9 @@ def guided_pokes():
 def test_guided_presses_calibrate_and_test_the_model(guided_pokes):
     _, readings = play_to_skin(make_poke_script(guided_pokes), load_universal())
     pokes, crosses = GuidedPresses(), []
-    for each in readings:
+    for batch in readings:
         crosses += [pokes.next_mm] if pokes.next_mm not in [None, *crosses] else []
-        pokes.add(each)
+        pokes.add(batch)
     np.testing.assert_allclose(crosses, guided_pokes[2])
     assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.held_out.sum()
     assert pokes.next_mm is None
@@ -183,7 +183,7 @@ def test_universal_model_is_refused_for_other_chips():
     skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
     assert "no place or force: the universal model is for five chips. Use a model for this board." in skin.alarms()
-    assert all(np.isnan(each.target).all() for each in readings)
+    assert all(np.isnan(batch.target).all() for batch in readings)
 
 
 def test_opened_board_uses_the_saved_calibration(random_pokes, tmp_path):
@@ -194,10 +194,10 @@ def test_opened_board_uses_the_saved_calibration(random_pokes, tmp_path):
     (tmp_path / "s3.json").write_text("{}")  # not the card of the model s3: a user's file with that name
     for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
         _, readings = play_to_skin(make_poke_script(random_pokes), models)
-        estimates = np.concatenate([each.target[each.contact] for each in readings])
+        estimates = np.concatenate([batch.target[batch.contact] for batch in readings])
         true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(estimates)]
         uncalibrated = np.concatenate(
-            [each.target[each.contact] for each in play_to_skin(make_poke_script(random_pokes), load_universal())[1]]
+            [batch.target[batch.contact] for batch in play_to_skin(make_poke_script(random_pokes), load_universal())[1]]
         )
         assert np.abs(estimates[:, :2] - true_mm).mean() < 0.6 * np.abs(uncalibrated[:, :2] - true_mm).mean()
     # opening a board does not change the model passed by the user

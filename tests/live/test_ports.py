@@ -61,8 +61,8 @@ def test_frames_of_random_values_are_described(seed, chips_n):
 
 def test_chips_without_noise_have_no_lsb():
     script = make_script(pokes_n=0)
-    still = replace(script, pieces=[script.pieces[0]] * len(script))
-    assert "steps not known yet" in str(find.recognise("port", chunks_of(still)))
+    without_noise = replace(script, pieces=[script.pieces[0]] * len(script))
+    assert "steps not known yet" in str(find.recognise("port", chunks_of(without_noise)))
 
 
 def test_only_board_is_found_and_two_are_ambiguous(tmp_path):

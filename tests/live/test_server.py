@@ -166,12 +166,12 @@ def test_page_waits_for_a_missing_board(tmp_path):
 
 def test_requests_from_other_hosts_and_sites_are_forbidden(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
-        own = address.removeprefix("http://")
+        host = address.removeprefix("http://")
         for headers, status in (
             ({"Host": "evil.example"}, 403), ({"Host": "127.0.0.1.evil.example"}, 403), ({"Host": "[::1"}, 403),
             ({"Host": "lohost[::1]::8786"}, 403),
             ({"Host": "localhost:9000"}, 200),  # through an SSH tunnel
-            ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{own}"}, 200),
+            ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{host}"}, 200),
         ):  # fmt: skip
             async with client.get(f"{address}/", headers=headers) as page:
                 assert page.status == status, headers

@@ -84,11 +84,11 @@ def test_unplugged_board_does_not_delay_the_others(tmp_path):
             # number of readings of each other board during each update of the last board
             updates, found = Counter(), []
             for *others, last in skins:
-                found += [each[1:4] for each in others if each.F_N > 0]
+                found += [contact[1:4] for contact in others if contact.F_N > 0]
                 if len(found) > 20:
                     unplugged.close()
                 if math.isnan(last.F_N) and any("unplugged" in alarm for alarm in last.alarms):
-                    assert not any("unplugged" in alarm for each in others for alarm in each.alarms)
+                    assert not any("unplugged" in alarm for contact in others for alarm in contact.alarms)
                     updates[last.t_s] += 1
                 if len(updates) >= 5 and max(updates.values()) >= 5:
                     break

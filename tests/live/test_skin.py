@@ -101,7 +101,7 @@ def test_frames_with_failed_reads_have_no_estimate(tmp_path):
     skin, readings = play_to_skin(
         inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))]
     )
-    failed = [row for each in readings for row in each.target[each.b_uT[:, 3] == np.float32(8028.16)]]
+    failed = [row for batch in readings for row in batch.target[batch.b_uT[:, 3] == np.float32(8028.16)]]
     assert len(failed) == 200
     assert np.isnan(failed).all()
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
@@ -195,7 +195,7 @@ def test_sleeve_of_forty_chips_has_layout_and_estimates(tmp_path):
     skin, readings = play_to_skin(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
     assert skin.layout.known
     assert skin.detected.chips_n == 40
-    found = np.concatenate([each.target[each.contact] for each in readings])
+    found = np.concatenate([batch.target[batch.contact] for batch in readings])
     nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
     assert set(nearest) == {0, 1}
     np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)

@@ -66,8 +66,8 @@ def write_punctual_arrivals(folder: Path, sent: Script) -> None:
     first = b"".join(sent.pieces).find(data)
     assert first >= 0  # the recording is the end of the sent bytes
     ends = np.cumsum([len(piece) for piece in sent.pieces]) - first
-    came = (ends > 0) & (ends <= len(data))
-    times = clocks.Arrivals(ends[came], 1e9 + sent.t_s[came])
+    received = (ends > 0) & (ends <= len(data))
+    times = clocks.Arrivals(ends[received], 1e9 + sent.t_s[received])
     (folder / ARRIVALS_FILE).write_text(clocks.render(times))
     seal(folder, header)
 
@@ -94,8 +94,8 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     assert numbers["capture"]["frames_n"] > 0.7 * len(script)  # opening and closing a terminal discards bytes
     model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
     _, readings = play_to_skin(script, [read_network(model)])
-    t_s = np.concatenate([each.t_s[each.contact] for each in readings])
-    found = np.concatenate([each.target[each.contact] for each in readings])
+    t_s = np.concatenate([batch.t_s[batch.contact] for batch in readings])
+    found = np.concatenate([batch.target[batch.contact] for batch in readings])
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
     pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
     true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]

@@ -58,8 +58,8 @@ def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: st
     row = np.concatenate([np.arange(20), np.arange(10)])  # the first ten rows are on two lines each
     line_i = np.repeat([0, 1, 2], 10)
     order = triplet_points(np.tile(np.arange(10) // 2, 3)[:, None].astype(np.float64), line_i)
-    own = LabelledRows(*some_rows(6, name, "own"), None)
-    return PreparedJob(start, rng, labelled, UnlabelledRows(poked, order, row), own)
+    few_labels = LabelledRows(*some_rows(6, name, "own"), None)
+    return PreparedJob(start, rng, labelled, UnlabelledRows(poked, order, row), few_labels)
 
 
 def example_data() -> TrainingData:
@@ -69,11 +69,11 @@ def example_data() -> TrainingData:
     return TrainingData(db_uT, target, np.repeat(["b0_s0", "b0_s1", "b1_s0", "b1_s1"], 12))
 
 
-def with_values(rows: TrainingData, part: str, at: np.ndarray, to: object) -> TrainingData:
-    """Return the data with `to` as the values of the array `part` in the rows `at`."""
-    values = getattr(rows, part).copy()
-    values[at] = to
-    return replace(rows, **{part: values})
+def with_values(data: TrainingData, part: str, row: np.ndarray, value: object) -> TrainingData:
+    """Return the data with `value` in the given rows of the array `part`."""
+    values = getattr(data, part).copy()
+    values[row] = value
+    return replace(data, **{part: values})
 
 
 def pooled(**changes: object) -> TrainingJob:

@@ -34,15 +34,17 @@ def test_each_copy_of_a_skin_is_on_one_board():
     copies, skin = virtual_boards(rows(), SKIN, augmentation(gain_sd=0.3), rng_for(1, "draw"))
     gain = copies / np.tile(rows(), (3, 1))
     for name in np.unique(skin):
-        own = gain[skin == name]
-        np.testing.assert_allclose(own, np.broadcast_to(own[0], own.shape), rtol=1e-5)  # quotients of float32
+        gain_of_copy = gain[skin == name]
+        np.testing.assert_allclose(
+            gain_of_copy, np.broadcast_to(gain_of_copy[0], gain_of_copy.shape), rtol=1e-5
+        )  # quotients of float32
     one_of_each = np.array([gain[skin == name][0] for name in np.unique(skin)])
     assert len(np.unique(np.round(one_of_each, 4), axis=0)) == 6
 
 
 def test_noise_has_the_given_deviation():
-    still = np.zeros((2000, 15), np.float32)
-    copies, _ = virtual_boards(still, np.array(["s"] * 2000), augmentation(noise_uT=5.0), rng_for(1, "draw"))
+    no_field = np.zeros((2000, 15), np.float32)
+    copies, _ = virtual_boards(no_field, np.array(["s"] * 2000), augmentation(noise_uT=5.0), rng_for(1, "draw"))
     assert abs(copies.std() - 5.0) < 0.05  # 90,000 draws: standard error 0.012
 
 

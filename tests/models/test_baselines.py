@@ -120,10 +120,10 @@ def test_weights_of_both_groups_have_the_same_sum(own_n, rows_max_n):
         patch.setattr(classical, "fit", recording_fit)
         results_of(task(few_labels=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
     (weight,) = weights
-    others, own = weight[:-own_n], weight[-own_n:]
+    others, labelled = weight[:-own_n], weight[-own_n:]
     assert len(others) == min(30, rows_max_n)
     assert (others == 1).all()
-    assert own.sum() == pytest.approx(len(others), rel=1e-6)  # float32 sums
+    assert labelled.sum() == pytest.approx(len(others), rel=1e-6)  # float32 sums
 
 
 def test_rows_are_unweighted_without_labels_of_a_new_skin(fits):

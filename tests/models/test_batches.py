@@ -40,8 +40,8 @@ def test_targets_belong_to_their_rows():
         for i, job in enumerate(jobs):
             chosen = rows_of(step["inputs"][i], job.labelled.inputs)
             assert (step["targets"][i].numpy() == job.labelled.targets[chosen]).all()
-            own = rows_of(step["few_labels"][i], job.few_labels.inputs)
-            assert (step["few_labels_targets"][i].numpy() == job.few_labels.targets[own]).all()
+            labelled_rows = rows_of(step["few_labels"][i], job.few_labels.inputs)
+            assert (step["few_labels_targets"][i].numpy() == job.few_labels.targets[labelled_rows]).all()
             rows_of(step["unlabelled"][i], job.unlabelled.inputs)
 
 
@@ -76,9 +76,9 @@ def test_poke_triplets_are_ordered_along_one_line():
 
 def test_rows_are_drawn_with_equal_probability():
     job, n = some_job(n=8), 400 * BATCH_N
-    drawn = np.concatenate([rows_of(step["inputs"][0], job.labelled.inputs) for step in batches([job], 400)])
+    rows = np.concatenate([rows_of(step["inputs"][0], job.labelled.inputs) for step in batches([job], 400)])
     # six binomial standard deviations
-    assert (np.abs(np.bincount(drawn, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()
+    assert (np.abs(np.bincount(rows, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()
 
 
 def test_batches_do_not_depend_on_the_stack():

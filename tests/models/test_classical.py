@@ -191,8 +191,8 @@ def test_shifted_places_shift_the_predictions(method, shift_mm):
 def test_constant_channel_is_ignored(method):
     db_uT, target = rows()
     query_uT, _ = rows(1)
-    still = np.full((len(db_uT), 1), 0.1, np.float32)
-    got = fit_to(method, np.hstack([db_uT, still]), target).predict(np.hstack([query_uT, still + 5]))
+    constant = np.full((len(db_uT), 1), 0.1, np.float32)
+    got = fit_to(method, np.hstack([db_uT, constant]), target).predict(np.hstack([query_uT, constant + 5]))
     np.testing.assert_allclose(got, fit_to(method, db_uT, target).predict(query_uT), atol=PREDICTION_ATOL_MM)
 
 

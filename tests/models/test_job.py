@@ -352,10 +352,10 @@ def test_augmentation_depends_on_fold_and_seed():
     recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings})
     other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings | {"gain_sd": 0.2}})
     job = replace(pooled(), recipe=recipe)
-    drawn = [
+    augmented = [
         prepare(one, example_data())[0].labelled.inputs
         for one in (job, job, replace(job, fold="b9"), replace(job, seed_i=5))
     ]
-    assert (drawn[0] == drawn[1]).all()
-    assert not any((drawn[0] == one).all() for one in drawn[2:])
+    assert (augmented[0] == augmented[1]).all()
+    assert not any((augmented[0] == one).all() for one in augmented[2:])
     assert key(job) != key(replace(job, recipe=other)) != key(pooled())

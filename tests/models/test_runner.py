@@ -52,16 +52,16 @@ def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
 
 
 def run(
-    some: list[TrainingJob], cache: Path, executor: Executor | None = None, log: list[str] | None = None
+    selected: list[TrainingJob], cache: Path, executor: Executor | None = None, log: list[str] | None = None
 ) -> list[TrainingResult]:
     tell = (lambda line: None) if log is None else log.append
-    return run_jobs(some, example_data(), executor=executor or InlineExecutor(), cache=cache, log=tell)
+    return run_jobs(selected, example_data(), executor=executor or InlineExecutor(), cache=cache, log=tell)
 
 
-def trainings_n(some: list[TrainingJob], cache: Path) -> int:
+def trainings_n(selected: list[TrainingJob], cache: Path) -> int:
     """Run jobs; return the number of stacks that are trained (not taken from the cache)."""
     executor = InlineExecutor()
-    run(some, cache, executor)
+    run(selected, cache, executor)
     return executor.calls_n
 
 
@@ -81,15 +81,15 @@ def test_result_reports_whether_it_was_cached(tmp_path):
 
 
 def test_results_are_in_the_order_of_jobs(tmp_path):
-    some = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adaptation(), fine_tuning()]
-    done = run(some, tmp_path)
-    assert len({one.key for one in done}) == len(some)
-    assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in some]
+    selected = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adaptation(), fine_tuning()]
+    done = run(selected, tmp_path)
+    assert len({one.key for one in done}) == len(selected)
+    assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in selected]
 
 
 def test_result_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
-    some = [*jobs(2), pooled(), adaptation(), jobs(3)[2]]
-    for job, one in zip(some, run(some, tmp_path), strict=True):
+    selected = [*jobs(2), pooled(), adaptation(), jobs(3)[2]]
+    for job, one in zip(selected, run(selected, tmp_path), strict=True):
         (alone,) = train_stack([job], example_data())
         np.testing.assert_allclose(one.predicted, alone.predicted, rtol=0, atol=STACKED_ATOL)
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
@@ -110,20 +110,20 @@ def test_call_sends_each_set_of_rows_once(tmp_path, monkeypatch):
 
 
 def test_killed_run_keeps_finished_jobs(tmp_path):
-    some = jobs(2 * SIZE_N + 1)
+    selected = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
-        run(some, tmp_path / "killed", InlineExecutor(die_after=1))
-    assert trainings_n(some, tmp_path / "killed") == 2  # two of three stacks
-    done, fresh = run(some, tmp_path / "killed"), run(some, tmp_path / "fresh")
+        run(selected, tmp_path / "killed", InlineExecutor(die_after=1))
+    assert trainings_n(selected, tmp_path / "killed") == 2  # two of three stacks
+    done, fresh = run(selected, tmp_path / "killed"), run(selected, tmp_path / "fresh")
     assert all(equal_results(a, b) for a, b in zip(done, fresh, strict=True))
 
 
 def test_stack_killed_during_writing_is_retrained(tmp_path):
     # Many steps with batches of one row amplify differences in the last bits, which depend on the position in a stack.
-    some = jobs(SIZE_N, steps_n=60, batch_n=1)
-    done = run(some, tmp_path)
+    selected = jobs(SIZE_N, steps_n=60, batch_n=1)
+    done = run(selected, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
-    assert all(equal_results(a, b) for a, b in zip(done, run(some, tmp_path), strict=True))
+    assert all(equal_results(a, b) for a, b in zip(done, run(selected, tmp_path), strict=True))
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "bit"])
@@ -186,8 +186,8 @@ def test_renamed_job_is_read_from_the_cache(tmp_path):
 
 def test_equal_jobs_are_trained_once(tmp_path):
     one = jobs(1)[0]
-    some = [one, replace(one, recipe_name="twin"), one]
-    done = run(some, tmp_path)
+    selected = [one, replace(one, recipe_name="twin"), one]
+    done = run(selected, tmp_path)
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     assert all(equal_results(done[0], other) for other in done[1:])
 
@@ -250,9 +250,9 @@ def prepare_dead(attempts: set[int]) -> object:
 @pytest.mark.parametrize(("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1, 2}, 2, 1)])
 def test_collapsed_training_is_repeated_at_most_twice(tmp_path, monkeypatch, dead, before_n, collapsed):
     monkeypatch.setattr(train, "prepare", prepare_dead(dead))
-    some, log = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
+    selected, log = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
     for _ in range(2):  # the second time, results are from the cache
-        first, second = run(some, tmp_path, log=log)
+        first, second = run(selected, tmp_path, log=log)
         assert (first.collapsed_before_n, first.collapsed) == (before_n, bool(collapsed))
         assert (second.collapsed_before_n, second.collapsed) == (0, False)
         assert second.explained_min > 0.5
@@ -279,14 +279,14 @@ def test_constant_or_unknown_target_is_not_a_collapse(tmp_path):
 
 def test_worker_process_gives_the_same_result(tmp_path, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
-    some = [adaptation(), fine_tuning()]
+    selected = [adaptation(), fine_tuning()]
     with make_executor(imports="reskin.models.train") as executor:
-        apart = run(some, tmp_path / "apart", executor)
-    assert all(equal_results(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
+        in_worker = run(selected, tmp_path / "apart", executor)
+    assert all(equal_results(a, b) for a, b in zip(in_worker, run(selected, tmp_path / "here"), strict=True))
 
 
-def by_key(some: list[TrainingJob]) -> dict[str, TrainingJob]:
-    return {f"key{i}": job for i, job in enumerate(some)}
+def by_key(selected: list[TrainingJob]) -> dict[str, TrainingJob]:
+    return {f"key{i}": job for i, job in enumerate(selected)}
 
 
 def test_jobs_with_equal_recipes_share_a_stack():
@@ -301,9 +301,9 @@ def test_jobs_with_equal_recipes_share_a_stack():
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
 def test_stacks_cover_every_job_once(kinds, size_n):
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
-    some = by_key([pooled(**settings[kind]) for kind in kinds])
-    found = make_stacks(some, size_n)
-    assert sorted(key for one in found for key in one) == sorted(some)
+    selected = by_key([pooled(**settings[kind]) for kind in kinds])
+    found = make_stacks(selected, size_n)
+    assert sorted(key for one in found for key in one) == sorted(selected)
     for one in found:
         assert 1 <= len(one) <= size_n
         assert len({kinds[int(key.removeprefix("key"))] for key in one}) == 1
@@ -312,9 +312,9 @@ def test_stacks_cover_every_job_once(kinds, size_n):
 
 
 def test_five_targets_are_learned():
-    own = example_data()
-    shear_N = own.target[:, 2:] * np.array([0.5, -0.25], np.float32)
-    five = replace(own, target=np.hstack([own.target, shear_N]))
+    data = example_data()
+    shear_N = data.target[:, 2:] * np.array([0.5, -0.25], np.float32)
+    five = replace(data, target=np.hstack([data.target, shear_N]))
     many = replace(without_triplets(), recipe=recipe(steps_n=400))
     (one,) = train_stack([replace(many, test=many.train)], five)
     assert one.predicted.shape == (len(many.train), 5)

@@ -40,8 +40,8 @@ def test_gradients_are_clipped_per_network():
     net = Stack(paper_layers(15), [some_weights(i) for i in range(3)])
     lengths = torch.tensor([0.0, 0.5, 70.0])
     for parameter in net.parameters():
-        drawn = torch.from_numpy(rng_for(0, "gradient", str(tuple(parameter.shape))).normal(size=parameter.shape))
-        parameter.grad = drawn.float()
+        gradient = torch.from_numpy(rng_for(0, "gradient", str(tuple(parameter.shape))).normal(size=parameter.shape))
+        parameter.grad = gradient.float()
     whole = torch.cat([one.grad.flatten(1) for one in net.parameters()], dim=1).norm(dim=1)
     for parameter in net.parameters():
         parameter.grad *= (lengths / whole)[:, None, None]
@@ -115,8 +115,10 @@ def test_stack_equals_plain_pytorch_loop(terms, decay):
 
 def relative_distance(weights: Weights, truth: Weights, start: Weights) -> float:
     """Return the distance of the weights from `truth`, relative to the distance of the initial weights from `truth`."""
-    off, way = (np.concatenate([(truth[name] - other[name]).ravel() for name in truth]) for other in (weights, start))
-    return float(np.linalg.norm(off) / np.linalg.norm(way))
+    off, start_off = (
+        np.concatenate([(truth[name] - other[name]).ravel() for name in truth]) for other in (weights, start)
+    )
+    return float(np.linalg.norm(off) / np.linalg.norm(start_off))
 
 
 @pytest.mark.parametrize("name", ["triplet", "unlabelled", "few_labels"])
@@ -224,8 +226,10 @@ def first_step_of_row_0(n: int, seed: int) -> int:
     job = some_job(n=n, draws=seed)
     feed = BatchSampler([job], 1, "cpu")
     steps = chain.from_iterable(feed.sample(BLOCK_STEPS_N) for _ in range(2))
-    drawn = [i for i, step in enumerate(steps) if (step["inputs"][0, 0].numpy() == job.labelled.inputs[0]).all()]
-    return drawn[0] if drawn else -1
+    steps_with_row_0 = [
+        i for i, step in enumerate(steps) if (step["inputs"][0, 0].numpy() == job.labelled.inputs[0]).all()
+    ]
+    return steps_with_row_0[0] if steps_with_row_0 else -1
 
 
 def test_diverging_network_does_not_affect_others_of_the_stack():

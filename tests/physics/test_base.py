@@ -27,16 +27,16 @@ def finite_elements(cells_n):
     return Layer(H_M, 3 * H_M, 8 * H_M, cells_n)
 
 
-def sum_of_waves(at, waves):
-    found = layer.displacement(at.r_m.ravel(), at.z_m.ravel(), waves)
-    return np.stack([getattr(found, name).reshape(at.r_m.shape) for name in PARTS])
+def sum_of_waves(motion, waves):
+    found = layer.displacement(motion.r_m.ravel(), motion.z_m.ravel(), waves)
+    return np.stack([getattr(found, name).reshape(motion.r_m.shape) for name in PARTS])
 
 
-def errors_of(at, truth):
+def errors_of(motion, truth):
     """Return the rms error of the displacement and of the gradient, each divided by the rms of the true values."""
-    near, parts_n = at.r_m < 4 * H_M, len(at.parts_m)
-    found = np.concatenate([at.parts_m, at.gradient.reshape(-1, *at.r_m.shape)])[:, near]
-    miss, size = ((of**2).sum(axis=1) for of in (found - truth[:, near], truth[:, near]))
+    near, parts_n = motion.r_m < 4 * H_M, len(motion.parts_m)
+    found = np.concatenate([motion.parts_m, motion.gradient.reshape(-1, *motion.r_m.shape)])[:, near]
+    miss, size = ((values**2).sum(axis=1) for values in (found - truth[:, near], truth[:, near]))
     return np.sqrt([miss[part].sum() / size[part].sum() for part in (slice(parts_n), slice(parts_n, None))])
 
 
@@ -46,7 +46,7 @@ def test_pressed_layer_converges_to_finite_elements(base):
     amplitude_m = WIDTH_M**2 * np.exp(-((k_per_m * WIDTH_M) ** 2) / 2) / 2 * layer.WAVES_W / H_M
     waves = layer.Waves(k_per_m, amplitude_m, H_M, base)
     solved = [finite_elements(cells_n).solve(1, gaussian, **HELD[base]) for cells_n in (4, 8)]
-    errors = np.array([errors_of(at.inside, sum_of_waves(at.inside, waves)) for at in solved])
+    errors = np.array([errors_of(solution.inside, sum_of_waves(solution.inside, waves)) for solution in solved])
     assert (errors[1] < [1e-3, 2e-2]).all()  # with 8 cells, the errors are 3e-4 and 9e-3
     # Taylor-Hood elements converge with orders 3 and 2
     assert (errors[0] / errors[1] > 2 ** np.array([2.7, 1.7])).all()
@@ -66,16 +66,16 @@ def test_contact_pressure_deforms_the_surface_to_the_tip(base):
         return 4 * top_m * (chi.deriv()(x2_m2) @ layer.CONTACT_W)
 
     top = finite_elements(8).solve(1, load, **HELD[base]).top
-    r_m, up_m = (of[top.r_m < contact.radius_m] for of in (top.r_m, top.parts_m[1]))
+    r_m, up_m = (values[top.r_m < contact.radius_m] for values in (top.r_m, top.parts_m[1]))
     # 1 %: the edge of the contact is inside a cell; measured errors are 0.4 % and 0.7 % of the depth
     np.testing.assert_allclose(up_m, TIP_M - np.sqrt(TIP_M**2 - r_m**2) - DEPTH_M, atol=1e-2 * DEPTH_M)
 
 
-def half_curl(at):
+def half_curl(motion):
     """Return D, E, S of `ShearMap`, derived from A, B, C and their gradients by the chain rule."""
-    ((a_r, a_z), (b_r, b_z), (c_r, _)), (_, b, c) = at.gradient, at.parts_m
-    in_line, across = (a_z + b_z - c_r) / 2, (a_z - b_z - c / at.r_m) / 2
-    return np.stack([(in_line + across) / 2, (in_line - across) / 2, b / at.r_m + (b_r - a_r) / 2])
+    ((a_r, a_z), (b_r, b_z), (c_r, _)), (_, b, c) = motion.gradient, motion.parts_m
+    in_line, across = (a_z + b_z - c_r) / 2, (a_z - b_z - c / motion.r_m) / 2
+    return np.stack([(in_line + across) / 2, (in_line - across) / 2, b / motion.r_m + (b_r - a_r) / 2])
 
 
 def test_finite_elements_cover_the_deepest_drag():
@@ -92,13 +92,13 @@ def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     def load(r_m):  # q = 3 Q / pi a^2 (1 - r^2 / a^2)^2; q cos f along r and -q sin f across r do the work 2 q A
         return 6 / np.pi / radius_m**2 * np.maximum(1 - (r_m / radius_m) ** 2, 0) ** 2
 
-    of = Layer(H_M, radius_m + H_M, radius_m + 8 * H_M, 6, along_x_strains)
-    solved = of.solve(0, load, {"axis": [1, 2], "base": [0, 1, 2], "far": [0, 1, 2]}, {})
-    at, table = solved.inside, shear.tabulate(traction, H_M)
-    (r_m, r_i), (z_m, z_i) = (np.unique(part.round(12), return_inverse=True) for part in (at.r_m, at.z_m))
+    elements = Layer(H_M, radius_m + H_M, radius_m + 8 * H_M, 6, along_x_strains)
+    solved = elements.solve(0, load, {"axis": [1, 2], "base": [0, 1, 2], "far": [0, 1, 2]}, {})
+    motion, table = solved.inside, shear.tabulate(traction, H_M)
+    (r_m, r_i), (z_m, z_i) = (np.unique(part.round(12), return_inverse=True) for part in (motion.r_m, motion.z_m))
     truth = np.moveaxis(shear.evaluate_map(traction, r_m, z_m, thickness_m=H_M), 2, 0)[:, r_i, z_i]
-    near = at.r_m < radius_m + 3 * H_M
-    found = [*at.parts_m[:, near], *half_curl(at)[:, near]]
+    near = motion.r_m < radius_m + 3 * H_M
+    found = [*motion.parts_m[:, near], *half_curl(motion)[:, near]]
     errors = [np.linalg.norm(f - t) / np.linalg.norm(t) for f, t in zip(found, truth[:, near], strict=True)]
     assert max(errors[:3]) < tolerance
     assert max(errors[3:]) < 4 * tolerance  # gradients converge with one order less
@@ -121,10 +121,10 @@ def test_stiff_plate_under_uniform_drag_moves_rigidly(sides_m):
 
 
 def test_base_friction_interpolates_between_slipping_and_bonded():
-    of = finite_elements(4)
-    slipping_m, bonded_m = (of.solve(1, gaussian, **HELD[base]).under_load_m for base in HELD)
-    between = [of.with_friction(gaussian, mu, **HELD["slipping"]) for mu in (1e-3, 0.5, 100.0)]
-    held = [(slipping_m - at.under_load_m) / (slipping_m - bonded_m) for at in between]
+    elements = finite_elements(4)
+    slipping_m, bonded_m = (elements.solve(1, gaussian, **HELD[base]).under_load_m for base in HELD)
+    between = [elements.with_friction(gaussian, mu, **HELD["slipping"]) for mu in (1e-3, 0.5, 100.0)]
+    held = [(slipping_m - solution.under_load_m) / (slipping_m - bonded_m) for solution in between]
     assert held[0] < 0.01
     assert (np.diff(held) > 0).all()
     assert 0.99 < held[-1] < 1

@@ -102,9 +102,9 @@ def test_tiled_boards_have_forty_chips():
     centres_mm = [(x, y, 0.0) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7)]
     assert board.chips_m.shape == (40, 3)
     for board_i, middle_mm in enumerate(centres_mm):
-        own = slice(5 * board_i, 5 * board_i + 5)
-        np.testing.assert_allclose(board.chips_m[own], one.chips_m + 1e-3 * np.array(middle_mm), atol=1e-15)
-        np.testing.assert_allclose(board.turn[own], one.turn)
+        chips_of_tile = slice(5 * board_i, 5 * board_i + 5)
+        np.testing.assert_allclose(board.chips_m[chips_of_tile], one.chips_m + 1e-3 * np.array(middle_mm), atol=1e-15)
+        np.testing.assert_allclose(board.turn[chips_of_tile], one.turn)
 
 
 @given(st.integers(1, 4), st.integers(1, 3), st.floats(1, 100))

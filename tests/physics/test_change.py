@@ -89,8 +89,8 @@ def test_tiny_move_keeps_precision():
 
 @pytest.mark.parametrize("place", [0.0, np.nan])
 def test_observer_on_a_dipole_is_refused(place):
-    at, away, moment = np.full((1, 3), place), np.ones((1, 3)), np.ones((1, 3))
+    dipole_m, away, moment = np.full((1, 3), place), np.ones((1, 3)), np.ones((1, 3))
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
-        change_of_field((at, moment), (away, moment), np.zeros((1, 3)))
+        change_of_field((dipole_m, moment), (away, moment), np.zeros((1, 3)))
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
-        change_of_field((away, moment), (at, moment), np.zeros((1, 3)))
+        change_of_field((away, moment), (dipole_m, moment), np.zeros((1, 3)))

@@ -28,8 +28,8 @@ def linear_at(r_m, z_m, depth_m, base="bonded"):
     return layer.displacement(r_m, z_m, layer.waves(contact, H_M, base))
 
 
-def det_f(at):
-    return np.linalg.det(at.f) * at.hoop
+def det_f(deformed):
+    return np.linalg.det(deformed.f) * deformed.hoop
 
 
 @pytest.mark.parametrize("base", BASES)
@@ -79,7 +79,7 @@ def test_steps_converge_quadratically(monkeypatch):
         monkeypatch.setattr(deformation, "LADDER", ladder)
         # a depth of a whole number of steps
         found.append(follow(r_m, z_m, 0.6 * H_M * deformation.depth_scale(TIP_M / H_M)))
-    loss = [np.abs(det_f(at) - 1).max() for at in found]
+    loss = [np.abs(det_f(deformed) - 1).max() for deformed in found]
     assert loss[1] < loss[0] / 2.5
     assert loss[2] < loss[1] / 2.5
     apart_m = [np.hypot(b.r_m - a.r_m, b.z_m - a.z_m).max() for a, b in pairwise(found)]
@@ -90,11 +90,11 @@ def test_steps_converge_quadratically(monkeypatch):
 @pytest.mark.parametrize("base", BASES)
 def test_shallow_poke_is_linear(base):
     r_m, z_m = nodes(r_max_m=1e-3)
-    at, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
+    deformed, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
     linear = linear_at(r_m, z_m, depth_m, base)
     # 5 % of the depth, because the material moves and the contact (0.3 mm) is as small as the shortest wave
-    np.testing.assert_allclose(at.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
-    np.testing.assert_allclose(at.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
+    np.testing.assert_allclose(deformed.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
+    np.testing.assert_allclose(deformed.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
 
 
 @pytest.mark.parametrize("base", BASES)

@@ -49,12 +49,14 @@ def test_table_equals_following_nodes(rung_i, share, base):
     start_m = places(np.random.default_rng(0), 150) * (1, 0, 1)
     start_m = start_m[start_m[:, 2] < H_M]  # without the surface, where the angle jumps at the edge of the contact
     moved = move(start_m, (0, 0, depth_m), base)
-    at = follow(np.abs(start_m[:, 0]), start_m[:, 2], depth_m, base)
+    followed = follow(np.abs(start_m[:, 0]), start_m[:, 2], depth_m, base)
     sign = np.sign(start_m[:, 0])
-    np.testing.assert_allclose(moved.after[0][:, 0], sign * at.r_m, atol=share * depth_m)
-    np.testing.assert_allclose(moved.after[0][:, 2], at.z_m, atol=share * depth_m)
+    np.testing.assert_allclose(moved.after[0][:, 0], sign * followed.r_m, atol=share * depth_m)
+    np.testing.assert_allclose(moved.after[0][:, 2], followed.z_m, atol=share * depth_m)
     if share < 0.01:
-        np.testing.assert_allclose(moved.after[1][:, 0], sign * np.sin(deformation.rotation_angle(at.f)), atol=3e-3)
+        np.testing.assert_allclose(
+            moved.after[1][:, 0], sign * np.sin(deformation.rotation_angle(followed.f)), atol=3e-3
+        )
 
 
 @given(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3), depths_m, bases)

@@ -21,7 +21,7 @@ sources_m = triples.map(lambda v: v + np.array([3.0, -2.0, 1.0]))
 observers_m = triples.map(lambda v: v + np.array([-3.0, 4.0, 5.0]))
 
 
-def at(source_m, moment, observer_m):
+def field_at(source_m, moment, observer_m):
     return field(np.atleast_2d(source_m), np.atleast_2d(moment).astype(float), np.atleast_2d(observer_m))[0]
 
 
@@ -35,11 +35,13 @@ def test_field_on_axis_and_beside(source_m, r_m):
     # rtol: the separation (source + r) - source loses digits
     for direction, times in (((0, 0, r_m), 2), ((r_m, 0, 0), -1)):
         truth_T = (0, 0, times * 2.0 * MU0_4PI / r_m**3)
-        np.testing.assert_allclose(at(source_m, (0, 0, 2.0), source_m + direction), truth_T, rtol=1e-9, atol=1e-25)
+        np.testing.assert_allclose(
+            field_at(source_m, (0, 0, 2.0), source_m + direction), truth_T, rtol=1e-9, atol=1e-25
+        )
 
 
 def test_field_at_45_degrees():
-    b_T = at((1.0, 2.0, 3.0), (0, 0, 1), np.array([1.0, 2.0, 3.0]) + np.array([1, 0, 1]) / np.sqrt(2))
+    b_T = field_at((1.0, 2.0, 3.0), (0, 0, 1), np.array([1.0, 2.0, 3.0]) + np.array([1, 0, 1]) / np.sqrt(2))
     np.testing.assert_allclose(b_T, MU0_4PI * np.array([1.5, 0, 0.5]), rtol=ROUNDING, atol=1e-20)
 
 
@@ -63,9 +65,9 @@ def test_field_equals_magpylib(seed):
 
 @given(sources_m, triples, triples, observers_m, coordinates)
 def test_field_is_linear_in_the_moment(source_m, one, other, observer_m, share):
-    together = at(source_m, one + share * other, observer_m)
-    apart = at(source_m, one, observer_m) + share * at(source_m, other, observer_m)
-    np.testing.assert_allclose(together, apart, rtol=1e-9, atol=1e-20)  # atol: the fields may cancel
+    together = field_at(source_m, one + share * other, observer_m)
+    summed = field_at(source_m, one, observer_m) + share * field_at(source_m, other, observer_m)
+    np.testing.assert_allclose(together, summed, rtol=1e-9, atol=1e-20)  # atol: the fields may cancel
 
 
 @given(sources_m, triples, observers_m)
@@ -82,8 +84,8 @@ def test_divergence_and_curl_are_zero(source_m, moment, observer_m):
 def test_rotation_by_90_degrees(source_m, moment, observer_m):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(
-        at(turn @ source_m, turn @ moment, turn @ observer_m),
-        turn @ at(source_m, moment, observer_m),
+        field_at(turn @ source_m, turn @ moment, turn @ observer_m),
+        turn @ field_at(source_m, moment, observer_m),
         rtol=1e-9,
         atol=1e-22,
     )

@@ -23,8 +23,8 @@ thicknesses_m = st.floats(1e-3, 5e-3)
 tips_m = st.floats(2e-3, 4e-3)
 
 
-def force(depth_m, modulus_Pa=190e3, **of):
-    return layer.force(np.atleast_1d(np.asarray(depth_m, dtype=float)), modulus_Pa=modulus_Pa, **(SKIN | of))
+def force(depth_m, modulus_Pa=190e3, **changes):
+    return layer.force(np.atleast_1d(np.asarray(depth_m, dtype=float)), modulus_Pa=modulus_Pa, **(SKIN | changes))
 
 
 def field(r_m, z_m, depth_m=1.2e-3):

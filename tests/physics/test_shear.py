@@ -290,9 +290,9 @@ def test_rotating_force_and_nodes_rotates_the_displacement(force_N, angle_rad):
 
 def test_mirror_symmetry_along_the_force():
     nodes_m, mirror = some_places_m(), np.array([1, -1, 1])
-    here, there = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
-    np.testing.assert_allclose(there.displacement_m, here.displacement_m * mirror, atol=1e-18)
-    np.testing.assert_allclose(there.half_curl, -here.half_curl * mirror, atol=1e-15)  # the curl is an axial vector
+    here, mirrored = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
+    np.testing.assert_allclose(mirrored.displacement_m, here.displacement_m * mirror, atol=1e-18)
+    np.testing.assert_allclose(mirrored.half_curl, -here.half_curl * mirror, atol=1e-15)  # the curl is an axial vector
     back = displace([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
 
@@ -326,15 +326,15 @@ def test_displacement_scales_with_size_and_stiffness(size, hardness):
     nodes_m = some_places_m(30)
     large = shear.tabulate_depth(size * 0.6e-3, thickness_m=size * H_M, tip_radius_m=size * TIP_M, base="bonded")
     here = displace([0.5, 0.2], nodes_m, centre_m=(0, 0))
-    there = displace(
+    scaled = displace(
         [0.5 * hardness * size**2, 0.2 * hardness * size**2],
         size * nodes_m,
         large,
         (0, 0),
         modulus_Pa=hardness * YOUNG_PA,
     )
-    np.testing.assert_allclose(there.displacement_m, size * here.displacement_m, atol=1e-9 * size * 1e-3)
-    np.testing.assert_allclose(there.half_curl, here.half_curl, atol=1e-9)
+    np.testing.assert_allclose(scaled.displacement_m, size * here.displacement_m, atol=1e-9 * size * 1e-3)
+    np.testing.assert_allclose(scaled.half_curl, here.half_curl, atol=1e-9)
 
 
 # tolerance: squares of numbers below 1e-150 lose digits
@@ -401,9 +401,9 @@ def test_small_force_needs_no_midpoint_step():
 def test_displacement_of_moved_nodes_rotates_with_the_force():
     nodes_m, turn = some_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
     here = displace([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
-    there = displace([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
-    np.testing.assert_allclose(there.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
-    np.testing.assert_allclose(there.half_curl, here.half_curl @ turn.T, atol=1e-12)
+    rotated = displace([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
+    np.testing.assert_allclose(rotated.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
+    np.testing.assert_allclose(rotated.half_curl, here.half_curl @ turn.T, atol=1e-12)
     assert not displace([0.5, 0.3], nodes_m * [1, 1, 0], by=shear.shear_in_steps).displacement_m.any()
 
 

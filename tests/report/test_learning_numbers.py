@@ -88,7 +88,7 @@ def test_paired_differences_by_board():
     # gains of 2 and 4 percentage points on the skins of b0, of 6 and 8 on the skins of b1
     assert paired("adapted", "triplet")["accuracy_pct"] == over(3.0, 7.0)
     by_board = paired("adapted", "triplet")["by_board"]
-    assert {board: own["accuracy_pct"] for board, own in by_board.items()} == {"b0": 3.0, "b1": 7.0}
+    assert {board: metrics["accuracy_pct"] for board, metrics in by_board.items()} == {"b0": 3.0, "b1": 7.0}
     assert paired("adapted", "control")["accuracy_pct"] == over(1.5, 3.5)
     assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 2, "sd": 0.0, "values": [-2.0, -2.0]}
     assert paired("adapted", "multi")["accuracy_pct"]["mean"] == 3.0
@@ -98,7 +98,7 @@ def test_paired_differences_by_board():
 def test_multi_minus_single_uses_skins_of_both():
     single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
     (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
-    assert {board: own["accuracy_pct"] for board, own in one["by_board"].items()} == {"b1": 80.0 - 30.0}
+    assert {board: metrics["accuracy_pct"] for board, metrics in one["by_board"].items()} == {"b1": 80.0 - 30.0}
     assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
@@ -222,7 +222,7 @@ def test_sensor_contrasts_of_methods_and_gains():
         "multi": {1: (50, 60), 15: (80, 84)}, "triplet": {1: (48, 58), 15: (78, 82)},
         "adapted": {1: (58, 64), 15: (80, 83)},
     }  # fmt: skip
-    rows = [row for name, own in scores.items() for row in points("trained_on_skins_n", own, method=name)]
+    rows = [row for name, by_count in scores.items() for row in points("trained_on_skins_n", by_count, method=name)]
     found = contrasts_of_sensors(tidy([], {"sensors": rows}))
     assert gains(found["sensors_more_multi"]) == {"b0": 30.0, "b1": 24.0}
     over = found["sensors_adapted_over_triplet"]

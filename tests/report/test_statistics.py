@@ -106,10 +106,10 @@ def test_adapted_networks_are_pooled_by_fold_and_seed():
     assert set(rows.rows_n) == {20}
     for places, part in ((AS_LABELLED, "all"), (REGISTERED, "registered")):
         for _, row in whole(tidy(adapted_cards()), places).iterrows():
-            own = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
+            cards = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
             for name in METRICS[:3]:  # R^2: see test_unequal_skins_pool_to_the_score_of_all_rows
                 total = 0.0
-                for one in own:
+                for one in cards:
                     total += one["scores"][part][name]
                 assert row[name] == pytest.approx(total / 2, rel=1e-12)  # rounding in float64
 
@@ -161,9 +161,9 @@ def test_paired_equals_scipys_paired_t_test(pairs):
 
 def test_differences_are_averaged_over_networks_then_skins():
     # means of the skins of b0: 2 and 10; skins have different numbers of networks
-    of = score_table({"b0": [[1.0, 3.0], [10.0]], "b1": [[5.0]]})
-    over = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # means of the skins of b0: 1 and 2
-    found = paired(of, over)
+    first = score_table({"b0": [[1.0, 3.0], [10.0]], "b1": [[5.0]]})
+    second = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # means of the skins of b0: 1 and 2
+    found = paired(first, second)
     assert found["by_board"] == {"b0": {"accuracy_pct": (1 + 8) / 2}, "b1": {"accuracy_pct": -4.0}}
     assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (0.25, 2)
 
@@ -213,16 +213,16 @@ def test_more_skins_of_equal_scores_change_nothing():
 @FEW
 @given(VALUES, st.integers(0, 99))
 def test_order_of_rows_does_not_matter(values, seed):
-    of = score_table({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
+    first = score_table({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
     over = score_table({f"b{i}": [[1.0], [0.0]] for i in range(len(values))})
-    assert paired(of.sample(frac=1, random_state=seed), over[::-1]) == paired(of, over)
+    assert paired(first.sample(frac=1, random_state=seed), over[::-1]) == paired(first, over)
 
 
 @FEW
 @given(VALUES)
 def test_swapping_the_sides_negates_the_difference(values):
-    of, over = board_scores(values), board_scores([1.0] * len(values))
-    ahead, back = paired(of, over)["accuracy_pct"], paired(over, of)["accuracy_pct"]
+    first, second = board_scores(values), board_scores([1.0] * len(values))
+    ahead, back = paired(first, second)["accuracy_pct"], paired(second, first)["accuracy_pct"]
     turned = negate(ahead)
     assert back["ci95"] == pytest.approx(turned["ci95"], abs=DOUBLE)
     assert back["mean"] == pytest.approx(turned["mean"], abs=DOUBLE)
@@ -233,7 +233,7 @@ def test_swapping_the_sides_negates_the_difference(values):
 @FEW
 @given(VALUES, st.floats(-50, 50))
 def test_threshold_is_equivalent_to_a_shift(values, above):
-    stat, moved = (statistic(own, boards=True) for own in (values, [value - above for value in values]))
+    stat, moved = (statistic(scores, boards=True) for scores in (values, [value - above for value in values]))
     if min(abs(end) for end in moved["ci95"]) > DOUBLE:
         assert verdict(stat, above=above) == verdict(moved)
 
@@ -297,9 +297,11 @@ def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
 def test_paired_with_single_counts_training_skins():
     boards = [f"b{i}" for i in range(4)]
     alike = transfer_scores({fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")})
-    apart = transfer_scores({f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)})
+    differing = transfer_scores(
+        {f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)}
+    )
     many = board_scores([80.0, 81.0, 82.0, 83.0])
-    sure, unsure = (paired_with_single(many, one)["accuracy_pct"] for one in (alike, apart))
+    sure, unsure = (paired_with_single(many, one)["accuracy_pct"] for one in (alike, differing))
     assert sure["mean"] == pytest.approx(60.0)
     assert sure["ci95"] == pytest.approx([60.0, 60.0])  # all gains are equal
     # The mean gains are 50 on every board and 60, 50, 40 for the training skins: variance 100 / 3, two degrees of
@@ -429,7 +431,7 @@ def test_tally_of_training_runs_counts_every_attempt(done):
     assert tally(done) == {
         "trainings_n": sum(map(len, attempts)),
         "collapsed_n": sum(map(sum, attempts)),
-        "kept_collapsed_n": sum(own[-1] for own in attempts),
+        "kept_collapsed_n": sum(collapses[-1] for collapses in attempts),
     }
 
 

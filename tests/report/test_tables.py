@@ -244,7 +244,12 @@ def test_summary_of_recordings_has_labels():
 
 
 def test_no_summary_without_held_out_boards():
-    assert summary_table({name: own for name, own in all_experiments().items() if name != "table2"}) is None
+    assert (
+        summary_table(
+            {name: experiment_numbers for name, experiment_numbers in all_experiments().items() if name != "table2"}
+        )
+        is None
+    )
 
 
 TABLE_1 = read_table1()

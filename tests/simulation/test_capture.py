@@ -112,7 +112,7 @@ def test_passes_of_an_exact_robot_differ_only_by_noise(capture):
 
 def test_protocol_may_have_another_frame_rate():
     slow, usual = (
-        capture_of(with_protocol("other", GRID | {"passes_n": 1} | own), "other") for own in ({"rate_hz": 133.0}, {})
+        capture_of(with_protocol("other", GRID | {"passes_n": 1} | rate), "other") for rate in ({"rate_hz": 133.0}, {})
     )
     for capture, rate_hz in ((slow, 133.0), (usual, 400.0)):
         frames_n, log = 130 * FRAMES_N, capture.probe

@@ -160,8 +160,8 @@ def test_perturbed_copy_is_detected(sd_uT, factor):
 
 
 def test_copied_capture_is_detected_among_others():
-    own, copied = (np.flatnonzero(LABELS.skin == skin) for skin in ("b0_s1", "b2_s1"))
-    few = own[: 8 * READINGS_N]
+    copy_rows, copied = (np.flatnonzero(LABELS.skin == skin) for skin in ("b0_s1", "b2_s1"))
+    few = copy_rows[: 8 * READINGS_N]
     capture = LABELS.capture.astype("U20")
     capture[few] = "c_b0_s1_more"
     planted = DB_uT.copy()
@@ -183,9 +183,9 @@ def test_copy_is_detected_in_a_sample(monkeypatch):
 
 
 def test_equal_directions_with_other_magnitudes_are_not_a_copy():
-    planted, own = DB_uT.copy(), LABELS.skin == "b0_s1"
-    factor = rng_for(4, "factor").uniform(1, 4, (own.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
-    planted[own] = factor * DB_uT[LABELS.skin == "b2_s1"]
+    planted, on_skin = DB_uT.copy(), LABELS.skin == "b0_s1"
+    factor = rng_for(4, "factor").uniform(1, 4, (on_skin.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
+    planted[on_skin] = factor * DB_uT[LABELS.skin == "b2_s1"]
     assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 

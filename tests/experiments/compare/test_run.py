@@ -129,7 +129,7 @@ def test_sixteen_orientations_are_distinct():
 
 
 def test_flipped_skin_is_a_rotated_checkerboard():
-    plain, flipped = (replace(SETUP, skin_flipped=way).rest for way in (False, True))
+    plain, flipped = (replace(SETUP, skin_flipped=is_flipped).rest for is_flipped in (False, True))
     turn = compare.quarter_turn(1)
     moments_by_node = {
         tuple(np.round(node * 1e6).astype(int)): moment

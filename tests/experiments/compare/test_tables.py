@@ -56,10 +56,10 @@ def test_table_compares_simulations_with_bounds():
 
 def test_single_board_of_equal_forces_has_no_growth_or_refit():
     alone = copy.deepcopy(BOARD)
-    for own in (alone, alone["nominal"]):
-        del own["growth"]
-    for own, name in ((alone, "refitted"), (alone["laws"], "refitted"), (alone, "memory")):
-        del own[name]
+    for section in (alone, alone["nominal"]):
+        del section["growth"]
+    for section, name in ((alone, "refitted"), (alone["laws"], "refitted"), (alone, "memory")):
+        del section[name]
     numbers = NUMBERS | {"by_board": {"b1": alone}, "over_boards": {}}
     table = tables(numbers, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes"]

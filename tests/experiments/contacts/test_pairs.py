@@ -37,8 +37,8 @@ ROWS = grid_rows()
 OWN = np.flatnonzero(ROWS.board == "b0")
 
 
-def pairs_at(separation_mm, rows=ROWS, own=OWN, pairs_n=80):
-    return draw_pairs(rows, own, separation_mm, pairs_n=pairs_n, rng=rng_for(0, "pairs", f"{separation_mm}"))
+def pairs_at(separation_mm, rows=ROWS, tested=OWN, pairs_n=80):
+    return draw_pairs(rows, tested, separation_mm, pairs_n=pairs_n, rng=rng_for(0, "pairs", f"{separation_mm}"))
 
 
 @given(st.sampled_from([2.0, 4.2, 6.0, 8.5, 12.0, 16.0]))
@@ -139,8 +139,8 @@ def test_thresholds_depend_only_on_held_out_contacts():
 
 
 def test_total_auc_excludes_pairs_at_one_place():
-    single, apart = scores("single"), scores("four", 2)
-    found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: apart}, 0.1)
+    single, separated = scores("single"), scores("four", 2)
+    found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: separated}, 0.1)
     assert found["auc"] == found["by_separation"][4.0]["auc"]
     assert found["by_separation"][0.0]["auc"]["odd"] < 0.01
 

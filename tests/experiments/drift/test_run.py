@@ -103,10 +103,10 @@ def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     svgs = drift_pages.figures(numbers, results["drawn"], "simulated")
     assert set(svgs) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
     # A random walk with steps of 0 uT equals the last window; readings before every contact remove any walk.
-    for policy, (still, _) in numbers["wander"].items():
+    for policy, (without_walk, _) in numbers["wander"].items():
         last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}
-        assert {name: still[name] for name in last} == pytest.approx(last)
-        assert still["spread"]["mse_xy_mm2"] == pytest.approx(numbers[policy][-1]["spread"]["mse_xy_mm2"])
+        assert {name: without_walk[name] for name in last} == pytest.approx(last)
+        assert without_walk["spread"]["mse_xy_mm2"] == pytest.approx(numbers[policy][-1]["spread"]["mse_xy_mm2"])
     assert numbers["wander"]["each"][1]["mse_xy_mm2"] == pytest.approx(numbers["each"][-1]["mse_xy_mm2"], rel=1e-3)
 
 

@@ -29,13 +29,13 @@ def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
             ("too much force", "not judged (fewer than 4 boards)", "yes", "bias 0.1 N"),
         )
     ]
-    own = {
+    about = {
         "unit": "indentation", "train_n": 5000, "test_n": 1000, "every_n": 5000, "regular_n": 390, "skins_n": 1,
         "seeds_n": 2, "left_out_units_n": 90, "contact_every_s": 0.0575, "lasts_s": 1166.2,
         "field": {"contact_uT": 140.0, "noload_noise_uT": 1.25},
         "findings": findings,
     }  # fmt: skip
-    return own | policies | ({"late": late} if force else {}) | changed
+    return about | policies | ({"late": late} if force else {}) | changed
 
 
 DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}

@@ -71,8 +71,8 @@ def test_bias_and_standard_error_over_indentations_equal_scipy():
     for skin in ("s0", "s1"):
         for press in range(20):
             rows = [(one, one.indentation == press) for one in networks if one.skin == skin]
-            true_N.append(np.mean([one.true[at, 2] for one, at in rows]))
-            predicted_N.append(np.mean([one.predicted[at, 2] for one, at in rows]))
+            true_N.append(np.mean([one.true[selected, 2] for one, selected in rows]))
+            predicted_N.append(np.mean([one.predicted[selected, 2] for one, selected in rows]))
     bias = force_bias(contact_forces(networks))
     errors_N = np.array(predicted_N) - np.array(true_N)
     assert bias["indentations_n"] == 40

@@ -123,9 +123,9 @@ def test_noload_places_may_be_empty(tmp_path):
 
 
 def test_constant_zero_depth_is_unknown(tmp_path):
-    still, account = read(tmp_path / "still", table().assign(depth_mm=0.0))
-    assert np.isnan(still.depth_mm).all()
-    assert account["no_depth_rows_n"] == len(still)
+    zero_depth, account = read(tmp_path / "still", table().assign(depth_mm=0.0))
+    assert np.isnan(zero_depth.depth_mm).all()
+    assert account["no_depth_rows_n"] == len(zero_depth)
     moving = table()
     moving["depth_mm"] = np.where(moving.phase == "contact", 0.5 + 0.1 * moving.x_mm, 0.0)
     found, account = read(tmp_path / "moving", moving)
