@@ -164,7 +164,7 @@ def numbers_and_figure_data(n=40):
     numbers = {
         "chips_n": 16, "rate_hz": 132.98, "area_mm": list(AREA.sides_mm), "pokes_n": 5 * n, "trained_n": 4 * n,
         "tested_n": n, "near_mm": NEAR_MM, **score_places(true, [predicted], indentation, AREA),
-        "variants": {name: score_places(true, variant_predictions, indentation, AREA) for name, variant_predictions in others.items()},
+        "variants": {name: score_places(true, outputs, indentation, AREA) for name, outputs in others.items()},
     }  # fmt: skip
     return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
 

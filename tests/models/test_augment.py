@@ -35,9 +35,8 @@ def test_each_copy_of_a_skin_is_on_one_board():
     gain = copies / np.tile(rows(), (3, 1))
     for name in np.unique(skin):
         gain_of_copy = gain[skin == name]
-        np.testing.assert_allclose(
-            gain_of_copy, np.broadcast_to(gain_of_copy[0], gain_of_copy.shape), rtol=1e-5
-        )  # quotients of float32
+        # quotients of float32
+        np.testing.assert_allclose(gain_of_copy, np.broadcast_to(gain_of_copy[0], gain_of_copy.shape), rtol=1e-5)
     one_of_each = np.array([gain[skin == name][0] for name in np.unique(skin)])
     assert len(np.unique(np.round(one_of_each, 4), axis=0)) == 6
 
