@@ -117,7 +117,7 @@ def test_open_accepts_loaded_models(model):  # noqa: F811
         reskin.open("/dev/none", model=None)
 
 
-def test_loaded_model_predicts_as_its_network(model):  # noqa: F811
+def test_loaded_model_predicts_like_its_network(model):  # noqa: F811
     b_uT = rng_for(0, "api").normal(500, 100, (4, 15)).astype(np.float32)
 
     loaded = reskin.load_model(str(model)).zero(b_uT[:2].tolist())

@@ -112,7 +112,7 @@ def test_field_of_all_nodes_equals_magpylib() -> None:
 @pytest.mark.timeout(600)
 def test_time_of_pokes_with_and_without_table() -> None:
     pokes_m, one = one_pass_m(), skin("s0")
-    changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # compiles
+    changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # the first call compiles the kernel
     forget_tables()
     start_s = time.perf_counter()
     _, first_T = changes_of_field(BOARD, one, pokes_m)

@@ -211,7 +211,8 @@ def _unset_variables(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.timeout(1800)
 def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
     rows = make_rows()
-    plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))  # imports
+    # the first call imports PyTorch
+    plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))
     train_stack([replace(fold_grid(rows, 0.0)[0], recipe=recipe(0.0, 1))], rows)
     columns: dict[str, list[float]] = defaultdict(list)
     for i in range(REPEATS_N):
@@ -260,7 +261,7 @@ def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
 def test_cpu_time_of_the_parts_of_a_training_step(triplet_weight: float) -> None:
     rows = make_rows()
     jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
-    train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # imports
+    train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # the first call imports PyTorch
     sgemm, best_s, best = max(sgemm_flop_per_s()), np.inf, {}
     for _ in range(REPEATS_N):
         with record_cpu_s({"all": [(train_module, "train")]}) as whole, record_cpu_s(STEP) as spent_s:

@@ -54,7 +54,7 @@ def checkout(scene: Mapping[str, Any]) -> Iterator[Path]:
     """Yield a temporary copy of this checkout that has only the given scene."""
     with tempfile.TemporaryDirectory() as temporary:
         root = copy_checkout(Path(temporary))
-        (root / SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is YAML
+        (root / SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is valid YAML
         yield root
 
 

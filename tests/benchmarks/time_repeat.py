@@ -25,7 +25,7 @@ from reskin.config import read_yaml
 from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
 
 SCENE = "repeat"
-SKINS_N = 6  # one per board
+SKINS_N = 6  # one skin on each board
 EXPERIMENTS = ("single_random", "lobo", "triplet")
 TRAINED = ("train_single", "train_multi", "train_triplet")
 AGAIN = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
@@ -61,7 +61,7 @@ def scene_settings() -> dict[str, Any]:
 def make_checkout(folder: Path) -> None:
     """Clone the last commit and commit the scene to the clone."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
-    (folder / f"pipeline/scenes/{SCENE}.yaml").write_text(json.dumps(scene_settings(), indent=1))  # JSON is YAML
+    (folder / f"pipeline/scenes/{SCENE}.yaml").write_text(json.dumps(scene_settings(), indent=1))  # JSON is valid YAML
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for words in (["add", "."], [*author, "commit", "--quiet", "--message", SCENE]):
         subprocess.run(["git", *words], cwd=folder, check=True)

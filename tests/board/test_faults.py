@@ -43,7 +43,7 @@ class TestFailedReads:
         sent = frames_of(np.tile([8028.16, 5194.00, 12943.36], 5)[None], np.full((1, 5), -880.49))
         assert faults.failed_reads(sent.b_uT, sent.temperature_degC).all()
 
-    def test_real_failed_recording(self, shared_data):
+    def test_real_recording_of_failed_reads_is_recognised(self, shared_data):
         assert faults.failed_reads(*load_ini(shared_data, "faults/b20_artillery_AFG_flex_50.head400.txt")).all()
 
     def test_real_working_board(self, shared_data):
@@ -58,7 +58,7 @@ class TestZeroReads:
     @pytest.mark.parametrize(
         ("name", "zeros_n"), [("position_1_20251028_003401", 18), ("multi_touch_1_2_20251109_230349", 61)]
     )
-    def test_zero_rows_of_real_recordings(self, shared_data, name, zeros_n):
+    def test_zero_reads_of_real_recordings_are_counted(self, shared_data, name, zeros_n):
         table = np.genfromtxt(shared_data / f"eflash7/{name}.csv", delimiter=",", skip_header=1)
         zeros = faults.zero_reads(table[:, -15:])
         assert zeros.all(axis=1).sum() == zeros.any(axis=1).sum() == zeros_n
@@ -100,7 +100,7 @@ class TestScale:
         assert faults.reset_chips(b_uT, None).all()
         assert not faults.reset_chips(b_uT, grid_uT).any()
 
-    def test_real_resets(self, shared_data):
+    def test_reset_chips_of_real_recordings_are_found(self, shared_data):
         one_chip, _ = load_ini(shared_data, "faults/b20_artillery_AFG_test_new_board15.head400.txt")
         all_chips, _ = load_ini(shared_data, "faults/b20_artillery_piezo.head400.txt")
         assert faults.reset_chips(one_chip, None).tolist() == [False, False, False, True, False]
@@ -151,7 +151,7 @@ class TestStuck:
         parts = [detector.feed(part) for part in np.split(b_uT, sorted(ends))]
         np.testing.assert_array_equal(np.concatenate(parts), faults.stuck_chips(b_uT))
 
-    def test_stuck_from_20th_equal_reading(self):
+    def test_chip_is_stuck_from_its_20th_equal_reading_on(self):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 3, 200, 0)
         b_uT[120:, 3:6] = b_uT[120, 3:6]
         expected = np.zeros((200, 3), bool)

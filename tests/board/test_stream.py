@@ -68,7 +68,7 @@ def test_any_finite_floats_round_trip(chips_n, payload):
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_byte_by_byte_equals_whole(wire):
+def test_stream_fed_byte_by_byte_decodes_like_the_whole(wire):
     data = b"\x07rubbish" + encode(make_frames(6, 5, 1, crlf_share=0.3), wire)[5:-3]
     data = data[:200] + data[205:]
     whole, account = decode_portions([data], wire, 5)
@@ -142,7 +142,7 @@ def test_missing_text_bytes_cost_only_touched_lines(frames, wire, where, missing
 
 
 @given(frames_strategy(min_frames_n=4), st.sampled_from(BINARY_WIRES), st.floats(0, 1))
-def test_joining_mid_frame_loses_one_frame(frames, wire, where):
+def test_stream_that_starts_within_a_frame_loses_one_frame(frames, wire, where):
     length_n = record_type(wire, chips_of(frames)).itemsize
     joined_n = 1 + int(where * (length_n - 3))  # the cut is not between CR and LF, which would lose the next frame too
     assert decode_damaged(join_mid_frame(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
@@ -225,7 +225,7 @@ def test_end_bytes_of_text_over_several_blocks(monkeypatch):
     assert kept.end_byte.tolist() == np.cumsum([len(line) for line in data.splitlines(keepends=True)]).tolist()
 
 
-def test_long_stream_with_many_breaks():
+def test_long_stream_with_many_damaged_frames_is_decoded():
     frames = make_frames(3 * stream.BLOCK_FRAMES_N, 5, 9, crlf_share=0.01)
     data = encode(frames, "binary")
     data = b"".join(data[i + 7 : i + 82 * 100] for i in range(0, len(data), 82 * 100))
@@ -259,7 +259,7 @@ def test_error_suggests_matching_wire():
         decode_all(data, "binary", 5, "a.bin")
 
 
-def test_error_without_suggestion():
+def test_error_has_no_suggestion_if_no_wire_format_fits():
     with pytest.raises(CaptureError, match="in 1 bytes, .* Wrong baud rate, chip count or wire format\\?$"):
         decode_all(b"\0", "binary", 5, "a.bin")
 

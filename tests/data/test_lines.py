@@ -15,7 +15,7 @@ from reskin.simulation.protocols import Hand
 from tests.data.tables import readings
 from tests.data.tables import rows as make_rows
 
-READINGS_N = 2  # per indentation
+READINGS_N = 2  # readings of each indentation
 
 
 def rows_at(place_mm, skins=None, indentation=None) -> Rows:
@@ -77,10 +77,10 @@ def test_grid_lines_equal_nested_loops(labels, data):
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_65_points_are_9_rows_and_9_columns():
+def test_65_places_form_9_rows_and_9_columns():
     lines = grid_lines(grid(depths_n=2), all_rows(grid(depths_n=2)))
     lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
-    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # rows of the grid, then columns
+    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # lines along rows of the grid, then along columns
     assert lines.line_i.max() == 17
     # Each table row belongs to one row and to one column of the grid.
     assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)
@@ -101,7 +101,7 @@ def test_visits_to_one_place_share_line_and_index():
 
 
 @given(places, st.data())
-def test_row_order_does_not_matter(labels, data):
+def test_lines_do_not_depend_on_row_order(labels, data):
     order = data.draw(st.permutations(range(len(labels))))
     original = rows_at([(x, y) for _, x, y in labels], [skin for skin, _, _ in labels])
     reordered = [labels[i] for i in order]

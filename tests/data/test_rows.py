@@ -20,7 +20,7 @@ def test_rows_without_place_or_force_are_counted():
     y_mm = np.array([0, 1, 2, 3, np.nan, 5], np.float32)
     Fz_N = np.array([1, 1, 0.05, np.nan, 1, 1], np.float32)
     rows = gather([readings(x_mm=x_mm, y_mm=y_mm, Fz_N=Fz_N)], Selection(force_min_N=0.1))
-    assert rows.target[:, 0].tolist() == [0, 3, 5]  # unknown force is kept
+    assert rows.target[:, 0].tolist() == [0, 3, 5]  # the row at x = 3 mm is kept: the selection ignores unknown forces
     assert rows.dropped == {"no_contact_rows_n": 2, "low_force_rows_n": 1}
 
 

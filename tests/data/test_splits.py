@@ -123,7 +123,7 @@ def test_pool_is_the_first_passes_of_held_out_skins(experiment, split):
 @given(order=st.permutations(range(12)))
 def test_pool_and_skins_do_not_depend_on_row_order(experiment, order):
     labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
-    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no rows
+    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # passes have the numbers 3 and 5
     original, shuffled = (
         rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
         for numbers in (range(12), order)
@@ -232,7 +232,7 @@ def test_held_out_board_has_a_pool_on_each_skin(seed, pool_n, draws_n):
     assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
     for fold in folds:
         held = np.flatnonzero(table.board == fold.name[:2])
-        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # disjoint and complete
+        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # every held-out row is in the pool or in the test set
         assert sorted([*fold.train, *held]) == list(range(len(table)))
         assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
         for skin in np.unique(table.skin[held]):

@@ -36,7 +36,7 @@ SCENE = synthesis()
 PERFECT = draw_instrument(synthesis("spreads", **NO_SPREAD), "b0", seed=1)
 REAL = draw_instrument(SCENE, "b0", seed=1)
 fields_T = st.tuples(*[st.floats(-1e-4, 1e-4)] * 3).map(np.array)
-ROUNDING_uT = 1e-9  # of 100 uT
+ROUNDING_uT = 1e-9  # rounding error of fields of 100 uT
 
 
 def uniform(b_T, chips_n=5):
@@ -90,7 +90,7 @@ def test_reference_chip_noise_is_averaged():
     read_uT = reference_uT(PERFECT, np.zeros((4000, 3)), rng_for(0, "noise")).reshape(4000, 5, 3)[:, 0]
     # mean of 3 readings minus mean of 4 no-load frames
     expected_uT = np.array([3.3, 3.3, 5.0]) * np.sqrt(1 / 3 + 1 / 4)
-    np.testing.assert_allclose(read_uT.std(axis=0), expected_uT, rtol=0.06)  # 5 standard errors
+    np.testing.assert_allclose(read_uT.std(axis=0), expected_uT, rtol=0.06)  # 6 %: five standard errors
 
 
 def test_iron_disturbance_falls_with_distance():

@@ -88,7 +88,7 @@ def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
     return row.error
 
 
-def test_skin_on_quadrature_nodes_equals_the_drawn_one():
+def test_skin_with_nodes_of_a_quadrature_equals_the_drawn_skin():
     even = spreads(skin_amplitude=0.0, skin_filler=0.0, skin_rotation_deg=0.0)
     drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
     ours = with_nodes(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
@@ -224,7 +224,7 @@ def test_reference_is_ten_times_better_than_the_limit(quadratures):
     assert 0 < rows[0].error < 0.1 * ERROR_MAX
 
 
-def test_magpylib_equals_the_kernel(quadratures):
+def test_fields_of_magpylib_and_of_the_kernel_are_equal(quadratures):
     _, calls = quadratures
     calls = {one.key[1]: one.call for one in calls if one.key[2] == rule_name(COARSE)}
     kernel_T = calls["kernel alone"]()
@@ -240,7 +240,7 @@ def test_field_by_flow_equals_field_by_paths():
     assert np.linalg.norm(ours_T - theirs_T) < 0.005 * np.linalg.norm(ours_T)
 
 
-def test_distant_boxes_are_dipoles():
+def test_field_of_distant_boxes_equals_that_of_dipoles():
     deep = replace(BOARD, chips_m=BOARD.chips_m - (0.0, 0.0, 40e-3))
     one = trial(deep)
     boxes_T = METHODS["magpylib cuboids"](one, Quadrature(2e-3, 2)).call()
@@ -348,7 +348,7 @@ def select(rows, ratio, method) -> list[Precision]:
     return [row for row in rows if row.study == runtime.study_name(ratio) and row.method == method]
 
 
-def test_stiffness_1e7_is_that_of_the_skin():
+def test_skin_has_a_stiffness_ratio_of_1e7():
     np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN_RELAXATION.tau_s, rtol=1e-12)
 
 

@@ -147,7 +147,7 @@ def test_expected_number_of_falls_by_noise():
     rise_uT, noise_uT, fillings_n = 0.5, 2.0, 10
     response_uT = rise_uT * np.arange(2001) + noise_uT * rng.standard_normal((fillings_n, 2001))
     found = monotonic(response_uT, 0.01 * np.arange(2001))["neighbours"]
-    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # 576
+    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # expected: 576 falls
     assert found["expected_falls_n"] == pytest.approx(expected_n, rel=0.02)  # the noise is estimated to 1 %
     assert found["falls_n"] == pytest.approx(expected_n, abs=4 * np.sqrt(expected_n))
 

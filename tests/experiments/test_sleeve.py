@@ -178,9 +178,8 @@ def test_table_lists_methods_and_source_without_a_paper_number():
     assert table["seeds"].tolist() == ["1", "2", "1"]
     assert "±" in table["accuracy, %"][1]
     assert "column `seeds` gives their number" in table.attrs["spread"]
-    assert float(table["median error, mm"][0]) == pytest.approx(
-        numbers["median_error_mm"]["mean"], rel=5e-3
-    )  # the table has three digits
+    # the table has three digits
+    assert float(table["median error, mm"][0]) == pytest.approx(numbers["median_error_mm"]["mean"], rel=5e-3)
     near = numbers["near_seam"]["median_error_mm"]["mean"]
     assert float(table["median near a border between boards, mm"][0]) == pytest.approx(near, rel=5e-3)
     assert f"first {4 * 40} pokes" in table.attrs["meaning"]

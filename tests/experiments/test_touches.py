@@ -78,7 +78,7 @@ def test_residual_of_the_touched_pair_is_noise(cut):
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_single_touch_at_an_unknown_place_is_called_two(cut):
+def test_single_touch_at_an_unknown_place_is_mistaken_for_two(cut):
     result = evaluate_detection(*cut, SECTION, 0)
     for name in result["detected_pct"]:
         assert result["unseen_place_called_two_pct"][name] > 90
@@ -131,7 +131,7 @@ def test_recordings_of_only_pairs_are_skipped_with_a_reason():
     assert len(shown["touches"]) == 1 + len(double)
 
 
-def test_fractions_must_leave_test_rows():
+def test_fractions_that_leave_no_test_rows_are_an_error():
     with pytest.raises(ValidationError, match="rows are left to test"):
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 

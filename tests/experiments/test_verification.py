@@ -90,7 +90,7 @@ def test_wrong_array_field_violates_maxwell(monkeypatch):
     assert f"magnetising array, {DESIGN.skin.polarity}: div B = 0" in failed(check_field(DESIGN.skin, SEED))
 
 
-def test_tolerance_of_the_field_constant(monkeypatch):
+def test_wrong_field_constant_is_detected_beyond_its_tolerance(monkeypatch):
     monkeypatch.setattr(change, "MU0_4PI", 1e-7)
     # relative error 1.3e-10: less than between mu_0 of two CODATA years
     assert failed(check_field(DESIGN.skin, SEED)) == set()

@@ -14,7 +14,7 @@ STAGES = (
     "audit", "report", "publish",
 )  # fmt: skip
 ATTEMPTS_N = 4
-ADDRESS_SPACE_MAX = 100 * 2**20  # bytes
+ADDRESS_SPACE_MAX = 100 * 2**20  # bytes of address space
 
 
 def address(stage: str) -> str:

@@ -109,7 +109,7 @@ def grip(
             continue
         estimate_N = float(estimates.target[-1, 2])
         forces_N.append((wire.force_N, estimate_N))
-        closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # the controller
+        closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # proportional controller
         share = (1 - np.cos(2 * np.pi * len(forces_N) / RATE_HZ / PERIOD_S)) / 2
         wire.force_N = finger.force_at(closed_mm, SOFT_N_MM * (HARD_N_MM / SOFT_N_MM) ** share)
     return np.array(forces_N)

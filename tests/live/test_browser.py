@@ -145,7 +145,8 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
                 f"Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5)(boards[0])"
             )
             blue = await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []")
-            assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3  # --link
+            # the colour `--link` in the page's style sheet
+            assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3
             await tab.until(f"({near}) && /x {x_mm:.0f}|x {x_mm - 1:.0f}/.test(boards[0].parts.place.textContent)")
             assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
         await tab.until(

@@ -231,7 +231,7 @@ def test_script_of_a_simulation_has_contacts(source):
     script = read_script(source)
     assert script.frames.b_uT.shape == (len(script), 15)
     assert np.all(np.diff(script.t_s) >= 0)
-    assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # uT
+    assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # contacts change the field by more than 100 uT
 
 
 def test_invalid_sources_raise(tmp_path):

@@ -50,7 +50,7 @@ def test_universal_model_estimates_places_and_their_standard_deviation(random_po
     assert skin.health.alarms == {}
 
 
-def test_chips_in_another_order_are_an_unknown_skin(random_pokes):
+def test_board_with_swapped_chips_raises_the_alarm_unknown_skin(random_pokes):
     skin, _ = play_to_skin(make_poke_script(random_pokes, rotated_n=1), load_universal())
     assert skin.health.alarms[UNKNOWN_SKIN].count_n > 0.5 * POKED_N * PRESSES_N
 

@@ -106,7 +106,7 @@ def test_chip_that_reads_zeros_is_named():
     }
 
 
-def test_repeated_frames_and_clock_jump():
+def test_repeated_frames_and_clock_jumps_raise_alarms():
     assert "frames repeat" in feed(inject_fault("repeated")).alarms
     assert "the board's clock jumps" in feed(inject_fault("clock-jump", "binary-clock")).alarms
 
@@ -150,7 +150,7 @@ def test_equal_change_on_all_chips_is_an_outside_field():
     assert [name.split(":")[0] for name in health.alarms] == ["external field"]
 
 
-def test_fault_policy_setting():
+def test_fault_policy_decides_which_frames_are_valid():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         frames = changed_frames(script, BATCH_FRAMES_N)

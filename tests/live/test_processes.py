@@ -76,7 +76,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
+def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=4), tmp_path / "c0"), tmp_path / "board"
     board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "crlf@1+1")
     wait_until(link.is_symlink)

@@ -67,7 +67,8 @@ async def until(socket, wanted: Callable[[dict], bool]) -> dict:
     """Receive messages until `wanted` accepts one; return this message."""
     end_s = time.monotonic() + LONG_S
     while time.monotonic() < end_s:
-        received = await asyncio.wait_for(socket.receive(), LONG_S)  # aiohttp's timeout restarts with every ping
+        # not aiohttp's time limit, which restarts with every ping
+        received = await asyncio.wait_for(socket.receive(), LONG_S)
         message = unpack(received.data) if received.type == aiohttp.WSMsgType.BINARY else json.loads(received.data)
         if wanted(message):
             return message
@@ -117,7 +118,7 @@ def test_unusable_address_is_an_error_and_is_not_printed():
         number = busy.getsockname()[1]
         for host, message in {
             "127.0.0.1": f"--http-port: cannot listen on {number}: another program uses it",
-            "192.0.2.1": "--host: 192.0.2.1 is not an address of this machine",  # reserved for documentation
+            "192.0.2.1": "--host: 192.0.2.1 is not an address of this machine",  # an address reserved for documentation
             "no such host": "--host: no such host is not an address of this machine",
         }.items():
             with pytest.raises(ParamsError, match=message):
@@ -170,7 +171,7 @@ def test_requests_from_other_hosts_and_sites_are_forbidden(tmp_path):
         for headers, status in (
             ({"Host": "evil.example"}, 403), ({"Host": "127.0.0.1.evil.example"}, 403), ({"Host": "[::1"}, 403),
             ({"Host": "lohost[::1]::8786"}, 403),
-            ({"Host": "localhost:9000"}, 200),  # through an SSH tunnel
+            ({"Host": "localhost:9000"}, 200),  # a request through an SSH tunnel
             ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{host}"}, 200),
         ):  # fmt: skip
             async with client.get(f"{address}/", headers=headers) as page:

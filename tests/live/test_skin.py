@@ -202,7 +202,7 @@ def test_sleeve_of_forty_chips_has_layout_and_estimates(tmp_path):
     assert skin.health.alarms == {}
 
 
-def test_eight_boards_at_once():
+def test_eight_boards_are_read_at_once():
     chips_n = range(1, 9)
 
     def look(name: str) -> int:

@@ -11,7 +11,8 @@ from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
 
 UNLABELLED = ("unlabelled", "unlabelled_positive", "unlabelled_negative")
-# paper section 4: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
+# Layers in section 4 of the paper: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) ->
+# xyF(3)
 PAPER = ("15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3")
 RELEASED = ("15-200", "ReLU", "200-200", "ReLU", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3", "ReLU")
 PRINTED = {"paper": PAPER, "released": RELEASED}

@@ -27,7 +27,7 @@ def feature_distance(weights: dict[str, np.ndarray]) -> float:
     return float(np.linalg.norm(known.mean(axis=0) - new.mean(axis=0)) / np.linalg.norm(known.std(axis=0)))
 
 
-def test_gradient_reversal():
+def test_gradient_of_features_is_reversed_and_scaled():
     values = torch.tensor([[[1.0, -2.0]]], requires_grad=True)
     passed = reverse_gradient(values, 0.25)
     torch.testing.assert_close(passed, values)
@@ -35,7 +35,7 @@ def test_gradient_reversal():
     torch.testing.assert_close(values.grad, torch.tensor([[[-0.75, -1.25]]]))
 
 
-def test_weight_rises_from_0_to_1():
+def test_weight_of_the_reversed_gradient_rises_from_0_to_1():
     assert ramp(0.0) == 0.0
     assert np.all(np.diff([ramp(part) for part in np.linspace(0, 1, 9)]) > 0)
     assert abs(ramp(1.0) - 1) < 1e-4

@@ -71,7 +71,7 @@ def test_ridge_equals_closed_form(weighted):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_knn_weighs_by_distance(weighted):
+def test_knn_weights_neighbours_by_inverse_distance(weighted):
     db_uT, target = rows()
     weight = rng_for(0, "weight").uniform(1, 20, len(db_uT)).astype(np.float32) if weighted else None
     query_uT, _ = rows(1, n=20)
@@ -155,7 +155,7 @@ def test_boosting_is_deterministic():
 
 
 @every_method
-def test_predictions_beat_the_mean(method):
+def test_predictions_are_better_than_the_mean_target(method):
     db_uT, target = rows(n=600)
     got = fit_to(method, db_uT[:400], target[:400]).predict(db_uT[400:])
     error, spread = ((got - target[400:]) ** 2).mean(axis=0), target[400:].var(axis=0)
@@ -226,7 +226,7 @@ def test_force_that_is_known_for_some_rows_is_learned(method):
 
 
 @every_method
-def test_weighted_rows_dominate(method):
+def test_rows_of_large_weight_dominate_the_prediction(method):
     """A tenth of the labels is shifted 8 mm along x; these rows have twice the weight of all others, or almost none."""
     db_uT, target = rows(n=400)
     further = np.arange(400) < 40

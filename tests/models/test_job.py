@@ -152,7 +152,7 @@ def test_loss_weights_follow_the_recipe():
     assert pooled().schedule == pooled().recipe
 
 
-# Paired comparisons
+# Methods are compared in pairs, with equal batches
 
 
 def first_batches(job: TrainingJob) -> list[np.ndarray]:
@@ -190,7 +190,7 @@ def test_folds_and_seeds_have_different_batches(changes):
     assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
-# Cache keys
+# Keys of the cache of training results
 
 
 def key(job: TrainingJob, rows: TrainingData | None = None) -> str:

@@ -133,7 +133,7 @@ def test_triplet_loss_scales_with_the_square(k):
     stretched = [one * k for one in three()]
     torch.testing.assert_close(
         triplet_loss(*stretched), triplet_loss(*three()) * k**2, rtol=1e-4, atol=0
-    )  # float32 rounding
+    )  # tolerance of float32
 
 
 @given(st.integers(0, 1000))
@@ -141,4 +141,4 @@ def test_swapping_positive_and_negative_changes_the_sign(seed):
     anchor, positive, negative = three(seed)
     both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
     mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)
-    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # float32 sums of about 80
+    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # tolerance: float32 sums of about 80

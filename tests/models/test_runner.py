@@ -172,7 +172,7 @@ def test_finished_jobs_are_not_trained_again(tmp_path):
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
-def test_additional_job_trains_one_stack(tmp_path, more, trained_n):
+def test_additional_job_trains_only_its_stack(tmp_path, more, trained_n):
     run(jobs(2), tmp_path)
     assert trainings_n([*jobs(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
@@ -299,7 +299,7 @@ def test_jobs_with_equal_recipes_share_a_stack():
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
-def test_stacks_cover_every_job_once(kinds, size_n):
+def test_every_job_is_in_one_stack(kinds, size_n):
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
     selected = by_key([pooled(**settings[kind]) for kind in kinds])
     found = make_stacks(selected, size_n)

@@ -135,7 +135,7 @@ def test_each_term_changes_the_weights(name):
 
 
 @pytest.mark.parametrize("name", ["unlabelled", "few_labels"])
-def test_data_of_each_term_decides_the_weights(name):
+def test_data_of_each_loss_term_changes_the_weights(name):
     schedule, terms = recipe(steps_n=10), replace(NO_TERMS, **{name: 0.5})
     one, other = some_job(terms=True), some_job(terms=True)
     swapped = replace(other, **{name: replace(getattr(other, name), inputs=getattr(other, name).inputs[::-1].copy())})

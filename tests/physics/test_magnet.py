@@ -91,8 +91,8 @@ def test_magnetisation_at_the_half_field():
 def test_magnetisation_limits():
     direction = np.array([[2.0, -1.0, 2.0]]) / 3
     strong_T, weak_T = (magnet.magnetise(b * direction, saturation_T=0.1, half_field_T=0.5) for b in (5e3, 5e-3))
-    np.testing.assert_allclose(strong_T, 0.1 * direction, rtol=1e-11)  # 1 - u^-3
-    np.testing.assert_allclose(weak_T, 0.1e-6 * direction, rtol=2e-6)  # 1 - u^3
+    np.testing.assert_allclose(strong_T, 0.1 * direction, rtol=1e-11)  # relative deviation from saturation: u^-3
+    np.testing.assert_allclose(weak_T, 0.1e-6 * direction, rtol=2e-6)  # relative deviation from a cubic law: u^3
 
 
 def test_zero_field_has_no_magnetisation():

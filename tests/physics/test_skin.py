@@ -84,7 +84,7 @@ def test_poke_equals_loop_over_rotated_dipoles(base):
     np.testing.assert_allclose(change(poke_m, one), truth_T, atol=1e-12 * PEAK_T)
 
 
-def test_material_leans_towards_the_dent():
+def test_moments_beside_the_tip_rotate_towards_the_dent():
     # Beside the tip, the surface slopes down towards the axis, so a moment that points up rotates towards the axis.
     one = skin()
     moved = move_dipoles(one, (0.0, 0.0, DEPTH_M))
@@ -115,7 +115,7 @@ def test_error_of_the_quadrature_in_use(depth_m, base):
     assert not broken(mechanics.quadrature(BOARD, used, tuple(fine), rules=rules, pokes_m=pokes_m, unseen_uT=0.33))
 
 
-def test_rotation_of_moments_matters():
+def test_field_change_without_rotation_of_moments_is_wrong():
     # Without rotation (R.M) of the moments, dB is wrong by 156-242 % for indentations on the grid.
     one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):

@@ -37,7 +37,7 @@ def test_departure_is_the_inverse_of_the_change_of_labels(way):
     assert other_orientation(relabel(board("one"), way), board("other")) == inverse_of(way)
 
 
-def test_no_false_alarm():
+def test_correct_or_uninformative_labels_raise_no_alarm():
     one, other = board("one"), board("other")
     assert other_orientation(one, other) is None
     assert other_orientation(relabel(board("few", 19), "with x mirrored"), other) is None

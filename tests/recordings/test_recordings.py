@@ -106,7 +106,7 @@ def test_ini_recording_has_fifty_passes(shared_data: Path, tmp_path: Path) -> No
     assert readings.Fz_N.max() == np.float32(4.1)
 
 
-def test_ini_centre_is_a_place(shared_data: Path, tmp_path: Path) -> None:
+def test_ini_centre_is_one_of_the_places(shared_data: Path, tmp_path: Path) -> None:
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path)
     centre = (readings.x_mm == 10) & (readings.y_mm == 10)
     assert centre.sum() == 6 * 50

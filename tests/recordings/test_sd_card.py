@@ -36,8 +36,8 @@ def test_log_round_trip(tmp_path_factory, chips_n):
     file = tmp_path_factory.mktemp("card") / "log.csv"
     file.write_text(render(t_s, b_uT, temperature_degC))
     read_s, read_uT, read_degC, account = read_log(file)
-    np.testing.assert_allclose(read_s, t_s, atol=5.1e-5)  # four decimals
-    np.testing.assert_allclose(read_uT, b_uT, atol=5.1e-3)  # two decimals
+    np.testing.assert_allclose(read_s, t_s, atol=5.1e-5)  # times have four decimals
+    np.testing.assert_allclose(read_uT, b_uT, atol=5.1e-3)  # fields have two decimals
     np.testing.assert_allclose(read_degC, temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == account["rows_read_n"] == 60
 

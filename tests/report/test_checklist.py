@@ -136,7 +136,7 @@ def test_claims_are_judged_by_interval_over_boards(rule, low, high, verdict):
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
-def test_lower_and_upper_limits_are_judged_alike(low, width, limit):
+def test_lower_and_upper_limits_are_judged_symmetrically(low, width, limit):
     ours = over_boards(low, low + width)
     least, most = (judge_value(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
     assert (least, most) in {(SUPPORTED, CONTRADICTED), (CONTRADICTED, SUPPORTED), (UNDECIDED, UNDECIDED)}

@@ -95,7 +95,7 @@ def test_line_without_marks_has_only_its_label():
     [np.arange(MARKS_MAX_N + 1.0), np.array([1.0, np.nan, 3.0])],
     ids=["too many", "one not drawn"],
 )
-def test_no_titles_for_too_many_or_missing_values(values):
+def test_too_many_or_missing_values_have_no_titles(values):
     assert titles(draw(lambda axes: axes.plot(values, values, "o"))) == []
     assert titles(draw(lambda axes: axes.scatter(values, values))) == []
 

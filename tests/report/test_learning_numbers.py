@@ -69,7 +69,7 @@ def test_table_2_pools_skins_by_board():
     table2 = numbers()["table2"]
     assert table2.keys() == {"multi", "triplet", "adapted"}
     assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "values": [78.0, 78.0]}
-    # board b0: 80 and 82; board b1: 84 and 86
+    # accuracies of the skins of b0: 80 and 82; of b1: 84 and 86
     assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
 
 

@@ -56,7 +56,7 @@ def test_split_and_join_are_inverse():
 
 
 @pytest.mark.parametrize("folder", sorted(file.parent for file in ROOT.glob("reports/*/numbers.json")), ids=str)
-def test_committed_reports_are_split(folder):
+def test_committed_numbers_and_provenance_are_separate(folder):
     numbers, provenance = (read_json(folder / name) for name in ("numbers.json", "provenance.json"))
     assert split(join(numbers, provenance)) == (numbers, provenance)
     assert {"git", "trained", "device", "seconds", "runtime"} <= set(provenance)
@@ -124,4 +124,4 @@ def test_scores_of_committed_reports(file):
     for name, value in shown.items():
         if not name.endswith(".method"):
             assert value in known
-            assert name.endswith(("_pct", "_mm2", "_N2", ".r2_f"))  # R² has no unit
+            assert name.endswith(("_pct", "_mm2", "_N2", ".r2_f"))  # only R² has no unit

@@ -160,7 +160,7 @@ def test_summary_is_in_the_first_section():
     assert text.count(SUMMARY) == first.count(SUMMARY) == 1
 
 
-def test_about_lists_counts():
+def test_section_about_lists_counts():
     numbers = all_experiments()
     counts = next(iter(numbers["described"].values()))["counts"]
     counts.clear()
@@ -187,7 +187,7 @@ def test_incomparable_results_are_omitted():
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_badge_has_the_source(source):
+def test_badge_shows_the_source(source):
     text = render(all_experiments(source))
     assert f'<strong class="badge {source}">{source.upper()}</strong>' in text
     assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text

@@ -107,7 +107,7 @@ def test_adapted_networks_are_pooled_by_fold_and_seed():
     for places, part in ((AS_LABELLED, "all"), (REGISTERED, "registered")):
         for _, row in whole(tidy(adapted_cards()), places).iterrows():
             cards = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
-            for name in METRICS[:3]:  # R^2: see test_unequal_skins_pool_to_the_score_of_all_rows
+            for name in METRICS[:3]:  # R^2 is tested in test_unequal_skins_pool_to_the_score_of_all_rows
                 total = 0.0
                 for one in cards:
                     total += one["scores"][part][name]
@@ -376,7 +376,7 @@ def test_over_boards_equals_over_folds():
             np.mean([one["scores"]["all"][name] for one in adapted_cards() if one["fold"] == board])
             for board in ("b0", "b1")
         ]
-        if name != "r2_f":  # R^2: see test_unequal_skins_pool_to_the_score_of_all_rows
+        if name != "r2_f":  # R^2 is tested in test_unequal_skins_pool_to_the_score_of_all_rows
             assert stat["values"] == pytest.approx(means)
 
 

@@ -97,9 +97,8 @@ def test_durations_are_log_uniform():
     stops = draw_presses(2000)
     frames_n = (stops.depth_mm > 0).sum(axis=1)
     position = np.log(frames_n / 20) / np.log(20)
-    np.testing.assert_allclose(
-        np.quantile(position, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.05
-    )  # 4 x 0.5/sqrt(n)
+    # four standard errors of a median, 0.5 / sqrt(n) each
+    np.testing.assert_allclose(np.quantile(position, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.05)
     after = np.arange(stops.depth_mm.shape[1]) >= frames_n[:, None]
     assert (stops.depth_mm[after] == LIFTED_MM).all()
     assert stops.depth_mm.max() <= 1.2
@@ -134,7 +133,7 @@ def test_chips_read_a_rising_press_late():
     )
     still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
     late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
-    assert (late_uT > 1.0).all()  # three LSB of z
+    assert (late_uT > 1.0).all()  # 1 uT is more than three LSB of z
     # The fast press is read up to 1.84 ms late, and frames are 2.5 ms apart: each reading is between two readings of
     # the slow press.
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
@@ -176,7 +175,7 @@ def test_walk_is_written_as_sd_card_log(tmp_path):
     assert (header.layout, header.wire, header.source) == ("sd-card", None, "simulated")
     t_s, b_uT, temperature_degC, account = read_log(tmp_path / capture.name / "log.csv")
     np.testing.assert_allclose(t_s, (1 + np.arange(len(capture.b_uT))) / 250)
-    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # two decimals
+    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # the log has two decimals
     np.testing.assert_allclose(temperature_degC, capture.temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == len(t_s)
     with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):

@@ -126,7 +126,7 @@ def test_halving_the_steps_halves_the_largest_field_change(start_m, drag_m, forc
     assert fine <= HALVED * coarse
 
 
-def test_planted_jump_at_first_contact_is_detected(monkeypatch):
+def test_field_jump_of_unlimited_slide_is_detected(monkeypatch):
     board, skin = draw_board_and_skin("b0")
     monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
     place_m = (6e-3, 2e-3)

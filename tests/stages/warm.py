@@ -83,7 +83,7 @@ def run_stages(names: list[str]) -> str:
         )
         for name, stage in stages.items():
             print(f"Running stage '{name}':", flush=True)
-            for out in stage.outs:  # as `dvc repro` does
+            for out in stage.outs:  # removes outputs first, as `dvc repro` does
                 out.remove()
             if run_stage(name, stage.cmd):
                 return FAILED

@@ -74,7 +74,7 @@ def test_card_describes_the_model(skin):
     assert skin.card["centre"]["gap_mm"] == NOMINAL.gap_mm
     assert skin.card["not_for"]
     assert len(skin.networks) == skin.card["lessons"]["seeds_n"]
-    assert FILE.stat().st_size <= 5e6  # bytes
+    assert FILE.stat().st_size <= 5e6  # limit on the size of the file in bytes
     assert tuple(skin.card["spreads"]) == skin.tables.names
 
 

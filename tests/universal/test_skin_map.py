@@ -57,7 +57,7 @@ def test_deviance_is_that_of_a_gaussian(skin):
         chi2 = off_uT @ np.linalg.solve(cov, off_uT)
         deviance = chi2 + np.linalg.slogdet(cov)[1]
         found = skin.evaluator.evaluate(db_uT[row : row + 1])
-        assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)  # single precision
+        assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)  # tolerance of single precision
         assert found.deviance[0, i] == pytest.approx(deviance, abs=0.02)
 
 

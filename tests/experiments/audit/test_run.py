@@ -125,7 +125,7 @@ def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
 
 @pytest.fixture(autouse=True)
 def _working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # costs are written to the working folder
+    monkeypatch.chdir(tmp_path)  # stages write their costs to the working folder
     monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
 

@@ -24,7 +24,7 @@ from reskin.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3
-NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # measured in the lab recordings
+NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # noise of x, y, z in the lab recordings
 UNSEEN = ("lobo", "sensors", "transfer")
 
 

@@ -104,7 +104,7 @@ def test_perpendicular_offset_does_not_change_the_position_along_the_line(share,
     weaker, stronger = contacts_of([2, 3, 1]), contacts_of([5, 7, 2])
     foot = weaker[0] + share * (stronger - weaker)[0]
     predicted = contacts_of(foot + aside_mm * np.array([-0.8, 0.6, 0]))
-    assert position_along_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # float32
+    assert position_along_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # tolerance of float32
 
 
 @pytest.mark.parametrize(

@@ -153,7 +153,8 @@ def test_untestable_findings_are_omitted():
 def test_growth_equals_the_slope_of_numpys_fit(values):
     contacts_n = [5000 * i for i in range(len(values))]
     slope = np.polyfit(np.array(contacts_n) / 10_000, values, 1)[0]
-    assert growth(contacts_n, np.array([values, values])) == pytest.approx(slope, abs=1e-9)  # both in double precision
+    # rounding in double precision
+    assert growth(contacts_n, np.array([values, values])) == pytest.approx(slope, abs=1e-9)
 
 
 def test_measured_text_has_policies_difference_and_interval():

@@ -51,7 +51,7 @@ def test_window_has_mean_and_standard_deviation_over_skins_and_seeds():
     assert row["contacts_n"] == 5000
 
 
-def test_window_without_forces_or_spread():
+def test_window_without_forces_has_no_force_error_and_single_network_no_spread():
     true = predictions().true.copy()
     true[:, 2] = np.nan
     [row] = window_means(score_windows([predictions(true=true)]), "each")
