@@ -105,6 +105,7 @@ def test_interval_coverage_by_kind_of_law_error(monkeypatch):
 
 
 def _scores(calibration, tested, labels_n, powers):
+    """Return coverage at the assumed and at the calibrated power, half width and accuracy: map, map with network."""
     lowered = lower_by_labels(calibration, labels_n, [calibration.nominal_powers(powers)])
     assumed = Powers(ASSUMED_POWER, ASSUMED_POWER)
     before, found = estimate(calibration.with_labels(labels_n), tested.db_uT, [assumed, *lowered])

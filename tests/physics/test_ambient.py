@@ -43,7 +43,7 @@ def test_field_outside_equals_magpylib_sphere(mu_r):
     theirs_T = magnet_sphere_Bfield(
         observers=observers_m - CENTRE_M, diameters=diameters_m, polarizations=polarisation_T
     )
-    # zero, except for rounding of fields of 50 uT
+    # tolerance: rounding of fields of 50 uT
     np.testing.assert_allclose(field(observers_m, mu_r=mu_r), theirs_T, rtol=1e-9, atol=1e-18)
 
 

@@ -47,7 +47,7 @@ def test_table_equals_following_nodes(rung_i, share, base):
     # edge is at another radius.
     depth_m = 0.55e-3 if rung_i is None else table(base).depth_m[rung_i]
     start_m = places(np.random.default_rng(0), 150) * (1, 0, 1)
-    start_m = start_m[start_m[:, 2] < H_M]  # without the surface, where the angle jumps at the edge of the contact
+    start_m = start_m[start_m[:, 2] < H_M]  # below the surface, on which the angle jumps at the contact edge
     moved = move(start_m, (0, 0, depth_m), base)
     followed = follow(np.abs(start_m[:, 0]), start_m[:, 2], depth_m, base)
     sign = np.sign(start_m[:, 0])
