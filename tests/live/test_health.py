@@ -37,7 +37,7 @@ def inject_fault(name, wire="binary"):
     from reskin.board.stream import decode_all
     from reskin.live.emulator import Script
 
-    duration_s = 4.0 if name == "chip-reset" else 1.5  # a chip stays reset until the end
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset lasts until the end
     script = inject(make_script(pokes_n=2, wire=wire), parse_fault(f"{name}@1.5+{duration_s}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     t_s = script.t_s if len(frames) == len(script) else np.linspace(0, script.duration_s, len(frames))

@@ -89,7 +89,8 @@ def test_draws_have_the_given_spreads():
     assert np.std(np.log(gains)) == pytest.approx(0.025, rel=0.1)
     cross = np.array([board.sensitivity for board in boards])[:, :, ~np.eye(3, dtype=bool)]
     assert np.std(cross) == pytest.approx(0.01, rel=0.1)
-    tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])  # tilts about two axes of 2 degrees each
+    # angle of two tilts, about x and about y, of 2 degrees each
+    tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])
     assert np.sqrt(np.mean(tilt_rad**2)) == pytest.approx(np.sqrt(2) * np.radians(2), rel=0.1)
 
 

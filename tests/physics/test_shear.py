@@ -184,13 +184,13 @@ def test_volume_is_conserved_and_rotation_is_half_the_curl():
     traction, places_m = sliding(), some_places_m()
     grad = gradients(traction, places_m)
     size = np.abs(grad).max()
-    np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)  # error of the differences
+    np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)  # error of central differences
     truth = np.stack(
         [grad[:, 2, 1] - grad[:, 1, 2], grad[:, 0, 2] - grad[:, 2, 0], grad[:, 1, 0] - grad[:, 0, 1]], axis=1
     )
     table = shear.tabulate(traction, H_M)
     found = displace([YOUNG_PA / 3, 0], places_m, table, centre_m=(0, 0)).half_curl
-    np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # error of the differences and of the table
+    np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # error of central differences and of the table
 
 
 @pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])

@@ -44,7 +44,7 @@ def draw_presses(presses_n, name="presses"):
 
 
 @given(st.floats(1e-3, 2.0))
-def test_depth_of_a_weight_balances_it(weight_N):
+def test_force_at_the_depth_of_a_weight_equals_the_weight(weight_N):
     depth_m = depths_under_load(SKIN, np.array([[weight_N]]))
     # tolerance: 1e-12 m times at most 20 N/mm is 2e-8 N
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)

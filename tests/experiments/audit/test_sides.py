@@ -211,7 +211,7 @@ def test_fields_within_the_noise_are_undecidable():
 def test_audit_does_not_depend_on_row_order(draw, copied, experiment):
     db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
     order = rng_for(draw, "order").permutation(len(DB_uT))
-    new_index = np.argsort(order)  # of each old row
+    new_index = np.argsort(order)  # new index of each old row
     fold = held_out(LABELS, experiment)
     shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
     moved = replace(fold, train=new_index[fold.train], test=new_index[fold.test])

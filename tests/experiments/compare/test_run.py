@@ -42,7 +42,7 @@ TURN = chip_rotations(SECTION)
 
 
 def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
-    """Return simulated presses at 25 places and two forces, with the parameters `how`, in the axes of scene lab."""
+    """Return simulated presses at 25 places and two forces, with these parameters, in the axes of scene lab."""
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
