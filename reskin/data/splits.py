@@ -338,8 +338,7 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
 
 
 def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
-    """Convert the JSON values of `folds.json` to folds; raise `SchemaError` if the number of rows differs from `rows`.
-    """
+    """Convert the JSON values of `folds.json` to folds; raise `SchemaError` if they were drawn from other rows."""
     if content["rows_n"] != len(rows):
         raise SchemaError(
             f"{where}: the folds were drawn from {content['rows_n']} rows, but the captures have {len(rows)} rows. Run "

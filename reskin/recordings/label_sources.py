@@ -124,7 +124,7 @@ class Places:
     row_n: int
 
     def order(self, scan: str, rng: np.random.Generator) -> list[int]:
-        """Return the numbers of all places in the order of one pass: random, or row by row, every other row backwards."""
+        """Return the numbers of all places in the order of a pass: random, or row by row, every other row backwards."""
         if scan == RANDOM:
             return [int(i) for i in rng.permutation(len(self.xy_mm))]
         rows = [list(range(first, first + self.row_n)) for first in range(0, len(self.xy_mm), self.row_n)]
@@ -154,7 +154,7 @@ BETTER_s = 0.005  # a clock mark is replaced if the delay of the new mark is sho
 
 
 def from_table(file: Path) -> LabelSource:
-    """Take labels from a CSV file to which a robot's program appends rows; rows from before the recording are skipped."""
+    """Take labels from a CSV file to which a robot's program appends rows; skip rows older than the recording."""
 
     def run(context: LabelContext) -> str:
         table, dwells, least_delay_s = SampleTable(str(file)), DwellBuilder(), math.inf
@@ -262,7 +262,7 @@ class ForceGauge:
             self._problem = f"{error} Later forces are missing"
 
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
-        """Pass samples to `use` until the recording stops; raise `CaptureError` if the gauge is unplugged before that."""
+        """Pass samples to `use` until the recording stops; raise `CaptureError` if the gauge is unplugged earlier."""
         while not context.stop.is_set():
             try:
                 chunk = read_waiting(device)
@@ -340,7 +340,7 @@ class Prompts:
         return f"place {place_i} (x {x_mm:g}, y {y_mm:g} mm)"
 
     def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
-        """Return the label of a press from a typed line; None at the end, a label without contact for a skipped place."""
+        """Return the label that a person typed for a press; None at the end, without contact for a skipped place."""
         for line in typed:
             match = REPLY.fullmatch(line)
             if line in ENDS:
