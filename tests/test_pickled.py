@@ -129,9 +129,12 @@ def test_archive_becomes_a_lab_recording(tmp_path):
     [
         (b"", "not a .npz with samples under bl_arr and cont_arr: BadZipFile"),
         (archive_of(bl_arr=[sample(0, [0, 0], FIELDS, [0, 0, 0])]), "cont_arr.npy"),
-        (archive_of(bl_arr=[1.5], cont_arr=[1.5]), "the array holds float64, not objects"),
+        (archive_of(bl_arr=[1.5], cont_arr=[1.5]), "the array contains float64, not objects"),
         (archive_of(bl_arr=[{"a": 1}], cont_arr=[{"a": 1}]), "KeyError 'Indent'"),
-        (archive_of(bl_arr=[sample(0, [0, 0], [1.0], [0, 0, 0])], cont_arr=[{}]), "a sample of 2 places, 1 fields"),
+        (
+            archive_of(bl_arr=[sample(0, [0, 0], [1.0], [0, 0, 0])], cont_arr=[{}]),
+            "a sample has 2 coordinates, 1 readings",
+        ),
         (
             archive_of(bl_arr=[sample(0, [0, 0], ["x"] * 20, [0, 0, 0])], cont_arr=[{}]),
             "ValueError Unknown format code",

@@ -38,18 +38,18 @@ SAME_VALUE_uT = 1e-3  # a smaller gap is a rounding error of float32 arithmetic
 # Because of noise, successive readings of a working chip differ. They are equal only if the chip is read again before
 # its next conversion (1.84 ms), or if its LSB is coarse. In 14 real recordings, at most 3 successive frames are equal.
 STUCK_FRAMES_MIN_N = 20
-# Minimum fraction of these frames in which another chip must change. It is below 1 because, in data without noise,
-# readings change only while the board is pressed or released.
+# A chip is stuck only if another chip changes in at least this fraction of the frames in which the chip does not. The
+# value is below 1 because, in data without noise, readings change only while the board is pressed or released.
 OTHERS_MOVE_MIN = 0.5
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
 CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock is a jump
-# assumed: frames count as repeated if this fraction of this many frames (0.1 s at 400 Hz) equals the previous frame
+# assumed: equal frames are a fault if, in a window of 40 frames (0.1 s at 400 Hz), over 40 % equal the previous frame
 REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4
 MISSING_STEPS = 1.6  # frames are missing if a step of the board's clock exceeds the median step by this factor
 SILENCE_S = 1.0
-# A silence must also exceed the median time between two frames by this factor, so that a slow log is not silent.
+# A silence must also exceed the median time between two frames by this factor, so that a slow log is not reported.
 SILENCE_STEPS = 50.0
 GARBAGE_FRAMES_N = 10  # more stray bytes than this many frames have suggest a wrong baud rate, not a torn frame
 LONG_LINE = 1.5  # a line of text that exceeds the median length by this factor contains stray bytes
@@ -247,7 +247,7 @@ def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: 
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
-    """Return the step of the grid on which the values of all given axes are; NaN if there is no grid."""
+    """Return the common step between the values of all given axes; NaN if they have no common step."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):
@@ -322,8 +322,8 @@ class Faults(NamedTuple):
     clock_jump: Bool[np.ndarray, " f"]
     unplug: Bool[np.ndarray, " f"]
     missing_frames_n: Int[np.ndarray, " f"]  # before each frame, according to the board's clock
-    torn_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame, if few
-    garbage_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame, if so many that the baud rate may be wrong
+    torn_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame, or 0 if they are garbage
+    garbage_bytes_n: Int[np.ndarray, " f"]  # so many stray bytes that the baud rate may be wrong, or 0
     scale: tuple[ScaleWindow, ...]  # the windows that this portion completed
 
 

@@ -56,6 +56,7 @@ class Reader:
         self.write_to(None)
 
     def unix_s(self) -> float:
+        """Return the current unix time, which never goes backwards."""
         return self._clock_s + time.monotonic()
 
     def take(self, wait_s: float) -> list[Chunk]:
@@ -99,7 +100,7 @@ class Reader:
 
     def _queue_chunk(self, chunk: bytes) -> None:
         with self._arrived:
-            # Read within the lock, so that a chunk that `take` did not return is never older than that call of `take`.
+            # The time is read within the lock, so that a chunk that `take` missed is never older than that call.
             now_s = self.unix_s()
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)

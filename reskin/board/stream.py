@@ -1,6 +1,6 @@
 """Split a byte stream into frames, without I/O; every byte belongs to a frame or is counted as lost.
 
-No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). The frames depend
+No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). The result depends
 only on the bytes, not on how the stream was divided into reads.
 """
 
@@ -76,6 +76,7 @@ class FrameStream:
         return {name: self._count[name] for name in ACCOUNT}
 
     def _advance(self, data: bytes, final: bool) -> Frames:
+        """Scan the undecided bytes and `data` for frames; if `final`, no more bytes follow."""
         buffer = self._rest + data if self._rest else data
         offset = self._count["bytes_n"] - len(self._rest)
         scan = self._scan(np.frombuffer(buffer, np.uint8), self._at_boundary, final, self._wire, self._chips_n)
@@ -187,7 +188,7 @@ def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void
 
 
 def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Return `_sure_frames_n` for the bytes of whole frames, at most `BLOCK_FRAMES_N`."""
+    """Return the result of `_sure_frames_n` for a block of whole frames."""
     rows = block.reshape(-1, record.itemsize)
     closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
     closed_n = len(rows) if closed.all() else int(closed.argmin())

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Shaped
 
-# These three values were tuned on all passes of the recording of scene `eflesh`, so they cannot be tested on it.
+# These three values were tuned on all passes of the recording of scene `eflesh`, so this recording cannot test them.
 # `follow_free` compares a reading with this many latest states: usually five contacts and five contact-free states.
 STATES_N = 10
 SIMILAR_MIN_N = 4  # a state is free of contact if it is similar to this many of the latest states, including itself
@@ -30,24 +30,21 @@ def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
 
 
 def initial(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
-    """Return the first no-load reading as baseline of every row (paper section 4: "a single no-load measurement")."""
+    """Use the first no-load reading for all rows (paper section 4: "a single no-load measurement")."""
     return np.broadcast_to(noload_uT[:1], noload_uT.shape).copy()
 
 
 def regular(
     noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"], *, regular_n: int
 ) -> Float32[np.ndarray, "f ch"]:
-    """Return the baseline of each row if it is updated only every `regular_n` indentations.
-
-    This is the policy "at regular intervals" of paper section 4.
-    """
+    """Use a new no-load reading only every `regular_n` indentations (paper section 4: "at regular intervals")."""
     rank_i = rank(indentation)
     _, first_i = np.unique(rank_i, return_index=True)  # the first row of each indentation
     return noload_uT[first_i[rank_i - rank_i % regular_n]]
 
 
 def each(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
-    """Return as the baseline of each row the no-load reading that was taken before the row's contact."""
+    """Use for each row the no-load reading that was taken before the row's contact."""
     return noload_uT
 
 
@@ -58,7 +55,7 @@ def free(
     *,
     within_uT: float,
 ) -> Float32[np.ndarray, "f ch"]:
-    """Return as the baseline of each row the latest earlier reading that `follow_free` classifies as free of contact.
+    """Use for each row the latest earlier reading that `follow_free` classifies as free of contact.
 
     The first baseline is the first no-load reading. The readings are processed in the order in which a board sends
     them: for each indentation, first the no-load reading, then the rows in contact. Two readings are similar if their

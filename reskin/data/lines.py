@@ -1,4 +1,4 @@
-"""Pokes along straight lines; the only label of a poke is its position in the order along the line.
+"""Pokes along straight lines; the only label of a poke is its rank along the line.
 
 This is the paper's method (section 5): "indent in a straight line and incrementally index these points". Here, the
 index is derived from the places of a robot's grid. The places are then discarded: `Lines` contains only row numbers,
@@ -41,8 +41,8 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
     """Assign the chosen row numbers to the grid lines of each skin, along x and along y, with an index along the line.
 
     Of the labels, only the skin and the commanded place are used. The index along a line in x is the rank of the row's
-    x among all distinct x of the skin's chosen rows (for lines in y, likewise). A line that lacks one of these places
-    therefore has a gap in its indices. Lines with a single place have no order and are left out.
+    x among all distinct x of the skin's chosen rows (for lines in y, likewise). A line without a row at one of these
+    coordinates therefore has a gap in its indices. Lines with a single place have no order and are left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
@@ -108,10 +108,10 @@ def take_pokes(
 ) -> Int64[np.ndarray, " d"]:
     """Draw `indentations_n` indentations of one skin, evenly over the places; return their row numbers, sorted.
 
-    `pool` are the row numbers to draw from. Of the labels, only the place is used, that of an indentation's first row.
-    In the first round, one indentation is drawn for each place; in the second round, another one, and so on. The last
-    round may cover only some places, chosen at random. If a call with the same state of `rng` draws fewer indentations,
-    these are a subset.
+    `pool` are the row numbers to draw from. Of the labels, only the place of an indentation's first row is used. In the
+    first round, one indentation is drawn for each place; in the second round, another one, and so on. The last round
+    may cover only some places, chosen at random. If a call with the same state of `rng` draws fewer indentations, these
+    are a subset.
     """
     _check_pool(rows, pool, indentations_n)
     indentations, first = np.unique(rows.indentation[pool], return_index=True)

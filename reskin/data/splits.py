@@ -59,8 +59,8 @@ class Split(Strict):
 class Fold:
     """Row numbers (in `Rows`) of the training rows, the test rows, and the pool.
 
-    The pool are the pokes on the held-out skins that adaptation may use. No method is tested on the pool, so that all
-    methods are tested on the same rows.
+    The pool contains the pokes on the held-out skins that adaptation may use. No method is tested on the pool, so that
+    all methods are tested on the same rows.
     """
 
     experiment: str
@@ -158,8 +158,8 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
 def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """Hold out a board as in experiment `lobo`, and draw a pool of its indentations; one fold per board and draw.
 
-    The pool are the indentations that may be labelled. All of them are excluded from the test rows, even if only some
-    are labelled, so that the test rows are the same for all numbers of labels.
+    The pool contains the indentations that may be labelled. All of them are excluded from the test rows, even if only
+    some are labelled, so that the test rows are the same for all numbers of labels.
     """
     assert split.labels_pool_n is not None
     assert split.labels_draws_n is not None
@@ -189,10 +189,11 @@ def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on one skin, test on all skins of the boards that have no training skin; one fold per training skin.
+    """Train on one skin, test on all skins of other boards; one fold per training skin.
 
-    With `split.pool_passes_n`, the pool of other experiments is excluded from the test rows here too, so that all
-    experiments are tested on the same rows.
+    Boards with a training skin of any fold are not tested on, so that the test rows are the same for all folds. With
+    `split.pool_passes_n`, the passes of the pool are excluded from the test rows here too, so that all experiments are
+    tested on the same rows.
 
     The paper trains on 3 skins, one at a time, and tests on 9 others. Here, with 6 boards of 3 skins each, the training
     skins are the first skins of the first three boards, and the test skins are all skins of the other three.

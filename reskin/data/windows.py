@@ -32,7 +32,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class Part:
-    """One window of one capture, with the baselines of one policy, and its place in the stack of all parts."""
+    """One window of one capture, with the baselines of one policy, and its position in the stack of all parts."""
 
     policy: str
     window_i: int

@@ -77,7 +77,7 @@ def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[n
 
 
 # Maximum deviation of a clock's fitted rate from 1. Real deviations are some per cent, if the nominal frame rate is
-# inaccurate; a larger one means that a mark is in milliseconds or that its two times are of different events.
+# inaccurate; a larger deviation means that a mark is in milliseconds or that its two times are of different events.
 RATE_LIMIT = 0.1
 
 # To align the clocks without marks, the stream is divided into time steps. `_search` finds an offset for its first
@@ -86,18 +86,22 @@ STEPS_PER_DWELL_N = 16  # steps in the median contact dwell (a "dwell length")
 STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
 SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths, in which a rate error of 50 ppm adds up to 0.2 dwell lengths
 WINDOW_STEPS_N = 2**14  # 1,000 dwell lengths
-EXPLAINED_MIN = 0.5  # minimum fraction of dwell time that agrees with the field: 0 by chance, 1 if every dwell agrees
+# Minimum fraction of dwell time that agrees with the field. The fraction is 0 by chance, and 1 if every dwell agrees.
+EXPLAINED_MIN = 0.5
 # The best offset must match this many more indentations than every other offset. An offset that is wrong by one period
 # of a periodic protocol matches one indentation less, and one contact may be too weak to detect.
 MARGIN_MIN = 1.5
-OVERLAP_MIN = 0.5  # minimum overlap with the dwells, relative to the largest overlap: a few dwells can fit by chance
-PEAK_DROP = 0.05  # a peak can be flat, so its position is the middle of the range above (1 - this) times its height
+# Minimum overlap of stream and dwells, relative to the largest overlap at any offset: the few dwells of a small overlap
+# can fit by chance.
+OVERLAP_MIN = 0.5
+# The top of a peak can be flat, so the position of the peak is the middle between its flanks at 5 % below the top.
+PEAK_DROP = 0.05
 # Contact threshold, as a multiple of the median distance from the no-load field in frames without contact: 2.7 standard
 # deviations of this distance above its median, for the 15 channels of a board.
 AWAY_NOISES = 1.5
 STRETCH_PERIODS_N = 32  # the no-load field is updated after this many periods, of one indentation each
 START_FRAMES_N = 4  # the first no-load field is the median of this many first frames
-REFERENCE_FRAMES_N = 4096  # about this many frames of a stretch are used to estimate the no-load field
+REFERENCE_FRAMES_N = 4096  # at most this many frames of a stretch are used to estimate the no-load field
 _REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S, one event on both clocks."
 
 # Stream times [f] and fields in uT [f ch]; the axes are not named, because f differs from block to block.

@@ -140,8 +140,8 @@ class FaultLog:
     ) -> Bool[np.ndarray, " f"]:
         """Record the rows (or frames) that `mask` marks as faulty; return the mask of the rows that the policy drops.
 
-        The fault is counted `count_n` times; None: once per marked row. Raises `CaptureError` if the policy refuses
-        recordings with this fault.
+        `position` is the time in s or the number of each row. The fault is counted `count_n` times; None: once per
+        marked row. Raises `CaptureError` if the policy refuses recordings with this fault.
         """
         action: Action = getattr(self._policy, fault)
         if mask.any():
@@ -187,8 +187,7 @@ class FaultLog:
     ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
         """Record the faults that can be detected in each reading by itself.
 
-        Returns two masks of dropped rows: those with a failed read, and those with other readings that are out of
-        range.
+        Returns two masks of rows to drop: rows with a failed read, and other rows with a reading that is out of range.
         """
         failed, zeros = np.asarray(readings.failed_read.any(axis=1)), np.asarray(readings.zeros.any(axis=1))
         dropped = self.record("failed_read", failed, position) | self.record("zeros", zeros & ~failed, position)
@@ -224,7 +223,7 @@ class FaultLog:
     def record_constant(
         self, channels: list[str], position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"] | None = None
     ) -> None:
-        """Record channels that never changed in a whole recording; raise `CaptureError` if the policy refuses it.
+        """Record channels that never changed in a whole recording; raise `CaptureError` if the policy refuses this.
 
         `position` is the position of each reading; None: the first and the last time of the stream.
         """

@@ -51,7 +51,7 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
 def _row(sample: Mapping[str, Any]) -> str:
     place, fields, forces = (sample[key] for key in ("Location", "ReSkin Data", "Force Data"))
     if (len(place), len(fields), len(forces)) != (2, len(COLUMNS), 3):
-        raise ValueError(f"a sample of {len(place)} places, {len(fields)} fields and {len(forces)} forces")
+        raise ValueError(f"a sample has {len(place)} coordinates, {len(fields)} readings and {len(forces)} forces")
     cells = [f"{mm:g}" for mm in place] + [f"{value:.4f}" for value in fields] + [f"{force:.6f}" for force in forces]
     return ",".join(cells)
 
@@ -63,7 +63,7 @@ def decode_array(npy: bytes, where: str) -> Any:
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = read_header(stream)
     if not dtype.hasobject:
-        raise CaptureError(f"{where}: the array holds {dtype}, not objects. {REMEDY}")
+        raise CaptureError(f"{where}: the array contains {dtype}, not objects. {REMEDY}")
     return decode(stream.read(), where)
 
 

@@ -136,7 +136,7 @@ def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
 
 
 def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Marks) -> Prepared:
-    """Prepare a capture folder that `reskin record` wrote; `probe` is a probe log that replaces the folder's."""
+    """Prepare a capture folder that `reskin record` wrote; `probe` is a probe log that is added or replaces its log."""
     _check_exists(recording, folder=True)
     header = read_header(recording)
     for option, given, in_header in (("--board", names.board, header.board), ("--skin", names.skin, header.skin)):

@@ -61,7 +61,7 @@ def parse(source: str | Path, where: str) -> ProbeLog:
         refuse_row(unknown, where, name, "known", "an empty field", "Only labels may be empty.")
     phases = table.column("phase")
     is_other = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
-    refuse_row(is_other, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
+    refuse_row(is_other, where, "phase", f"{NOLOAD} or {CONTACT}", phases, f"Write {NOLOAD} or {CONTACT}.")
     numbers = {name: np.asarray(table.column(name)) for name in TYPES if name != "phase"}
     log = ProbeLog(contact=np.asarray(pc.equal(phases, CONTACT)), **numbers)
     _check_numbers(log, where)

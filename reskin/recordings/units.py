@@ -32,13 +32,14 @@ DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
     """Raise if raw fields are probably not in uT.
 
-    This is so if they exceed the chip's full scale, are weaker than the earth's field, or have steps between values
-    that no chip has in uT. The steps are visible only if values were neither averaged nor rounded to decimals.
+    Fields are in another unit if they exceed the chip's full scale, if they are weaker than the earth's field, or if
+    the steps between their values are not those of any chip in uT. The steps are visible only if the values were
+    neither averaged nor rounded to decimals.
     """
     _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
     if usual_uT < WEAKEST_uT:
-        rule = f"{WEAKEST_uT:g} uT or more at most chips, as the earth's field is"
+        rule = f"{WEAKEST_uT:g} uT or more on most chips, like the earth's field"
         raise CaptureError(where, "field", rule, f"{usual_uT:.4g}", "Convert mT or G to uT.")
     step_uT = _find_step(b_uT)
     if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
@@ -85,7 +86,7 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
     known_mm = place_mm[known]
     extent_mm = float(np.ptp(known_mm, axis=0).max()) if len(known_mm) else 0.0
     if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
-        rule = f"one, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
+        rule = f"equal, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
         got, remedy = f"{extent_mm:.4g}", "Convert m or um to mm."
         is_far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
         if 0 < is_far.sum() <= FAR_SHARE_MAX * len(is_far):

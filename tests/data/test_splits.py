@@ -360,7 +360,7 @@ def test_saved_folds_list_boards_and_skins():
 
 def test_saved_folds_of_other_rows_are_refused():
     document = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
-    with pytest.raises(SchemaError, match="but its captures have 2"):
+    with pytest.raises(SchemaError, match="but the captures have 2 rows"):
         parse_folds(document, rows(["b0", "b1"], ["s0", "s1"]), "folds.json")
 
 

@@ -195,7 +195,7 @@ def test_wrong_column_order_is_refused(tmp_path: Path, sent: Wire, declared: Wir
 
 def test_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
     folder = write(tmp_path, "binary", probe=probe.render(dataclasses.replace(LOG, x_mm=LOG.x_mm * 1000)).encode())
-    with pytest.raises(CaptureError, match="probe.csv: places must be one, or spread over 1 to 200 mm; got 5.9e"):
+    with pytest.raises(CaptureError, match="probe.csv: places must be equal, or spread over 1 to 200 mm; got 5.9e"):
         read(folder, header_of("binary"))
 
 

@@ -128,7 +128,7 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
 def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
     if readings_n <= rows_late_n:
         raise CaptureError(
-            f"{header.capture}: {readings_n} rows are not more than the {rows_late_n} of option rows_late. Was the "
+            f"{header.capture}: the recording has {readings_n} rows, but option rows_late is {rows_late_n}. Was the "
             "recording cut?"
         )
     if readings_n != truths_n:

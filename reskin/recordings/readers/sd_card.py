@@ -93,7 +93,7 @@ def _check_kept(account: dict[str, int], where: str) -> None:
         counts = f"{failed_n} had failed I2C reads, {stuck_n} stuck chips"
         raise CaptureError(
             f"{where}: only {kept_n} of {read_n} lines are fault-free: {counts}. At least "
-            f"{100 * KEPT_SHARE_MIN:g} % must be. Check the wiring, and log again."
+            f"{100 * KEPT_SHARE_MIN:g} % must be fault-free. Check the wiring, and log again."
         )
 
 

@@ -203,7 +203,7 @@ def test_places_in_metres_or_micrometres_are_refused(tmp_path: Path, factor: flo
     folder = write(tmp_path, [[5.0 * i, 0.0, 142.0] for i in range(4)], [300.0] * 4)
     eflesh.read(folder, HEADER, DEFAULT_POLICY)
     rescale(folder / eflesh.STATES, slice(1, 4), factor)
-    assert "states.csv: places must be one, or spread over 1 to 200 mm" in error_of(folder)
+    assert "states.csv: places must be equal, or spread over 1 to 200 mm" in error_of(folder)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])

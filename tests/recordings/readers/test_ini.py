@@ -201,7 +201,7 @@ def test_invalid_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
 
 
 def test_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
-    assert "4 rows are not more than the 5 of option rows_late" in error_of(
+    assert "the recording has 4 rows, but option rows_late is 5" in error_of(
         write(tmp_path, ONE_PASS[:4]), header_with_lateness("5")
     )
 
@@ -221,7 +221,7 @@ def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> 
 @pytest.mark.parametrize(
     ("columns", "factor", "expected"),
     [
-        (slice(0, 2), 1e-3, "places must be one, or spread over 1 to 200 mm; got 0.008"),
+        (slice(0, 2), 1e-3, "places must be equal, or spread over 1 to 200 mm; got 0.008"),
         (slice(0, 2), 1e3, "Convert m or um to mm"),
         (slice(2, 3), 0.01, "force must be 0.05 N or more somewhere in contact; got 0.015 at most"),
         (slice(2, 3), 1e3, "Convert grams or mN to N"),

@@ -193,7 +193,7 @@ def scale_column(column: str, factor: float) -> list[str]:
         ("B", 1e-2, "Convert mT or G to uT"),
         ("B", 1e-6, "Convert mT or G to uT"),
         ("B", 1e4, "below the full scale"),
-        ("_mm", 1e-3, "places must be one, or spread over 1 to 200 mm; got 0.004. Convert m or um"),
+        ("_mm", 1e-3, "places must be equal, or spread over 1 to 200 mm; got 0.004. Convert m or um"),
         ("_mm", 1e3, "got 4000. Convert m or um"),
         ("F", 102.0, "force must be below 100 N; got -357 in line 4. Convert grams"),
         ("F", 1e3, "Convert grams or mN to N"),

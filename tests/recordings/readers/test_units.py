@@ -94,7 +94,7 @@ def test_places_pass_in_millimetres_only(extent_mm: float, start_mm: float) -> N
     check_places(place_mm, "here")
     for factor in (1e-3, 1e3):
         if extent_mm * factor > 200 or 0.01 < extent_mm * factor < 1:
-            with pytest.raises(CaptureError, match="^here: places must be one, or spread over 1 to 200 mm"):
+            with pytest.raises(CaptureError, match="^here: places must be equal, or spread over 1 to 200 mm"):
                 check_places(factor * place_mm, "here")
 
 
