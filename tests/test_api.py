@@ -126,7 +126,7 @@ def test_loaded_model_predicts_like_its_network(model):  # noqa: F811
     noload_uT = b_uT[:2].mean(axis=0, dtype=np.float64)
     np.testing.assert_array_equal(predicted, read_network(model)((b_uT[2:] - noload_uT).astype(np.float32)))
     np.testing.assert_array_equal(loaded.predict(b_uT[2].tolist()), predicted[0])
-    with pytest.raises(ReskinError, match="the model has no no-load reading"):
+    with pytest.raises(ReskinError, match="the no-load reading is missing"):
         reskin.load_model(model).predict(b_uT)
     with pytest.raises(ReskinError, match=r"fields of shape \(2,\) do not fit the 15 channels"):
         loaded.predict([1.0, 2.0])

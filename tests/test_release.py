@@ -172,5 +172,5 @@ def test_checkout_commands_are_listed():
 def test_checkout_commands_raise_outside_a_checkout(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["reskin", name, "any.csv"])
-    with pytest.raises(ParamsError, match=f"reskin {name} works in a checkout of the project"):
+    with pytest.raises(ParamsError, match=f"reskin {name} must be run in a checkout of the project"):
         add_checkout_commands()
