@@ -128,8 +128,8 @@ def describe(log: LogEstimates) -> dict[str, Any]:
 def score_contacts(log: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
     """Score estimates of place and force, and count readings whose contact was missed or falsely detected.
 
-    `true` contains x_mm, y_mm and F_N, and NaN for readings without contact. Each model is scored separately; the result
-    contains the means of the scores over the models and, under `spread`, their standard deviations.
+    `true` contains x_mm, y_mm and F_N, and NaN for readings without contact. Each model is scored separately. The
+    result contains the means of the scores over the models and, under `spread`, their standard deviations.
     """
     truly_touched = np.isfinite(true[:, 2])
     both_touched = log.contact & truly_touched

@@ -18,8 +18,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
     """Score predictions of (x_mm, y_mm, F_N); return the scores by the names in `METRICS` and `TRUTH`.
 
     `mse_xy_mm2` is averaged over x and y; the paper does not say whether its MSE is the sum or the mean. `r2_f` is
-    1 - `mse_f_N2` / (variance of the true forces), which is 0 for a constant prediction of the mean force. The scores of
-    the force are missing if no true force is known; `r2_f` is also missing if all true forces are equal.
+    1 - `mse_f_N2` / (variance of the true forces), which is 0 for a constant prediction of the mean force. The scores
+    of the force are missing if no true force is known; `r2_f` is also missing if all true forces are equal.
     """
     error = predicted.astype(float) - true
     known = ~np.isnan(error[:, 2])
@@ -41,8 +41,8 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
     """Shift all predicted places by one constant offset that makes the mean error of x and of y zero.
 
-    The origin of each rig was set manually. Scores after this shift show how much of the error is due to the origin. The
-    offset is computed from the true places, so these scores are a diagnostic and not a result.
+    The origin of each rig was set manually. Scores after this shift show how much of the error is due to the origin.
+    The offset is computed from the true places, so these scores are a diagnostic and not a result.
     """
     shifted = predicted.astype(float)
     shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)

@@ -1,10 +1,10 @@
 """Set environment variables that make numerical libraries compute the same bits on every x86-64 processor with AVX2.
 
-PyTorch, NumPy, OpenBLAS and Numba select their code by the instruction sets of the processor, and OpenBLAS splits matrix
-products among threads. Both affect the order of summation, and training amplifies the rounding errors. With the values
-below, and with `reskin.models.reproducible` instead of MKL, results are bit-identical on all processors with AVX2
-(tests/test_numerics.py). The libraries read the variables when they are loaded. Therefore, `pin` must run before NumPy
-is imported, and this module must not import NumPy.
+PyTorch, NumPy, OpenBLAS and Numba select their code by the instruction sets of the processor, and OpenBLAS splits
+matrix products among threads. Both affect the order of summation, and training amplifies the rounding errors. With the
+values below, and with `reskin.models.reproducible` instead of MKL, results are bit-identical on all processors with
+AVX2 (tests/test_numerics.py). The libraries read the variables when they are loaded. Therefore, `pin` must run before
+NumPy is imported, and this module must not import NumPy.
 """
 
 import os

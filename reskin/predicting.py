@@ -40,8 +40,8 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
 
     Returns
     -------
-    A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also the number
-    of readings in contact with a misfit above `MISFIT_MAX`, and the number with a force at a limit of the model's range.
+    A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also two counts
+    of readings in contact: with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range.
     """
     models = read_models([] if model is None else [model])
     inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
@@ -128,12 +128,12 @@ def _read_capture(folder: Path) -> sd_card.Log:
             "wrote, or the log of an SD card."
         )
     stream = folder / STREAM_FILE
-    frames, decode_counts = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
+    frames, decoded = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     kept = frames.where(timed)
     *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
-    return *log, decode_counts | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
+    return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
 
 
 def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:

@@ -120,10 +120,10 @@ def test_unsuitable_inputs_are_an_error_and_nothing_is_written(tmp_path, model):
     cases = [
         (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model 15"),
         (log, tmp_path / "other.safetensors", out, r"model file not found. Models in this folder: model\.safetensors"),
-        (log, model, log, "is the log, the model or its card"),
-        (log, model, model, "is the log, the model or its card"),
-        (log, model, model.with_suffix(".json"), "is the log, the model or its card"),
-        (log, model, tmp_path / "four" / ".." / "model.json", "is the log, the model or its card"),
+        (log, model, log, "is the log, the model or the model's card"),
+        (log, model, model, "is the log, the model or the model's card"),
+        (log, model, model.with_suffix(".json"), "is the log, the model or the model's card"),
+        (log, model, tmp_path / "four" / ".." / "model.json", "is the log, the model or the model's card"),
         (tmp_path / "none.csv", model, out, r"none\.csv: file not found"),
     ]
     files = (log, model, model.with_suffix(".json"))
