@@ -118,7 +118,7 @@ def test_unsuitable_inputs_are_an_error_and_nothing_is_written(tmp_path, model):
     four = tmp_path / "four"
     four.mkdir()
     cases = [
-        (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model 15"),
+        (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model has 15"),
         (log, tmp_path / "other.safetensors", out, r"model file not found. Models in this folder: model\.safetensors"),
         (log, model, log, "is the log, the model or the model's card"),
         (log, model, model, "is the log, the model or the model's card"),

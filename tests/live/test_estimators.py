@@ -208,7 +208,7 @@ def test_opened_board_uses_the_saved_calibration(random_pokes, tmp_path):
 def test_calibration_is_refused_for_several_boards(random_pokes, tmp_path):
     noload_uT, b_uT, place_mm, force_N = random_pokes
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
-    with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):
+    with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) and cannot be used for 2 boards"):
         reskin.open(["/dev/a", "/dev/b"], model=calibrated)
     calibrated.save(tmp_path / "s3.safetensors")
     with pytest.raises(ParamsError, match="is a calibration of the universal model, load it with reskin.load_univ"):

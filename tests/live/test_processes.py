@@ -170,7 +170,7 @@ def test_invalid_options_print_one_sentence(shell):
     assert "use only one of --port, --replay" in errors
     assert "Traceback" not in errors
     for arguments, message in (
-        (["nothing"], "not the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
+        (["nothing"], "must be the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
         (["nothing", "--fault", "melted"], r"is not NAME\[@START_S\[\+DURATION_S\]\] with one of failed-read"),
     ):
         with pytest.raises(ReskinError, match=message):

@@ -219,7 +219,7 @@ def test_eight_boards_are_read_at_once():
 
 def test_other_chip_count_and_missing_port_raise(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
-        with pytest.raises(ReskinError, match="the board has 12 channels, but the model 15"):
+        with pytest.raises(ReskinError, match="the board has 12 channels, but the model has 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
     with pytest.raises(ReskinError, match="cannot open the port"), reskin.open("/dev/none"):
         pass
