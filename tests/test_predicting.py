@@ -148,11 +148,11 @@ def test_unsuitable_inputs_are_an_error_and_nothing_is_written(tmp_path, model):
         ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),
         (
             {"input": CARD["input"] | {"channels_n": 12}},
-            "inputs raw give 12 inputs, but the weights are for 15",
+            "inputs raw are 12 inputs, but the weights are for 15",
         ),
         (
             {"recipe": {"inputs": "shape", "architecture": "paper"}},
-            "inputs shape give 16 inputs, but the weights are for 15",
+            "inputs shape are 16 inputs, but the weights are for 15",
         ),
         ({"recipe": {"inputs": "spectrum", "architecture": "paper"}}, "recipe.inputs must be 'raw' or 'shape'"),
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture is missing"),
@@ -191,7 +191,7 @@ def test_model_without_its_card_is_an_error(tmp_path, model):
             "data/models/quick/train_multi/lobo.paper.b0.seed0.safetensors",
             "`reskin scenes use quick` and then `make re",
         ),
-        ("mine/one.safetensors", "Give the path of a trained"),
+        ("mine/one.safetensors", "Use the path of a trained"),
     ],
 )
 def test_error_for_a_missing_model_names_the_scene_that_trains_it(tmp_path, path, remedy):
@@ -205,7 +205,7 @@ def test_error_for_a_wrong_model_file_does_not_suggest_deleting_it(tmp_path, mod
         tmp_path / "net.pt": "not a trained model",
         model.with_suffix(".json"): f"not a trained model.* Give {model}",
         tmp_path: r"this is a folder.* model\.safetensors",
-        FILE: "this is the universal model. Use it without --model",
+        FILE: "this is the universal model. Omit --model",
     }
     for file, message in cases.items():
         with pytest.raises(ReskinError, match=f"{file}: {message}") as refused:

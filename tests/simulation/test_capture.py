@@ -255,8 +255,8 @@ def test_unknown_parameter_is_named(section, name):
     [
         (GRID | {"skins_n": 5}, {}, "skins_n 5 is more than the 4 skins of rigid boards"),
         (GRID | {"boards": "soft"}, {}, "boards must be one of .'rigid'., not 'soft'"),
-        (GRID | {"terms": ["ageing"]}, {}, "terms must be exactly those of the protocols"),
-        (GRID, {"terms": {"ageing": AGEING}}, "terms must be exactly those of the protocols"),
+        (GRID | {"terms": ["ageing"]}, {}, "terms must be those that the protocols list"),
+        (GRID, {"terms": {"ageing": AGEING}}, "terms must be those that the protocols list"),
         (HAND | {"depth_mm": (1.2, 0.4)}, {}, "must list the smaller depth first"),
         (HAND | {"tilt_sd_deg": 5.0}, {}, "a tilted stylus .tilt_sd_deg. needs the term friction"),
         (DRAG | {"terms": []}, {}, "protocol other: a drag needs the term friction"),
