@@ -48,7 +48,7 @@ def test_readings_are_written_reproducibly(tmp_path):
 
 
 def test_capture_without_readings_is_an_error(tmp_path):
-    with pytest.raises(SchemaError, match="no readings left"):
+    with pytest.raises(SchemaError, match="all readings of the capture were dropped"):
         io.write_readings(tmp_path / "c0.parquet", [], {})
     assert list(tmp_path.iterdir()) == []
 

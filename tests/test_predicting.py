@@ -203,7 +203,7 @@ def test_error_for_a_wrong_model_file_does_not_suggest_deleting_it(tmp_path, mod
     (tmp_path / "net.pt").write_bytes(b"PK" + bytes(100))
     cases = {
         tmp_path / "net.pt": "not a trained model",
-        model.with_suffix(".json"): f"not a trained model.* Give {model}",
+        model.with_suffix(".json"): f"not a trained model.* Use {model}",
         tmp_path: r"this is a folder.* model\.safetensors",
         FILE: "this is the universal model. Omit --model",
     }

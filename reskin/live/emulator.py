@@ -228,7 +228,7 @@ def _change_values(frames: Frames, fault: str) -> None:
             temperature_degC[:, chip_i] = CRLF_TEMPERATURE_degC
         case "clock-jump":
             if np.isnan(frames.device_s).all():
-                raise ParamsError("--fault: clock-jump needs frames with a clock. Use a capture of wire binary-clock.")
+                raise ParamsError("--fault: clock-jump needs a clock in each frame. Use a capture in format binary-clock.")
             frames.device_s[:] += CLOCK_JUMP_S
 
 
