@@ -36,7 +36,7 @@ class LogEstimates:
     """
 
     t_s: Float64[np.ndarray, " f"]
-    targets: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm, F_N by each of m models
+    targets: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm and F_N, as estimated by each of m models
     contact: Bool[np.ndarray, " f"]
     quiet_n: int
     noise_uT: float

@@ -228,7 +228,7 @@ def _change_values(frames: Frames, fault: str) -> None:
             temperature_degC[:, chip_i] = CRLF_TEMPERATURE_degC
         case "clock-jump":
             if np.isnan(frames.device_s).all():
-                raise ParamsError("--fault: clock-jump needs a clock in each frame. Use a capture in format binary-clock.")
+                raise ParamsError("--fault: clock-jump needs a capture with a clock. Use one in format binary-clock.")
             frames.device_s[:] += CLOCK_JUMP_S
 
 
@@ -307,7 +307,7 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            self._link.unlink(missing_ok=True)  # before closing: another emulator may reuse the name later
+            self._link.unlink(missing_ok=True)  # first: another emulator may create this link after the close
         for descriptor in self._open_ends:
             os.close(descriptor)
         self._open_ends = ()

@@ -70,7 +70,7 @@ class Network:
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        """Cached, because controllers predict for every frame."""
+        """The network as a PyTorch model; cached, because controllers predict for every frame."""
         from reskin.models.network import Predictor  # imported here, because it imports torch
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}

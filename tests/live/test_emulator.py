@@ -193,7 +193,7 @@ class TestFaults:
         assert frames_n("torn") == len(SCRIPT) - 2 * 10  # a torn frame also costs the next frame
 
     def test_clock_jump_needs_frames_with_a_clock(self):
-        with pytest.raises(ParamsError, match="Use a capture in format binary-clock"):
+        with pytest.raises(ParamsError, match="needs a capture with a clock"):
             inject(
                 replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),
                 parse_fault("clock-jump@0.5"),
