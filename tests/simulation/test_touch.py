@@ -85,7 +85,7 @@ def test_friction_limits_press_and_drag_together(start_m, angle_rad, force_N, fr
     board, skin = draw_board_and_skin(f"b{name_i}")
     assert skin.hold is not None
     drag_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
-    end_m = np.subtract(start_m, drag_m)
+    end_m = np.clip(np.subtract(start_m, drag_m), -8e-3, 8e-3)  # on the skin
     tip_m = path(skin, (start_m, end_m), (force_N, force_N), STOPS_N // 4)
     found = drag_tip(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), friction=Friction(coefficient=friction))
     limit_N = friction * forces(skin, tip_m[0, :, 2])
