@@ -165,10 +165,10 @@ def test_broken_safetensors_are_an_error(tmp_path):
         io.read_tensors(tmp_path / "m.safetensors")
 
 
-def flip_bits(file: Path) -> Iterator[int]:
-    """For each byte of a file, flip one bit, yield the index of the byte, and restore the byte."""
+def flip_bits(file: Path, every_n: int = 1) -> Iterator[int]:
+    """For every n-th byte of a file, flip one bit, yield the index of the byte, and restore the byte."""
     content_before = file.read_bytes()
-    for i in range(len(content_before)):
+    for i in range(0, len(content_before), every_n):
         content = bytearray(content_before)
         content[i] ^= 1 << i % 8
         file.write_bytes(content)
@@ -196,12 +196,12 @@ def test_flipped_bits_of_tables_are_detected(tmp_path):
     io.write_readings(file, [readings()], {"rows_n": 6})
     before, chunks = repr(io.read_table(file).to_pydict()), pq.read_metadata(file).row_group(0)
     end, detected_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0  # file metadata start after this byte
-    for i in flip_bits(file):
+    for i in flip_bits(file, every_n=3):
         try:
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
             detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert detected_n > end // 2  # the other bytes are in page headers, and their bits do not affect the values
+    assert detected_n > end // 6  # the other bytes are in page headers, and their bits do not affect the values
 
 
 def test_tensors_without_digest_are_read(tmp_path):

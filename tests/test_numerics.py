@@ -37,8 +37,7 @@ def digests_under(*settings: str) -> str:
     "settings",
     [
         ("MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41"),  # code that MKL and oneDNN use on unknown processors
-        ("MKL_ENABLE_INSTRUCTIONS=AVX2",),
-        ("OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"),
+        ("MKL_ENABLE_INSTRUCTIONS=AVX2", "OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"),
     ],
     ids=" ".join,
 )
