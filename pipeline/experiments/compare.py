@@ -268,7 +268,7 @@ AS_SAID = "Labels, chips and skin lie as the scene says."
 
 @dataclass(frozen=True)
 class Turn:
-    """An orientation of a chip's axes relative to the scene's settings: sign changes, then quarter turns about z."""
+    """Orientation of a chip's or the labels' axes relative to the scene: sign changes, then quarter turns about z."""
 
     quarters: int
     signs: tuple[int, int, int]

@@ -651,8 +651,8 @@ def judge_finding(name: str, finding: str, comparisons: Sequence[Comparison]) ->
 POLICIES = ("initial", "regular", "each", "free")
 WANDER_MEANING = (
     "The networks of figure 5a, tested again on their last window after a random walk was added to the captures. After "
-    "the training contacts, each contact adds one normally distributed step per channel, to contact readings and "
-    "no-load readings alike. The row without an added walk is the last window of figure 5a. The table of skins gives the "
+    "the training contacts, each contact adds one normally distributed step per channel, to contact readings and to "
+    "no-load readings. The row without an added walk is the last window of figure 5a. The table of skins gives the "
     "drift of the field at rest without an added walk, as rms change over 1 to 1,000 contacts."
 )
 FINDINGS_MEANING = (
@@ -703,7 +703,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _possible_reasons(numbers: Mapping[str, Any]) -> str:
-    """Describe possible reasons for the scores: errors of the no-load reading, and softening of the skin."""
+    """Describe two possible reasons for the scores: errors of the no-load reading, and softening of the skin."""
     field, late = numbers["field"], numbers.get("late", {})
     offsets = ", ".join(
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()

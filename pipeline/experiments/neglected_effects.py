@@ -110,7 +110,7 @@ def _make_subject(simulation: SimulationSettings, seed: int) -> Subject:
 
 
 def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
-    """Evaluate ageing, relaxation and memory: compare simulations of the whole protocol with and without each effect."""
+    """Evaluate ageing, relaxation and memory, from simulations of the whole protocol with and without each effect."""
     n, relaxation = len(subject.plan), RELAXATION
     rows = []
     for name, terms, description in (
@@ -149,7 +149,7 @@ def _friction(subject: Subject) -> Effect:
 
 
 def _earth(plain: Response) -> Effect:
-    """Evaluate the earth's field: add it to no-load readings and contact readings, and subtract the no-load readings."""
+    """Evaluate the earth's field, which is added to the no-load reading and to the contact reading."""
     rest_T = plain.rest_T[:, None] + EARTH_T
     measured_T = (rest_T + plain.change_T) - rest_T
     description = "a steady field, as long as the board does not turn; a no-load reading before each contact"
@@ -158,7 +158,7 @@ def _earth(plain: Response) -> Effect:
 
 
 def _hold(subject: Subject) -> list[Effect]:
-    """Evaluate how the base holds the skin: compare with an infinite layer that slides freely and is linearly elastic."""
+    """Evaluate the base's hold, by comparison with an infinite layer that slides freely and is linearly elastic."""
     if subject.skin.hold is None:
         return []
     free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])

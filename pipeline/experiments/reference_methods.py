@@ -394,7 +394,7 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Return the control of each method that receives no pokes or another skin's: the same method with its own pokes."""
+    """Return the control of each method with no pokes or another skin's: the same method with the skin's own pokes."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
