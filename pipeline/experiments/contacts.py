@@ -251,8 +251,7 @@ def compare_prediction(
 def position_along_line(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Return the position of each prediction along the line through both contacts: 0 at the weaker, 1 at the stronger.
-    """
+    """Return the position of each prediction along the line through both contacts: 0 at the weaker, 1 at the stronger."""
     line_mm = (stronger - weaker)[:, :2].astype(np.float64)
     return ((predicted - weaker)[:, :2] * line_mm).sum(axis=1) / (line_mm**2).sum(axis=1)
 

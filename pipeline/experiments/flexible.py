@@ -79,8 +79,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
     } | gaps(data) | summarise_flexible(of_paper)  # fmt: skip
     if SHAPE in recipes:
         numbers[SHAPE] = summarise_flexible(
-            before[SHAPE]
-            + [replace(prediction, variant=AFTER) for prediction in after if prediction.variant == SHAPE]
+            before[SHAPE] + [replace(prediction, variant=AFTER) for prediction in after if prediction.variant == SHAPE]
         )
     plot_data = draw_forces(of_paper, rng_for(data.settings.seed, "flexible", "drawn"))
     write_results(results, numbers, plot_data, read_losses(indentations, poked.dropped), trainings)

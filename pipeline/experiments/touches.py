@@ -311,9 +311,7 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
     single_pct = [
         100 * float(np.median(relative_residual(known, block.test.places, block.test.db_uT))) for block in blocks
     ]
-    pairs = [
-        explain_pair(known, (recording.places[0], recording.places[1]), recording.db_uT) for recording in double
-    ]
+    pairs = [explain_pair(known, (recording.places[0], recording.places[1]), recording.db_uT) for recording in double]
     return {"single_touches_pct": statistic(single_pct), "pairs": pairs} | {
         f"mean_{name}": statistic([pair[name] for pair in pairs])
         for name in ("left_over_pct", "stronger_alone_pct", "other_pairs_pct")
