@@ -180,13 +180,13 @@ def score_board(
 
 
 def one_row_per_poke(
-    indentation: Int64[np.ndarray, " f"], own: Int64[np.ndarray, " a"], rng: np.random.Generator
+    indentation: Int64[np.ndarray, " f"], candidates: Int64[np.ndarray, " a"], rng: np.random.Generator
 ) -> Int64[np.ndarray, " b"]:
-    """Draw one row at random from each indentation; `own` are the row numbers to draw from.
+    """Draw one row at random from each indentation; `candidates` are the row numbers to draw from.
 
     `indentation` has one element for every row of the scene. The result is sorted.
     """
-    shuffled = rng.permutation(own)
+    shuffled = rng.permutation(candidates)
     return np.sort(shuffled[np.unique(indentation[shuffled], return_index=True)[1]])
 
 

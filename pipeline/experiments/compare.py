@@ -42,7 +42,8 @@ NOLOAD_READINGS_N = 10
 CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against force, from a light touch to a firm press
 LIGHT_N = 1e-3  # force of a light touch
 PLACE_STRIDE = 5  # the curve is a median over every fifth place of a board
-# Friction under the tip limits the slide: k / mu in N/mm, from no limit (full slide at any force) to a slippery tip.
+# Values of k / mu in N/mm (spring constant of the skin's hold / friction coefficient under the tip). This ratio limits
+# how far a tip slides a skin: from no limit (full slide at any force) to a slippery tip.
 GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 Fields = Float[np.ndarray, "n k 3"]
@@ -78,30 +79,34 @@ def compare_boards(
     fitted = {board: fit(presses, setup, TEN) for board, presses in aligned.items()}
     names = list(aligned)
     by_board, plot_data = {}, {}
-    for i, (board, own) in enumerate(aligned.items()):
+    for i, (board, aligned_presses) in enumerate(aligned.items()):
         laws, parameters = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
         if len(names) > 1:
             law_of = names[(i + 1) % len(names)]
-            laws["refitted"] = fit(own, setup, SEVEN, fitted[law_of])
+            laws["refitted"] = fit(aligned_presses, setup, SEVEN, fitted[law_of])
             parameters["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
-        simulated_uT = {name: simulate_uT(law, setup, own.place_mm, own.recorded.force_N) for name, law in laws.items()}
-        simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.recorded.force_N)
+        simulated_uT = {
+            name: simulate_uT(law, setup, aligned_presses.place_mm, aligned_presses.recorded.force_N)
+            for name, law in laws.items()
+        }
+        simulated_uT["nominal"] = nominal_uT(setup, aligned_presses.place_mm, aligned_presses.recorded.force_N)
         agreements = {
-            name: agreement(own, fields_uT) | {"beyond_n": beyond_n(laws.get(name), setup, own.recorded.force_N)}
+            name: agreement(aligned_presses, fields_uT)
+            | {"beyond_n": beyond_n(laws.get(name), setup, aligned_presses.recorded.force_N)}
             for name, fields_uT in simulated_uT.items()
         }
-        frictions = fit_frictions(own, setup, fitted[board])
+        frictions = fit_frictions(aligned_presses, setup, fitted[board])
         curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in frictions}
         by_board[board] = (
             agreements.pop("fitted")
             | {"grips": frictions}
             | agreements
-            | estimate_memory(own, simulated_uT["fitted"], section, seed)
-            | {"laws": parameters, "frames": check_frames(own, setup, section)}
-            | {"noise_uT": dict(zip("xyz", own.recorded.noise_uT.tolist(), strict=True))}
-            | {"pokes_n": len(own.recorded), "left_out_n": own.recorded.excluded_n}
+            | estimate_memory(aligned_presses, simulated_uT["fitted"], section, seed)
+            | {"laws": parameters, "frames": check_frames(aligned_presses, setup, section)}
+            | {"noise_uT": dict(zip("xyz", aligned_presses.recorded.noise_uT.tolist(), strict=True))}
+            | {"pokes_n": len(aligned_presses.recorded), "left_out_n": aligned_presses.recorded.excluded_n}
         )
-        plot_data[board] = _plot_data(own, simulated_uT["fitted"]) | {"curve_uT": curves}
+        plot_data[board] = _plot_data(aligned_presses, simulated_uT["fitted"]) | {"curve_uT": curves}
     numbers = {
         "by_board": by_board,
         "over_boards": summarise_boards(by_board),
@@ -116,9 +121,11 @@ def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
     """Return statistics over boards of the agreement of each simulation with the recordings."""
     summary: dict[str, Any] = {}
     for simulation in ("nominal", "fitted", "refitted"):
-        rows = [_of_simulation(own, simulation) for own in by_board.values() if _has_simulation(own, simulation)]
-        values = {name: [own[name] for own in rows] for name in ("cosine_mean", "explained_median")}
-        grown = [own["growth"] for own in rows if "growth" in own]
+        rows = [
+            _of_simulation(numbers, simulation) for numbers in by_board.values() if _has_simulation(numbers, simulation)
+        ]
+        values = {name: [numbers[name] for numbers in rows] for name in ("cosine_mean", "explained_median")}
+        grown = [numbers["growth"] for numbers in rows if "growth" in numbers]
         values["growth_difference"] = [growths["simulated"] - growths["recorded"] for growths in grown]
         if rows:
             summary[simulation] = {
@@ -375,8 +382,8 @@ def find_frames(
         simulated_uT = nominal(place_mm @ labels.matrix[:2, :2].T)
         # Entry [k, l, t] of `cosine`: cosine, over all pokes, between the field of recorded chip k after orientation t
         # and the field simulated at chip l.
-        at_chips_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
-        moments = np.einsum("nka,nlb->klab", read_uT, at_chips_uT)
+        rotated_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
+        moments = np.einsum("nka,nlb->klab", read_uT, rotated_uT)
         sizes = np.linalg.norm(read_uT, axis=(0, 2))[:, None] * np.linalg.norm(simulated_uT, axis=(0, 2))
         cosine = np.einsum("klab,tba->klt", moments, turns) / sizes[..., None]
         if labels == TURNS[0]:
@@ -396,10 +403,10 @@ def _best_chips(
     """
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
-    of_pair = worth.max(axis=2) - PENALTY * (1 - np.eye(len(worth)))
-    chips, positions = linear_sum_assignment(of_pair, maximize=True)
+    pair_worth = worth.max(axis=2) - PENALTY * (1 - np.eye(len(worth)))
+    chips, positions = linear_sum_assignment(pair_worth, maximize=True)
     turn_i = worth[chips, positions].argmax(axis=1)
-    total = of_pair[chips, positions].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
+    total = pair_worth[chips, positions].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
     turns = tuple(TURNS[i] for i in turn_i)
     return Frames(labels, flipped, positions, turns, signed[chips, positions, turn_i], as_written, float(total))
 
@@ -493,16 +500,16 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate agreement with its bounds, the fitted parameters, and the orientation of labels, chips and skin."""
     by_board = numbers["by_board"]
     rows = [
-        _board_row(board, name, _of_simulation(own, name), own["laws"].get(name, {}))
-        for board, own in by_board.items()
+        _board_row(board, name, _of_simulation(numbers_of_board, name), numbers_of_board["laws"].get(name, {}))
+        for board, numbers_of_board in by_board.items()
         for name in SIMULATIONS
-        if _has_simulation(own, name)
-    ] + [_summary_row(name, own) for name, own in numbers["over_boards"].items()]
+        if _has_simulation(numbers_of_board, name)
+    ] + [_summary_row(name, stats) for name, stats in numbers["over_boards"].items()]
     laws = [
         {"board": board, "law": _title(name, law)}
         | {title: f"{law[parameter]:.3g}" for parameter, title in TITLES.items()}
-        for board, own in by_board.items()
-        for name, law in own["laws"].items()
+        for board, numbers_of_board in by_board.items()
+        for name, law in numbers_of_board["laws"].items()
     ]
     result = {
         "compare": tabulate(rows, meaning=MEANING.format(100 * numbers["memory_put_in"])),
@@ -515,29 +522,29 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     return result
 
 
-def _board_row(board: str, name: str, own: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
-    good = [own["cosine_mean"] >= COSINE_MIN[name], own["explained_median"] >= EXPLAINED_MIN]
-    row = _cells(board, _title(name, law), f"{own['cosine_mean']:.3f}", f"{own['explained_median']:.3f}", name)
-    row[HELD] = f"{own['beyond_n']}"
-    row["cosine by file"] = ", ".join(f"{value:.3f}" for value in own["cosine_by_group"].values())
-    if "growth" in own:
-        grown = own["growth"]
+def _board_row(board: str, name: str, agreed: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
+    good = [agreed["cosine_mean"] >= COSINE_MIN[name], agreed["explained_median"] >= EXPLAINED_MIN]
+    row = _cells(board, _title(name, law), f"{agreed['cosine_mean']:.3f}", f"{agreed['explained_median']:.3f}", name)
+    row[HELD] = f"{agreed['beyond_n']}"
+    row["cosine by file"] = ", ".join(f"{value:.3f}" for value in agreed["cosine_by_group"].values())
+    if "growth" in agreed:
+        grown = agreed["growth"]
         row[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}"
         good.append(abs(grown["simulated"] - grown["recorded"]) <= GROWTH_WITHIN)
-    if "memory" in own:
-        row[MEMORY] = " / ".join(f"{100 * own['memory'][side]:.1f}" for side in ("simulated", "recorded"))
+    if "memory" in agreed:
+        row[MEMORY] = " / ".join(f"{100 * agreed['memory'][side]:.1f}" for side in ("simulated", "recorded"))
     return row | {"within bounds": "yes" if all(good) else "no"}
 
 
-def _summary_row(name: str, own: Mapping[str, Any]) -> dict[str, str]:
+def _summary_row(name: str, stats: Mapping[str, Any]) -> dict[str, str]:
     verdicts = [
-        verdict(own["cosine_mean"], above=COSINE_MIN[name]), verdict(own["explained_median"], above=EXPLAINED_MIN)
+        verdict(stats["cosine_mean"], above=COSINE_MIN[name]), verdict(stats["explained_median"], above=EXPLAINED_MIN)
     ]  # fmt: skip
-    cosine, explained = (show_digits(own[metric], 3) for metric in ("cosine_mean", "explained_median"))
-    row = _cells(f"all ({own['cosine_mean']['n']})", SIMULATIONS[name], cosine, explained, name)
-    if "growth_difference" in own:
-        row[GROWTH] = f"difference {show_digits(own['growth_difference'], 2)}"
-        verdicts.append(verdict_within(own["growth_difference"], GROWTH_WITHIN))
+    cosine, explained = (show_digits(stats[metric], 3) for metric in ("cosine_mean", "explained_median"))
+    row = _cells(f"all ({stats['cosine_mean']['n']})", SIMULATIONS[name], cosine, explained, name)
+    if "growth_difference" in stats:
+        row[GROWTH] = f"difference {show_digits(stats['growth_difference'], 2)}"
+        verdicts.append(verdict_within(stats["growth_difference"], GROWTH_WITHIN))
     return row | {"within bounds": combine_verdicts(verdicts)}
 
 
@@ -548,8 +555,8 @@ def _cells(board: str, law: str, cosine: str, explained: str, name: str) -> dict
 
 def _friction_rows(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
     lines = []
-    for board, own in by_board.items():
-        for row in own.get("grips", []):
+    for board, board_numbers in by_board.items():
+        for row in board_numbers.get("grips", []):
             line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}"}
             line["force at two thirds of the slide, N"] = f"{row['grip_N']:.2g}"
             line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
@@ -590,11 +597,11 @@ def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: st
     boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
     with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]
-        for axes, (board, own) in zip(panels, boards.items(), strict=True):
+        for axes, (board, board_data) in zip(panels, boards.items(), strict=True):
             style = {"color": COLOURS[0], "marker": MARKERS[0], "linestyle": "", "markersize": 3, "alpha": 0.5}
-            axes.plot(own["force_N"], own["length_uT"]["recorded"], label="recorded", **style)
+            axes.plot(board_data["force_N"], board_data["length_uT"]["recorded"], label="recorded", **style)
             styles = iter(("-.", ":", "--", (0, (1, 3))))
-            for grip, length_uT in own["curve_uT"].items():
+            for grip, length_uT in board_data["curve_uT"].items():
                 line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
                 friction = "no friction limit" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
                 label = f"simulated, {friction}" + (" (used)" if grip == used else "")
@@ -609,17 +616,19 @@ def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: st
 
 
 def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str:
-    columns_n = max(len(own["places_mm"]) for own in boards.values())
+    columns_n = max(len(board_data["places_mm"]) for board_data in boards.values())
     half_mm = np.abs(chips_mm).max() + 0.6 * ARROW_MM
     with drawing(2.0 * columns_n, 4.2 * len(boards) + 0.6) as figure:
         panels = figure.subplots(2 * len(boards), columns_n, squeeze=False)
-        for row_i, (board, own) in enumerate(boards.items()):
-            recorded_uT = np.array(own["arrows_uT"]["recorded"])
+        for row_i, (board, board_data) in enumerate(boards.items()):
+            recorded_uT = np.array(board_data["arrows_uT"]["recorded"])
             longest_uT = np.linalg.norm(recorded_uT[..., :2], axis=-1).max()
             for side_i, (side, colour) in enumerate(zip(("recorded", "simulated"), COLOURS, strict=False)):
                 row = panels[2 * row_i + side_i]
                 row[0].set_ylabel(f"{board}\n{side}")
-                for axes, db_uT, place_mm in zip(row, own["arrows_uT"][side], own["places_mm"], strict=False):
+                for axes, db_uT, place_mm in zip(
+                    row, board_data["arrows_uT"][side], board_data["places_mm"], strict=False
+                ):
                     sides_mm = np.array(db_uT)[:, :2] * ARROW_MM / longest_uT
                     style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.014}
                     axes.quiver(*chips_mm.T, *sides_mm.T, color=colour, **style)
@@ -637,12 +646,12 @@ def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -
 def _draw_growth(boards: Mapping[str, Any], by_board: Mapping[str, Any], source: str) -> str:
     with drawing(3.6 * len(boards) + 0.6, 3.6) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]
-        for axes, (board, own) in zip(panels, boards.items(), strict=True):
+        for axes, (board, board_data) in zip(panels, boards.items(), strict=True):
             for side, colour, marker in zip(("recorded", "simulated"), COLOURS, MARKERS, strict=False):
                 slope = by_board[board].get("growth", {}).get(side)
                 label = side if slope is None else f"{side}: power {slope:.2f}"
                 style = {"color": colour, "marker": marker, "linestyle": "", "markersize": 3, "alpha": 0.6}
-                axes.plot(own["force_N"], own["length_uT"][side], label=label, **style)
+                axes.plot(board_data["force_N"], board_data["length_uT"][side], label=label, **style)
             axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
             axes.legend(frameon=False, fontsize=8)
         figure.suptitle(f"Change of field against force ({source})", x=0.01, ha="left", fontsize=11)

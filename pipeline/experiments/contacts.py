@@ -84,7 +84,7 @@ def contacts(
     numbers: dict[str, Any] = {
         "pairs_n": section.pairs_n,
         "boards_n": len(boards),
-        # Two detectors use networks that were trained on all other boards, and so on the contacts that set thresholds.
+        # Two detectors use networks that were trained on all other boards, including the contacts that set thresholds.
         "threshold_set_on": (
             f"training contacts of a {plot_data[0]['kept_aside']} among which detectors look no neighbours up; the "
             "networks behind `residual` and `networks disagree` were trained on them"
@@ -172,14 +172,15 @@ class Pairs:
 
 
 def draw_pairs(
-    rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
+    rows: Rows, candidates: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
 ) -> Pairs:
     """Draw pairs of rows: two places of a skin with this separation, and then one row at each place.
 
-    `own` are the row numbers to draw from. With a separation of 0 mm, both rows are at the same place.
+    `candidates` are the row numbers to draw from. With a separation of 0 mm, both rows are at the same place.
     """
     by_skin = [
-        _pairs_at_distance(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])
+        _pairs_at_distance(rows, candidates[rows.skin[candidates] == skin], separation_mm)
+        for skin in np.unique(rows.skin[candidates])
     ]
     sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in by_skin for i, j in pairs]
     if not sides:
@@ -188,21 +189,21 @@ def draw_pairs(
     chosen = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
     first, second = (np.array([rng.choice(side) for side in both]) for both in zip(*chosen, strict=True))
     force_N, length_uT = rows.target[:, 2], np.linalg.norm(rows.db_uT, axis=1)
-    strength = length_uT if np.isnan(force_N[own]).any() else force_N
+    strength = length_uT if np.isnan(force_N[candidates]).any() else force_N
     swap = strength[first] > strength[second]
     return Pairs(np.where(swap, second, first), np.where(swap, first, second))
 
 
 def _pairs_at_distance(
-    rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float
+    rows: Rows, skin_rows: Int64[np.ndarray, " a"], separation_mm: float
 ) -> tuple[list[Int64[np.ndarray, " b"]], Int64[np.ndarray, "p 2"]]:
     """Return the row numbers at each place of a skin, and the pairs of places (by index) with this separation.
 
-    `own` are the row numbers of the skin.
+    `skin_rows` are the row numbers of the skin.
     """
-    places_mm, place_i = np.unique(rows.target[own, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
+    places_mm, place_i = np.unique(rows.target[skin_rows, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
     order = np.argsort(place_i.ravel(), kind="stable")
-    rows_at = np.split(own[order], np.cumsum(np.bincount(place_i.ravel()))[:-1])
+    rows_at = np.split(skin_rows[order], np.cumsum(np.bincount(place_i.ravel()))[:-1])
     distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
     near = np.abs(distance_mm - separation_mm) <= TOLERANCE_MM
     # A place is paired with itself only at 0 mm, although 0 mm is also within the tolerance of small separations.
@@ -251,7 +252,7 @@ def compare_prediction(
 def position_along_line(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Return the position of each prediction along the line through both contacts: 0 at the weaker, 1 at the stronger."""
+    """Return the position of each prediction along the line through both contacts: 0 is the weaker, 1 the stronger."""
     line_mm = (stronger - weaker)[:, :2].astype(np.float64)
     return ((predicted - weaker)[:, :2] * line_mm).sum(axis=1) / (line_mm**2).sum(axis=1)
 

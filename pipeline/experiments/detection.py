@@ -8,7 +8,7 @@ from jaxtyping import Float
 NEIGHBOURS_N = 5  # nearest neighbours that a distance is averaged over (assumed)
 NOISE_uT = 15.0  # norm of a reading's noise over 15 channels; recorded boards have 3 to 5 uT per channel
 
-# Maps the name of a detector to one score per reading; a larger score means that the reading is less like known ones.
+# Scores by name of the detector, one per reading. A larger score means that the reading is less like known readings.
 Scores = Mapping[str, Float[np.ndarray, "_"]]
 
 

@@ -260,11 +260,11 @@ def _metrics_in(scores: pd.DataFrame, *names: str) -> list[str]:
 def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
     """Return one row per window, with means over skins and seeds; `spread` contains the standard deviations."""
     rows = []
-    for _, own in scores[scores["policy"] == policy].groupby("window_i"):
-        values = {name: own[name].to_numpy() for name in _metrics_in(own, *METRICS, "bias_f_N")}
-        row: dict[str, Any] = {"contacts_n": round(float(np.mean(own["contacts_n"].to_numpy())))}
+    for _, window_scores in scores[scores["policy"] == policy].groupby("window_i"):
+        values = {name: window_scores[name].to_numpy() for name in _metrics_in(window_scores, *METRICS, "bias_f_N")}
+        row: dict[str, Any] = {"contacts_n": round(float(np.mean(window_scores["contacts_n"].to_numpy())))}
         row |= {name: float(scores_of_metric.mean()) for name, scores_of_metric in values.items()}
-        row["noload_off_uT"] = float(np.mean(own["noload_off_uT"].to_numpy()))
+        row["noload_off_uT"] = float(np.mean(window_scores["noload_off_uT"].to_numpy()))
         row["spread"] = {
             name: float(scores_of_metric.std(ddof=1))
             for name, scores_of_metric in values.items()
@@ -279,10 +279,10 @@ def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndar
 
     Row i has the same skin and seed under every policy, so the rows of two policies form pairs.
     """
-    own = scores[scores["policy"] == policy]
+    policy_scores = scores[scores["policy"] == policy]
     return {
-        name: np.ascontiguousarray(own.pivot_table(name, index=["skin", "seed_i"], columns="window_i"))
-        for name in _metrics_in(own, *METRICS)
+        name: np.ascontiguousarray(policy_scores.pivot_table(name, index=["skin", "seed_i"], columns="window_i"))
+        for name in _metrics_in(policy_scores, *METRICS)
     }
 
 
@@ -291,9 +291,11 @@ def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
 
     `sd_seeds` is the standard deviation over the networks of one skin, averaged over skins.
     """
-    own = scores[(scores["policy"] == policy) & (scores["window_i"] == scores["window_i"].max())]
-    contacts_n = round(float(np.mean(own["contacts_n"].to_numpy())))
-    rows = own.drop(columns=["policy", "seed_i", "window_i", "contacts_n", "noload_off_uT"]).dropna(axis=1, how="all")
+    window_scores = scores[(scores["policy"] == policy) & (scores["window_i"] == scores["window_i"].max())]
+    contacts_n = round(float(np.mean(window_scores["contacts_n"].to_numpy())))
+    rows = window_scores.drop(columns=["policy", "seed_i", "window_i", "contacts_n", "noload_off_uT"]).dropna(
+        axis=1, how="all"
+    )
     return {"contacts_n": contacts_n} | add_seed_sd(summarise(board_means(rows), boards=True), rows, "board", "skin")
 
 
@@ -385,8 +387,8 @@ def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float |
 
     Returns None if `force_left` is unknown for any skin.
     """
-    own = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
-    ratios_pct = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
+    windows = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
+    ratios_pct = [force_left(windows[skin, TRAIN], late) for (skin, i), late in windows.items() if i == window_i]
     return None if None in ratios_pct else float(np.mean([value for value in ratios_pct if value is not None]))
 
 
@@ -496,9 +498,13 @@ def score_wandering(
             inputs = trained.scaler.encode(VIEW[job.recipe.inputs](part.rows.db_uT))
             scores.setdefault(part.policy, []).append(score(part.rows.target, trained.scaler.decode(predict(inputs))))
             off_uT.setdefault(part.policy, []).append(part.noload_off_uT)
-        for policy, own in scores.items():
-            stats = summarise(pd.DataFrame(own)[[name for name in METRICS if name in own[0]]])
-            row: dict[str, Any] = {"step_uT": step_uT, "noload_off_uT": float(np.mean(off_uT[policy])), "n": len(own)}
+        for policy, network_scores in scores.items():
+            stats = summarise(pd.DataFrame(network_scores)[[name for name in METRICS if name in network_scores[0]]])
+            row: dict[str, Any] = {
+                "step_uT": step_uT,
+                "noload_off_uT": float(np.mean(off_uT[policy])),
+                "n": len(network_scores),
+            }
             row |= {name: stat["mean"] for name, stat in stats.items()}
             row["spread"] = {name: stat["sd"] for name, stat in stats.items() if "sd" in stat}
             rows.setdefault(policy, []).append(row)
@@ -511,7 +517,7 @@ def add_walk(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> 
     The steps of the walk have a standard deviation of `step_uT` per contact and channel.
     """
     since_n = np.maximum(rank(readings.indentation) + 1 - after_n, 0)
-    rng = rng_for(seed, "drift", "wander", readings.skin)  # the same walk for all step sizes, scaled
+    rng = rng_for(seed, "drift", "wander", readings.skin)  # all step sizes scale the same random walk
     walk_T = baseline_walk(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
     walk_uT = (walk_T / micro).astype(np.float32)
     return replace(readings, b_uT=readings.b_uT + walk_uT, noload_uT=readings.noload_uT + walk_uT)
@@ -575,7 +581,7 @@ def judge_findings(
     """Test each finding of the paper for which the scene has the required policies and quantities.
 
     `networks` are the errors of the networks by policy. Row i of two policies is a pair (same skin and seed) on board
-    `boards[i]`. `contacts_n` is the number of contacts before each window. `late` is the result of `late_force`.
+    `boards[i]`. `contacts_n` is the number of contacts before each window. `late` are the numbers of `late_force`.
     """
     frequent = [policy for policy in ("regular", "each") if policy in networks]
     findings = []

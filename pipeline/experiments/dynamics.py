@@ -139,9 +139,9 @@ def _scores(
 def lags(presses: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, float]:
     """Summarise, over presses and networks, the lag in ms of the predicted force behind the true force."""
     lags_ms = [
-        lag_ms(presses.t_s[rows], predicted_N[rows], presses.t_s[own], presses.true[own, 2])
-        for own in (presses.press_i == press_i for press_i in np.unique(presses.press_i[presses.scored]))
-        for rows in [own & presses.scored]
+        lag_ms(presses.t_s[rows], predicted_N[rows], presses.t_s[in_press], presses.true[in_press, 2])
+        for in_press in (presses.press_i == press_i for press_i in np.unique(presses.press_i[presses.scored]))
+        for rows in [in_press & presses.scored]
         if rows.sum() > WINDOW_N
         for predicted_N in force_N
     ]

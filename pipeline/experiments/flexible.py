@@ -153,8 +153,12 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the variants of the paper's recipe, and those of recipe `shape` if the scene has it."""
     lines = [_line(title, numbers, name, source) for name, title in VARIANTS.items() if name in numbers]
     if SHAPE in numbers:
-        own = numbers[SHAPE]
-        lines += [_line(OF_SHAPE + title, own, name, source) for name, title in VARIANTS.items() if name in own]
+        shape_numbers = numbers[SHAPE]
+        lines += [
+            _line(OF_SHAPE + title, shape_numbers, name, source)
+            for name, title in VARIANTS.items()
+            if name in shape_numbers
+        ]
     spread = (
         "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
         f"{numbers['seeds_n']} networks. The networks of one fold predict all these boards, so the interval does not "

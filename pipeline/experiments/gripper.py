@@ -40,7 +40,7 @@ DEPTH_OF_1_N_MM = 0.8
 READINGS_N = 5  # readings averaged for the press of known force, as for each indentation (paper section 3)
 WITHIN = 0.1  # tolerance of the force relative to the aim (ours; the paper's gripper of section 6 holds a blueberry)
 Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
-Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # of changes of field: x, y in mm, F in N
+Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # dB in uT -> x, y in mm, F in N
 Positive = Annotated[float, Field(gt=0, le=100)]
 
 
@@ -199,13 +199,15 @@ def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float
     the standard deviation over the estimators of one board, averaged over boards.
     """
     first_step = round(SETTLED_S * RATE_HZ)
-    deviations = {board: [forces_N[first_step:] / aim_N - 1 for forces_N in own] for board, own in runs.items()}
-    all_runs = np.concatenate([deviation for own in deviations.values() for deviation in own], axis=1)
+    deviations = {
+        board: [forces_N[first_step:] / aim_N - 1 for forces_N in board_runs] for board, board_runs in runs.items()
+    }
+    all_runs = np.concatenate([deviation for board_runs in deviations.values() for deviation in board_runs], axis=1)
     rows = pd.DataFrame(
         [
             {"board": board, "error_pct": 100 * np.abs(deviation).mean()}
-            for board, own in deviations.items()
-            for deviation in own
+            for board, board_runs in deviations.items()
+            for deviation in board_runs
         ]
     )
     error = add_seed_sd(summarise(rows.groupby("board").mean(), boards=True), rows, "board")["error_pct"]

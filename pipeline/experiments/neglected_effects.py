@@ -34,7 +34,7 @@ from reskin.simulation.settings import MAIN, SimulationSettings
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
 RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
 MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
-WARMER_K = 1.0
+WARMER_K = 1.0  # rise of the skin's temperature
 EARTH_T = np.array([20e-6, 0.0, -45e-6])  # the earth's field at a middle latitude
 PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # places of the indentations for effects inside the skin: flank and edge
 BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # boxes of powder, for the effect of the powder's own field

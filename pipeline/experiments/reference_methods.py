@@ -118,7 +118,7 @@ def reference_methods(
         "alarm": alarm,
     }
     write_results(results, numbers, {}, trainings=tally(trainings))
-    io.write_json(SECONDS / settings.scene / "reference_methods.json", [asdict(one) for one in seconds])
+    io.write_json(SECONDS / settings.scene / "reference_methods.json", [asdict(record) for record in seconds])
 
 
 # --- Folds, pokes, points ---
@@ -242,12 +242,12 @@ def pairs_uT(
     return old_uT
 
 
-def _poke_means(rows: Rows, own: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean target and the mean field of each poke; `own` are row numbers."""
-    _, poke, count = np.unique(rows.indentation[own], return_inverse=True, return_counts=True)
+def _poke_means(rows: Rows, selected: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean target and the mean field of each poke; `selected` are row numbers."""
+    _, poke, count = np.unique(rows.indentation[selected], return_inverse=True, return_counts=True)
     sums = [np.zeros((len(count), values.shape[1])) for values in (rows.target, rows.db_uT)]
     for total, values in zip(sums, (rows.target, rows.db_uT), strict=True):
-        np.add.at(total, poke.ravel(), values[own])
+        np.add.at(total, poke.ravel(), values[selected])
     return sums[0] / count[:, None], sums[1] / count[:, None]
 
 
@@ -272,7 +272,7 @@ def score_adversarial(
     """
     view, rows = VIEW[recipe.inputs], data.rows
     scaler = FIT[recipe.scaling](view(rows.db_uT[fold.train]), rows.target[fold.train])
-    known, new, test = (scaler.encode(view(rows.db_uT[part])) for part in (fold.train, fold.pool, fold.test))
+    known, new, test = (scaler.encode(view(rows.db_uT[side])) for side in (fold.train, fold.pool, fold.test))
     domains = Domains(known, scaler.encode_target(rows.target[fold.train]), new)
     points, trainings = [], []
     for method, pokes, own_weight in ((CONTROL, NONE, 0.0), (ADVERSARIAL, OWN, weight)):
@@ -339,8 +339,8 @@ def score_unlabelled(
     points, times = [], []
     test_uT = known.frame.field(known.data.rows.db_uT[fold.test])
     rest_uT = known.presses[fold.board].rest_uT.ravel()
-    own = pool_of(known, fold)
-    pools = {OWN: own, NONE: own[:0], FOREIGN: pool_of(known, next_board(fold, folds))}
+    own_pool = pool_of(known, fold)
+    pools = {OWN: own_pool, NONE: own_pool[:0], FOREIGN: pool_of(known, next_board(fold, folds))}
     for given, pool in pools.items():
         for method, place_mm, force_N, seconds in [
             *estimate_universal(variants.nominal.model, rest_uT, pool, test_uT, WAYS["nominal"]),
@@ -450,19 +450,19 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
     def residual(fitted: Chart, board: Board) -> Float[np.ndarray, " b"]:
         return search(fitted, frame.field(board.tested_uT)).residual
 
-    charts = {board: fit_board(own) for board, own in boards.items()}
-    inverted = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}
-    residuals = {board: own.residual for board, own in inverted.items()}
+    charts = {name: fit_board(board) for name, board in boards.items()}
+    inverted = {name: search(charts[name], frame.field(board.tested_uT)) for name, board in boards.items()}
+    residuals = {name: estimated.residual for name, estimated in inverted.items()}
     true_mm = {board: data.rows.target[first[board].test[::TESTED_EVERY_N], :2].astype(float) for board in boards}
-    off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in inverted.items()}
+    off_mm = {name: estimated.place_mm - frame.place(true_mm[name]) for name, estimated in inverted.items()}
     limits = limits_of(residuals, fraction)
     strangers: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     names = list(boards)
-    for i, (board, own) in enumerate(boards.items()):
+    for i, (board, readings) in enumerate(boards.items()):
         other = boards[names[(i + 1) % len(names)]]
         strangers.setdefault((ANOTHER, OF_RIGHT), {})[board] = residual(charts[board], other)
         for name, change in STRANGERS.items():
-            stranger = own.alter(change)
+            stranger = readings.alter(change)
             strangers.setdefault((name, OF_RIGHT), {})[board] = residual(charts[board], stranger)
             strangers.setdefault((name, OF_STRANGER), {})[board] = residual(fit_board(stranger), stranger)
     alarm = {
@@ -470,8 +470,8 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
         "limit": statistic(list(limits.values()), boards=True),
         "right": alarm_statistics(residuals, residuals, limits),
         "strangers": [
-            {"stranger": stranger, "law": law} | alarm_statistics(own, residuals, limits)
-            for (stranger, law), own in strangers.items()
+            {"stranger": stranger, "law": law} | alarm_statistics(stranger_residuals, residuals, limits)
+            for (stranger, law), stranger_residuals in strangers.items()
         ],
     }
     return alarm, {"method": INVERSION, "by": "left over"} | score_flagged(residuals, off_mm, fraction)
@@ -490,9 +490,9 @@ def alarm_statistics(residuals: ByBoard, own_residuals: ByBoard, limits: Mapping
     the negatives of the ROC curve.
     """
     by_board = {
-        "alarm_pct": [100 * float((own > limits[board]).mean()) for board, own in residuals.items()],
-        "auc": [roc_area(own_residuals[board], own) for board, own in residuals.items()],
-        "left_median": [float(np.median(own)) for own in residuals.values()],
+        "alarm_pct": [100 * float((values > limits[board]).mean()) for board, values in residuals.items()],
+        "auc": [roc_area(own_residuals[board], values) for board, values in residuals.items()],
+        "left_median": [float(np.median(values)) for values in residuals.values()],
     }
     return {name: statistic(values, boards=True) for name, values in by_board.items()}
 

@@ -73,13 +73,14 @@ def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int
     """Draw the random splits of every skin; rows with equal values of `group` are on the same side."""
     folds = []
     for skin in np.unique(rows.skin):
-        own = np.flatnonzero(rows.skin == skin)
+        skin_rows = np.flatnonzero(rows.skin == skin)
         splits = draw_sides(
-            group[own], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
+            group[skin_rows], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
             state=seed_for(seed, "shear", by, str(skin)), what=f"{by}s of skin {skin}", where="experiment shear",
         )  # fmt: skip
         folds += [
-            Fold("shear", f"{skin}-{by}{i}", own[train], own[test], NO_POOL) for i, (train, test) in enumerate(splits)
+            Fold("shear", f"{skin}-{by}{i}", skin_rows[train], skin_rows[test], NO_POOL)
+            for i, (train, test) in enumerate(splits)
         ]
     return folds
 

@@ -124,13 +124,13 @@ def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, "
     """Return the row numbers of the first indentations of each capture (training) and of the last ones (test)."""
     held_out = np.zeros(len(rows), bool)
     for capture in np.unique(rows.capture):
-        own = rows.capture == capture
-        indentations = np.unique(rows.indentation[own])  # in order of time
+        in_capture = rows.capture == capture
+        indentations = np.unique(rows.indentation[in_capture])  # in order of time
         test_n = round(test_fraction * len(indentations))
         if not 0 < test_n < len(indentations):
             what = f"{test_n} of the {len(indentations)} pokes of {capture} would be held out: one side is empty"
             raise ParamsError(f"experiment sleeve: {what}. Use a capture with more pokes.")
-        held_out |= own & (rows.indentation >= indentations[-test_n])
+        held_out |= in_capture & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
 

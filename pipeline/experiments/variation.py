@@ -51,7 +51,7 @@ def variation(settings: Settings, section: Variation, main: Path, indentations: 
     worn_capture = read_captures(indentations)[0]
     boards: dict[str, str] = {}
     visits: dict[str, list[Visits]] = {}
-    for name in settings.captures_in(main):  # one capture in memory at a time
+    for name in settings.captures_in(main):  # captures are read one by one, to limit the use of memory
         capture = io.read_readings(main / f"{name}.parquet")
         boards[capture.skin] = capture.board
         visits[capture.skin] = [find_visits(capture, place_mm, section.depth_mm) for place_mm in section.places_mm]

@@ -132,7 +132,7 @@ def test_recordings_of_pairs_alone_give_a_reason():
 
 
 def test_fractions_must_leave_test_rows():
-    with pytest.raises(ValidationError, match="rows are left to test"):
+    with pytest.raises(ValidationError, match="the rest are the test rows"):
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 
 

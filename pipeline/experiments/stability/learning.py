@@ -27,7 +27,7 @@ BOTTLENECK = "layer3.weight"
 # Tolerance of weights, which are near 0.1. Float32 sums in another order differ by 6e-8; 50 steps amplify this.
 ROUNDING = 1e-4
 NEGLIGIBLE_RATE = 1e-12  # learning rate at which the weights hardly change
-SCALE_POWERS = (-20, -10, 10, 20)  # labels are multiplied by these powers of two (1e-6 to 1e6), which needs no rounding
+SCALE_POWERS = (-20, -10, 10, 20)  # labels are multiplied by 2^power (1e-6 to 1e6), which causes no rounding errors
 RECIPE = Recipe(
     architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=32,
     rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,

@@ -114,6 +114,7 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
 
 
 def thickness(usual: Skin) -> list[Case]:
+    """Run cases of skins whose thickness is zero or negative."""
     return [
         rejection_case(AREA, f"a thickness of {skin.thickness_m / milli:.2g} mm", should="refused",
                        attempt=partial(forces, skin, np.array([1e-4])))
@@ -122,6 +123,7 @@ def thickness(usual: Skin) -> list[Case]:
 
 
 def depth(board: Board, skin: Skin) -> list[Case]:
+    """Run cases of a tip above the skin, of deep indentations, and of an indentation through the skin."""
     lifted_T = float(np.abs(poke(board, skin, -0.2)).max())
     lifted_N = float(np.abs(forces(skin, np.array([-0.2 * skin.thickness_m]))).max())
     shares = np.array([0.2, 0.59, FLAGGED_DEPTH, 0.8])
@@ -155,6 +157,7 @@ def _almost_through(board: Board, skin: Skin) -> Case:
 
 
 def place(board: Board, skin: Skin) -> list[Case]:
+    """Run cases of a poke beside the skin, a place inside a magnet, and a chip at the position of a dipole."""
     inside_m = CUBE_SIDE_M * rng_for(0, "stability", "inside").uniform(-0.5, 0.5, (500, 3))
     error = inside_a_box(inside_m, CUBE_SIDE_M)
     beside_m = np.array([[skin.seat_m[0] + 0.51 * skin.sides_m[0], skin.seat_m[1], DEPTH * skin.thickness_m]])
@@ -170,6 +173,7 @@ def place(board: Board, skin: Skin) -> list[Case]:
 
 
 def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]:
+    """Run cases of a skin without magnetisation, and of a skin with five times the usual magnetisation."""
     once_T, bare_T, strong_T = (poke(board, skin) for skin in (usual, bare, strong))
     error, left_T = scaled_error(strong_T, 5 * once_T), float(np.abs(bare_T).max())
     return [
@@ -181,6 +185,7 @@ def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]
 
 
 def single_precision(board: Board, fine: Skin) -> Case:
+    """Run a case of dB computed in float32, compared with float64."""
     rest = fine.nodes_m, fine.moments_A_m2
     depths_m = mechanics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
     moved = mechanics.follow_dipoles(fine, PLACES_M[0], depths_m)
@@ -196,6 +201,7 @@ def single_precision(board: Board, fine: Skin) -> Case:
 
 
 def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
+    """Run a case of skins drawn from one seed: two with the same name, and one with another name."""
     bytes_of = [skin.nodes_m.tobytes() + skin.moments_A_m2.tobytes() for skin in (first, again, renamed)]
     same, differs = bytes_of[0] == bytes_of[1], bytes_of[0] != bytes_of[2]
     words = {True: "the same bytes", False: "other bytes"}
@@ -205,6 +211,7 @@ def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
 
 
 def memory(board: Board, skin: Skin) -> Case:
+    """Run a case of the memory use per poke, from the peak memory for `POKES_N` and for four times as many pokes."""
     rng = rng_for(0, "stability", "memory")
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]

@@ -55,7 +55,7 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
     normal_N = forces(skin, path_m[:, 2])
     smooth, sticky = (_drag(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
     assert skin.hold is not None
-    # With this friction, a press hardly slides the skin, and neither does a drag.
+    # On a skin with this friction, neither a press nor a drag slides the skin noticeably.
     slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))
     _, pressed_T = changes_of_field(board, slippery, path_m)
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)

@@ -33,7 +33,7 @@ from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, p
 HALF_SPACE_M = 100.0  # a layer of this thickness acts as a half-space under a tip of a few millimetres
 A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fit 1.780)
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
-RINGS_N = 40  # rings of pressure in a contact
+RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
 FRICTION = 0.8  # coefficient
 BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)  # wave number * thickness
