@@ -366,7 +366,7 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
 
 def _fit_once(fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray) -> Arrays:
     """Fit a scaler, or return the cached arrays of the same fit."""
-    fit_key = (*key, len(db_uT))  # the row count tells a fit to training rows from a fit to training and test rows
+    fit_key = (*key, len(db_uT))  # the row count distinguishes training rows from training and test rows
     if fit_key not in fits:
         fits[fit_key] = FIT[key[-1]](db_uT, target).arrays()
     return fits[fit_key]
@@ -381,7 +381,7 @@ def audit_scaler(
     sides: Sides,
     fit: Callable[[np.ndarray, np.ndarray], Arrays],
 ) -> Check:
-    """Check that a model's scaler was fitted to its training rows, and not to training and test rows together."""
+    """Check that a network's scaler was fitted to the training rows alone, and not to training and test rows."""
     both_sides = np.concatenate([sides.train, sides.test])
     train_gap, both_gap = (
         _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)

@@ -91,7 +91,7 @@ def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarra
             f"its surface is {-skin.depth_zero_m / milli:.2g} mm below depth 0, and depths_mm are at most "
             f"{depths_mm.max():g}"
         )
-        raise ParamsError(f"skin {skin.name}: {what}. Poke deeper.")
+        raise ParamsError(f"skin {skin.name}: {what}. Increase depths_mm of the main protocol.")
     return touched
 
 

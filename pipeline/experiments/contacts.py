@@ -265,8 +265,8 @@ def detection_rates(
 ) -> dict[str, Any]:
     """Return, for each detector, the percentages of single and of double contacts that score above its threshold.
 
-    `aside` are the scores of the single contacts that set the thresholds. `double` are scores by separation in mm, and
-    so are the percentages for double contacts.
+    `aside` are the scores of the single contacts that set the thresholds. `double` maps each separation in mm to the
+    scores of double contacts; the percentages for double contacts are also by separation.
     """
     limits = thresholds(aside, false_alarm_fraction)
     separated = {

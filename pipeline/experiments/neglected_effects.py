@@ -293,9 +293,9 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
 
 
 def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
-    """Return the percentage of stops, over all skins, that are deeper than 0.6 of the thickness.
+    """Return the effect of depths beyond 0.6 of the thickness, which published solutions do not cover.
 
-    Published solutions do not cover larger depths.
+    No error is known; the description states the percentage of such stops over all skins.
     """
     depth_m = milli * simulation.main.plan(rng_for(seed, "left out"), simulation.main_boards.skin_mm).depth_mm.ravel()
     skins = [

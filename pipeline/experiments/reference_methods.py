@@ -208,9 +208,9 @@ def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Se
 def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) -> Float[np.ndarray, "b ch"]:
     """Map the test fields of a new board to fields that known boards would read (direct standardisation).
 
-    The linear map is fitted by ridge regression to pairs: labelled pokes of the new board, and known boards at the same
-    place and force. Each pair has the same weight, independent of the strength of the poke. The ridge penalty is chosen
-    on the same pairs.
+    The linear map is fitted by ridge regression to pairs of fields: the field of a labelled poke of the new board, and
+    the field of known boards at the same place and force. All pairs have the same weight, independent of the strength
+    of the poke. The ridge penalty is chosen on the same pairs.
     """
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
     paired = np.isfinite(old_uT).all(axis=1)

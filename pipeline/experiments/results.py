@@ -24,7 +24,7 @@ def read_captures(indentations: Path, names: tuple[str, ...] = ()) -> list[Readi
 def only(captures: Sequence[Capture], folder: Path) -> Capture:
     """Return the only element of `captures`, which were read from `folder`; raise `SchemaError` unless it has one."""
     if len(captures) != 1:
-        remedy = "Run its protocol on one skin (skins_n: 1), and simulate it again."
+        remedy = "Set skins_n: 1 for the experiment's protocol, and simulate the captures again."
         raise SchemaError(f"{folder}: {len(captures)} captures, but the experiment reads exactly one. {remedy}")
     return captures[0]
 

@@ -622,7 +622,7 @@ def draw_trial(
     pokes_m[:, :2] += skin.seat_m
     if not (pokes_m[:, 2] + skin.depth_zero_m > 0).all():
         got = f"{pokes_m[:, 2].min() + skin.depth_zero_m:.3g} m"
-        raise ParamsError(f"skin {name}", "true depth of every poke", "above 0 m", got, "Poke deeper.")
+        raise ParamsError(f"skin {name}", "true depth of every poke", "above 0 m", got, "Use larger depths.")
     return Trial(board, design, skin, pokes.depths_mm, pokes_m)
 
 
