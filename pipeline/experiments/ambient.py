@@ -115,7 +115,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One ambient field, as the change that it adds to each row of channels (`added_uT`).
+    """One ambient field; `added_uT` is the change of each input row that the field causes.
 
     `reference_uT` is the estimate of this change from the reading of the reference chip. `keys` contains the field's
     strength, or the distance of the ball of iron and the rms fields that it causes.

@@ -183,7 +183,7 @@ def _check_disjoint(what: str, label: np.ndarray, sides: Sides, *, rule: str = "
 
 
 def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Generator) -> Check:
-    """Check that no test capture is a copy of the captures of a training skin under another name."""
+    """Check that no test capture is a copy of a training skin's captures under another name."""
     test, train = (
         strong_indentations(name[side], labels.indentation[side], db_uT[side])
         for name, side in ((labels.capture, sides.test), (labels.skin, sides.train))
@@ -339,7 +339,7 @@ Fits = dict[tuple[str, str, str, str, int], Arrays]  # scaler arrays by experime
 
 
 def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
-    """Check every network: the rows that its scaler was fitted to, collapse, and the data it was adapted with."""
+    """Check, for every network, which rows its scaler was fitted to, whether it collapsed, and how it was adapted."""
     views = {name: view(data.rows.db_uT) for name, view in VIEW.items()}
     fits: Fits = {}
     keys: dict[tuple[str, int], set[str]] = {}  # by fold and seed: keys of the pretrained networks that may be adapted

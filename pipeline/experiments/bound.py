@@ -51,9 +51,9 @@ def bound(settings: Settings, models: Path, results: Path) -> None:
 
 
 def bound_errors(simulation: SimulationSettings, *, seed: int) -> dict[str, Any]:
-    """Bound the errors on the first skin of the main protocol, averaged over all places, by depth and over all depths.
+    """Return the bound of the errors on the first skin of the main protocol, averaged over places.
 
-    Pokes that do not reach the skin are excluded and counted.
+    There is one bound for each depth, and one over all depths. Pokes that do not reach the skin are excluded and counted.
     """
     kind, (board_name, skin_name) = simulation.main_boards, list_captures(simulation, MAIN)[0]
     board = draw_board(kind.design, simulation.spreads, seed=seed, name=board_name)

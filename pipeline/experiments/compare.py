@@ -64,7 +64,7 @@ class Compare(Strict):
 
 
 def compare(settings: Settings, section: Compare, indentations: Path, results: Path) -> None:
-    """Compare the recorded boards of a scene with simulated ones."""
+    """Compare the recorded changes of field of a scene's boards with simulated ones, and write the results."""
     design = settings.shared_section(SkinDesign, "skin")
     boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
     write_results(results, *compare_boards(boards, section, design, settings.seed))
@@ -285,7 +285,7 @@ class Turn:
         return quarter_turn(self.quarters) @ np.diag(self.signs)
 
     def describe(self) -> str:
-        """Describe the difference from the scene's settings; return an empty string if there is none."""
+        """Describe the difference from the orientation that the scene states; return an empty string if none."""
         mirrored = " and ".join(axis for axis, sign in zip(AXES, self.signs, strict=True) if sign < 0)
         turned = [f"turned by {90 * self.quarters} degrees more than the scene says"] * bool(self.quarters)
         return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))

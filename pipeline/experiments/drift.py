@@ -113,7 +113,7 @@ class WindowPredictions:
 
 
 def drift(settings: Settings, section: Drift, indentations: Path, results: Path) -> None:
-    """Train and test networks under every no-load policy, on every capture of the scene."""
+    """Train and test networks for every no-load policy, on every capture of the scene, and write the results."""
     preload_training()
     selection = settings.section(Selection, "selection")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
@@ -477,7 +477,7 @@ def score_wandering(
     networks: Sequence[tuple[TrainingJob, list[Part], TrainingResult]],
     seed: int,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Test the networks again on their last window, after a random walk has been added to the field of all readings.
+    """Test each network again on its last test window, after a random walk has been added to all readings.
 
     Returns, for each policy, one row per step size of the walk, with mean scores over skins and seeds; `spread`
     contains the standard deviations.

@@ -44,7 +44,10 @@ SHAPE = "shape"
 
 
 def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
-    """Adapt the networks of the first fold of lobo to each flexible skin, and test them on later passes of the skin."""
+    """Adapt networks that were trained on rigid boards to each flexible skin; test them on later passes of the skin.
+
+    The networks are those of the first fold of experiment `lobo` (leave one board out).
+    """
     preload_training()
     data = read_data(settings, main, folds)
     starts, captures = read_pretrained(pretrained), read_captures(indentations)

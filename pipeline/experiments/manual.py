@@ -93,7 +93,7 @@ def count_pokes(data: SceneData, lines: Lines) -> int:
 
 
 def fold_without(data: SceneData, board: str) -> Fold:
-    """Return the fold of `lobo` that holds out a board."""
+    """Return the fold of experiment `lobo` (leave one board out) that holds out `board`."""
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
         what = f"board {board} is not held out by any fold of lobo ({', '.join(sorted(folds))})"
