@@ -53,7 +53,8 @@ def bound(settings: Settings, models: Path, results: Path) -> None:
 def bound_errors(simulation: SimulationSettings, *, seed: int) -> dict[str, Any]:
     """Return the bound of the errors on the first skin of the main protocol, averaged over places.
 
-    There is one bound for each depth, and one over all depths. Pokes that do not reach the skin are excluded and counted.
+    There is one bound for each depth, and one over all depths. Pokes that do not reach the skin are excluded, and their
+    number is reported.
     """
     kind, (board_name, skin_name) = simulation.main_boards, list_captures(simulation, MAIN)[0]
     board = draw_board(kind.design, simulation.spreads, seed=seed, name=board_name)
