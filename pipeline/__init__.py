@@ -1,5 +1,5 @@
-"""Reproduction of the ReSkin paper: DVC stages, experiments, scenes, reports and MLflow, on the library `reskin`."""
+"""Reproduction of the ReSkin paper: DVC stages, experiments, scenes, reports and MLflow, based on library `reskin`."""
 
 import reskin  # noqa: F401  (imported first: it sets variables that NumPy reads on import)
 
-FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"  # paths in a checkout
+FLOW, PARAMS, PLAN, SCENES = "dvc.yaml", "params.yaml", "pipeline/plan.yaml", "pipeline/scenes"  # in a checkout

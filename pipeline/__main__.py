@@ -1,4 +1,4 @@
-"""Run a stage, as dvc.yaml does (`python -m pipeline STAGE --scene NAME ...`), or a `reskin` command."""
+"""Run a DVC stage (`python -m pipeline STAGE --scene NAME ...`, the form used in dvc.yaml) or a `reskin` command."""
 
 import argparse
 import sys
@@ -12,7 +12,8 @@ def main() -> None:
     here, code = Path.cwd().resolve(), Path(pipeline.__file__).resolve()
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if not code.is_relative_to(here) and (here / "pipeline/__main__.py").is_file():
-        sys.exit(f"error: {here} is a checkout, but the code in {code.parent} runs. Try: cd {here}; python -m pipeline")
+        problem = f"{here} is a checkout, but Python imports the code in {code.parent}"
+        sys.exit(f"error: {problem}. Try: cd {here}; python -m pipeline")
     try:
         if name == "code":
             from pipeline.stages.code import write_digests

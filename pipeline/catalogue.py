@@ -12,19 +12,20 @@ Kind = Literal["models", "curve", "analysis", "study", "report"]
 
 
 class Experiment(Strict):
-    """An experiment that scenes can run, and what it requires of a scene.
+    """An experiment that scenes can run, and its requirements for a scene.
 
-    kind: what its stage writes. `models`: networks with cards. `curve`: the points of a curve. `analysis`: numbers,
+    kind: what the stage writes. `models`: networks with JSON cards. `curve`: points of a curve. `analysis`: numbers,
     figure data and capture losses. `study`: numbers only. `report`: nothing, because the report stage computes it.
     Each analysis or study is a module of `pipeline.experiments`.
-    stage: the stage that runs it.
-    key: the name of its results in numbers.json; it stays the same if the experiment is renamed.
+    stage: the DVC stage that runs the experiment.
+    key: the name of the results in numbers.json; it stays the same if the experiment is renamed.
     needs: other experiments that the scene must also run.
-    protocol: the simulated protocol whose captures it reads; None for the main protocol.
-    folds: the keys of section `split` that determine its folds; None if it has no folds of its own.
-    settings: whether the scene's file has a section for it, named after its stage.
-    recorded: whether a scene with recorded captures may run it.
-    alone: whether it may be the only experiment of a scene, because it needs neither folds nor places in mm.
+    protocol: the simulated protocol whose captures the experiment reads; None for the main protocol.
+    folds: the keys of the scene's section `split` that set how the experiment's folds are drawn; None if no folds are
+        drawn for the experiment.
+    settings: whether the scene's file must have a section of settings for the experiment, named after the stage.
+    recorded: whether scenes with recorded captures may run the experiment.
+    alone: whether a scene may run only this experiment, because it needs neither folds nor places in mm.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""Commands that manage the recordings, scenes and results of a checkout, which is the working directory.
+"""Commands for the recordings, scenes and results of the checkout in the working directory.
 
-`reskin.cli` adds them to `reskin` if it runs in a checkout. Each command imports what it needs when it runs, so that
-`reskin --help` is quick.
+`reskin.cli` adds these commands to `reskin` if the working directory is a checkout. Most imports are inside the
+commands, so that `reskin --help` starts quickly.
 """
 
 import sys
@@ -32,14 +32,14 @@ Board = Annotated[str, Option(help="Name of the circuit board.")]
 Marks = Annotated[
     list[str] | None,
     Option(
-        help="Layouts capture, serial-*: STREAM_S,PROBE_S, the times of the same event in s, on the stream's clock and "
-        "on the robot's clock; may be repeated."
+        help="Layouts capture, serial-*: the time of one event in seconds, first on the stream's clock, then on the "
+        "robot's clock, as STREAM_S,PROBE_S; may be repeated."
     ),
 ]
 
 
 def checked_plan() -> "Plan":
-    """Read the plan; raise if it is out of date."""
+    """Read pipeline/plan.yaml; raise `ParamsError` if the plan is out of date."""
     from pipeline import plan
 
     return plan.check(ROOT)
@@ -55,7 +55,7 @@ def add(
     like: Annotated[
         str | None, Option(help="If SCENE is new: copy the settings of this recorded scene (ini, lab, ...).")
     ] = None,
-    name: Annotated[str | None, Option(help="Name of the capture. Default: made from board and skin.")] = None,
+    name: Annotated[str | None, Option(help="Name of the capture. Default: board and skin.")] = None,
     probe: Annotated[Path | None, Option(help="Layouts capture, serial-*: log of the robot (CSV).")] = None,
     chips_n: Annotated[
         int | None, Option("--chips", help="Layouts serial-*: chips in a frame. Default: 5.", min=1, max=64)
@@ -70,14 +70,14 @@ def add(
     mark: Marks = None,
     rows_late: Annotated[
         int | None,
-        Option(help="Layout ini: rows by which the fields lag behind the labels. Default: detected.", min=0, max=5),
+        Option(help="Layout ini: number of rows by which fields lag behind labels. Default: detected.", min=0, max=5),
     ] = None,
     force_axis: Annotated[
         Literal["x", "y", "z"] | None, Option(help="Layout eflesh: direction of the force gauge. Default: z.")
     ] = None,
     allow_copy: Annotated[
         bool,
-        Option("--allow-copy", help="Accept readings that the scene already has under another board or skin."),
+        Option("--allow-copy", help="Accept readings that are already in the scene under another board or skin."),
     ] = False,
 ) -> None:
     """Add a recording to a scene. The next `dvc repro` uses it."""
@@ -131,7 +131,7 @@ def _check_options(layout: str, options: Mapping[str, tuple[object, Set[str]]]) 
 def fetch(
     source: Annotated[str | None, Argument(help="lab, ini, eflesh or eflash7. Default: list these sources.")] = None,
     origin: Annotated[
-        str | None, Option("--from", help="Take the files from this git mirror or folder instead of the origin.")
+        str | None, Option("--from", help="Take the files from this git mirror or folder instead of their home.")
     ] = None,
     yes: Annotated[bool, Option("--yes", help="Do not ask before using data that has no licence.")] = False,
 ) -> None:
@@ -158,7 +158,7 @@ def remove(
 
 @app.command(rich_help_panel=MAINTENANCE)
 def merge() -> None:
-    """Resolve conflicts in captures, plan, dvc.lock and reports after branches with different recordings are merged."""
+    """Resolve merge conflicts in data/captures.yaml, plan, dvc.lock and reports, if branches added other recordings."""
     from pipeline.manage import merge as merging
 
     typer.echo(merging.merge(ROOT))
@@ -166,7 +166,7 @@ def merge() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def publish() -> None:
-    """Write training runs and reports that MLflow lacks, for example because it was deleted or unreachable."""
+    """Write missing training runs and reports to MLflow, for example after its store was deleted or unreachable."""
     from pipeline.scenes import read_scene
     from pipeline.stages.report import read_curves
     from pipeline.tracking import publish as write
@@ -185,7 +185,7 @@ def publish() -> None:
 
 @app.command(rich_help_panel=PIPELINE)
 def compare(
-    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all that `dvc repro` runs.")] = None,
+    scene: Annotated[str | None, Argument(help="Name of a scene. Default: all scenes that `dvc repro` runs.")] = None,
     against: Annotated[str, Option(help="Compare with the reports of this git revision or folder.")] = "HEAD",
 ) -> None:
     """Compare the reports in reports/ with the committed ones; exit status 1 if any value differs."""
@@ -201,7 +201,7 @@ def verify_reports(
         list[str] | None, Argument(metavar="[SCENE]...", help="Default: all scenes that `dvc repro` runs.")
     ] = None,
     against: Annotated[
-        Path | None, Option(help="Do not rerun: compare the commit with an earlier rerun's reports in this folder.")
+        Path | None, Option(help="Do not rerun: compare committed reports with those of an earlier rerun here.")
     ] = None,
 ) -> None:
     """Rerun scenes in a fresh clone of the last commit; exit status 1 if any value of their reports differs."""
@@ -220,16 +220,16 @@ def check_cache() -> None:
 
 @app.command(rich_help_panel=MAINTENANCE)
 def readme(
-    check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if a part is out of date.")] = False,
+    check: Annotated[bool, Option("--check", help="Write nothing; exit status 1 if a page is out of date.")] = False,
 ) -> None:
     """Write the generated parts of README.md and docs from the results in reports/."""
     from pipeline.report.readme import fill_pages
 
-    changed, shown = fill_pages(ROOT, write=not check)
+    changed, scenes_shown = fill_pages(ROOT, write=not check)
     if check and changed:
         typer.echo(f"out of date: {', '.join(changed)}; run: reskin readme", err=True)
         sys.exit(1)
-    typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}; results shown: scenes {', '.join(shown)}")
+    typer.echo(f"rewritten: {', '.join(changed) or 'nothing'}; results shown: scenes {', '.join(scenes_shown)}")
 
 
 @scenes.command("list")
@@ -243,7 +243,7 @@ def list_scenes() -> None:
 
 
 @scenes.command()
-def use(names: Annotated[list[str], Argument(help="Scenes to run; they replace the current ones.")]) -> None:
+def use(names: Annotated[list[str], Argument(help="Scenes to run, instead of those that run now.")]) -> None:
     """Set the scenes that `dvc repro` runs."""
     from pipeline import plan
     from pipeline.manage import tidy as tidying
@@ -256,7 +256,7 @@ def use(names: Annotated[list[str], Argument(help="Scenes to run; they replace t
 
 @scenes.command()
 def tidy() -> None:
-    """Delete the results of experiments that planned scenes no longer run."""
+    """Delete the results of experiments that the scenes in the plan no longer run."""
     from pipeline.manage import tidy as tidying
 
     stale = tidying.tidy(ROOT, checked_plan())
@@ -272,5 +272,6 @@ def check() -> None:
     typer.echo(f"{PLAN} is up to date; scenes: {', '.join(checked_plan().scenes) or 'none'}")
 
 
-# Help shows the groups of commands in the order of their first commands; maintenance comes last.
+# `reskin --help` lists groups of commands in the order in which their first commands are registered. Sorting puts the
+# group of maintenance commands last.
 app.registered_commands.sort(key=lambda command: command.rich_help_panel == MAINTENANCE)

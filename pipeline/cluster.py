@@ -1,8 +1,9 @@
 """A `concurrent.futures` executor that runs calls on the workers of a Dask scheduler.
 
-Workers must see the checkout under the same path (on the same machine, or on a shared file system), because results are
-files in it. Results are bit-identical to those of a local run: a worker with different code, libraries or environment
-variables, or with more than one thread, is rejected before work begins, or at its first call if it joins later.
+Workers must have the checkout at the same path (on the same machine or on a shared file system), because calls read and
+write files in the checkout. Results are bit-identical to those of a local run, because a worker with different code,
+libraries or environment variables, or with more than one thread, is rejected. Workers are checked when the executor is
+created; a worker that joins later is checked at its first call.
 """
 
 import os
@@ -22,10 +23,10 @@ from reskin.code import package_digest
 from reskin.errors import ParamsError
 from reskin.numerics import signature
 
-CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # workers may start at the same time; their imports take seconds
+CONNECT_TIMEOUT_s, WORKERS_TIMEOUT_s = 20.0, 60.0  # the workers' imports take seconds
 HELP = "docs/cluster.md describes how to start workers."
 LIBRARIES = ("numpy", "scipy", "numba", "torch", "dask", "distributed")
-CODE = (".py", ".json", ".safetensors")  # files of code and tables; settings are sent with each call
+CODE = (".py", ".json", ".safetensors")  # suffixes of the compared files; settings are sent with each call
 PACKAGES = (Path(pipeline.__file__).parent, Path(reskin.__file__).parent)
 
 
@@ -56,7 +57,8 @@ class Cluster(Executor):
         except BaseException:
             self._client.close()
             raise
-        self._executor = self._client.get_executor(pure=False)  # every call must run, because calls write files
+        # pure=True would not repeat equal calls, but every call must run, because calls write files.
+        self._executor = self._client.get_executor(pure=False)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run a call on one of the workers."""
@@ -73,9 +75,9 @@ class Cluster(Executor):
 
 
 def run_on_worker(folder: str, expected: Mapping[str, str], call: Callable[[], Any]) -> Any:
-    """Run a call on a worker, in the folder of the checkout, because the paths of stages are relative to it.
+    """Run a call on a worker in `folder`, the checkout, because stages use paths relative to the checkout.
 
-    The worker is checked again, because it may have joined after `_check_workers`.
+    The worker is compared with `expected` again, because it may have joined after `_check_workers`.
     """
     _compare(expected, describe_process(), f"process {os.getpid()}")
     os.chdir(folder)  # safe, because a worker has one thread
@@ -88,7 +90,7 @@ def import_on_worker(name: str) -> None:
 
 
 def describe_process() -> dict[str, str]:
-    """Return everything that determines the bits of a result: versions, imported sources, environment variables."""
+    """Return the properties of this process that determine every bit of a result: versions, sources, variables."""
     from reskin.numerics import DEVICE_VARIABLE, device
 
     return {
@@ -123,22 +125,25 @@ def _check_workers(client: Any, address: str) -> None:
         if worker["nthreads"] != 1:
             raise ParamsError("RESKIN_EXECUTOR", f"threads of worker {name}", "1", worker["nthreads"], HELP)
     expected = describe_process()
-    for name, theirs in client.run(describe_process).items():
-        _compare(expected, theirs, name)
+    for name, properties in client.run(describe_process).items():
+        _compare(expected, properties, name)
 
 
-def _compare(expected: Mapping[str, str], theirs: Mapping[str, str], name: str) -> None:
-    for what, value in expected.items():
-        got = theirs.get(what, "nothing")  # missing if the worker imported an older version of this module
+def _compare(expected: Mapping[str, str], properties: Mapping[str, str], worker: str) -> None:
+    """Raise `ParamsError` if a worker's properties differ from the expected ones."""
+    for name, value in expected.items():
+        got = properties.get(name, "nothing")  # missing if the worker imported an older version of this module
         if got != value:
-            raise ParamsError("RESKIN_EXECUTOR", f"{what} of worker {name}", value, got, f"Restart it. {HELP}")
+            raise ParamsError("RESKIN_EXECUTOR", f"{name} of worker {worker}", value, got, f"Restart it. {HELP}")
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
-    """Copy the outcome of a Dask future to `future`; a dead worker becomes `BrokenExecutor`, as in a local run."""
+    """Copy the result or error of a Dask future to `future`; a dead worker gives `BrokenExecutor`, as locally."""
     from distributed import KilledWorker
 
-    if submitted.cancelled():  # by Dask, because it lost the scheduler; no code waits for calls that we cancel
+    # Dask cancels calls if it loses the scheduler. Calls that this executor cancels need no other error: nobody waits
+    # for their results.
+    if submitted.cancelled():
         remedy = "Finished training runs are cached: start the scheduler again, then repeat the command."
         future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))
         return

@@ -14,17 +14,17 @@ from reskin.board.faults import find_lsb
 from reskin.data.baseline import rank, subtract
 from reskin.schema import AXES_PER_CHIP_N, Readings
 
-FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which changes of field are compared
-NEAR = 0.2  # relative tolerance of these forces
+FORCES_N = (0.5, 1.0, 2.0, 3.0)  # forces at which field changes are compared
+NEAR = 0.2  # readings count for one of these forces if their force differs from it by at most this fraction
 ENOUGH_N = 20  # minimum number of readings for a statistic
 LAGS_N = (1, 10, 100, 1000)  # numbers of contacts between the two no-load readings that are compared
-STEP_READINGS_N = 2000  # number of readings used to find the chips' resolution
-PRESSED_N = 0.5  # below this force, a weak chip shows mostly its noise
+STEP_READINGS_N = 2000  # the chips' resolution is found from this many readings
+PRESSED_N = 0.5  # N; below this force, the field change of a weak chip is mostly noise
 
 
 def describe(readings: Readings) -> dict[str, float]:
-    """Describe one capture; quantities with too few readings are omitted."""
-    # A row with a force but no place is not a contact; a row with neither is an unlabelled contact.
+    """Summarise the readings of one capture: values by quantity; quantities with too few readings are omitted."""
+    # A reading with a force but no place is not a contact; a reading with neither is an unlabelled contact.
     touched = ~(readings.Fz_N <= 0) & ~(np.isnan(readings.x_mm) & ~np.isnan(readings.Fz_N))
     change_uT = subtract(readings.b_uT, readings.noload_uT).astype(np.float64)
     return {
@@ -39,20 +39,20 @@ def describe(readings: Readings) -> dict[str, float]:
 
 
 def without_rest(described: Mapping[str, float]) -> dict[str, float]:
-    """Leave out the fields at rest and their changes, which are unknown if the recorder subtracted a baseline."""
-    of_rest = ("field_at_rest", "rest_changes")
-    return {name: number for name, number in described.items() if not name.startswith(of_rest)}
+    """Remove the fields at rest and their changes, which are unknown if the recorder subtracted a baseline."""
+    prefixes = ("field_at_rest", "rest_changes")
+    return {name: number for name, number in described.items() if not name.startswith(prefixes)}
 
 
 def over_skins(described: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
     """Summarise every quantity over skins: mean, standard deviation, minimum and maximum.
 
-    described: pairs of a skin and the description of one capture. The captures of a skin are averaged first.
+    described: pairs of a skin's name and the description of one capture. The captures of a skin are averaged first.
     """
     rows = pd.DataFrame([numbers for _, numbers in described])
     skins = rows.groupby([skin for skin, _ in described], sort=False).mean()
     weak, strong = "change_at_1_N_uT", "change_at_3_N_uT"
-    if {weak, strong} <= set(skins):  # computed per skin, because one capture may contain only one of these forces
+    if {weak, strong} <= set(skins):  # per skin, because a capture may contain only one of the two forces
         skins["change_at_3_N_over_1_N"] = skins[strong] / skins[weak]
     summary = summarise(skins)
     return {name: stat | {"least": float(skins[name].min()), "most": float(skins[name].max())}
@@ -70,8 +70,8 @@ def _rest(noload_uT: Float[np.ndarray, "f ch"]) -> dict[str, float]:
 def _wander(readings: Readings) -> dict[str, float]:
     """Return the rms difference between the fields at rest of two contacts, for each number of contacts between them.
 
-    The difference due to a random walk grows as the square root of this lag. The difference due to the after-effects of
-    contacts has its full size at lag 1, and repeats with the scan.
+    The number of contacts is the lag. A difference caused by a random walk grows as the square root of the lag. A
+    difference caused by after-effects of contacts has its full size at lag 1, and repeats when the scan repeats.
     """
     _, first_i = np.unique(rank(readings.indentation), return_index=True)
     rest_uT = readings.noload_uT[first_i].astype(np.float64)
@@ -83,26 +83,28 @@ def _wander(readings: Readings) -> dict[str, float]:
 
 
 def _noise(readings: Readings, touched: Bool[np.ndarray, " f"]) -> dict[str, float]:
-    # Nothing moves during one stop of an indentation, so deviations from the stop's mean are noise.
-    # Its variance is pooled over all stops.
-    stops = [part[touched] for part in (readings.indentation, readings.x_mm, readings.y_mm)]
+    """Return the standard deviation of one reading's noise (median over chips), for x and y together and for z."""
+    # The tip does not move during a stop of an indentation, so deviations from the stop's mean are noise. The variance
+    # of the noise is pooled over all stops.
+    stops = [column[touched] for column in (readings.indentation, readings.x_mm, readings.y_mm)]
     by_stop = pd.DataFrame(readings.b_uT[touched].astype(np.float64)).groupby(stops, dropna=False, sort=False)
     dof_n = int(touched.sum()) - by_stop.ngroups
     if dof_n < ENOUGH_N:
         return {}
-    left_uT = readings.b_uT[touched] - by_stop.transform("mean").to_numpy()
-    sd_uT = np.sqrt((left_uT**2).sum(axis=0) / dof_n).reshape(-1, AXES_PER_CHIP_N)
+    deviation_uT = readings.b_uT[touched] - by_stop.transform("mean").to_numpy()
+    sd_uT = np.sqrt((deviation_uT**2).sum(axis=0) / dof_n).reshape(-1, AXES_PER_CHIP_N)
     return {"noise_xy_uT": float(np.median(sd_uT[:, :2])), "noise_z_uT": float(np.median(sd_uT[:, 2]))}
 
 
 def _steps(readings: Readings) -> dict[str, float]:
+    """Return the size of one digital step (median over chips), for x and y together and for z."""
     lsb_uT = find_lsb(readings.b_uT[:STEP_READINGS_N])
     known = {"step_xy_uT": lsb_uT[:, 0], "step_z_uT": lsb_uT[:, 1]}
     return {name: float(np.nanmedian(steps)) for name, steps in known.items() if np.isfinite(steps).any()}
 
 
 def _rate(readings: Readings) -> dict[str, float]:
-    """Return the rate of readings within one stop, if the capture has a clock."""
+    """Return the median rate of readings within a stop, in Hz, if the capture has a clock."""
     between_s = np.diff(readings.t_s)[(np.diff(readings.indentation) == 0) & (np.diff(readings.reading_i) == 1)]
     known_s = between_s[between_s > 0]  # also drops NaN (no clock)
     return {"rate_hz": float(1 / np.median(known_s))} if len(known_s) >= ENOUGH_N else {}
@@ -116,6 +118,7 @@ def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
 
 
 def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
+    """Return the median field change at each force in `FORCES_N`, and the ratio of weakest to strongest chip."""
     size_uT = np.linalg.norm(change_uT, axis=1)
     numbers = {}
     for level_N in FORCES_N:

@@ -1,7 +1,7 @@
 """Executors that run calls in worker processes, in this process or on a cluster; RESKIN_EXECUTOR selects one.
 
 RESKIN_EXECUTOR is an environment variable rather than a setting, because the hash of a training run must not depend on
-where it runs.
+where the training runs.
 """
 
 import multiprocessing
@@ -23,11 +23,11 @@ CLUSTER = "dask:"  # prefix of the address of a running scheduler
 def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
     """Make the executor that RESKIN_EXECUTOR names: `processes:N` (default N = 2), `here`, or `dask:ADDRESS`.
 
-    Each process has one thread. A single task runs in this process, unless the variable is set. Module `imports` is
-    imported once for all processes.
+    Each worker process has one thread. If the variable is not set, a single task runs in this process. The worker
+    processes are forked from a server that has imported module `imports`.
     """
     if address := _scheduler_address():
-        from pipeline.cluster import Cluster  # imported late: Dask is an extra
+        from pipeline.cluster import Cluster  # imported only if needed, because Dask is optional
 
         return Cluster(address, imports)
     workers_n = _workers_n(DEFAULT if tasks_n > 1 else HERE)
@@ -35,7 +35,7 @@ def make_executor(tasks_n: int = 2, *, imports: str) -> Executor:
 
 
 def prepare_workers(imports: str) -> None:
-    """Start the fork server early, so that it imports a module while this process reads its data."""
+    """Start the fork server, so that it imports module `imports` while this process reads its data."""
     if not _scheduler_address() and _workers_n(DEFAULT):
         _context(imports)
         forkserver.ensure_running()
@@ -49,27 +49,28 @@ def _workers_n(default: str) -> int:
     kind, _, count = name.partition(":")
     if kind != "processes" or not count.isdecimal() or int(count) < 1:
         rule = "processes:N with N >= 1, here, or dask:ADDRESS"
-        raise ParamsError(VARIABLE, "the executor", rule, repr(name), "Unset it for two processes.")
+        raise ParamsError(VARIABLE, "the executor", rule, repr(name), "Unset it to use two processes.")
     return int(count)
 
 
 def _scheduler_address() -> str:
-    """Return the address of the scheduler in RESKIN_EXECUTOR; empty for work on this machine."""
+    """Return the address of the Dask scheduler in RESKIN_EXECUTOR; empty if calls run on this machine."""
     name = os.environ.get(VARIABLE, "")
     return name.removeprefix(CLUSTER) if name.startswith(CLUSTER) else ""
 
 
 def _context(imports: str) -> ForkServerContext:
-    # forkserver: a child forked from a multi-threaded process can hang in BLAS; one forked from a process that has only
-    # imported modules does not.
+    """Return the multiprocessing context whose fork server imports module `imports`."""
+    # Start method "forkserver": a process forked from a multi-threaded process can hang in BLAS. A process forked from
+    # the fork server, which has only imported modules, does not hang.
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([imports])
     return context
 
 
 def end_workers() -> None:
-    """Stop the fork server, so that the CPU time of workers counts as that of this process's children."""
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # otherwise it ends only after this process
+    """Stop the fork server, so that the CPU time of workers is included in the CPU time of this process's children."""
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]  # would otherwise outlive this process
 
 
 class InProcessExecutor(Executor):
@@ -86,7 +87,7 @@ class InProcessExecutor(Executor):
 
 
 def _end_with_parent() -> None:
-    """Make a worker exit when its stage is killed; otherwise it would still run when the stage is started again."""
+    """Make this worker exit when its parent process ends; otherwise it would go on after its stage is killed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 

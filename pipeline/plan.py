@@ -20,8 +20,8 @@ HEADER = """\
 # Which scenes run, and the items that each stage of dvc.yaml iterates over. Generated from pipeline/scenes and
 # data/captures.yaml by `reskin scenes use` and `reskin add`: do not edit.
 """
-MANY_N = 30  # if a recorded scene has more captures, one stage reads all of them (docs/growth.md)
-NOT_INGESTED = {"walk"}  # kinds of protocols without a log of the probe; their experiments read raw captures
+MANY_N = 30  # one stage ingests all captures of a recorded scene with more captures than this (docs/growth.md)
+NOT_INGESTED = {"walk"}  # kinds of protocols without a probe log; their experiments read raw captures
 
 
 def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]:
@@ -29,8 +29,8 @@ def make_plan(scenes: Mapping[str, Scene], registry: Registry) -> dict[str, Any]
 
     Most stages iterate over names of scenes. `simulate` and `ingest_simulated` iterate over folders of captures, one
     for each protocol of a scene, and `ingest` over recorded captures. An experiment that has its own protocol in
-    simulated scenes, but may also run in recorded scenes (`drift`), iterates over scenes and the folder of captures of
-    each scene.
+    simulated scenes, but may also run in recorded scenes (`drift`), iterates over pairs of a scene and its folder of
+    captures.
     """
     captures = {name: sorted(registry.captures.get(name, {})) for name in scenes}
     for name, scene in scenes.items():
@@ -97,9 +97,10 @@ def scene_file(root: Path, name: str, *, remedy: str = "To create one, see docs/
 
 @contextmanager
 def scene_copy(root: Path, name: str, like: str | None) -> Iterator[None]:
-    """Create scene `name` as a copy of scene `like`, and delete it if the block fails; without `like`, do nothing.
+    """Create scene `name` as a copy of scene `like`, and delete it if the `with` block fails.
 
-    Comments are copied, except those above the first setting, which describe the other scene.
+    If `like` is None, nothing is created. Comments are copied, except those above the first setting, which describe the
+    other scene.
     """
     if like is None:
         yield
@@ -127,7 +128,7 @@ def use(root: Path, names: Sequence[str]) -> None:
     require_idle(root)
     yaml = YAML()
     yaml.width = 120
-    document = {key: _in_short_lines(value) for key, value in plan_of(root, names).items()}
+    document = {key: _in_flow_style(value) for key, value in plan_of(root, names).items()}
     with io.replacing(root / PLAN) as temporary, temporary.open("w", encoding="utf-8") as stream:
         stream.write(HEADER)
         yaml.dump(document, stream)
@@ -140,21 +141,22 @@ def _keep_outputs(root: Path) -> None:
     DVC keeps a list of the outputs that it wrote. `dvc checkout`, `dvc exp run` and `dvc exp apply` delete the listed
     outputs that no stage of the current plan writes, so the list is emptied.
     """
-    if not (root / DVC_FILES).is_dir():  # DVC has not run here
+    if not (root / DVC_FILES).is_dir():  # DVC has not run in this checkout
         return
-    from dvc.exceptions import DvcException  # imported late: it takes a second
+    from dvc.exceptions import DvcException  # imported late: the import takes a second
     from dvc.repo import Repo
 
-    with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start, it deletes nothing either
+    with suppress(DvcException), Repo(str(root)) as repo:  # if DVC cannot start, it cannot delete outputs either
         repo.state.links.clear()
 
 
 def check(root: Path) -> Plan:
-    """Read the plan; raise `ParamsError` if it is out of date, or if a scene or params.yaml is wrong."""
+    """Read the plan; raise `ParamsError` if it is out of date, or if a scene or params.yaml is invalid."""
     plan = read_plan(root / PLAN)
     if plan.model_dump(mode="json") != plan_of(root, list(plan.scenes)):
         remedy = f"Try: reskin scenes use {' '.join(plan.scenes)}"
-        raise ParamsError(f"{root / PLAN} is out of date: its scenes or captures have changed since. {remedy}")
+        problem = "is out of date: scenes or captures have changed since it was written"
+        raise ParamsError(f"{root / PLAN} {problem}. {remedy}")
     return plan
 
 
@@ -164,8 +166,8 @@ def plan_of(root: Path, names: Sequence[str]) -> dict[str, Any]:
     return make_plan(scenes, read_registry(root))
 
 
-def _in_short_lines(value: Any) -> Any:
-    """Make ruamel write lists, and mappings whose values are all strings, in flow style."""
+def _in_flow_style(value: Any) -> Any:
+    """Make ruamel write lists, and mappings whose values are all strings, in flow style (`[a, b]`, `{a: b}`)."""
     from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
     if isinstance(value, list):
@@ -173,7 +175,7 @@ def _in_short_lines(value: Any) -> Any:
         sequence.fa.set_flow_style()
         return sequence
     if isinstance(value, dict):
-        mapping = CommentedMap({key: _in_short_lines(item) for key, item in value.items()})
+        mapping = CommentedMap({key: _in_flow_style(item) for key, item in value.items()})
         if all(isinstance(item, str) for item in value.values()):
             mapping.fa.set_flow_style()
         return mapping

@@ -20,7 +20,7 @@ def stage_position() -> str | None:
     try:
         order = stages_in_order()
         return f"stage {order.index(stage) + 1} of {len(order)}" if stage in order else None
-    except Exception as error:  # a stage must not fail because this line cannot be made
+    except Exception as error:  # a stage must not fail because its position is unknown
         return f"its position among all stages is unknown ({type(error).__name__} {error})"
 
 
@@ -39,9 +39,10 @@ def stages_in_order() -> list[str]:
 
 
 def _ask_dvc() -> list[str]:
-    from dvc.repo import Repo  # imported late: it takes a second
+    from dvc.repo import Repo  # imported late: the import takes a second
     from dvc.repo.reproduce import get_active_graph, plan_repro
 
     with Repo() as repo:
         stages = plan_repro(get_active_graph(repo.index.graph))
-        return [stage.addressing for stage in stages if stage.cmd]  # added recordings are stages without a command
+        # Added recordings are stages without a command.
+        return [stage.addressing for stage in stages if stage.cmd]

@@ -16,50 +16,53 @@ from reskin.numerics import departures
 
 EXPERIMENTS = (".dvc", "tmp", "exps")  # folder of DVC's temporary copies of a checkout, for `dvc exp`
 PACKAGES = (ROOT / "pipeline", ROOT / "reskin")
-NO_CODE = ("plan.yaml", "scenes")  # settings, although they are in the folders of the code
+NO_CODE = ("plan.yaml", "scenes")  # in package `pipeline`, but settings rather than code
 COSTS = Path(".reskin/costs")
 SECONDS = Path(".reskin/seconds")  # times of training and prediction on this machine
 COMPUTING = ("numpy", "scipy", "numba", "scikit-learn", "torch", "pandas")
 CPUINFO = Path("/proc/cpuinfo")  # Linux only
-# Names of instruction sets, by the CPU's flag.
+# Names of instruction sets, by the flag in /proc/cpuinfo.
 INSTRUCTIONS = {"avx2": "AVX2", "avx512f": "AVX-512", "amx_tile": "AMX", "asimd": "NEON", "sve": "SVE"}
 
 
 def home() -> Path:
-    """Return the checkout that has the caches: the working directory, or its original if `dvc exp` made a copy."""
+    """Return the checkout that contains the caches: the working directory, or the original if `dvc exp` copied one."""
     here = Path.cwd()
-    around = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
-    return around[-1] if around else Path()
+    originals = [parent for parent in here.parents if here.relative_to(parent).parts[:3] == EXPERIMENTS]
+    return originals[-1] if originals else Path()
 
 
 def is_experiment() -> bool:
+    """Return whether the working directory is a copy of a checkout that `dvc exp` made."""
     return home() != Path()
 
 
 def code_version() -> str:
-    """Return the last commit that changed the two packages, with `+dirty` if they changed since; `unknown` outside git.
+    """Return the last commit that changed the two packages; `unknown` outside git.
 
-    HEAD is not used, because a later commit of results must not make equal results look different.
+    `+dirty` is appended if the packages have uncommitted changes. HEAD is not used, because a later commit of results
+    must not make equal results look different.
     """
-    of_code = (*map(str, PACKAGES), *(f":(exclude){PACKAGES[0] / name}" for name in NO_CODE))
-    commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *of_code)
+    code_paths = (*map(str, PACKAGES), *(f":(exclude){PACKAGES[0] / name}" for name in NO_CODE))
+    commit = _git("log", "-1", "--format=%h", "--abbrev=12", "--", *code_paths)
     if not commit:
         return "unknown"
-    return commit + ("+dirty" if _git("status", "--porcelain", "--", *of_code) else "")
+    return commit + ("+dirty" if _git("status", "--porcelain", "--", *code_paths) else "")
 
 
 def code_version_of(modules: Iterable[str]) -> str:
-    """Return the last commit that changed what these modules do; `+dirty` and `unknown` as for `code_version`.
+    """Return the last commit that changed the code of these modules; `unknown` outside git.
 
-    Commits that change other modules, comments or docstrings do not count.
+    Commits that change only other modules, comments or docstrings do not count. `+dirty` is appended if the code has
+    uncommitted changes.
     """
     files = [str(file.relative_to(ROOT)) for name in modules for file in files_of(name)]
     edited = _git("status", "--porcelain", "--", *files) and any(
         _normalised_at("HEAD", file) != normalised(file, (ROOT / file).read_bytes().strip()) for file in files
     )
     for commit in _git("log", "--format=%H", "--", *files).splitlines():
-        words = ("diff-tree", "--root", "--no-commit-id", "--name-only", "--relative", "-r", commit)
-        names = _git(*words, "--", *files).splitlines()
+        arguments = ("diff-tree", "--root", "--no-commit-id", "--name-only", "--relative", "-r", commit)
+        names = _git(*arguments, "--", *files).splitlines()
         if any(_normalised_at(f"{commit}^", name) != _normalised_at(commit, name) for name in names):
             return commit[:12] + ("+dirty" if edited else "")
     return "unknown"
@@ -78,12 +81,12 @@ def machine() -> str:
 
 
 def processor_name(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) -> str:
-    """Return the processor's model, its instruction sets, and the settings that differ from those of `numerics`.
+    """Return the processor's model, its instruction sets, and the settings that differ from `reskin.numerics`.
 
-    cpuinfo: content of Linux's /proc/cpuinfo. otherwise: the name to use if that has no model name.
+    cpuinfo: content of Linux's /proc/cpuinfo. otherwise: the processor's name if `cpuinfo` has no model name.
     """
     lines = [line.partition(":") for line in cpuinfo.splitlines()]
-    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # of the first processor
+    values = {name.strip().lower(): value.strip() for name, _, value in reversed(lines)}  # first processor
     flags = set(values.get("flags", values.get("features", "")).split())
     model = values.get("model name") or otherwise or "unknown processor"
     plain = " ".join(model.replace("(R)", "").replace("(TM)", "").split())
@@ -93,40 +96,40 @@ def processor_name(cpuinfo: str, environ: Mapping[str, str], *, otherwise: str) 
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the packages whose arithmetic decides results."""
+    """Return the versions of the packages whose arithmetic affects results."""
     return {name: version(name) for name in COMPUTING}
 
 
 def clear_cost(folder: Path, stage: str) -> None:
-    """Delete what the last run of a stage recorded about its training runs."""
+    """Delete the times of training runs that the last run of a stage recorded."""
     io.remove(_trainings_file(folder, stage))
 
 
 def record_trainings(folder: Path, stage: str, trained: Mapping[str, tuple[float, bool]], waited_s: float) -> None:
-    """Record the training runs of a stage.
+    """Add training runs to the record of the current run of a stage.
 
-    trained: for each key, the seconds that training took, and whether its result was reused from an earlier run.
-    waited_s: how long the stage waited for the training runs.
+    trained: for each training run's key, the seconds that it took, and whether its result comes from an earlier run.
+    waited_s: how long the stage waited for these training runs.
     """
-    before = _read_trainings(folder, stage)
-    reused = {key for key, (_, was_reused) in trained.items() if was_reused} - set(before["computed_s"])
+    recorded = _read_trainings(folder, stage)
+    reused = {key for key, (_, was_reused) in trained.items() if was_reused} - set(recorded["computed_s"])
     io.write_json(
         _trainings_file(folder, stage),
         {
-            "waited_s": before["waited_s"] + waited_s,
-            "computed_s": before["computed_s"] | {key: seconds for key, (seconds, _) in trained.items()},
-            "reused": sorted({*before["reused"], *reused}),
+            "waited_s": recorded["waited_s"] + waited_s,
+            "computed_s": recorded["computed_s"] | {key: seconds for key, (seconds, _) in trained.items()},
+            "reused": sorted({*recorded["reused"], *reused}),
         },
     )
 
 
 def record_cost(folder: Path, stage: str, seconds: float) -> None:
-    """Record the cost of a stage outside its outputs, because costs differ between equal runs.
+    """Write the cost of a stage to `folder`, which is not a stage output, because costs differ between equal runs.
 
-    A stage that does not run, or that DVC restores, keeps the cost of its last run.
+    A stage that DVC skips or restores keeps the cost of its last run.
     """
     usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes on macOS, KiB elsewhere
+    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is in bytes on macOS, in KiB elsewhere
     trained = _read_trainings(folder, stage)
     computed_s = trained["computed_s"]
     fresh_s = sum(seconds for key, seconds in computed_s.items() if key not in trained["reused"])
@@ -134,8 +137,8 @@ def record_cost(folder: Path, stage: str, seconds: float) -> None:
         folder / f"{stage}.json",
         {
             "seconds": round(seconds, 2),
-            # The stage waits less than the sum of the times of training runs if these run in parallel. If it waits
-            # longer than this sum, the difference counts here, for example the workers' imports.
+            # Time without training runs. If these run in parallel, the stage waits less than the sum of their times. If
+            # it waits longer than this sum, for example for the workers' imports, the excess counts as other time.
             "other_s": round(max(seconds - min(trained["waited_s"], fresh_s), 0.0), 2),
             "trainings_s": computed_s,
             "reused_n": len(trained["reused"]),
@@ -172,9 +175,10 @@ def _read_trainings(folder: Path, stage: str) -> dict[str, Any]:
     return io.read_json(file) if file.exists() else {"waited_s": 0.0, "computed_s": {}, "reused": []}
 
 
-def _git(*words: str) -> str:
+def _git(*arguments: str) -> str:
+    """Run git in the folder of the two packages, and return its output; empty if git fails or is not installed."""
     try:
-        completed = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+        completed = subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
     except OSError:
-        return ""  # no git on this machine: the version is reported as unknown
+        return ""
     return completed.stdout.strip() if completed.returncode == 0 else ""

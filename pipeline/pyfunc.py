@@ -1,7 +1,7 @@
-"""Load a trained network with `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`. No pickle file is read.
+"""Load a trained network with `mlflow.pyfunc.load_model("runs:/RUN_ID/model")`, without pickle files.
 
-The model takes changes of field in uT, one row per reading (DataFrame or array, Bx0, By0, Bz0, Bx1, ...), and returns
-x_mm, y_mm and force_N.
+The model takes field changes in uT, one row per reading (DataFrame or array with columns Bx0, By0, Bz0, Bx1, ...), and
+returns x_mm, y_mm and force_N.
 """
 
 from pathlib import Path
@@ -16,17 +16,17 @@ COLUMNS = ("x_mm", "y_mm", "force_N")
 
 
 class NetworkModel:
-    """The model that MLflow calls."""
+    """A trained network with the method `predict` that MLflow calls."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
 
     def predict(self, model_input: pd.DataFrame) -> pd.DataFrame:
-        """Predict places and forces from changes of field in uT, [f ch]."""
+        """Predict x_mm, y_mm and force_N from field changes in uT, one row per reading."""
         db_uT: Float[np.ndarray, "f ch"] = np.atleast_2d(np.asarray(model_input, np.float32))
         return pd.DataFrame(self.network(db_uT), columns=list(COLUMNS))
 
 
 def _load_pyfunc(path: str) -> NetworkModel:
-    """Load the weights that file MLmodel of the run names; MLflow calls this function."""
+    """Load the network from `path`, the weights that the run's file MLmodel names; MLflow calls this function."""
     return NetworkModel(read_network(Path(path)))

@@ -17,8 +17,8 @@ from reskin.errors import ParamsError, did_you_mean
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Name, Recipe, Schedule
 from reskin.recordings.fault_policy import FaultPolicy
 
-MAIN_PROTOCOL = "grid"  # protocol of the captures on which folds are drawn
-# The rows of table 2 and their experiments. A scene that runs all of these gets the table before its report.
+MAIN_PROTOCOL = "grid"  # protocol whose captures are split into folds
+# The rows of table 2 and their experiments. If a scene runs all four, stage table2 writes the table before the report.
 TABLE_2 = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 EXPERIMENTS: Mapping[str, Experiment] = {experiment.name: experiment for experiment in (*LEARNING, *read_experiments())}
@@ -27,7 +27,7 @@ SECTIONS = {experiment.stage for experiment in EXPERIMENTS.values() if experimen
 
 
 def stages(names: Iterable[str], *kinds: Kind) -> list[str]:
-    """Return the stages that run the named experiments of the given kinds, each once and in a fixed order."""
+    """Return the stages that run the named experiments of the given kinds, in the order of the catalogue."""
     chosen = set(names)
     return list(
         dict.fromkeys(
@@ -56,7 +56,7 @@ class ProtocolSummary(Strict, extra="allow"):
 
 
 class Simulation(Strict):
-    """What the plan needs of section `simulate`; `pipeline.simulation`, which imports the physics, checks the rest."""
+    """The part of section `simulate` that the plan needs; `pipeline.simulation` checks the whole section."""
 
     boards: dict[str, dict[str, Any]]
     protocols: Annotated[dict[str, ProtocolSummary], Field(min_length=1)]
@@ -87,7 +87,7 @@ class Scene(Strict, extra="allow"):
 
     @property
     def with_folds(self) -> tuple[str, ...]:
-        """The experiments that have folds of their own."""
+        """The experiments for which folds are drawn."""
         return tuple(experiment.name for experiment in self.entries if experiment.folds is not None)
 
     @property
@@ -97,7 +97,7 @@ class Scene(Strict, extra="allow"):
 
     @property
     def curves(self) -> dict[str, str]:
-        """The stage of each experiment whose results are points of a curve."""
+        """The stage of each experiment of kind `curve`, by experiment."""
         of_curves = (experiment for experiment in EXPERIMENTS.values() if experiment.kind == "curve")
         return {experiment.name: experiment.stage for experiment in of_curves if experiment.name in self.experiments}
 
@@ -108,11 +108,11 @@ class Scene(Strict, extra="allow"):
 
     @property
     def described(self) -> str:
-        """The key under which numbers.json describes its captures."""
+        """The key of the scene's main captures in section `described` of numbers.json."""
         return "recorded" if self.source == "recorded" else MAIN_PROTOCOL
 
     def runs(self, unit: str) -> bool:
-        """Return whether the scene runs a stage (`drift`), or the part of a stage for a protocol (`simulate-wear`)."""
+        """Return whether the scene runs a stage (`drift`), or a stage for one protocol (`simulate-wear`)."""
         stage, _, part = unit.partition("-")
         if stage in {experiment.stage for experiment in EXPERIMENTS.values() if experiment.kind != "report"}:
             return stage in {experiment.stage for experiment in self.entries}
@@ -126,7 +126,8 @@ class Scene(Strict, extra="allow"):
             if missing := set(experiment.needs) - set(self.experiments):
                 raise ValueError(f"experiment {experiment.name} needs {', '.join(sorted(missing))} in the same scene")
         split_keys = {key for experiment in self.entries for key in experiment.folds or ()}
-        split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()  # adaptation draws pokes from a pool
+        # Adaptation draws its pokes from the first `pool_passes_n` passes.
+        split_keys |= {"pool_passes_n"} if "adapt" in self.experiments else set()
         wrong = [
             *_differences(
                 "the scene",
@@ -156,6 +157,7 @@ class Scene(Strict, extra="allow"):
 
 
 def _differences(place: str, have: Set[str], want: Set[str]) -> list[str]:
+    """Describe the keys that are missing at a place of the scene's file, and those that no experiment uses."""
     missing = [f"{place} lacks {', '.join(sorted(want - have))}"] if want - have else []
     unused = [f"no experiment uses {', '.join(sorted(have - want))} of {place}"] if have - want else []
     return missing + unused
@@ -189,7 +191,7 @@ def read_scene(root: Path, name: str) -> Scene:
 
 
 def check_scene(settings: Settings) -> Scene:
-    """Check a scene, and each section with the settings model of its stage."""
+    """Check a scene and its sections; each section is parsed by the settings model of the stage that uses it."""
     scene = parse_scene(settings.of_scene, settings.where)
     for stage in dict.fromkeys(
         ["split", *(experiment.stage for experiment in scene.entries if experiment.kind != "report")]
@@ -204,7 +206,7 @@ def check_scene(settings: Settings) -> Scene:
 
 
 def parse_scene(content: Mapping[str, Any], where: str) -> Scene:
-    """Check a scene's experiments, and that it has the sections that they need; what these contain is not checked."""
+    """Check a scene's experiments, and that it has the sections that these need; the sections are not parsed."""
     for name, value in content.items():
         if name not in (known := {*Scene.model_fields, *SECTIONS}):
             got, guess = repr(value)[:80], did_you_mean(name, sorted(known))
@@ -223,7 +225,7 @@ def read_shared(path: Path) -> Shared:
         for name, row in getattr(shared, section).items():
             where = f"{path}: {section}.{name}"
             if "steps_n" in row:
-                raise ParamsError(f"{where}: steps_n belongs in the sections of scenes that name this row.")
+                raise ParamsError(f"{where}: scenes set steps_n, in the sections that name this row. Remove it here.")
             parse(model, row | {"steps_n": 1}, where)
     return shared
 

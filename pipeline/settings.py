@@ -24,7 +24,7 @@ Count = Annotated[int, Field(ge=1)]
 
 
 class Seeded(Strict):
-    """The seed of a scene."""
+    """Model of the key `seed` of a scene."""
 
     seed: Seed
 
@@ -34,12 +34,12 @@ class SectionWithRows(Strict):
 
     @classmethod
     def expand(cls, section: Row, settings: "Settings", where: str) -> Row:
-        """Replace the names of rows by the rows, before the section is parsed."""
+        """Replace the names of rows in a section by the content of the rows; called before the section is parsed."""
         raise NotImplementedError
 
 
 class Training(SectionWithRows):
-    """Recipes by name, each trained on every fold with `seeds_n` seeds; `paper` is the headline recipe.
+    """Training recipes by name; `paper` is the headline recipe. Each is trained on every fold with `seeds_n` seeds.
 
     The scene's file sets `recipe` (the name of a shared recipe), `steps_n`, and for each variant the values that
     differ.
@@ -63,7 +63,7 @@ class SectionWithTraining(SectionWithRows):
 
 
 class Adaptations(SectionWithRows):
-    """Adaptations by name, each with `pokes_n` unlabelled indentations of every held-out skin.
+    """Settings of adaptations by name; each adapts networks with `pokes_n` unlabelled indentations of a held-out skin.
 
     The scene's file sets `adaptation` (the name of a shared adaptation), `base` (a recipe of section train_triplet),
     `steps_n` and the variants.
@@ -89,10 +89,11 @@ class Adaptations(SectionWithRows):
 class Settings:
     """The settings of a scene; each section is parsed into a typed model when it is first read.
 
-    where: the scene's file, for error messages. of_scene: its content.
+    where: the path of the scene's file, for error messages. of_scene: the content of that file.
     shared: the content of `params.yaml` and of the library's nominal skin.
-    captures: names of its recorded captures; empty if it is simulated.
-    held_out: its experiments that have folds of their own. models: its stages that write models.
+    captures: names of the scene's recorded captures; empty for a simulated scene.
+    held_out: experiments of the scene for which folds are drawn. models: stages of the scene that write models.
+    parsed: sections that were parsed already, by settings model and name.
     """
 
     scene: str
@@ -111,7 +112,7 @@ class Settings:
         return self.of_scene[section]
 
     def section(self, model: type[Section], name: str) -> Section:
-        """Return a section of the scene's file, parsed, with the shared rows that it names."""
+        """Parse a section of the scene's file, with the content of the shared rows that the section names."""
         if (model, name) not in self.parsed:
             content, where = self[name], f"{self.where}: {name}"
             if issubclass(model, SectionWithRows):
@@ -120,13 +121,13 @@ class Settings:
         return cast(Section, self.parsed[model, name])
 
     def shared_section(self, model: type[Section], name: str) -> Section:
-        """Return a section that all scenes share, such as `skin`, parsed."""
+        """Parse a section that all scenes share, such as `skin`."""
         if (model, name) not in self.parsed:
             self.parsed[model, name] = parse(model, self.shared[name], name)
         return cast(Section, self.parsed[model, name])
 
     def row(self, shared: str, section: dict[str, Any], key: str, where: str) -> dict[str, Any]:
-        """Remove a key from a section and return the shared row that its value names, such as a recipe.
+        """Remove a key from a section, and return the row of `params.yaml`, section `shared`, that its value names.
 
         Raises `ParamsError`, which names `where` and the key, if the key or the row is missing.
         """
@@ -158,7 +159,7 @@ def section_of(stage: Callable[..., None]) -> type[Strict] | None:
 
 
 def read_settings(scene: str, root: Path = Path()) -> Settings:
-    """Read the settings of a scene of a checkout."""
+    """Read the settings of a scene from a checkout."""
     file, plan = root / SCENES / f"{scene}.yaml", root / PLAN
     planned = read_yaml(plan) if plan.is_file() else {}
     lists = {key: tuple(planned.get(key, {}).get(scene, ())) for key in ("captures", "held_out", "models")}
@@ -166,7 +167,7 @@ def read_settings(scene: str, root: Path = Path()) -> Settings:
 
 
 def read_shared_files(root: Path = Path()) -> dict[str, Any]:
-    """Read what scenes share: `params.yaml` and the nominal skin."""
+    """Read the settings that all scenes share: `params.yaml` and the nominal skin."""
     nominal = read_yaml(NOMINAL)
     return {**read_yaml(root / PARAMS), **{name: nominal[name] for name in SHARED}}
 
@@ -180,16 +181,20 @@ def take(section: dict[str, Any], key: str, where: str) -> Any:
 
 
 def expand_variants(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and every variant of it."""
+    """Replace `steps_n` and `variants` of a section by `recipes`: the headline recipe, and every variant of it.
+
+    shared: the row of `params.yaml` that the section names; with `steps_n`, it is the headline recipe.
+    """
     section = dict(section)
     headline = dict(shared) | {"steps_n": take(section, "steps_n", where)}
     variants = take(section, "variants", where)
     if "recipes" in section:
         raise ParamsError(f"{where}: unknown key recipes. Remove it: recipes result from recipe, steps_n and variants.")
-    if not isinstance(variants, dict) or not all(isinstance(own, dict) for own in variants.values()):
+    if not isinstance(variants, dict) or not all(isinstance(changes, dict) for changes in variants.values()):
         rule = "a mapping of names to the settings that a variant changes, {} for none"
         raise ParamsError(f"{where}.variants", "the variants", rule, variants, "Correct it there.")
     if HEADLINE in variants:
-        rule = f"other than {HEADLINE}, the name of the section's own recipe in tables"
+        rule = f"other than {HEADLINE}, the name of the recipe without changes in tables"
         raise ParamsError(f"{where}.variants", "a variant's name", rule, HEADLINE, "Choose another name.")
-    return section | {"recipes": {HEADLINE: headline} | {name: headline | own for name, own in variants.items()}}
+    recipes = {HEADLINE: headline} | {name: headline | changes for name, changes in variants.items()}
+    return section | {"recipes": recipes}

@@ -11,10 +11,11 @@ KINDS = {
     "wear": "grid", "flexible": "grid", "drag": "drag", "hand": "hand", "sleeve": "scatter", "glass": "load",
     "grip": "load", "press": "press", "log": "walk",
 }  # fmt: skip
-# Protocols that are compared with the main boards, or whose captures are given to networks trained on these.
+# Protocols on the main boards: their captures are compared with those of the main protocol, or test networks that were
+# trained on the main boards.
 ON_MAIN_BOARDS = ("wear", "drag", "hand", "glass", "grip", "press", "log")
-ON_OTHER_BOARDS = ("flexible",)
-OF_ONE_SKIN = ("wear", "glass", "press", "log")  # their experiments read one capture
+ON_OTHER_BOARDS = ("flexible",)  # protocols on boards other than the main ones
+OF_ONE_SKIN = ("wear", "glass", "press", "log")  # protocols whose experiments read one capture
 
 
 def simulation_settings(settings: Settings) -> SimulationSettings:

@@ -14,12 +14,12 @@ from pipeline.settings import read_settings, section_of
 from reskin.errors import ReskinError, explaining
 
 
-def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Run the function of a stage with the paths given as options and the settings of `--scene`."""
-    stage = work.__name__
-    parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=work.__doc__)
+def run(function: Callable[..., None], arguments: Sequence[str]) -> None:
+    """Run the function of a stage; the command line gives its paths as options, and its scene as `--scene`."""
+    stage = function.__name__
+    parser = argparse.ArgumentParser(prog=f"python -m pipeline {stage}", description=function.__doc__)
     parser.add_argument("--scene", required=True)
-    kinds = {name: parameter.annotation for name, parameter in inspect.signature(work).parameters.items()}
+    kinds = {name: parameter.annotation for name, parameter in inspect.signature(function).parameters.items()}
     for name, kind in kinds.items():
         if name not in ("settings", "section"):
             parser.add_argument(f"--{name.replace('_', '-')}", type=kind, required=True)
@@ -33,9 +33,9 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
             clear_cost(costs, unit)
             if "settings" in kinds:
                 options["settings"] = read_settings(scene)
-            if model := section_of(work):
+            if model := section_of(function):
                 options["section"] = options["settings"].section(model, stage)
-            work(**options)
+            function(**options)
             end_workers()
             record_cost(costs, unit, time.monotonic() - start_s)
     except ReskinError as error:
@@ -44,7 +44,7 @@ def run(work: Callable[..., None], arguments: Sequence[str]) -> None:
 
 
 def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
-    """Return the name under which the cost is recorded: the stage, and the capture or protocol if it runs per item."""
+    """Return the name under which the cost is recorded: the stage, and the capture or protocol if it has one."""
     if stage == "ingest":
         return f"{stage}-{options['indentations'].stem}"
     if stage in ("simulate", "ingest_simulated"):
@@ -54,5 +54,5 @@ def _unit(stage: str, scene: str, options: Mapping[str, Any]) -> str:
 
 
 def say(sentence: str) -> None:
-    """Print a sentence to standard error at once."""
+    """Print a sentence to standard error without buffering."""
     print(sentence, file=sys.stderr, flush=True)

@@ -21,15 +21,16 @@ COUNTS = (
 KEYS = (*NAMES, *COUNTS)  # all other columns are metrics
 UNCERTAINTY = ("coverage_pct", "half_width_mm")  # metrics of 90 % intervals, for methods that give an uncertainty
 ALL_SKINS = ""  # value in column `skin` of a row for all skins that a network was tested on
-AS_LABELLED, REGISTERED = "as_labelled", "registered"  # column `places`; registered: one offset per board, a diagnosis
+# Values of column `places`; registered: positions are corrected by one offset per board, estimated from its labels.
+AS_LABELLED, REGISTERED = "as_labelled", "registered"
 METHODS = {
     "triplet": "network + triplet",
     "adapt": "network, adapted",
-}  # names of methods by experiment; others: "network"
-CONFIDENCE = 0.95  # of intervals; convention
+}  # names of methods by experiment; "network" for all other experiments
+CONFIDENCE = 0.95  # confidence level of intervals; convention
 PERCENTAGES = ("accuracy_pct", "coverage_pct")  # metrics between 0 and 100
 AT_MOST_1 = ("r2_f", "cosine_mean", "explained_median")  # metrics that are at most 1
-DECIMALS = 12  # decimals of differences in %, mm2 or N2; further ones are rounding errors of float sums
+DECIMALS = 12  # differences in %, mm2 or N2 are rounded to these; further decimals are rounding errors
 BOARDS_MIN = 4  # fewest boards for an interval; with fewer, the values of the boards are given
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "undecided"
 FEW_BOARDS = f"not judged (fewer than {BOARDS_MIN} boards)"
@@ -44,7 +45,8 @@ VERDICTS = (
 
 Cards = Sequence[Mapping[str, Any]]
 Values = Sequence[float] | Float[np.ndarray, " n"] | pd.Series
-# mean and n; if n > 1, sd; for boards also ci95 ([low, high]), or the `values` of the boards if there are few
+# Keys `mean` and `n`; also `sd` if n > 1. If the values belong to boards, also `ci95` ([low, high]), or `values` (one
+# value per board) if there are few boards.
 Stat = Mapping[str, Any]
 
 
@@ -74,7 +76,8 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
         for point in experiment_points
     ]
     rows = [dict.fromkeys(NAMES, "") | row for keys, scores in keyed for row in _rows(keys, scores)]
-    groups: dict[Hashable, list[dict[str, Any]]] = {}  # rows for all skins: from one network, or from one per skin
+    # Joint rows by fold and seed: one row, or several if networks are adapted to one skin each.
+    groups: dict[Hashable, list[dict[str, Any]]] = {}
     for row in (row for row in rows if row["skin"] == ALL_SKINS):
         groups.setdefault(tuple(row.get(key) for key in KEYS if key != "rows_n"), []).append(row)
     kept = [*map(_pool, groups.values()), *(row for row in rows if row["skin"] != ALL_SKINS)]
@@ -109,7 +112,7 @@ def _rows(keys: Mapping[str, Any], scores: Mapping[str, Any]) -> list[dict[str, 
 
 
 def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Pool the scores of the networks of one fold and seed, weighted by the number of rows that each was tested on."""
+    """Average the scores of the networks of one fold and seed, weighted by the number of test rows of each network."""
     rows_n = np.array([row["rows_n"] for row in rows])
     known = [name for name in (*METRICS, *TRUTH) if all(name in row for row in rows)]
     parts = {name: np.array([row[name] for row in rows]) for name in known}
@@ -122,7 +125,7 @@ def _pool(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def to_csv(table: pd.DataFrame) -> str:
-    """Write the table as CSV with six significant digits, as in numbers.json."""
+    """Return the table as CSV text with six significant digits, as in numbers.json."""
     return table.convert_dtypes().to_csv(index=False, float_format="%.6g")
 
 
@@ -150,7 +153,9 @@ def records(rows: pd.DataFrame) -> dict[str, dict[str, float]]:
 
 
 def tally(trainings: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Count training runs: all, those that collapsed, and the collapsed ones kept because every repeat collapsed.
+    """Count training runs: all, those that collapsed, and collapsed runs that were kept because every repeat collapsed.
+
+    A training run has collapsed if the output of its network is nearly constant.
 
     >>> tally([{"collapsed": False, "collapsed_before_n": 1}, {"collapsed": True, "collapsed_before_n": 2}])
     {'trainings_n': 5, 'collapsed_n': 4, 'kept_collapsed_n': 1}
@@ -244,7 +249,10 @@ def statistic(values: Values, *, boards: bool = False, metric: str = "") -> dict
 
 
 def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = False) -> dict[str, dict[str, Any]]:
-    """Summarise each column over its known values; `differences`: the columns are not bounded as metrics are."""
+    """Summarise each column over its values that are not NaN.
+
+    differences: whether the columns are differences of metrics, which do not have the bounds of the metrics.
+    """
     known = {str(name): units[name].dropna().to_numpy() for name in units}
     return {
         name: statistic(values, boards=boards, metric="" if differences else name)
@@ -256,7 +264,8 @@ def summarise(units: pd.DataFrame, *, boards: bool = False, differences: bool = 
 def over_units(rows: pd.DataFrame, *unit: str, boards: bool = False) -> dict[str, dict[str, Any]]:
     """Summarise every metric over units, which are the groups of rows with equal values in the columns `unit`.
 
-    The value of a unit is the mean of its rows. `sd_seeds` is the mean sd within a unit; several boards do not get it.
+    The value of a unit is the mean of its rows. `sd_seeds`, the mean standard deviation within a unit, is added unless
+    the units are several boards.
     """
     groups = rows.groupby(list(unit))[_metrics(rows)]
     summary = summarise(groups.mean(), boards=boards)
@@ -366,10 +375,10 @@ def summarise_differences(by_board: pd.DataFrame) -> dict[str, Any]:
 
 
 def paired_with_single(method: pd.DataFrame, single: pd.DataFrame) -> dict[str, Any]:
-    """Summarise, like `paired`, the difference between a method and networks of one skin on their test skins.
+    """Summarise the difference between `method` and `single`, networks of one skin, on the test skins of `single`.
 
-    Boards and the training skins of the networks of one skin are both samples, so the interval and `p` use
-    `two_way_error`.
+    The result is like that of `paired`, but the interval and `p` use `two_way_error`, because both the boards and the
+    training skins of `single` are samples.
     """
     theirs = single.groupby(["fold", "board", "skin"])[_metrics(single)].mean()
     ours, skins = _skin_means(method), pd.MultiIndex.from_tuples([pair[1:] for pair in theirs.index])
@@ -397,7 +406,7 @@ def _unpaired(skins: Sequence[Any]) -> SchemaError:
 
 
 def negate(stat: Stat) -> dict[str, Any]:
-    """Change the sign of a difference."""
+    """Change the sign of a difference: its mean, its values and its interval."""
     negative = {**stat, "mean": -stat["mean"]}
     negative |= {"values": [-value for value in stat["values"]]} if "values" in stat else {}
     return negative | ({"ci95": [-end for end in reversed(stat["ci95"])]} if "ci95" in stat else {})
@@ -407,7 +416,7 @@ def negate(stat: Stat) -> dict[str, Any]:
 
 
 def verdict(stat: Stat, *, above: float = 0.0) -> str:
-    """Judge by its interval whether a mean over boards is above a threshold."""
+    """Judge from the 95 % interval whether a mean over boards is above a threshold."""
     if "ci95" not in stat:
         return FEW_BOARDS
     low, high = stat["ci95"]
@@ -415,7 +424,7 @@ def verdict(stat: Stat, *, above: float = 0.0) -> str:
 
 
 def verdict_within(stat: Stat, margin: float) -> str:
-    """Judge by its interval whether a mean over boards is nearer to 0 than `margin` (equivalence)."""
+    """Judge from the 95 % interval whether a mean over boards is nearer to 0 than `margin` (equivalence)."""
     if "ci95" not in stat:
         return FEW_BOARDS
     low, high = stat["ci95"]

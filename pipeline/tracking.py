@@ -29,11 +29,12 @@ ARTIFACTS = "mlartifacts"
 LOADER = "pipeline.pyfunc"
 PARENT = "mlflow.parentRunId"
 LAYOUT = 2  # version of the content of MLflow runs; runs of older versions are written again
-METRICS_MAX_N = 1000  # in one call to MLflow
-TIMEOUT_S = 2.0
-LOCK_TIMEOUT_S = 5.0  # UIs and other writers lock the store for a much shorter time
-PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for all writing; a local server takes 0.1 s per run
-# Run times and provenance, and values that other MLflow runs contain.
+METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
+TIMEOUT_S = 2.0  # for the answer of an HTTP server
+LOCK_TIMEOUT_S = 5.0  # for a locked SQLite store; UIs and other writers lock it for a much shorter time
+PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for writing all runs; a local server takes 0.1 s per run
+# Keys of numbers.json that are not metrics of the report's run: run times, provenance, and values that other MLflow
+# runs contain.
 NOT_METRICS = {"provenance", "runtime", "described", "variants"}
 
 # A point of a sweep or experiment: the name of its curve, its step (a number of pokes, skins, ...), and means by name.
@@ -92,9 +93,8 @@ def _probe_sqlite(file: str) -> None:
 def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene: str, root: Path) -> dict[str, int]:
     """Write every training run and the report of a scene to MLflow, each once.
 
-    A sweep or an experiment is one MLflow run with metrics by step, because hundreds of child runs would hide others.
-    Tag `current` marks the runs of the current results. Restored results that are already in MLflow are tagged again
-    but not written again.
+    A sweep or an experiment is one MLflow run with metrics by step, because hundreds of child runs would hide the
+    other runs. Tag `current` marks the runs of the current results. Results that are in MLflow already are only tagged.
 
     Parameters
     ----------
@@ -110,7 +110,8 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
     Returns
     -------
     dict
-        Numbers of new and kept training runs, and of superseded MLflow runs.
+        Numbers of training runs that were written (`new_n`) and that MLflow had already (`kept_n`), and of MLflow runs
+        that are no longer current (`superseded_n`).
 
     Raises
     ------
@@ -134,9 +135,9 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
 
 
 class Publisher:
-    """Writes the MLflow runs of one scene, each once, and remembers the keys of the current ones.
+    """Writes the MLflow runs of one scene, each once, and remembers the keys of the runs of current results.
 
-    The tag `run_key` is a digest of a run's content, and identifies the run.
+    The tag `run_key`, a digest of a run's content, identifies the run.
     """
 
     def __init__(self, client: Any, scene: str, root: Path, *, runs_n: int) -> None:
@@ -148,7 +149,7 @@ class Publisher:
         self.end_s = time.monotonic() + self.limit_s
 
     def find(self, stage: str, **tags: str) -> Any:
-        """Find a stage's newest run with these tags; None if there is none."""
+        """Return a stage's newest run with these tags; None if no run has them."""
         query = " and ".join(f"tags.{name} = '{value}'" for name, value in {"stage": stage, **tags}.items())
         runs = self.client.search_runs([self.experiment_id], query, max_results=1)
         return runs[0] if runs else None
@@ -177,13 +178,13 @@ class Publisher:
         return str(run.info.run_id), True
 
     def set_tags(self, run: Any, tags: Mapping[str, str]) -> None:
-        """Set the tags of a run whose values have changed."""
+        """Set those tags of a run whose values differ from `tags`."""
         for name, value in tags.items():
             if run.data.tags.get(name) != value:
                 self.client.set_tag(run.info.run_id, name, value)
 
     def log(self, run_id: str, rows: Iterable[tuple[str, float, int]], params: Mapping[str, Any] | None = None) -> None:
-        """Write metrics (name, value, step) and parameters."""
+        """Write metrics, given as rows (name, value, step), and parameters to a run."""
         from mlflow.entities import Metric, Param
 
         metrics = [Metric(name, value, 0, step) for name, value, step in rows]
@@ -226,7 +227,7 @@ class Publisher:
         self.client.log_inputs(run_id, datasets=_datasets(card))
         for artifact in (file, file.with_suffix(".safetensors")):
             self.client.log_artifact(run_id, str(artifact), "model")
-        # File MLmodel names the loader and the weights. It is a YAML file; JSON is valid YAML.
+        # File MLmodel names the loader and the file of the weights. MLflow reads it as YAML; JSON is valid YAML.
         flavor = {"python_function": {"loader_module": LOADER, "data": f"{file.stem}.safetensors"}}
         about = {"artifact_path": "model", "flavors": flavor, "run_id": run_id}
         self.client.log_text(run_id, json.dumps(about, indent=2), "model/MLmodel")
@@ -242,10 +243,10 @@ class Publisher:
             self.client.set_terminated(run_id)
 
     def write_report(self, reports: Path) -> None:
-        """Write the report's numbers and files; its key covers numbers, figures and tables, but not costs.
+        """Write the report's numbers and files to a run, whose key covers numbers, figures and tables, but not costs.
 
-        Tag `inputs` identifies the results that the report shows. If these were restored without the report
-        (`dvc checkout` does not restore reports), the report that was written with them is the current one.
+        Tag `inputs` identifies the results that a report shows. If earlier results were restored without their report
+        (`dvc checkout` does not restore reports), the run of their report becomes the current one again.
         """
         inputs = _digest(sorted(self.current))
         earlier = self.find("report", inputs=inputs)
@@ -265,11 +266,14 @@ class Publisher:
             if unwritten:
                 self.log(run_id, metrics)
             self.client.set_tag(run_id, "inputs", inputs)
-            self.client.log_artifacts(run_id, str(reports))  # always: page texts and costs may have changed
+            self.client.log_artifacts(run_id, str(reports))  # always, because page texts and costs may have changed
             self.client.set_terminated(run_id)
 
     def mark_superseded(self) -> int:
-        """Tag the runs that are no longer current, so that `tags.current = 'true'` shows each result once."""
+        """Set tag `current` of superseded runs to false, so that `tags.current = 'true'` shows each result once.
+
+        Return the number of these runs.
+        """
         marked_n, token = 0, None
         while True:
             page = self.client.search_runs(
@@ -285,7 +289,7 @@ class Publisher:
 
 
 def run_key(card: Mapping[str, Any]) -> str:
-    """Return a digest of a card without its commit: equal results of two commits are the same run."""
+    """Return a digest of a card without its commit, so that equal results of two commits are the same run."""
     return _digest({name: value for name, value in card.items() if name != "git"} | {"published_as": LAYOUT})
 
 
@@ -296,13 +300,13 @@ def _digest(value: Any) -> str:
 @contextmanager
 def _client(uri: str) -> Iterator[Any]:
     """Yield a client with short time-outs, whose errors are raised as `TrackingUnavailable`."""
-    # Set before the import, because MLflow reads these once. Without limits, each call to a dead server takes minutes.
+    # MLflow reads these variables once, when it is imported. Without limits, a call to a dead server takes minutes.
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "10")
     os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
     import logging
 
-    # Errors are raised as one sentence. MLflow would also log a traceback, which would hide that sentence.
+    # Errors are raised as one sentence. Tracebacks that MLflow would log as well would hide that sentence.
     levels = {"alembic": "WARNING", "mlflow": "WARNING", "mlflow.store.db.utils": "CRITICAL"}
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
@@ -325,7 +329,7 @@ def _experiment(client: Any, scene: str, root: Path) -> str:
     if existing is not None:
         return str(existing.experiment_id)
     location = None if server_uri() else (root / ARTIFACTS / scene).resolve().as_uri()
-    # The kind makes the UI show training runs, not chats.
+    # With this kind of experiment, the UI shows training runs instead of chats.
     kind = {"mlflow.experimentKind": "custom_model_development"}
     return str(client.create_experiment(scene, artifact_location=location, tags=kind))
 

@@ -2,10 +2,10 @@
 
 =====================================  ==========================================================
 `open`                                 read contacts from a board as they happen
-`record`, `lifted`, `touch`            record a board while a program moves a robot
-`load_universal`                       the universal model, to be calibrated to any skin
+`record`, `lifted`, `touch`            record a board, with labels from a robot's program
+`load_universal`                       the universal model, which can be calibrated to any skin
 `load_model`, `Model`                  a trained network
-`load_rows`                            ingested readings, in the form that networks are trained on
+`load_rows`                            contact readings, as training data for networks
 `draw_skin`, `draw_board`              simulated skins and boards
 `simulate_pokes`, `Pokes`              indentations of a simulated skin
 =====================================  ==========================================================
@@ -16,14 +16,14 @@
     >>> b_uT.shape
     (1, 15)
 
-Public names are imported when they are first used, so that `import reskin` is quick.
+The modules behind these names are imported at the first use of a name, so that `import reskin` is quick.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from reskin.numerics import pin
 
-pin()  # before any module of the package imports NumPy
+pin()  # must run before NumPy is imported
 
 if TYPE_CHECKING:
     from reskin.api import (

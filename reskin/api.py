@@ -1,8 +1,8 @@
 """The public functions and classes of `reskin`, for notebooks and robot programs.
 
-They take names and plain values and return NumPy arrays. Names end in units: mm, N, s, uT. The channels of a field are
-Bx, By, Bz of chip 0, then of chip 1, and so on. Each function imports what it needs when it is called, so that
-`import reskin` is quick.
+The functions take names and plain values and return NumPy arrays. The names of arguments and results end in their
+units: mm, N, s, uT. The channels of a field are Bx, By, Bz of chip 0, then of chip 1, and so on. Each function imports
+its dependencies when it is called, so that `import reskin` is quick.
 """
 
 from __future__ import annotations
@@ -36,19 +36,20 @@ NOMINAL_BOARD = "rigid"
 
 
 def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
-    """Load the contact readings that networks are trained on.
+    """Load ingested contact readings, as training data for networks.
 
     Parameters
     ----------
     folder : path
         A folder of ingested readings (Parquet), such as `data/indentations/quick` after `dvc repro`.
     force_min_N : float
-        Leave out readings with a smaller normal force.
+        Readings with a normal force below this value are left out.
 
     Returns
     -------
     Rows
-        `db_uT` [f ch] is the field change; `target` [f 3] is x_mm, y_mm and Fz_N; `board` and `skin` [f] are names.
+        For f readings: `db_uT` [f ch] is the field change from the no-load reading; `target` [f 3] is x_mm, y_mm and
+        Fz_N; `board` and `skin` [f] are the names of each reading's board and skin.
 
     Raises
     ------
@@ -81,13 +82,13 @@ def draw_board(name: str = "b0", *, seed: int = 0, spreads: Changes | None = Non
     spreads : mapping, optional
         Board-to-board standard deviations that replace the nominal ones, such as `{"chip_offset_uT": 0.0}`.
     **design
-        Settings that replace those of the nominal board: `chips_xy_mm` [[x, y], ...] relative to the skin's centre,
-        `chips_turn_deg` [angle, ...], `gap_mm`.
+        Settings that replace those of the nominal board: `chips_xy_mm` [[x, y], ...] (positions relative to the skin's
+        centre), `chips_turn_deg` [angle, ...] (rotations in the plane of the board), `gap_mm` (between chips and skin).
 
     Returns
     -------
     Board
-        `chips_m` [k 3] is the position of each chip.
+        `chips_m` [k 3] is the position of each chip in m.
 
     Raises
     ------
@@ -122,8 +123,8 @@ def draw_skin(name: str = "b0_s0", *, seed: int = 0, spreads: Changes | None = N
     Returns
     -------
     Skin
-        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the positions and moments of the dipoles that represent its
-        magnetisation.
+        `nodes_m` [s 3] and `moments_A_m2` [s 3] are the positions and moments of the dipoles that represent the
+        skin's magnetisation.
 
     Raises
     ------
@@ -162,16 +163,16 @@ class Pokes(NamedTuple):
 def simulate_pokes(
     skin: Skin, pokes: ArrayLike, *, board: Board | None = None, seed: int = 0, chip: Changes | None = None
 ) -> Pokes:
-    """Simulate indentations of a fresh skin: what the chips read, and the normal force.
+    """Simulate the chip readings and the normal force for indentations of a skin without wear.
 
-    Ageing and friction are not simulated here; some protocols of the pipeline include them.
+    Ageing and friction are not simulated.
 
     Parameters
     ----------
     skin : Skin
         A skin from `draw_skin`.
     pokes : array [n 3]
-        x_mm, y_mm and depth_mm of each indentation (n may be 0); the centre of the skin is at (8, 8) mm.
+        x_mm, y_mm and depth_mm of n indentations; n may be 0. The centre of the skin is at (8, 8) mm.
     board : Board, optional
         The board under the skin, from `draw_board`; the nominal board if not given.
     seed : int
@@ -182,12 +183,12 @@ def simulate_pokes(
     Returns
     -------
     Pokes
-        `noload_uT` and `b_uT` [n ch], and `Fz_N` [n].
+        Fields before (`noload_uT` [n ch]) and during (`b_uT` [n ch]) each indentation, and normal forces `Fz_N` [n].
 
     Raises
     ------
     ParamsError
-        If `pokes` has a different shape or a setting is invalid.
+        If `pokes` does not have shape [n 3], or a setting is invalid.
 
     Examples
     --------
@@ -225,12 +226,12 @@ def simulate_pokes(
 class Model:
     """A trained network, as `load_model` returns it.
 
-    First call `zero` with readings without contact, then `predict`.
+    First call `zero` with readings that were taken without contact, then `predict`.
 
     Attributes
     ----------
     card : mapping
-        The model's JSON card: what it was trained on, and how.
+        The model's JSON card: training data, recipe, inputs and outputs.
     """
 
     def __init__(self, network: Network) -> None:
@@ -247,7 +248,7 @@ class Model:
         Parameters
         ----------
         b_uT : array [f ch] or [ch]
-            Fields without contact; `predict` subtracts their mean.
+            Fields measured without contact; `predict` subtracts their mean.
 
         Returns
         -------
@@ -263,12 +264,12 @@ class Model:
         return self
 
     def predict(self, b_uT: ArrayLike) -> np.ndarray:
-        """Predict place and normal force.
+        """Predict the place and the normal force of a contact.
 
         Parameters
         ----------
         b_uT : array [f ch] or [ch]
-            Fields in contact. Without contact the field change is only noise, and the prediction is meaningless.
+            Fields measured in contact. For fields without contact, the prediction is meaningless.
 
         Returns
         -------
@@ -283,15 +284,15 @@ class Model:
             If the number of channels differs from the model's.
         """
         if self._noload_uT is None:
-            raise ParamsError("predict: the model has no no-load reading. First call zero with fields without contact.")
+            raise ParamsError("predict: the no-load reading is missing. First call zero with fields without contact.")
         rows_uT = self._rows(b_uT)
         predicted = self._network((rows_uT - self._noload_uT).astype(np.float32))
         return predicted if np.ndim(b_uT) == 2 else predicted[0]
 
     def export_onnx(self, file: Path | str) -> None:
-        """Write the network as an ONNX file: its input is field changes in uT, its output x_mm, y_mm and F_N.
+        """Write the network as an ONNX file whose input is field changes in uT, and whose output is x_mm, y_mm and F_N.
 
-        Needs the package onnx (`pip install '.[onnx]'`).
+        Requires the package onnx (`pip install '.[onnx]'`).
         """
         from reskin.models import trained
 
@@ -313,7 +314,7 @@ def load_model(file: Path | str) -> Model:
     Parameters
     ----------
     file : path
-        The weights (.safetensors). The JSON card of the same name must be in the same folder.
+        The weights (.safetensors). The model's JSON card must be beside it, with the same name and suffix .json.
 
     Returns
     -------
@@ -336,16 +337,16 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal(calibration: Path | str | None = None) -> Universal:
-    """Load the universal model that comes with the library. It needs no recordings of the skin.
+    """Load the universal model that comes with the library; it predicts for a new skin without training data from it.
 
-    Its methods calibrate it to a skin: `zero` takes readings without contact, `see` takes presses at unknown places,
-    and `label` takes presses at known places. `next_place` proposes where to press next, and `save` writes the
-    calibration.
+    Its methods calibrate the model to a skin: `zero` accepts readings without contact, `see` accepts presses at unknown
+    places, and `label` accepts presses at known places. `next_place` proposes where to press next, and `save` writes
+    the calibration to a file.
 
     Parameters
     ----------
     calibration : path, optional
-        A file that `save` wrote; its calibration is continued.
+        A calibration file that `save` wrote; the returned model continues from this calibration.
 
     Returns
     -------
@@ -373,18 +374,19 @@ def open(port: str, *, model: AnyModel = (), baud: int = 115200) -> LiveSkin: ..
 @overload
 def open(port: list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkins: ...
 def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> LiveSkin | LiveSkins:
-    """Open a board's port, to read contacts as they happen.
+    """Read contacts live from one or more boards; use the result in a `with` statement.
 
-    The `with` statement opens the port, detects wire format and chips, and takes the no-load reading: nothing may touch
-    the skin in the first second. A thread reads the port, so that no bytes are lost when your loop is slow.
+    The `with` statement opens the port, detects the wire format and the number of chips, and measures the no-load
+    reading: nothing may touch the skin in the first second. A background thread reads the port, so that no bytes are
+    lost when your loop is slow.
 
     Parameters
     ----------
     port : str or list of str
         A serial port or `socket://host:port`; a list for several boards at once.
     model : optional
-        One or more trained networks (files or `Model` objects), or one universal model (a calibration file, or an
-        object, which is not modified). Default: the uncalibrated universal model.
+        One or more trained networks (files or `Model` objects), or one universal model (a calibration file or a
+        `Universal` object; the object is not modified). Default: the uncalibrated universal model.
     baud : int
         Baud rate; USB ports ignore it.
 
@@ -392,14 +394,15 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
     -------
     LiveSkin or LiveSkins
         Iteration yields the latest `Contact`: time, place, force, standard deviation of the place, field, alarms.
-        `every()` yields a contact for each reading. With a list of ports, iteration yields tuples of contacts, in the
-        order of the ports; an unplugged board does not delay the others.
+        If your loop is slow, older contacts are skipped; `every()` yields a contact for each reading instead. With a
+        list of ports, iteration yields tuples of contacts, in the order of the ports; an unplugged board does not delay
+        the others.
 
     Raises
     ------
     ReskinError
-        If a model cannot be read or a port is named twice; in the `with` statement, if a port cannot be opened or sends
-        no frames, or if the board's number of chips does not match the model.
+        If a model cannot be read or a port is listed twice. In the `with` statement: if a port cannot be opened or
+        sends no frames, or if the board's number of chips does not match the model.
 
     Examples
     --------
@@ -417,7 +420,7 @@ def open(port: str | list[str], *, model: AnyModel = (), baud: int = 115200) -> 
 
 
 def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
-    """Return trained networks, in the given order, or one universal model."""
+    """Load the models that are given as files; return all networks in the given order, or one universal model."""
     from reskin.predicting import read_models
     from reskin.universal.model import Universal
 
@@ -439,7 +442,7 @@ def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
 
 
 def lifted() -> Label:
-    """Return the label of an untouched board, for `record`. One such label must come before each touch."""
+    """Return the label for `record` that nothing touches the skin. One such label must come before each touch."""
     from reskin.recordings.labels import Label
 
     return Label(False)
@@ -455,16 +458,16 @@ def touch(
     Fz_N: float = math.nan,
     pass_i: int = 0,
 ) -> Label:
-    """Return the label of a stationary touch, for `record`.
+    """Return the label for `record` that the robot touches the skin and does not move.
 
     Parameters
     ----------
     x_mm, y_mm : float
-        The place of the touch.
+        Place of the touch.
     depth_mm, Fx_N, Fy_N, Fz_N : float, optional
-        Depth, and forces on the skin (Fz positive in compression); NaN where unknown.
+        Indentation depth, and force on the skin (Fz positive in compression). Default: NaN, for unknown values.
     pass_i : int
-        Number of the pass over all places.
+        If all places are touched repeatedly: number of the repetition, from 0.
 
     Examples
     --------
@@ -487,42 +490,43 @@ def record(
     skin: str | None = None,
     scan: str | None = None,
 ) -> Path:
-    """Record a board while a program moves a robot and reports its position.
+    """Record a board while a program moves a robot and labels the contacts.
 
-    Prints a summary to stderr: what was recorded, lost and left out.
+    Prints a summary to stderr: the amounts of data that were recorded, lost and left out.
 
     Parameters
     ----------
     labels : iterable or callable
-        Yields `lifted()` or `touch(...)` once the robot has stopped. A callable is called for each label, until it
-        returns None.
+        Yields `lifted()` or `touch(...)` each time the robot has stopped. A callable is called for each label, until
+        it returns None.
     port : str, optional
-        The board's port; if not given, the only board that is connected.
+        The board's port. Default: the port of the only connected board.
     out : path, optional
-        The capture's folder, which must be new; `captures/DATE-TIME` if not given.
+        Folder to create for the capture. Default: `captures/DATE-TIME`.
     seconds : float
-        Maximum duration.
+        Maximum duration of the recording.
     dwell_s : float
-        How long each label is valid; the next label is requested after this time.
+        Time for which each label is valid; the next label is requested after this time.
     board, skin, scan : str, optional
-        For the header: names of the board and the skin, and the order of places (random, snake or a description).
+        Written to the capture's header: names of the board and the skin, and the order in which places are touched
+        (random, snake or a description).
 
     Returns
     -------
     Path
-        The capture's folder, for `reskin add`.
+        The capture's folder, which `reskin add` accepts.
 
     Raises
     ------
     ReskinError
         If no board is detected, or it sends no frames.
     Exception
-        Any exception that the program raises; what was recorded until then is kept.
+        Any exception from `labels`; the data that were recorded before it are kept.
 
     Examples
     --------
     >>> def presses():
-    ...     for x_mm, y_mm in places:  # in random order, because a skin remembers the last touch
+    ...     for x_mm, y_mm in places:  # in random order, because the last touch affects the next one
     ...         robot.lift_and_go_to(x_mm, y_mm)
     ...         yield reskin.lifted()
     ...         robot.press()

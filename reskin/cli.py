@@ -1,7 +1,7 @@
-"""The `reskin` command: ports, template, record, emulate, live, decode, predict.
+"""The `reskin` command, with the subcommands ports, template, record, emulate, live, decode and predict.
 
-In a checkout of the project the commands of `pipeline.cli` are added. Each command imports what it needs when it runs,
-so that `reskin --help` is quick.
+In a checkout of the project, the subcommands of `pipeline.cli` are added. Each command imports its dependencies when it
+runs, so that `reskin --help` is quick.
 """
 
 import importlib
@@ -19,7 +19,7 @@ from typer import Argument, Option
 
 from reskin.errors import ParamsError, ReskinError, explaining
 
-CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`, listed here for help and errors outside a checkout
+CHECKOUT_COMMANDS = (  # commands of `pipeline.cli`; named in help and error texts outside a checkout
     "add", "check-cache", "compare", "fetch", "merge", "publish", "readme", "remove", "scenes", "verify-reports",
 )  # fmt: skip
 
@@ -28,7 +28,7 @@ BOARD, RECORDINGS, PIPELINE, MAINTENANCE = (
     "Recordings",
     "Pipeline",
     "Maintenance",
-)  # groups of commands in `reskin --help`
+)  # titles of command groups in `reskin --help`
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -43,12 +43,12 @@ Chips = Annotated[int, Option("--chips", help="Number of chips in a frame.", min
 SOURCE = "A capture folder, `nominal` (a simulated skin), or the YAML file of a simulated scene."
 ON_FAULT = (
     "NAME=flag keeps the estimates of readings with that fault, such as stuck=flag; NAME=drop hides them. May be "
-    "repeated. Names: params.yaml, section faults."
+    "repeated. The names are listed in params.yaml, section faults."
 )
-LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM, to be prompted for places; or a CSV that a robot's program appends to."
+LABELS = "grid:NXxNY:STEP_MM or line:N:STEP_MM: prompts for each place. Or a CSV to which a robot's program appends."
 SCAN = (
     "Order in which places are pressed. With prompts (--labels grid, line): random (default) or snake; otherwise any "
-    "note, which is kept in the header."
+    "note, which is written to the header."
 )
 GAUGE = "Port of a force gauge that sends lines of Fz, or Fx Fy Fz, in N; PORT@BAUD if its rate is not 9600."
 FAULT = (
@@ -56,13 +56,14 @@ FAULT = (
     "saturated, int16-wrap, magnet, too-hot, crlf, clock-jump, repeated, dropped, torn, wrong-baud, stall, unplug."
 )
 MODEL = "A trained model (.safetensors with its JSON card) or a saved calibration. Default: the universal model."
-LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), or what `record` or `decode` wrote (folder, file)."
+LOG = "An SD card's log (t_s,T0,Bx0,By0,Bz0,T1,...; degC, uT), a folder from `record`, or a file from `decode`."
 
 
 def main() -> None:
-    """Run the command; print user errors without a traceback."""
+    """Run the `reskin` command; print a `ReskinError` without a traceback."""
     try:
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that `finally` and `with` clean up
+        # Exit status 128 + SIGTERM; `sys.exit` raises SystemExit, so that `finally` and `with` blocks clean up.
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         with explaining("reskin"):
             add_checkout_commands()
             app()
@@ -76,7 +77,7 @@ def fail(error: ReskinError) -> NoReturn:
 
 
 def add_checkout_commands() -> None:
-    """Add the commands of `pipeline.cli`, imported from the working directory if that is a checkout of the project."""
+    """Add the commands of `pipeline.cli` if the working directory is a checkout of the project."""
     here = Path.cwd()
     if (here / "dvc.yaml").is_file() and (here / "pipeline/cli.py").is_file():
         sys.path.insert(0, str(here))
@@ -84,8 +85,8 @@ def add_checkout_commands() -> None:
         app.info.epilog = "Stages of dvc.yaml: python -m pipeline STAGE --scene NAME ..."
     elif sys.argv[1:2] and sys.argv[1] in CHECKOUT_COMMANDS:
         raise ParamsError(
-            f"reskin {sys.argv[1]} works in a checkout of the project, a folder with dvc.yaml and pipeline/; {here} is "
-            "not one. Change to the checkout first."
+            f"reskin {sys.argv[1]} must be run in a checkout of the project, a folder with dvc.yaml and pipeline/. "
+            f"{here} is not a checkout: change to one first."
         )
 
 
@@ -106,29 +107,29 @@ def common_options(
 
 @app.command("ports", rich_help_panel=BOARD)
 def find_ports(
-    names: Annotated[list[str] | None, Argument(help="Ports to listen to. Default: all ports of this machine.")] = None,
+    names: Annotated[list[str] | None, Argument(help="Ports to search. Default: all ports of this machine.")] = None,
     hunt: Annotated[bool, Option("--hunt", help="Find the board by unplugging it and plugging it in.")] = False,
 ) -> None:
-    """Find boards: their port, wire format, number of chips, rate and scale."""
+    """Find connected boards, and print the port, wire format, number of chips, frame rate and scale of each."""
     from reskin.board import find
 
-    for found in find.scan_ports([find.find_replugged_port(typer.echo)] if hunt else names):
-        typer.echo(found)
+    for line in find.scan_ports([find.find_replugged_port(typer.echo)] if hunt else names):
+        typer.echo(line)
 
 
 @app.command(rich_help_panel=RECORDINGS)
 def template(
-    out: Annotated[Path, Argument(help="The CSV file to write; must be new.")],
+    out: Annotated[Path, Argument(help="The CSV file to write; it must not exist.")],
     chips_n: Chips = 5,
 ) -> None:
-    """Write an empty CSV for your own recording (layout `table`). Add one row per reading; see data/README.md."""
+    """Write a CSV with a header line only, to fill with your own recording: one row per reading; see data/README.md."""
     from reskin import io
     from reskin.recordings.readers.table import NEEDED, columns_of
 
     if out.exists():
         raise ParamsError(f"{out}: the file exists. Choose another name.")
     io.write_text(out, ",".join(columns_of(chips_n)) + "\n")
-    typer.echo(f"wrote {out}; required: {', '.join(NEEDED)} and fields in uT. Then: reskin add --layout table")
+    typer.echo(f"wrote {out}. Fill in {', '.join(NEEDED)} and fields in uT, then run reskin add --layout table")
 
 
 @app.command(rich_help_panel=BOARD)
@@ -149,10 +150,10 @@ def record(
     labels: Annotated[str | None, Option(help=LABELS)] = None,
     gauge: Annotated[str | None, Option(help=GAUGE)] = None,
     dwell_s: Annotated[
-        float, Option("--dwell", help="Seconds after Enter for which the label is valid.", min=0.1)
+        float, Option("--dwell", help="Time in s after Enter for which a label is valid.", min=0.1)
     ] = 1.0,
 ) -> None:
-    """Record what a board sends, with labels if requested; `reskin add` can add labels from a robot's log later."""
+    """Record a board, with labels if requested. `reskin add` can add labels from a robot's log later."""
     from reskin.board.find import DetectedBoard, find_board
     from reskin.live.record import label_source, record_board
 
@@ -160,7 +161,7 @@ def record(
     if port is None:
         if wire is not None or chips_n is not None:
             raise ParamsError(
-                "--wire and --chips describe the board on --port. Add --port, or omit them to detect both."
+                "--wire and --chips need --port. Add --port, or omit --wire and --chips to detect the board."
             )
         detected = find_board()
         typer.echo(str(detected))
@@ -177,12 +178,12 @@ def record(
 @app.command(rich_help_panel=BOARD)
 def emulate(
     source: Annotated[str, Argument(help=SOURCE)],
-    port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME of a link to a pseudo-terminal.")] = "pty",
-    speed: Annotated[float, Option(help="Multiple of the source's rate; inf: as fast as possible.", min=0.01)] = 1.0,
+    port: Annotated[str, Option(help="pty, tcp, tcp:PORT, or ./NAME (creates a link to a pseudo-terminal).")] = "pty",
+    speed: Annotated[float, Option(help="Speed relative to the source; inf: as fast as possible.", min=0.01)] = 1.0,
     fault: Annotated[list[str] | None, Option(help=FAULT)] = None,
     loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
 ) -> None:
-    """Emulate a board: send a capture or a simulation through a port, with faults if requested."""
+    """Emulate a board: send the frames of a capture or a simulation through a port, with faults if requested."""
     from reskin.live.emulator import inject, make_port, parse_fault, play, read_script
 
     faults = [parse_fault(text) for text in fault or ()]
@@ -190,7 +191,7 @@ def emulate(
     for spec in faults:
         script = inject(script, spec)
     emulated, stop = make_port(port), threading.Event()
-    typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C ends it")
+    typer.echo(f"{emulated.name}: {len(script)} frames in {script.duration_s:.1f} s, {script.wire}; Ctrl-C: stop")
     started_s = time.monotonic()
     try:
         sent_n = play(script, emulated, stop, speed=speed, loop=loop)
@@ -205,15 +206,17 @@ def emulate(
 def live(
     port: Annotated[list[str] | None, Option(help="Port of a board; may be repeated. Default: all boards.")] = None,
     model: Annotated[list[Path] | None, Option(help=f"{MODEL} The estimates of several models are averaged.")] = None,
-    replay: Annotated[str | None, Option(help="Instead of a board: a capture folder.")] = None,
-    emulate: Annotated[str | None, Option(help="Instead of a board: nominal, or a simulated scene's YAML.")] = None,
+    replay: Annotated[str | None, Option(help="Folder of a capture to play, instead of a board.")] = None,
+    emulate: Annotated[
+        str | None, Option(help="Simulation to play, instead of a board: nominal, or the YAML of a simulated scene.")
+    ] = None,
     host: Annotated[
-        str, Option(help="Address to listen on. 0.0.0.0 serves other machines; the printed address then has a token.")
+        str, Option(help="Address to listen on. 0.0.0.0: other machines can connect; the printed URL then has a token.")
     ] = "127.0.0.1",
-    http_port: Annotated[int, Option(help="Port of the page.", min=1, max=65535)] = 8765,
+    http_port: Annotated[int, Option(help="TCP port of the page.", min=1, max=65535)] = 8765,
     on_fault: Annotated[list[str] | None, Option(help=ON_FAULT)] = None,
 ) -> None:
-    """Show boards in the browser: chips, contact, force, traces and alarms."""
+    """Show boards live in the browser: chip readings, contact, force, traces and alarms."""
     from contextlib import ExitStack
 
     from reskin.board.find import find_boards
@@ -240,18 +243,18 @@ def live(
 
 @app.command(rich_help_panel=RECORDINGS)
 def decode(
-    stream: Annotated[Path, Argument(help="A file of the bytes that a port sent.")],
+    stream: Annotated[Path, Argument(help="A file with the raw bytes from a port.")],
     out: Annotated[Path, Option(help="The Parquet file to write.")],
     wire: Annotated[Wire, Option(help="Wire format.")] = "binary",
     chips_n: Chips = 5,
 ) -> None:
-    """Decode a serial dump to a table of frames, and count lost bytes."""
+    """Decode the raw bytes of a serial port to a table of frames, and count lost bytes."""
     from reskin import io
     from reskin.recordings.decode import decode_dump
 
-    table, account = decode_dump(io.read_bytes(stream), wire, chips_n, str(stream))
+    table, counts = decode_dump(io.read_bytes(stream), wire, chips_n, str(stream))
     io.write_table(out, table)
-    typer.echo(f"decoded {out}: " + ", ".join(f"{key} {count}" for key, count in account.items()))
+    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count}" for key, count in counts.items()))
 
 
 @app.command(rich_help_panel=RECORDINGS)
@@ -260,15 +263,15 @@ def predict(
     out: Annotated[Path, Option(help="The CSV to write: t_s,x_mm,y_mm,F_N,contact.")],
     model: Annotated[Path | None, Option(help=MODEL)] = None,
     rate_hz: Annotated[
-        float, Option("--rate-hz", help="Frames per second, for a `decode` file without a clock.")
+        float, Option("--rate-hz", help="Frames per second, for a file from `decode` without a clock.")
     ] = 400.0,
 ) -> None:
-    """Estimate contacts, places and forces from a log. The log must begin with 0.5 s or more without contact."""
+    """Estimate contacts, places and forces from a log that begins with at least 0.5 s without contact."""
     from reskin.predicting import predict as write
     from reskin.predicting import warnings
 
     counts = write(log, model, out, rate_hz=rate_hz)
-    typer.echo(f"predicted {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
+    typer.echo(f"wrote {out}: " + ", ".join(f"{key} {count:.6g}" for key, count in counts.items()))
     for sentence in warnings(counts):
         typer.echo(sentence)
 

@@ -1,4 +1,4 @@
-"""Digests of code: of single modules, ignoring comments and docstrings, and of whole packages."""
+"""Digests of Python code, to detect changes: of single modules without comments and docstrings, and of packages."""
 
 import ast
 import hashlib
@@ -16,10 +16,10 @@ _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
 @cache
 def digest(name: str, *, data: bool = True) -> str:
-    """Return a digest of a module: its syntax without docstrings, and data files of the same name.
+    """Return a digest of a module's syntax without docstrings and, if `data`, of its data files.
 
-    Formatting, comments and the version of Python do not change it. `page.yaml` belongs to `page.py` beside it; with
-    `data=False`, such files do not count.
+    Formatting, comments and the version of Python do not change the digest. The data files of a module have the same
+    name and are in the same folder: `page.yaml` belongs to `page.py`.
     """
     hasher = hashlib.sha256()
     for file in files_of(name) if data else [file_of(name)]:
@@ -28,18 +28,18 @@ def digest(name: str, *, data: bool = True) -> str:
 
 
 def files_of(name: str) -> list[Path]:
-    """Return the files of a module or package: its Python file, and data files of the same name beside it."""
+    """Return the Python file of a module or package, followed by data files of the same name in the same folder."""
     file, path = file_of(name), ROOT / name.replace(".", "/")
     return [file, *sorted(data for data in path.parent.glob(f"{path.name}.*") if data.suffix in DATA)]
 
 
 def normalised(file: str, content: bytes) -> bytes:
-    """Return the syntax of a Python file without comments and docstrings, and any other file as it is."""
+    """Return a Python file's syntax without comments and docstrings; return the content of other files unchanged."""
     return json.dumps(_syntax(ast.parse(content))).encode() if file.endswith(".py") else content
 
 
 def package_digest(*packages: Path, suffixes: Sequence[str] = (".py",)) -> str:
-    """Return a digest of all files of packages with these suffixes, byte by byte."""
+    """Return a digest of the bytes of all files in these folders that have one of the suffixes."""
     hasher = hashlib.sha256()
     for package in packages:
         for file in sorted(file for file in package.rglob("*") if file.suffix in suffixes):
@@ -50,9 +50,8 @@ def package_digest(*packages: Path, suffixes: Sequence[str] = (".py",)) -> str:
 def imported(*names: str) -> list[str]:
     """Return the modules of `PACKAGES` that the named modules import, directly or indirectly.
 
-    The result includes the named modules themselves and the packages that contain any of these modules.
-
-    Imports under `if TYPE_CHECKING:` do not count.
+    The result includes the named modules, and all packages that contain any of the modules. Imports under
+    `if TYPE_CHECKING:` are ignored.
     """
     modules = set(names).union(*map(_graph().find_upstream_modules, names))
     return sorted({name.rsplit(".", i)[0] for name in modules for i in range(name.count(".") + 1)})
@@ -60,20 +59,22 @@ def imported(*names: str) -> list[str]:
 
 @cache
 def _graph() -> Any:
-    import grimp  # imported late: only stages that trace imports need it
+    import grimp  # imported late, because few commands trace imports
 
     return grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True, cache_dir=None)
 
 
 def file_of(name: str) -> Path:
-    """Return the file of a module, such as `reskin.io`."""
+    """Return the file of a module such as `reskin.io`, or the `__init__.py` of a package."""
     path = ROOT / name.replace(".", "/")
     module = path.with_suffix(".py")
     return module if module.is_file() else path / "__init__.py"
 
 
 def _syntax(node: ast.AST) -> list[Any]:
-    """Convert a syntax tree to lists; empty fields are dropped, as they differ between Python versions.
+    """Convert a syntax tree to nested lists, without docstrings.
+
+    Empty fields are dropped, because Python versions differ in the empty fields that a node has.
 
     >>> same = ["x = 1", "'Say.'\\nx = (1)  # metres"]
     >>> len({json.dumps(_syntax(ast.parse(source))) for source in [*same, "x = 2"]})

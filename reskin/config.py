@@ -1,6 +1,6 @@
 """Settings: YAML files, and strict pydantic models that validate them.
 
-A settings model is frozen, allows no unknown keys and has few defaults; it is defined beside the code that uses it.
+A settings model is frozen, rejects unknown keys and has few default values. It is defined in the module that uses it.
 """
 
 import json
@@ -26,23 +26,24 @@ Model = TypeVar("Model", bound=Strict)
 
 
 def read_yaml(path: Path) -> Any:
-    """Read YAML 1.2 as DVC does (`1e-3` is a number)."""
+    """Read a YAML 1.2 file, the version that DVC uses (in YAML 1.1, `1e-3` would be text)."""
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ParamsError(f"{path}: file not found. Check the name.") from None
     except (YAMLError, UnicodeDecodeError) as error:
         problem = " ".join(str(error).split())
-        raise ParamsError(f"{path}: the file is not YAML: {problem}. Correct the line it names.") from None
+        raise ParamsError(f"{path}: the file is not YAML: {problem}. Correct the line that is named here.") from None
 
 
 def parse(model: type[Model], value: Any, where: str) -> Model:
-    """Validate plain values against a model; raise a `ParamsError` that names the wrong key and the allowed values."""
+    """Create a settings model from plain values; raise a `ParamsError` that names the wrong key and its rule."""
     try:
-        # Validated as JSON: a YAML list may then fill a tuple, but the text "3" is still not accepted for the number 3.
+        # Strict validation of Python values rejects a list for a tuple. Strict validation of JSON accepts it, but still
+        # rejects the text "3" for a number.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
-        # A misspelt key makes another key missing: report the unknown key first.
+        # A misspelt key causes two errors, an unknown and a missing key: report the unknown key.
         details = error.errors(include_url=False)
         first = min(details, key=lambda detail: detail["type"] != "extra_forbidden")
         missing = [item for item in details if item["type"] == "missing" and item["loc"][:-1] == first["loc"][:-1]]
@@ -66,7 +67,7 @@ def parse(model: type[Model], value: Any, where: str) -> Model:
 
 
 def _path_in_file(loc: Sequence[int | str], value: Any) -> list[str]:
-    """Return the keys of an error's location that are in the file; pydantic also lists the types that it tried."""
+    """Return the keys and indices that locate an error, without the names of types that pydantic adds to `loc`."""
     kept = []
     for i, part in enumerate(loc):
         known = part in value if isinstance(value, dict) else isinstance(value, list | tuple) and isinstance(part, int)

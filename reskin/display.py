@@ -7,9 +7,9 @@ import numpy as np
 
 
 def one_line(instance: Any) -> str:
-    """Return the name and fields of a dataclass, with the shapes of arrays and the types of other large values.
+    """Return the name and fields of a dataclass, with shapes for arrays and types for other objects.
 
-    Use it as `__repr__`: the default prints every number.
+    For use as `__repr__`, because the default `__repr__` prints every number of an array.
     """
     parts = (f"{field.name}={_show(getattr(instance, field.name))}" for field in fields(instance))
     return f"{type(instance).__name__}({', '.join(parts)})"

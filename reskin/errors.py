@@ -1,4 +1,4 @@
-"""Errors that a user can cause or fix, and messages for machine failures and missing packages."""
+"""Exceptions for errors that a user can fix, and their messages for machine failures and missing packages."""
 
 import errno
 from collections.abc import Iterable, Iterator
@@ -14,10 +14,10 @@ class ReskinError(ValueError):
     Parameters
     ----------
     where : object
-        If it is the only argument, the whole message: where, what is wrong, and what to try. Otherwise only the place:
-        a file with its line or byte, an option, a setting.
+        Without further arguments, the complete message. With further arguments, only the location of the error: a file
+        with the line or byte, an option, or a setting.
     what, rule, got, remedy
-        The parts of a message: what is wrong, what it must be, what it is, and what to try.
+        The other parts of the message: the wrong thing, what it must be, what it is, and what to try.
 
     Examples
     --------
@@ -34,7 +34,7 @@ class ReskinError(ValueError):
 
 
 class CaptureError(ReskinError):
-    """Bytes, headers or recordings cannot be read, or a board sends nothing."""
+    """A stream, a header or a recording cannot be read, or a board sends no data."""
 
 
 class SchemaError(ReskinError):
@@ -42,22 +42,22 @@ class SchemaError(ReskinError):
 
 
 class ParamsError(ReskinError):
-    """A setting, a scene, an option of a command or an argument is invalid."""
+    """A setting, a scene, a command-line option or an argument is invalid."""
 
 
 class TrainingError(ReskinError):
-    """Training cannot continue: there are no rows, or the loss is no longer finite."""
+    """Training cannot continue, for example because there are too few training rows."""
 
 
 class LeakError(ReskinError):
-    """Test rows of a result were also used for training."""
+    """Rows that were used for training are also test rows, so the scores would be invalid."""
 
 
 class MachineError(ReskinError):
-    """The machine failed: no disk space, no memory, no permission, or a dead worker process. Finished work is kept."""
+    """The machine failed: no disk space, memory or permission, or a worker process died. Finished work is kept."""
 
 
-EXTRAS = {  # package -> extra that installs it; the extra `pipeline` installs all others
+EXTRAS = {  # package -> extra of pyproject.toml that installs the package; `pipeline` installs all packages not listed
     "torch": "train",
     "onnx": "onnx",
     "onnxruntime": "onnx",
@@ -65,7 +65,7 @@ EXTRAS = {  # package -> extra that installs it; the extra `pipeline` installs a
     "distributed": "dask",
     "psycopg2": "team",
 }
-DISK_REMEDIES = {  # by errno
+DISK_REMEDIES = {  # errno of a disk error -> what the user can do
     getattr(errno, name): remedy
     for names, remedy in (
         ("ENOSPC EDQUOT EFBIG", "Free some disk space."),
@@ -80,7 +80,9 @@ RETRY = "Run it again: finished work is kept."
 
 @contextmanager
 def explaining(where: str) -> Iterator[None]:
-    """Turn machine failures into `MachineError`, and a missing package into `ParamsError`; pass on all other errors.
+    """Convert machine failures to `MachineError`, and a missing package to `ParamsError`; `where` starts the message.
+
+    All other exceptions are not changed.
 
     >>> with explaining("split"):
     ...     raise OSError(errno.ENOSPC, "No space left on device", "data/folds/lab.json")
@@ -109,7 +111,7 @@ Run it again: finished work is kept.
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """Return a space and a question with the most similar known name; empty if no name is similar.
+    """Return " Did you mean ...?" with the known name that is most similar to `name`, or "" if none is similar.
 
     >>> did_you_mean("stuk", ["zeros", "stuck"])
     ' Did you mean stuck?'
@@ -119,12 +121,12 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def require(package: str, where: object) -> None:
-    """Raise `ParamsError` if an optional package is not installed; call this before long computations."""
+    """Raise `ParamsError` if an optional package is not installed. Call it before a long computation."""
     if find_spec(package) is None:
         raise missing_package(package, where)
 
 
 def missing_package(package: str, where: object) -> ParamsError:
-    """Return the error for a missing package; it names the extra that installs the package."""
+    """Create the error for a missing package, with the command that installs the package."""
     extra = EXTRAS.get(package, "pipeline")
     return ParamsError(f"{where}: package {package} is not installed. In the checkout: pip install '.[{extra}]'")

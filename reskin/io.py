@@ -1,4 +1,7 @@
-"""Read and write Parquet, safetensors, JSON and text files (every write is atomic), and cache computed arrays."""
+"""Read and write Parquet, safetensors, JSON and text files, and cache computed arrays.
+
+Files are written under a temporary name and then renamed, so that an interrupted write leaves no partial file.
+"""
 
 import errno
 import hashlib
@@ -25,8 +28,8 @@ from reskin.numerics import signature
 from reskin.schema import Readings, arrow_schema, from_table, to_table
 
 COUNTS_KEY = b"reskin.account"
-DIGEST = "digest"  # in the metadata of a safetensors file
-HEADER_AT = 8  # a safetensors file begins with the length of its header, in this many bytes
+DIGEST = "digest"  # key in the metadata of a safetensors file
+HEADER_AT = 8  # byte at which the header of a safetensors file starts; the bytes before are its length
 REMEDY = (
     "It was cut or changed. If `dvc repro` wrote it, delete it, then run `reskin check-cache` and `dvc repro`. "
     "Otherwise copy it again."
@@ -37,12 +40,12 @@ MACHINE_ERRNOS = {
     errno.EMFILE,
     errno.ENFILE,
     errno.ESTALE,
-}  # with these errors, the file may be intact
+}  # errors for which the file itself may be intact
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` for a file or folder, and rename it to `path` when the block succeeds."""
+    """Yield a temporary path in the folder of `path`, for a new file or folder; rename it to `path` on success."""
     make_folder(path.parent)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -55,23 +58,24 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.replace(path)
     except BaseException as error:
         if isinstance(error, OSError) and error.errno in DISK_REMEDIES and _is_written(error, temporary):
-            error.filename = str(path)  # not the temporary name
-        with suppress(OSError):  # the first error is reported
+            error.filename = str(path)  # report the final name instead of the temporary name
+        with suppress(OSError):  # a second error must not hide the first
             remove(temporary)
         raise
 
 
 def _is_written(error: OSError, temporary: Path) -> bool:
-    """Return whether an error concerns the file being written, and not a file that is read at the same time."""
-    if error.filename is None:  # from an open stream; EIO may come from reading or from writing
+    """Return whether an error concerns the file being written, and not another file that is read in the same block."""
+    if error.filename is None:  # the error is from an open stream; EIO may be an error of reading or of writing
         return error.errno != errno.EIO
-    names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)  # copyfile gives both
+    # An error of `shutil.copyfile` contains both file names.
+    names = (error.filename,) if error.errno == errno.EIO else (error.filename, error.filename2)
     return any(str(temporary) in str(name) for name in names)
 
 
 @contextmanager
 def restoring(*files: Path) -> Iterator[None]:
-    """Restore the content of files if the block fails or is interrupted."""
+    """Restore the content that files had before the block, if the block fails or is interrupted."""
     contents = {file: file.read_bytes() for file in files}
     try:
         yield
@@ -87,7 +91,7 @@ def make_folder(folder: Path) -> None:
     """Create a folder and its parents if they are missing; raise `SchemaError` if that is impossible."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except (FileNotFoundError, FileExistsError, NotADirectoryError) as error:  # /proc, a missing drive, a file
+    except (FileNotFoundError, FileExistsError, NotADirectoryError) as error:
         raise SchemaError(
             f"{folder}: cannot create this folder: {error.strerror}. Choose another folder for the output."
         ) from None
@@ -121,7 +125,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
-    """Write texts into a folder, by file name; the folder's earlier content is deleted."""
+    """Write a folder of text files from a mapping of file names to texts; delete the folder's earlier content."""
     with replacing(folder) as temporary:
         temporary.mkdir()
         for name, text in texts.items():
@@ -129,7 +133,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
 
 
 def append(file: FileIO, data: bytes) -> None:
-    """Append all bytes to an unbuffered file, or no bytes if the disk is full."""
+    """Append data to an unbuffered file; if writing fails, truncate the file to its earlier length and raise."""
     start = file.tell()
     try:
         while data:
@@ -140,12 +144,12 @@ def append(file: FileIO, data: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON with two-space indent; NaN and infinity are errors, because JSON has neither."""
+    """Write JSON with two-space indent; raise ValueError for NaN and infinity, which are not valid JSON."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:
-    """Read JSON; raise `SchemaError` with the place of the first syntax error."""
+    """Read JSON; raise `SchemaError` with the line and column of the first syntax error."""
     _check_is_file(path)
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -154,11 +158,11 @@ def read_json(path: Path) -> Any:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Write named arrays and metadata as safetensors, with a digest of both."""
+    """Write named arrays and metadata as a safetensors file; the metadata also contain a digest of all content."""
     dense = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     metadata = {**metadata, DIGEST: _digest(dense, metadata)}
     content = safetensors.numpy.save(dense, metadata)
-    with replacing(path) as temporary, temporary.open("wb") as stream:  # save_file hides disk errors
+    with replacing(path) as temporary, temporary.open("wb") as stream:  # safetensors' save_file would hide disk errors
         stream.write(content[:HEADER_AT] + _sorted_header(content, metadata))
         stream.write(memoryview(content)[stream.tell() :])
 
@@ -166,10 +170,10 @@ def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mappi
 def read_tensors(
     path: Path, names: Sequence[str] = (), *, digest_needed: bool = False
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read arrays and metadata that `write_tensors` wrote; no pickle is ever opened.
+    """Read arrays and metadata that `write_tensors` wrote: the arrays `names`, or all arrays if `names` is empty.
 
-    If all arrays are read, they are compared with the file's digest. Files from older code have no digest; they are
-    accepted unless `digest_needed`. If only some arrays are read, nothing is checked.
+    If all arrays are read, the content is compared with the file's digest. Files from older code have no digest; they
+    are accepted unless `digest_needed`. If only some arrays are read, the digest is not checked.
     """
     _check_is_file(path)
     try:
@@ -195,7 +199,8 @@ def _digest(tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> s
 
 
 def _sorted_header(content: bytes, metadata: Mapping[str, str]) -> bytes:
-    # The order in which the library writes the metadata differs from process to process.
+    # The safetensors library writes the metadata in an order that differs from process to process. Sorting makes the
+    # file's bytes reproducible.
     length = int.from_bytes(content[:HEADER_AT], "little")
     header = json.loads(content[HEADER_AT : HEADER_AT + length]) | {"__metadata__": dict(sorted(metadata.items()))}
     return json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode().ljust(length)
@@ -212,7 +217,7 @@ def read_table(path: Path) -> pa.Table:
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block; `counts` is written last, so it may change until then."""
+    """Write the readings of one capture block by block, and then `counts`, which iterating over `blocks` may update."""
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:
@@ -221,7 +226,7 @@ def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, 
                 writer = pq.ParquetWriter(temporary, schema, compression="zstd", write_page_checksum=True)
             writer.write_table(to_table(block))
         if writer is None:
-            raise SchemaError(f"{path}: the capture has no readings left. See what was dropped, and why.")
+            raise SchemaError(f"{path}: all readings of the capture were dropped. Check its labels and its faults.")
         writer.add_key_value_metadata({COUNTS_KEY.decode(): json.dumps(dict(counts), sort_keys=True)})
         writer.close()
 
@@ -231,7 +236,7 @@ def read_readings(path: Path) -> Readings:
 
 
 def read_ingest_counts(path: Path) -> dict[str, int]:
-    """Read the ingestion counts of one capture: bytes, frames and rows, and those dropped, by reason."""
+    """Read the ingestion counts of one capture: bytes, frames and rows, and how many were dropped for which reason."""
     with _parquet(path) as file:
         metadata = file.metadata.metadata or {}
     if COUNTS_KEY not in metadata:
@@ -246,7 +251,7 @@ def _check_is_file(path: Path) -> None:
 
 
 def _raise_machine_error(error: Exception) -> None:
-    """Raise the error if it comes from the disk, permissions or limits; the file may be intact then."""
+    """Raise the error again if its cause is the machine (disk, permissions, limits) and not the file's content."""
     if isinstance(error, OSError) and error.errno in MACHINE_ERRNOS:
         raise error
 
@@ -262,13 +267,13 @@ def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
         raise SchemaError(f"{path}: the file is not readable as Parquet: {reason}. {REMEDY}") from None
 
 
-# --- Cache of computed arrays, beside the compiled code of a package ---
+# --- Cache of computed arrays, in the folder __pycache__ of a package ---
 
 LIBRARIES = ("numpy", "scipy", "numba")
 
 
 def load_cached_array(package: Path, name: str) -> np.ndarray | None:
-    """Read a cached array; None if it is not cached, or was computed by other code or with other library versions."""
+    """Read a cached array; return None unless it was computed by the same code with the same library versions."""
     try:
         return np.load(_cache_file(package, name), allow_pickle=False)
     except (OSError, ValueError, EOFError):
@@ -276,7 +281,7 @@ def load_cached_array(package: Path, name: str) -> np.ndarray | None:
 
 
 def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
-    """Cache an array, and delete cached arrays that were computed by other code."""
+    """Write an array to the cache; delete cached arrays of other versions of the code or of the libraries."""
     file = _cache_file(package, name)
     try:
         with replacing(file) as temporary, temporary.open("wb") as stream:
@@ -285,7 +290,7 @@ def save_cached_array(package: Path, name: str, array: np.ndarray) -> None:
         for old in set(file.parent.glob("kept-*.npy")) - current:
             remove(old)
     except (OSError, SchemaError):
-        return  # on a read-only or full disk, the array is computed again next time
+        return  # if the disk is full or read-only, the array is not cached and will be computed again
 
 
 def _cache_file(package: Path, name: str) -> Path:

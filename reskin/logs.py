@@ -1,6 +1,6 @@
-"""Estimate contacts, places and forces in a log without labels (paper section 6: dog shoe, glove), and score them.
+"""Estimate contacts, places and forces in a log (paper section 6: dog shoe, glove), and score them if labels exist.
 
-The no-load reading is the mean of the log's quiet start.
+A log must start without contact. The mean field of this quiet start is the no-load reading.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,23 +13,30 @@ from jaxtyping import Bool, Float, Float32, Float64
 from reskin.errors import CaptureError
 from reskin.metrics import score
 
-WINDOW_S = 0.1  # assumed: length of the windows whose means are compared with that of the start
-QUIET_MIN_S = 0.5  # assumed: a shorter start gives no reliable no-load reading
-WANDER_SDS = 4.0  # standard errors of a window's mean; with 15 channels, 1 in 1,000 windows exceeds it by chance
-START_WINDOWS_N = 2  # the noise is estimated from this many windows at the start
-# In contact, |dB| exceeds its median in the quiet start by this many standard deviations of one channel's noise.
+WINDOW_S = 0.1  # assumed: length of the windows whose mean fields are compared with the mean field of the start
+QUIET_MIN_S = 0.5  # assumed: shortest quiet start; the mean of a shorter one is not a reliable no-load reading
+# A window is quiet if its mean differs from that of the start by at most this many standard errors in every channel.
+# With 15 channels, noise alone exceeds this in 1 of 1,000 windows.
+WANDER_SDS = 4.0
+START_WINDOWS_N = 2  # number of windows at the start of the log from which mean and noise are estimated
+# A reading is in contact if |dB| exceeds its median over the quiet start by more than this multiple of the noise, which
+# is the rms of dB over all channels in the quiet start.
 CONTACT_SDS = 6.0
-POINTS_MAX_N = 1500  # points of a series in a figure
+POINTS_MAX_N = 1500  # largest number of points of a series in a figure
 
 Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 
 
 @dataclass(frozen=True)
 class LogEstimates:
-    """Estimates for each reading of a log; places and forces are meaningful only in contact."""
+    """Estimates for each of f readings of a log; places and forces are meaningful only in contact.
+
+    contact: whether a reading is in contact. quiet_n: number of readings before the first contact. noise_uT: rms of the
+    field change over all channels of the quiet start.
+    """
 
     t_s: Float64[np.ndarray, " f"]
-    targets: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm, F_N by each of m models
+    targets: Float64[np.ndarray, "m f 3"]  # x_mm, y_mm and F_N, as estimated by each of m models
     contact: Bool[np.ndarray, " f"]
     quiet_n: int
     noise_uT: float
@@ -38,9 +45,9 @@ class LogEstimates:
 def estimate(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator], *, where: str
 ) -> LogEstimates:
-    """Find the quiet start of a log, subtract its mean field, and estimate place and force for every reading.
+    """Find the quiet start of a log, subtract its mean field from all readings, and estimate place and force for each.
 
-    Raises CaptureError, which names `where`, if the log does not start without contact.
+    Raises CaptureError, with `where` in its message, if the log does not start without contact.
     """
     return estimate_after(quiet_start(t_s, b_uT, where=where), t_s, b_uT, models)
 
@@ -48,7 +55,7 @@ def estimate(
 def estimate_after(
     quiet_n: int, t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], models: Sequence[Estimator]
 ) -> LogEstimates:
-    """Subtract the mean of the first `quiet_n` readings, and estimate place and force for every reading."""
+    """Subtract the mean field of the first `quiet_n` readings, detect contact, and estimate place and force."""
     noload_uT = b_uT[:quiet_n].mean(axis=0, dtype=np.float64)
     db_uT = (b_uT - noload_uT).astype(np.float32)
     noise_uT = float(np.sqrt((db_uT[:quiet_n].astype(np.float64) ** 2).mean()))
@@ -61,8 +68,9 @@ def estimate_after(
 def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], *, where: str) -> int:
     """Return the number of readings before the first contact.
 
-    The quiet start lasts as long as the mean of every channel over a window of 0.1 s stays within 4 standard errors of
-    the mean of the first two windows. Raises CaptureError if it is shorter than 0.5 s.
+    The log is divided into windows of 0.1 s. The quiet start ends with the first window in which the mean of a channel
+    differs by more than 4 standard errors from the channel's mean over the first two windows. Raises CaptureError if
+    the quiet start is shorter than 0.5 s.
     """
     window_n = max(round(WINDOW_S / step_s(t_s)), 2)
     windows_n = len(b_uT) // window_n
@@ -70,7 +78,8 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
     if windows_n > START_WINDOWS_N:
         first_uT = b_uT[:start_n].astype(np.float64)
         means_uT = b_uT[: windows_n * window_n].reshape(windows_n, window_n, -1).mean(axis=1, dtype=np.float64)
-        # From differences of consecutive readings, so that a contact at the very start is not taken for noise.
+        # The noise is estimated from differences of consecutive readings: a contact in the first two windows would
+        # increase the standard deviation of the readings themselves.
         sd_uT = np.diff(first_uT, axis=0).std(axis=0) / np.sqrt(2)
         error_uT = sd_uT * np.sqrt(1 / window_n + 1 / start_n)
         moved = (np.abs(means_uT - first_uT.mean(axis=0)) > WANDER_SDS * error_uT).any(axis=1)
@@ -91,12 +100,12 @@ def quiet_start(t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"
 
 
 def step_s(t_s: Float64[np.ndarray, " f"]) -> float:
-    """Return the median time between readings."""
+    """Return the median time between consecutive readings, in s."""
     return float(np.median(np.diff(t_s)))
 
 
 def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
-    """Count contacts: runs of two or more readings in contact. A gap of one reading does not end a run."""
+    """Count contacts: runs of two or more consecutive readings in contact. A gap of one reading does not end a run."""
     padded = np.concatenate([[False], contact, [False]])
     closed = padded | (np.roll(padded, 1) & np.roll(padded, -1))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], closed, [False]]).astype(int)))
@@ -104,7 +113,7 @@ def contacts_n(contact: Bool[np.ndarray, " f"]) -> int:
 
 
 def describe(log: LogEstimates) -> dict[str, Any]:
-    """Summarise a log: duration, rate, noise, contacts, and the largest force (mean over models)."""
+    """Summarise a log: duration, rate, noise, contacts, and the largest force in contact (averaged over models)."""
     return {
         "rate_hz": 1 / step_s(log.t_s),
         "duration_s": float(log.t_s[-1] - log.t_s[0] + step_s(log.t_s)),
@@ -117,9 +126,10 @@ def describe(log: LogEstimates) -> dict[str, Any]:
 
 
 def score_contacts(log: LogEstimates, true: Float64[np.ndarray, "f 3"]) -> dict[str, Any]:
-    """Score estimates against the truth, which is NaN without contact; count missed and false readings.
+    """Score estimates of place and force, and count readings whose contact was missed or falsely detected.
 
-    Each model is scored separately: the scores are means over the models, and `spread` holds their standard deviations.
+    `true` contains x_mm, y_mm and F_N, and NaN for readings without contact. Each model is scored separately. The
+    result contains the means of the scores over the models and, under `spread`, their standard deviations.
     """
     truly_touched = np.isfinite(true[:, 2])
     both_touched = log.contact & truly_touched
@@ -149,16 +159,17 @@ def truth_at(
     end_s: Float64[np.ndarray, " d"],
     true: Float[np.ndarray, "d 3"],
 ) -> Float64[np.ndarray, "f 3"]:
-    """Return for each reading the true values of the dwell that contains it; NaN between dwells."""
+    """Return, for each reading, the true values of the dwell during which it was taken; NaN between dwells."""
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])
     return np.where(inside[:, None], true[dwell_i].astype(np.float64), np.nan)
 
 
 def thin(log: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Return at most 1,500 evenly spaced readings for figures; without contact, the estimates are None.
+    """Return data of a figure: at most 1,500 evenly spaced readings, with None as the estimate without contact.
 
-    `estimated` is the estimate of the first model; with several models, `low` and `high` are their range.
+    `estimated` is the estimate of the first model. With several models, `low` and `high` are the smallest and the
+    largest of their estimates.
     """
     kept = np.unique(np.linspace(0, len(log.t_s) - 1, POINTS_MAX_N).astype(int))
     targets = np.where(log.contact[:, None], log.targets, np.nan)[:, kept]

@@ -1,4 +1,7 @@
-"""Metrics of predictions: the paper's three, and R^2 of the force. True forces that are NaN (unknown) are left out."""
+"""Metrics of predictions: the three metrics of the paper, and R^2 of the force. Unknown true forces are NaN.
+
+Predictions for rows with an unknown true force are scored only for place.
+"""
 
 from typing import Any
 
@@ -7,15 +10,16 @@ from jaxtyping import Float
 
 ACCURACY_LIMIT_MM = 1.0  # paper section 4: both |dx| and |dy| within 1 mm
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
-TRUTH = ("force_mean_N", "force_var_N2")  # of the scored rows, so that scores of parts can be combined
+# Mean and variance of the true forces of the scored rows, needed to combine the R^2 of several groups of rows.
+TRUTH = ("force_mean_N", "force_var_N2")
 
 
 def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> dict[str, float]:
-    """Score predictions of (x_mm, y_mm, F_N); the keys of the result are in `METRICS` and `TRUTH`.
+    """Score predictions of (x_mm, y_mm, F_N); return the scores by the names in `METRICS` and `TRUTH`.
 
-    MSE_xy is the mean over the two axes (the paper does not say whether it sums or averages). R^2 of the force is
-    1 - MSE_F / (variance of the true forces); a constant prediction of their mean scores 0. The force has no scores if
-    no true force is known, and no R^2 if the true force does not vary.
+    `mse_xy_mm2` is averaged over x and y; the paper does not say whether its MSE is the sum or the mean. `r2_f` is
+    1 - `mse_f_N2` / (variance of the true forces), which is 0 for a constant prediction of the mean force. The scores
+    of the force are missing if no true force is known; `r2_f` is also missing if all true forces are equal.
     """
     error = predicted.astype(float) - true
     known = ~np.isnan(error[:, 2])
@@ -28,17 +32,17 @@ def score(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -
         numbers["mse_f_N2"] = float((error[known, 2] ** 2).mean())
         force_N = true[known, 2].astype(float)
         numbers |= {"force_mean_N": float(force_N.mean()), "force_var_N2": float(force_N.var())}
-        # Rounding can make the variance of equal forces nonzero, and that of nearly equal forces zero.
+        # Because of rounding, the computed variance can be nonzero for equal forces, and zero for nearly equal forces.
         if np.ptp(force_N) > 0 and numbers["force_var_N2"] > 0:
             numbers["r2_f"] = 1 - numbers["mse_f_N2"] / numbers["force_var_N2"]
     return numbers
 
 
 def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
-    """Shift predicted places by one constant offset, so that their mean error is zero.
+    """Shift all predicted places by one constant offset that makes the mean error of x and of y zero.
 
-    Each rig's origin was set manually; this shows how much of the error is due to registration. It uses the true
-    places, so it is a diagnostic, not a result.
+    The origin of each rig was set manually. Scores after this shift show how much of the error is due to the origin.
+    The offset is computed from the true places, so these scores are a diagnostic and not a result.
     """
     shifted = predicted.astype(float)
     shifted[:, :2] -= (predicted[:, :2] - true[:, :2]).mean(axis=0)
@@ -48,7 +52,11 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
 def score_groups(
     true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"], board: np.ndarray, skin: np.ndarray
 ) -> dict[str, Any]:
-    """Score all test rows, each test skin, and (as a diagnostic) all rows after removing one offset per test board."""
+    """Score all test rows together, the rows of each test skin, and all rows after `register` per test board.
+
+    `board` and `skin` are the names of each row's board and skin. The result's key `registered`, for the last of these
+    scores, is a diagnostic.
+    """
     registered = predicted.copy()
     for name in np.unique(board):
         registered[board == name] = register(true[board == name], predicted[board == name])

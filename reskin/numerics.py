@@ -1,10 +1,10 @@
-"""Select the same arithmetic on every x86-64 processor with AVX2, by environment variables that libraries read on load.
+"""Set environment variables that make numerical libraries compute the same bits on every x86-64 processor with AVX2.
 
-PyTorch, NumPy, OpenBLAS and Numba choose their code by the instructions that a processor offers, and OpenBLAS splits
-matrix products among threads. Each choice changes the order of summation, and training amplifies the rounding errors.
-With the values below, and `reskin.models.reproducible` in place of MKL, results are bit-identical on every such
-processor (tests/test_numerics.py). `pin` must run before NumPy is imported, so this module imports nothing that needs
-NumPy.
+PyTorch, NumPy, OpenBLAS and Numba select their code by the instruction sets of the processor, and OpenBLAS splits
+matrix products among threads. Both affect the order of summation, and training amplifies the rounding errors. With the
+values below, and with `reskin.models.reproducible` instead of MKL, results are bit-identical on all processors with
+AVX2 (tests/test_numerics.py). The libraries read the variables when they are loaded. Therefore, `pin` must run before
+NumPy is imported, and this module must not import NumPy.
 """
 
 import os
@@ -22,8 +22,8 @@ PINNED = {
     "OPENBLAS_NUM_THREADS": "1",
     "NUMBA_CPU_NAME": "haswell",
 }
-# NumPy feature to disable -> CPU flag of its newest instructions. NumPy warns about disabled features that the
-# processor lacks, so only features whose flag is present are disabled.
+# NumPy feature to disable -> CPU flag of the newest instructions that the feature uses. NumPy warns if a disabled
+# feature is not available on the processor, so only features whose flag is present are disabled.
 BEYOND_AVX2 = {"X86_V4": "avx512vl", "AVX512_ICL": "avx512_vbmi2", "AVX512_SPR": "avx512_fp16"}
 VARIABLES = (*PINNED, "NPY_DISABLE_CPU_FEATURES", "NUMBA_CPU_FEATURES")
 TOO_LATE = "NumPy was imported before pipeline"
@@ -32,9 +32,9 @@ _loaded_before: list[str] = []
 
 
 def pin() -> None:
-    """Set the variables that are not set yet, for this process and its child processes.
+    """Set the environment variables in this process, and thereby in its child processes.
 
-    On processors without AVX2, nothing is set. A variable that the user has set is not changed.
+    A variable that the user has set is not changed. On processors without AVX2, no variable is set.
     """
     chosen = pinned(cpu_flags(), os.environ)
     if "numpy" in sys.modules and not chosen.keys().isdisjoint({"OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES"}):
@@ -43,7 +43,7 @@ def pin() -> None:
 
 
 def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, str]:
-    """Return values for the variables that `environment` lacks.
+    """Return the variables to set on a processor with these CPU flags: those that `environment` does not set.
 
     >>> pinned(frozenset({"neon"}), {})
     {}
@@ -60,7 +60,9 @@ def pinned(flags: frozenset[str], environment: Mapping[str, str]) -> dict[str, s
 
 
 def departures(environment: Mapping[str, str]) -> list[str]:
-    """List the settings that differ from those of `pin`; they may change the last bits of results.
+    """List the variables whose values differ from those that `pin` sets; they may change the last bits of results.
+
+    The list also contains a note if NumPy was imported before `pin` ran.
 
     >>> departures({"ATEN_CPU_CAPABILITY": "default", "NUMBA_CPU_NAME": "haswell"})
     ['ATEN_CPU_CAPABILITY=default']
@@ -74,12 +76,12 @@ def departures(environment: Mapping[str, str]) -> list[str]:
 
 
 def signature() -> tuple[str, ...]:
-    """Return the settings that may change the last bits of a training run here; they are part of cache keys."""
+    """Return the settings of this process that affect the last bits of a training run; cache keys contain them."""
     return ("pinned" if "avx2" in cpu_flags() else "not pinned", *departures(os.environ))
 
 
 def cpu_flags(cpuinfo: Path = CPUINFO) -> frozenset[str]:
-    """Read the instruction sets of this processor; empty if they are not listed or the processor is not x86-64."""
+    """Read the flags of this processor's instruction sets; return an empty set if the processor is not x86-64."""
     if platform.machine().lower() not in ("x86_64", "amd64") or not cpuinfo.is_file():
         return frozenset()
     lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -91,7 +93,7 @@ DEVICES = ("cpu", "cuda")
 
 
 def device() -> str:
-    """Return the device that networks are trained on: RESKIN_DEVICE, or `cpu` if it is not set."""
+    """Return the device that runs the networks: the value of RESKIN_DEVICE, or `cpu` if the variable is not set."""
     name = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
     if name not in DEVICES:
         raise ParamsError(DEVICE_VARIABLE, "the device", f"one of {DEVICES}", repr(name), "Unset it for cpu.")

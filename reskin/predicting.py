@@ -1,6 +1,6 @@
 """Estimate contacts, places and forces in a log with a trained model, and write them as CSV.
 
-It is not checked whether the model was trained for the board that wrote the log; the user has to choose it.
+The user has to choose a model that fits the board of the log: only the number of channels is checked.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ from reskin.recordings.readers import sd_card
 from reskin.universal.calibration import CHANNELS_N, is_calibration
 from reskin.universal.model import MISFIT_MAX, Universal, load_universal
 
-FORCE_LIMIT = 1.05  # a force within this factor of either end of the model's range counts as at the limit
+FORCE_LIMIT = 1.05  # an estimated force within this factor of an end of the model's force range is "at the limit"
 PARQUET_MAGIC = b"PAR1"
 
 
@@ -35,23 +35,23 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
     ----------
     log : a capture's folder, a table that `reskin decode` wrote, or the log of an SD card
     model : a network or a calibration of the universal model; None for the uncalibrated universal model
-    out : the CSV file; places and forces are empty without contact
+    out : the CSV file to write; the fields for place and force are empty without contact
     rate_hz : frames per second, for a table without a clock
 
     Returns
     -------
-    Counts of frames, contacts and dropped frames; for the universal model also the counts of readings in
-    contact with a misfit above `MISFIT_MAX`, and of those with a force at a limit of the model's range
+    A summary of the log (`reskin.logs.describe`) and counts of dropped frames. For the universal model, also two counts
+    of readings in contact: with a misfit above `MISFIT_MAX`, and with a force at a limit of the model's range.
     """
     models = read_models([] if model is None else [model])
     inputs = (log,) if model is None else (log, model, model.with_suffix(".json"))
     if out.resolve() in {file.resolve() for file in inputs}:
-        raise ParamsError(f"--out: {out} is the log, the model or its card. Choose another file.")
-    t_s, b_uT, _, account = read_any_log(log, rate_hz)
+        raise ParamsError(f"--out: {out} is the log, the model or the model's card. Choose another file.")
+    t_s, b_uT, _, counts = read_any_log(log, rate_hz)
     channels_n = CHANNELS_N if isinstance(models, Universal) else models[0].card["input"]["channels_n"]
     if b_uT.shape[1] != channels_n:
         raise SchemaError(
-            f"{log}: the log has {b_uT.shape[1]} channels, but the model {channels_n}. Use a model for such boards."
+            f"{log}: the log has {b_uT.shape[1]} channels, but the model has {channels_n}. Use a model for this board."
         )
     estimators: Sequence[Estimator]
     if isinstance(models, Universal):
@@ -61,11 +61,11 @@ def predict(log: Path, model: Path | None, out: Path, *, rate_hz: float = 400.0)
         estimators, universal = models, None
     estimates = estimate(t_s, b_uT, estimators, where=str(log))
     io.write_text(out, render(estimates))
-    return describe(estimates) | ({} if universal is None else universal.count_suspects(estimates)) | account
+    return describe(estimates) | ({} if universal is None else universal.count_suspects(estimates)) | counts
 
 
 class _UniversalOfLog:
-    """The universal model as an estimator for a log; it stores the misfit of each reading."""
+    """Adapts the universal model to the interface of `Estimator`, and stores the misfit of each reading."""
 
     def __init__(self, model: Universal) -> None:
         self._model = model
@@ -88,7 +88,7 @@ class _UniversalOfLog:
 
 
 def warnings(counts: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each count of `predict` that casts doubt on its estimates."""
+    """Return warnings for the user, from those counts of `predict` that cast doubt on its estimates."""
     sentences, contact_n = [], counts["contact_readings_n"]
     if unknown_n := counts.get("unknown_skin_readings_n"):
         sentences.append(
@@ -118,7 +118,7 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
 
 
 def _read_capture(folder: Path) -> sd_card.Log:
-    """Read what `reskin record` wrote; frames after the last known arrival have no time and are dropped."""
+    """Read the frames of a capture; drop frames without a time, which follow the last recorded arrival time."""
     header = read_header(folder)
     if header.layout == "sd-card":
         return sd_card.read_log(folder / LOG_FILE)
@@ -128,12 +128,12 @@ def _read_capture(folder: Path) -> sd_card.Log:
             "wrote, or the log of an SD card."
         )
     stream = folder / STREAM_FILE
-    frames, account = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
+    frames, decoded = decode_all(io.read_bytes(stream), header.wire, header.chips_n, str(stream))
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     kept = frames.where(timed)
     *log, counts = sd_card.keep_whole(t_s[timed], kept.b_uT, kept.temperature_degC, str(stream))
-    return *log, account | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
+    return *log, decoded | {"dropped_no_time_frames_n": int((~timed).sum())} | counts  # type: ignore[return-value]
 
 
 def read_models(files: Sequence[Path]) -> Sequence[Network] | Universal:
@@ -152,15 +152,15 @@ def _is_calibration(file: Path) -> bool:
     except SchemaError:
         if file.suffix == SUFFIX:
             raise
-        return False  # another kind of file, which `read_network` refuses
+        return False  # `read_network` reports the error
 
 
 def render(estimates: LogEstimates) -> str:
-    """Return the estimates of one model as CSV: mm and N to three decimals, empty fields without contact."""
+    """Return one model's estimates as CSV: mm and N with three decimals; fields are empty without contact."""
     (target,) = estimates.targets
     target = np.where(estimates.contact[:, None], np.round(target, 3), np.nan)
     fields = dict(zip(("x_mm", "y_mm", "F_N"), target.T, strict=True))
     table = {"t_s": pa.array(np.round(estimates.t_s, 4))}
-    # from_pandas: NaN becomes null, which CSV writes as an empty field
+    # `from_pandas` converts NaN to null, which is an empty field in CSV.
     table |= {name: pa.array(values, from_pandas=True) for name, values in fields.items()}
     return tables.render_csv(pa.table(table | {"contact": pa.array(estimates.contact.astype(np.int8))}))

@@ -1,8 +1,8 @@
-"""The table of readings, `data/indentations`: columns, types and units, and its Arrow schema.
+"""Columns, types, units and Arrow schema of the tables of readings in `data/indentations`.
 
-Axis letters, used in every array annotation: n indentations, f readings (frames), ch = 3 k channels
-(Bx, By, Bz of chip 0, then of chip 1, ...), k chips, s sources, o observers, b batch, d dwells of the robot,
-c chunks of a stream, g steps of a time grid.
+Array annotations use these letters for axes: n indentations, f readings (frames), ch = 3 k channels (Bx, By, Bz of
+chip 0, then of chip 1, ...), k chips, s sources of a field, o points at which a field is computed, b rows of a batch,
+d dwells of a robot, c chunks of a stream, g steps of a time grid.
 """
 
 from dataclasses import dataclass, fields
@@ -23,11 +23,11 @@ AXES_PER_CHIP_N = 3
 
 @dataclass(frozen=True)
 class Readings:
-    """The readings of one capture, one row each; NaN where a recording lacks a value.
+    """The readings of one capture, one row per reading; unknown values are NaN.
 
-    Recorded and simulated forces have the signs of `FORCE_SIGNS`. `b_uT` is the field as read; `noload_uT` is the
-    mean field of the no-load reading that belongs to the row's indentation. `x_mm`, `y_mm` are NaN on a row without
-    contact. `n_contacts` counts the skin's contacts before this one.
+    The signs of forces are those of `FORCE_SIGNS`. `b_uT` is the measured field; `noload_uT` is the mean field without
+    contact before the row's indentation. `x_mm` and `y_mm` are NaN in rows without contact. `n_contacts` is the number
+    of earlier contacts of the skin.
     """
 
     capture: str
@@ -58,7 +58,7 @@ class Readings:
 
 
 LABELS = ("capture", "board", "skin", "source")
-# Unit of every numeric column: the suffix of its name, if that is a unit.
+# Column -> unit, for numeric columns: the suffix of the column's name if it is a unit, or else "1" (no unit).
 UNITS = {
     field.name: suffix if (suffix := field.name.rpartition("_")[2]) in ("mm", "N", "uT", "degC", "s") else "1"
     for field in fields(Readings)
@@ -100,7 +100,7 @@ def to_table(readings: Readings) -> pa.Table:
 
 
 def from_table(table: pa.Table, where: str) -> Readings:
-    """Convert a table of one capture to readings; raise `SchemaError` if it does not have this schema."""
+    """Convert a table of one capture to readings; raise `SchemaError` if its schema is not `arrow_schema`."""
     chips_n = check_schema(table.schema, where)
     values: dict[str, object] = {}
     for name in LABELS:
@@ -118,7 +118,7 @@ def from_table(table: pa.Table, where: str) -> Readings:
 
 
 def check_schema(schema: pa.Schema, where: str) -> int:
-    """Check names, types and units against `arrow_schema`; return the number of chips."""
+    """Check that a table has the columns, types and units of `arrow_schema`; return its number of chips."""
     missing = [field.name for field in fields(Readings) if field.name not in schema.names]
     if missing:
         raise SchemaError(f"{where}: column {', '.join(missing)} is missing. Ingest the capture again.")
@@ -126,13 +126,13 @@ def check_schema(schema: pa.Schema, where: str) -> int:
     if not pa.types.is_fixed_size_list(b_type) or b_type.list_size % AXES_PER_CHIP_N:
         raise SchemaError(where, "b_uT", "a fixed list of 3 values per chip", b_type, "Ingest it again.")
     chips_n = b_type.list_size // AXES_PER_CHIP_N
-    for want in arrow_schema(chips_n):
-        have = schema.field(want.name)
-        if have.type != want.type:
-            raise SchemaError(where, f"column {want.name}", want.type, have.type, "Ingest it again.")
-        unit, want_unit = (have.metadata or {}).get(b"unit"), (want.metadata or {})[b"unit"]
-        if unit != want_unit:
-            got = "no unit" if unit is None else unit.decode()
-            remedy = "Convert it, then write the unit."
-            raise SchemaError(where, f"unit of {want.name}", repr(want_unit.decode()), got, remedy)
+    for expected in arrow_schema(chips_n):
+        actual = schema.field(expected.name)
+        if actual.type != expected.type:
+            raise SchemaError(where, f"column {expected.name}", expected.type, actual.type, "Ingest it again.")
+        actual_unit, expected_unit = (actual.metadata or {}).get(b"unit"), (expected.metadata or {})[b"unit"]
+        if actual_unit != expected_unit:
+            got = "no unit" if actual_unit is None else actual_unit.decode()
+            remedy = "Convert the column to this unit, and write the unit to the column's metadata."
+            raise SchemaError(where, f"unit of {expected.name}", repr(expected_unit.decode()), got, remedy)
     return chips_n

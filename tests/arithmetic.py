@@ -1,14 +1,14 @@
-"""Print digests of the weights of three tiny training runs, on this processor or on emulated ones.
+"""Print digests of the weights after three tiny training runs, on this processor or on emulated processors.
 
-The runs train the paper's networks as one batch with all terms of the loss, the adversarial network, and the network
-of the universal model. `python -m tests.arithmetic` prints their digests; test_numerics.py runs it with several
-settings. `python -m tests.arithmetic Haswell-v2 EPYC-v1` also runs on processors that QEMU emulates (package qemu-user;
-about two minutes per processor; `qemu-x86_64 -cpu help` lists their names) and fails if the digests differ. MKL and
-PyTorch choose their code by the maker and the features of the emulated processor, so this finds differences that
-environment variables alone cannot cause.
+The three runs train: the paper's networks in one stack, with all terms of the loss; the adversarial network; and the
+network of the universal model. `python -m tests.arithmetic` prints one digest per run; test_numerics.py calls this
+command with several environment variables. `python -m tests.arithmetic Haswell-v2 EPYC-v1` also runs on these two
+processors, emulated by QEMU (package qemu-user; about two minutes per processor; `qemu-x86_64 -cpu help` lists the
+processors), and fails if the digests differ. MKL and PyTorch select code by the maker and the instruction sets of the
+processor, so emulation finds differences that environment variables alone cannot cause.
 """
 
-import pipeline  # isort: skip  # noqa: F401  (must be first: sets variables that NumPy reads when imported)
+import pipeline  # isort: skip  # noqa: F401  (must be first: `pipeline` sets variables that NumPy reads when imported)
 
 import hashlib
 import os
@@ -67,9 +67,9 @@ def universal_network() -> str:
 
 
 def digests_on(name: str) -> str:
-    """Return the digests that an emulated processor computes."""
+    """Return the digests computed on the emulated processor with this QEMU name."""
     command = ["qemu-x86_64", "-cpu", name, sys.executable, "-m", "tests.arithmetic"]
-    # NumPy reads this machine's /proc/cpuinfo and warns of features that the emulated processor lacks.
+    # Under QEMU, NumPy reads the real /proc/cpuinfo and warns about instruction sets that the emulated processor lacks.
     environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": ""}
     done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, check=True)
     return done.stdout.decode().strip()
@@ -80,9 +80,9 @@ def main(processors: Sequence[str]) -> None:
     print(here, flush=True)
     different = []
     for name in processors:
-        there = digests_on(name)
-        print(f"{there}  {name}", flush=True)
-        different += [name] * (there != here)
+        emulated = digests_on(name)
+        print(f"{emulated}  {name}", flush=True)
+        different += [name] * (emulated != here)
     if different:
         sys.exit(f"the weights differ from those of this processor on: {', '.join(different)}")
 

@@ -1,6 +1,6 @@
-"""Shared fixtures and settings of the tests; array annotations are checked at run time."""
+"""Fixtures and settings of all tests. Array annotations are checked at run time (`check_arrays`)."""
 
-import pipeline  # isort: skip  # noqa: F401  (must be first: sets variables that NumPy reads when imported)
+import pipeline  # isort: skip  # noqa: F401  (must be first: `pipeline` sets variables that NumPy reads when imported)
 
 import gc
 import inspect
@@ -17,41 +17,42 @@ from jaxtyping import AbstractArray, jaxtyped
 
 from tests.benchmarks import FULL
 
-# How long an example takes depends on how busy the machine is.
+# No deadlines: the time of an example depends on the load of the machine.
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=50)
 settings.register_profile("thorough", settings.get_profile("busy"), max_examples=1000)  # --hypothesis-profile=thorough
 settings.load_profile("busy")
 
 SHARED_DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
-LONG = (  # files that run stages and commands
+LONG = (  # the slowest test files: they run stages and commands
     "stages/test_story", "test_lab_story", "test_fetching", "test_adding", "test_adding_an_experiment", "test_numerics",
 )  # fmt: skip
-CHECKED_N = 50  # calls checked per function and test
+CHECKED_N = 50  # number of calls of a function that are checked in each test
 calls_n: Counter[Any] = Counter()
 
 
-def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
-    """Check shapes and dtypes of arrays in the first calls of each function in each test.
+def check_arrays(decorated: Any = None, *, typechecker: Any) -> Any:
+    """Decorate a function or dataclass: in its first calls in each test, check the shapes and dtypes of arrays.
 
-    Checking every call would take longer than the calls; mypy checks the other types.
+    Checking every call would take longer than the calls themselves. Other types are left to mypy.
     """
-    if of is None:
+    if decorated is None:
         return partial(check_arrays, typechecker=typechecker)
-    if inspect.isclass(of):
-        if is_dataclass(of):
-            of.__init__ = check_arrays(of.__init__, typechecker=typechecker)
-        return of
-    if not any(map(_names_an_array, inspect.get_annotations(of).values())):
-        return of
+    if inspect.isclass(decorated):
+        if is_dataclass(decorated):
+            decorated.__init__ = check_arrays(decorated.__init__, typechecker=typechecker)
+        return decorated
+    if not any(map(_names_an_array, inspect.get_annotations(decorated).values())):
+        return decorated
     checked = None
 
-    @wraps(of)
+    @wraps(decorated)
     def checked_at_first(*args: Any, **kwargs: Any) -> Any:
         nonlocal checked
-        calls_n[of] += 1
-        if calls_n[of] > CHECKED_N:
-            return of(*args, **kwargs)
-        checked = checked or jaxtyped(of, typechecker=typechecker)  # late, because it is slower than the import
+        calls_n[decorated] += 1
+        if calls_n[decorated] > CHECKED_N:
+            return decorated(*args, **kwargs)
+        # decorated at the first call, because decorating all functions would slow down the import
+        checked = checked or jaxtyped(decorated, typechecker=typechecker)
         return checked(*args, **kwargs)
 
     return checked_at_first
@@ -59,7 +60,7 @@ def check_arrays(of: Any = None, *, typechecker: Any) -> Any:
 
 def _names_an_array(hint: Any) -> bool:
     if isinstance(hint, str):
-        return "[" in hint  # a plain name is a class, not an array annotation
+        return "[" in hint  # array annotations have brackets
     return (inspect.isclass(hint) and issubclass(hint, AbstractArray)) or any(map(_names_an_array, get_args(hint)))
 
 
@@ -67,27 +68,27 @@ def pytest_runtest_setup() -> None:
     calls_n.clear()
 
 
-gc.disable()  # while everything is imported
-jaxtyping.jaxtyped = check_arrays  # the import hook decorates all functions of the project with it
-if not FULL:  # benchmarks at full size run the code as it is
-    # jaxtyping's pytest plugin would import NumPy too early
+gc.disable()  # imports are faster without garbage collection
+jaxtyping.jaxtyped = check_arrays  # the import hook applies `jaxtyped` to all functions of the project
+if not FULL:  # no checks in benchmarks at full size
+    # not with jaxtyping's pytest plugin, which would import NumPy before `pipeline`
     jaxtyping.install_import_hook(["pipeline", "reskin"], "beartype.beartype")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the longest files, so that workers end together (--dist loadfile)."""
+    """Run the slowest files first, so that all workers (--dist loadfile) end at about the same time."""
     items.sort(key=lambda item: next((i for i, name in enumerate(LONG) if f"/{name}.py" in item.nodeid), len(LONG)))
 
 
 def pytest_collection_finish() -> None:
-    """Exclude all imported objects from garbage collection: they live to the end."""
+    """Exclude all imported objects from garbage collection; they are needed until the end."""
     gc.freeze()
     gc.enable()
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real recordings beside the checkout; tests that need it are skipped without it."""
+    """Return the folder of real recordings beside the checkout; skip the test if the folder is missing."""
     if not SHARED_DATA.is_dir():
         pytest.skip("needs the real recordings in ../shared/data, which are not part of the repository")
     return SHARED_DATA.resolve()

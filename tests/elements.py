@@ -1,7 +1,7 @@
-"""Finite elements (scikit-fem) of a layer and of a plate: references for the layer, its shear and rigid sliding.
+"""Finite-element solutions (scikit-fem) of a layer and of a plate: references for the deformation of the skin.
 
-The elements are Taylor-Hood: displacement of order 2, pressure of order 1. Axisymmetric loads and loads along x need
-only the (r, z) plane. The shear modulus is 1.
+The elements are Taylor-Hood elements: displacement of order 2, pressure of order 1. For axisymmetric loads and for
+loads along x, the solution in the (r, z) plane suffices. The shear modulus is 1.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 from skfem import Basis, BilinearForm, ElementQuad1, ElementQuad2, ElementVector, LinearForm, MeshQuad, asm
 from skfem.helpers import ddot, dot, sym_grad, trace
 
-SLIP_SHARE = 1e-3  # Coulomb's law is smoothed below this fraction of the largest slip
+SLIP_SHARE = 1e-3  # friction is proportional to slip below this fraction of the largest slip (smoothed Coulomb law)
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Solution:
-    """The motion in the layer, at its base and top, and the load-weighted mean displacement of the loaded component."""
+    """Motion inside the layer, at its base and at its top, and the load-weighted mean displacement along the load."""
 
     inside: Motion
     base: Motion
@@ -39,7 +39,7 @@ class Solution:
 
 
 def axisymmetric_strains(u, r):
-    """Return the normal strains and the shear strains of the displacements u_r, u_z."""
+    """Return the normal strains and the shear strains of an axisymmetric displacement (u_r, u_z)."""
     (r_r, r_z), (z_r, z_z) = u.grad
     return (r_r, u[0] / r, z_z), (r_z + z_r,)
 
@@ -52,12 +52,12 @@ def along_x_strains(u, r):
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer with cells of one size out to `fine_m`, then growing to half a thickness at `end_m`."""
+    """A layer meshed in the (r, z) plane: uniform cells up to radius `fine_m`, growing cells up to `end_m`."""
 
     thickness_m: float
     fine_m: float
     end_m: float
-    cells_n: int  # over the thickness
+    cells_n: int  # number of cells over the thickness
     strains: Callable = axisymmetric_strains
 
     @cached_property
@@ -85,68 +85,75 @@ class Layer:
         return asm(BilinearForm(work), self.basis), coupling
 
     def solve(self, part_i: int, load: Callable, held: dict[str, list[int]], drag: dict[str, Callable]) -> Solution:
-        """Solve for a load(r) on one component at the top, with fixed components and springs(r) on u_r at edges."""
-        (work, dilation), at = self.matrices, self.basis
-        load_vector = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), at.boundary("top"))
-        for edge, of in drag.items():
-            work = work + asm(BilinearForm(lambda u, v, w, of=of: of(w.x[0]) * u[0] * v[0] * w.x[0]), at.boundary(edge))
-        fixed = np.concatenate([at.get_dofs(edge).all([f"u^{i + 1}"]) for edge, parts in held.items() for i in parts])
+        """Solve for load(r) on component `part_i` at the top, with fixed components and springs(r) on u_r per edge."""
+        (work, dilation), basis = self.matrices, self.basis
+        load_vector = asm(LinearForm(lambda v, w: load(w.x[0]) * v[part_i] * w.x[0]), basis.boundary("top"))
+        for edge, springs in drag.items():
+            work = work + asm(
+                BilinearForm(lambda u, v, w, springs=springs: springs(w.x[0]) * u[0] * v[0] * w.x[0]),
+                basis.boundary(edge),
+            )
+        fixed = np.concatenate(
+            [basis.get_dofs(edge).all([f"u^{i + 1}"]) for edge, parts in held.items() for i in parts]
+        )
         matrix = sp.bmat([[work, dilation.T], [dilation, None]], format="csc")
         right_side = np.append(load_vector, np.zeros(dilation.shape[0]))
         free, solution = np.setdiff1d(np.arange(len(right_side)), fixed), np.zeros(len(right_side))
         solution[free] = splu(matrix[free][:, free], permc_spec="MMD_ATA").solve(right_side[free])
-        total = asm(LinearForm(lambda v, w: load(w.x[0]) * v * w.x[0]), at.boundary("top").with_element(ElementQuad1()))
-        parts = solution[: at.N], solution[at.N :]
-        motions = (_motion(where, *parts) for where in (at, at.boundary("base"), at.boundary("top")))
+        total = asm(
+            LinearForm(lambda v, w: load(w.x[0]) * v * w.x[0]), basis.boundary("top").with_element(ElementQuad1())
+        )
+        parts = solution[: basis.N], solution[basis.N :]
+        motions = (_motion(where, *parts) for where in (basis, basis.boundary("base"), basis.boundary("top")))
         return Solution(*motions, load_vector @ parts[0] / total.sum())
 
     def with_friction(self, load: Callable, friction: float, *, steps_n: int = 4, **edges) -> Solution:
-        """Solve for a pressure on top with Coulomb friction at the base, by fixed-point iteration.
+        """Solve for the pressure load(r) at the top and Coulomb friction at the base, by fixed-point iteration.
 
         The traction is t = -friction p u / (|u| + u0), with p and u of the previous iteration: the layer sticks where p
         is large and slides elsewhere.
         """
-        at = self.solve(1, load, edges["held"], edges["drag"])
-        small_m = SLIP_SHARE * np.abs(at.base.parts_m[0]).max()
+        solution = self.solve(1, load, edges["held"], edges["drag"])
+        small_m = SLIP_SHARE * np.abs(solution.base.parts_m[0]).max()
         for _ in range(steps_n):
-            stress = at.base.pressure - 2 * at.base.gradient[1, 1]
-            per_m = friction * np.maximum(stress, 0) / (np.abs(at.base.parts_m[0]) + small_m)
-            at = self.solve(1, load, edges["held"], edges["drag"] | {"base": lambda _r, per_m=per_m: per_m})
-        return at
+            stress = solution.base.pressure - 2 * solution.base.gradient[1, 1]
+            per_m = friction * np.maximum(stress, 0) / (np.abs(solution.base.parts_m[0]) + small_m)
+            solution = self.solve(1, load, edges["held"], edges["drag"] | {"base": lambda _r, per_m=per_m: per_m})
+        return solution
 
 
-def _motion(at: Basis, displacement: np.ndarray, pressure: np.ndarray) -> Motion:
-    u, p = at.interpolate(displacement), at.with_element(ElementQuad1()).interpolate(pressure)
-    return Motion(*at.global_coordinates(), np.asarray(u), u.grad, np.asarray(p))
+def _motion(basis: Basis, displacement: np.ndarray, pressure: np.ndarray) -> Motion:
+    u, p = basis.interpolate(displacement), basis.with_element(ElementQuad1()).interpolate(pressure)
+    return Motion(*basis.global_coordinates(), np.asarray(u), u.grad, np.asarray(p))
 
 
 def plate(sides_m, place_m, patch_motion_m, stiffness, *, cells_n=12, patch_m=1.5e-3):
-    """Displace a patch of a plate in plane stress on a uniform bed of springs.
+    """Solve for a plate in plane stress on a uniform bed of springs, a patch of which is displaced.
 
-    `stiffness` is E t over the drag per area, in units of the plate's area. Return the centre of the patch, the mean
-    motion and the mean rotation.
+    `stiffness` is Young's modulus times thickness, divided by the spring stiffness per area and by the area of the
+    plate. Returns the centre of the patch, and the mean displacement and the mean rotation of the plate.
     """
     area_m2, (nu, young) = np.prod(sides_m), (0.5, stiffness * np.prod(sides_m))
     mesh = MeshQuad.init_tensor(*(np.linspace(-side_m / 2, side_m / 2, cells_n + 1) for side_m in sides_m))
-    at = Basis(mesh, ElementVector(ElementQuad2()), intorder=5)
+    basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=5)
 
     def work(u, v, _w):
         e, e_v = sym_grad(u), sym_grad(v)
         return young / (1 - nu**2) * ((1 - nu) * ddot(e, e_v) + nu * trace(e) * trace(e_v)) + dot(u, v)
 
     def mean(form, weight=lambda x: 1.0):
-        return asm(LinearForm(lambda v, w: weight(w.x) * form(v, w.x)), at)
+        return asm(LinearForm(lambda v, w: weight(w.x) * form(v, w.x)), basis)
 
     def bump(x):
         return np.exp(-((x[0] - place_m[0]) ** 2 + (x[1] - place_m[1]) ** 2) / (2 * patch_m**2))
 
-    ones = at.project(lambda x: np.stack([np.ones_like(x[0]), np.zeros_like(x[0])]))
+    ones = basis.project(lambda x: np.stack([np.ones_like(x[0]), np.zeros_like(x[0])]))
     patch = np.stack([mean(lambda v, _x, i=i: v[i], bump) for i in (0, 1)])
     patch /= patch[0] @ ones
     middle_m = np.array([mean(lambda v, x, i=i: x[i] * v[0], bump) @ ones for i in (0, 1)])
     middle_m /= mean(lambda v, _x: v[0], bump) @ ones
-    matrix = sp.bmat([[asm(BilinearForm(work), at), patch.T], [patch, None]], format="csc")
-    solution = splu(matrix).solve(np.append(np.zeros(at.N), patch_motion_m))[: at.N]
+    matrix = sp.bmat([[asm(BilinearForm(work), basis), patch.T], [patch, None]], format="csc")
+    solution = splu(matrix).solve(np.append(np.zeros(basis.N), patch_motion_m))[: basis.N]
     move_m = np.array([mean(lambda v, _x, i=i: v[i]) @ solution for i in (0, 1)]) / area_m2
     spin = mean(lambda v, x: x[0] * v[1] - x[1] * v[0]) @ solution
     return middle_m, move_m, spin / (area_m2 * (sides_m[0] ** 2 + sides_m[1] ** 2) / 12)

@@ -1,6 +1,6 @@
-"""Helper for tests of the checks that experiments tabulate."""
+"""Helper for tests of experiments whose results are checks (rows with error, tolerance and reason)."""
 
 
 def broken(rows):
-    """Return the failed checks; pytest shows their error, tolerance and reason."""
+    """Return the failed checks with error, tolerance and reason, which pytest prints on failure."""
     return [row for row in rows if not row.holds]

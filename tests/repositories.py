@@ -1,4 +1,4 @@
-"""Git repositories for tests; they stand in for public repositories of recordings."""
+"""Git repositories for tests, which replace the public repositories of recordings."""
 
 import subprocess
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ def git(folder: Path, *arguments: str) -> str:
 
 
 def commit(folder: Path, files: Mapping[str, bytes]) -> str:
-    """Write and commit files in a repository, which is created if needed; return the commit's hash."""
+    """Write files to a git repository (created if necessary) and commit them; return the hash of the commit."""
     if not (folder / ".git").exists():
         folder.mkdir(parents=True)
         git(folder, "init", "--quiet")
@@ -26,7 +26,7 @@ def commit(folder: Path, files: Mapping[str, bytes]) -> str:
 
 
 def bare(folder: Path, mirror: Path, *, filters: bool) -> str:
-    """Make a bare clone, which may serve commits without their files (`filters`); return its URL."""
+    """Create a bare clone and return its URL; with `filters`, clients may fetch commits without their files."""
     subprocess.run(["git", "clone", "--quiet", "--bare", str(folder), str(mirror)], check=True)
     git(mirror, "config", "uploadpack.allowFilter", str(filters).lower())
     return mirror.as_uri()

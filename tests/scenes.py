@@ -1,4 +1,4 @@
-"""Scenes for tests, as plain dictionaries, and the settings that a stage reads from them."""
+"""Scenes for tests, as dictionaries, and their settings as a stage reads them."""
 
 from pipeline.scenes import EXPERIMENTS, Scene, check_scene, stages
 from pipeline.settings import Settings
@@ -24,7 +24,7 @@ def recorded_scene(**changes: object) -> dict[str, object]:
 
 SCHEDULE = {"batch_n": 64, "rate_max": 1e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 ADAPTATIONS = {"adaptation": "paper", "base": "paper", "steps_n": 1, "pokes_n": 8, "variants": {}}
-# replaces params.yaml in tests
+# content of params.yaml in tests
 SHARED: dict[str, object] = {
     "lost_fraction_max": 0.05,
     "faults": DEFAULT_POLICY.model_dump(),
@@ -35,7 +35,7 @@ SHARED: dict[str, object] = {
     "skin": {}, "rig": {}, "chip": {}, "spreads": {}, "terms": {},
 }  # fmt: skip
 
-# The sections of a scene that each experiment needs.
+# Sections of a scene that each experiment needs.
 SECTIONS: dict[str, dict[str, object]] = {
     "lobo": {"train_multi": TRAINING},
     "transfer": {"train_single": TRAINING},
@@ -67,7 +67,7 @@ SECTIONS |= {
     },
     "contacts": {"contacts": {"pairs_n": 10, "separations_mm": [8.0], "false_alarm_fraction": 0.05}},
 }  # fmt: skip
-# The settings of section split that each experiment needs.
+# Settings in section `split` that each experiment needs.
 SPLIT_SETTINGS: dict[str, dict[str, object]] = {
     "transfer": {"transfer_skins_n": 1},
     "single_random": {"random_test_fraction": 0.1, "random_repeats_n": 1},

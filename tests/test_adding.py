@@ -1,4 +1,4 @@
-"""Tests of adding recordings: the result, or a one-line error without leftover files."""
+"""Tests of `reskin add`: the added recording, or a one-line error that leaves no files."""
 
 import shutil
 from pathlib import Path
@@ -33,7 +33,7 @@ from tests.universal.skins import fields_uT
 
 @pytest.fixture(scope="module")
 def empty(tmp_path_factory) -> Path:
-    """Return a checkout whose plan has no scenes."""
+    """Return a copy of the checkout whose plan has no scenes."""
     root = copy_checkout(tmp_path_factory.mktemp("checkout"))
     plan.use(root, [])
     with (root / SCENES / "small.yaml").open("w") as stream:
@@ -89,7 +89,7 @@ def test_added_recording_is_tracked_registered_and_planned(root, lab_file):
 
 
 @pytest.mark.parametrize("found", ["Against the scene, chips 1 and 2 are exchanged.", None, CaptureError("no places")])
-def test_difference_from_section_compare_is_a_warning(root, lab_file, monkeypatch, capsys, found):
+def test_difference_from_the_simulated_skin_is_a_warning(root, lab_file, monkeypatch, capsys, found):
     def find_departure(*_: object) -> str | None:
         if isinstance(found, CaptureError):
             raise found
@@ -114,7 +114,7 @@ def test_scene_without_section_compare_is_not_compared(root, lab_file, monkeypat
     assert "warning" not in capsys.readouterr().err
 
 
-def test_exchanged_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
+def test_swapped_coordinates_are_a_warning(root, tmp_path, lab_file, capsys):
     columns = table.columns_of(5)
     for i, exchanged in enumerate((False, True)):
         places_mm = rng_for(i, "places").uniform(0, 16, (40, 2)).round(2)
@@ -153,12 +153,12 @@ def test_failed_removal_changes_nothing(root, lab_file):
     assert_refused(root, lambda: add.remove(root, "small", "board1_skin1_readings"), "nowhere")
 
 
-def test_leftovers_of_a_killed_add_are_an_error(root, lab_file):
+def test_existing_folder_of_a_killed_add_is_an_error(root, lab_file):
     (root / "data/raw/small/board1_skin1_readings").mkdir(parents=True)
     assert_refused(root, lambda: add_lab(root, lab_file), "`reskin add` was killed")
 
 
-def test_errors_name_the_users_file(root, tmp_path):
+def test_errors_name_the_file_of_the_user(root, tmp_path):
     (tmp_path / "mine.csv").write_bytes(b"indent,phase,x_mm,y_mm,T0,Bx0,By0,Bz0,Fx,Fy,Fz\n")
     assert_refused(root, lambda: add_lab(root, tmp_path / "mine.csv"), str(tmp_path / "mine.csv"))
 
@@ -255,7 +255,7 @@ def test_recording_cannot_join_a_simulated_scene(root, lab_file):
     )
 
 
-# A native capture: two indentations, ten frames per dwell, at 400 Hz.
+# Native captures in the following tests have two indentations with ten frames per dwell, at 400 Hz.
 FRAMES = make_frames(60, 2, seed=0)
 
 
@@ -343,7 +343,7 @@ def test_capture_with_many_lost_bytes_is_an_error(root, tmp_path):
     )
 
 
-def test_command_line_prints_one_line_without_traceback(root, tmp_path):
+def test_command_prints_a_one_line_error(root, tmp_path):
     (tmp_path / "broken.csv").write_bytes(b"")
     arguments = ["--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     done = run(root, "reskin", "add", str(tmp_path / "broken.csv"), *arguments, check=False)
@@ -353,7 +353,7 @@ def test_command_line_prints_one_line_without_traceback(root, tmp_path):
 
 
 def output_of(arguments: list[str]) -> str:
-    """Return the output or the error of a command in the working directory, run in this process."""
+    """Run a command in this process, in the working directory; return its output or error."""
     done = CliRunner().invoke(app, arguments)
     return str(done.exception) if isinstance(done.exception, ReskinError) else done.stdout
 
@@ -371,7 +371,7 @@ def app_raising(arguments: list[str]) -> None:
     raise CliRunner().invoke(app, arguments).exception
 
 
-def test_command_line_reports_a_scene_added_to_the_plan(root, lab_file, monkeypatch):
+def test_command_prints_that_the_scene_was_added_to_the_plan(root, lab_file, monkeypatch):
     monkeypatch.chdir(root)
     arguments = ["add", str(lab_file), "--layout", "lab", "--board", "b", "--skin", "s", "--scene", "small"]
     done = run(root, "reskin", *arguments)

@@ -1,4 +1,4 @@
-"""Tests of which stages an edit reruns, from DVC's index and hashes; only stage `code` runs here."""
+"""Tests of which stages DVC would rerun after an edit, from DVC's index and hashes; only stage `code` is run."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +13,7 @@ from reskin.models.job import CODE_MODULES, JobKeys
 from tests.models.example_jobs import example_data, pooled
 from tests.stages.checkout import ROOT, copy_checkout, run
 
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
 STAGE = """\
   repeat: # how much force differs from reading to reading
     foreach: ${stages.repeat}
@@ -53,7 +53,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """Return a checkout that runs scene ci."""
+    """Return a copy of the checkout whose plan has scene ci."""
     folder = copy_checkout(tmp_path_factory.mktemp("edited"))
     run(folder, "reskin", "scenes", "use", "ci")
     return folder
@@ -65,7 +65,7 @@ def before(root) -> dict[str, tuple[Any, ...]]:
 
 
 def state(root: Path) -> dict[str, tuple[Any, ...]]:
-    """Run stage `code`; return the command, the hashes of dependencies and the outputs of each other stage."""
+    """Run stage `code`; return, for each other stage, the command, the hashes of the dependencies, and the outputs."""
     from dvc.dependency.param import read_param_file
     from dvc.repo import Repo
 
@@ -93,7 +93,7 @@ def state(root: Path) -> dict[str, tuple[Any, ...]]:
 
 
 def stale_stages(before: dict[str, tuple[Any, ...]], after: dict[str, tuple[Any, ...]]) -> set[str]:
-    """Return the changed stages and the stages that depend on their outputs."""
+    """Return the stages that DVC would rerun: those that changed, and those that depend on outputs of such stages."""
     stale: set[str] = set()
     more = {name for name in after if after[name] != before.get(name)}
     while more - stale:
@@ -109,7 +109,7 @@ def _overlap(path: Path, other: Path) -> bool:
 
 @contextmanager
 def edited_files(root: Path, files: dict[str, str]) -> Iterator[None]:
-    """Write files; restore them and the plan at the end."""
+    """Write files within the block; afterwards, restore the files and the plan."""
     original = {root / name: (root / name).read_text() for name in [PLAN, *files] if (root / name).exists()}
     try:
         for name, text in files.items():
@@ -124,12 +124,12 @@ def edited_files(root: Path, files: dict[str, str]) -> Iterator[None]:
 
 
 def insert_before(file: Path, line: str, text: str) -> str:
-    """Return the content of a file with a text inserted before a line."""
+    """Return the content of a file with `text` inserted before `line`."""
     assert line in file.read_text()
     return file.read_text().replace(line, f"{text}{line}", 1)
 
 
-def test_new_experiment_runs_its_stage_and_the_report(root, before):
+def test_new_experiment_reruns_its_stage_and_the_report(root, before):
     scene = f"{SCENES}/ci.yaml"
     files = {f"pipeline/experiments/{name}": text for name, text in FILES.items()} | {
         FLOW: insert_before(root / FLOW, "  report: #", STAGE),
@@ -139,16 +139,16 @@ def test_new_experiment_runs_its_stage_and_the_report(root, before):
         run(root, "reskin", "scenes", "use", "ci")
         after = state(root)
     assert stale_stages(before, after) == {
-        "repeat@ci", "table2@ci", "report@ci", "publish@ci",  # stages that show numbers
-        "contacts@ci",  # depends on the whole scene file
+        "repeat@ci", "table2@ci", "report@ci", "publish@ci",  # stages that read the numbers of all experiments
+        "contacts@ci",  # reads the whole scene file
     }  # fmt: skip
 
 
-def test_caption_reruns_the_report_and_code_reruns_the_experiment(root, before):
+def test_edited_caption_reruns_the_report_and_edited_code_the_experiment(root, before):
     captions, module = "pipeline/experiments/shear.yaml", "pipeline/experiments/shear.py"
     with edited_files(root, {captions: (root / captions).read_text().replace("title: ", "title: More ", 1)}):
         after = state(root)
-    assert stale_stages(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # one module makes all tables
+    assert stale_stages(before, after) == {"table2@ci", "report@ci", "publish@ci"}  # all tables are in one module
     with edited_files(root, {module: (root / module).read_text() + "\n\nMORE = 1\n"}):
         after = state(root)
     assert stale_stages(before, after) == {"shear@ci", "table2@ci", "report@ci", "publish@ci"}

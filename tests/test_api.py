@@ -1,4 +1,4 @@
-"""The public functions of `reskin` equal what the pipeline computes, and their examples run."""
+"""Tests of the public functions of `reskin`: results equal those of the pipeline, and docstring examples run."""
 
 import doctest
 import importlib
@@ -63,15 +63,16 @@ def test_simulate_pokes_equals_a_simulated_capture_without_noise():
     noload_uT, b_uT, Fz_N = reskin.simulate_pokes(skin, places.tolist(), board=board, chip=QUIET_CHIP)
 
     per_poke = capture.b_uT.reshape(len(places), -1, 15)
-    step_uT = 0.5  # the chip's largest quantisation step; the rounding of places to float32 changes less
+    # tolerance: the largest quantisation step of a chip; rounding of places to float32 changes the field less
+    step_uT = 0.5
     assert np.abs(per_poke[:, 1] - noload_uT).max() <= step_uT
     last_contact_i = per_poke.shape[1] - 1 - shared["rig"]["moving_frames_n"]
     assert np.abs(per_poke[:, last_contact_i] - b_uT).max() <= step_uT
     assert np.abs(b_uT - noload_uT).max() > 100 * step_uT
-    np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)  # steps of the sensor
+    np.testing.assert_allclose(Fz_N, capture.probe.Fz_N[contact], atol=0.01)  # resolution of the force sensor
 
 
-def test_designs_take_plain_values_and_wrong_ones_raise():
+def test_designs_accept_plain_values_and_refuse_wrong_ones():
     spreads = {"chip_offset_uT": 0.0}
     board = reskin.draw_board(chips_xy_mm=[[0, 0], [7, 0]], chips_turn_deg=[0, 90], spreads=spreads)
     assert board.chips_m.shape == (2, 3)
@@ -82,24 +83,24 @@ def test_designs_take_plain_values_and_wrong_ones_raise():
         reskin.simulate_pokes(reskin.draw_skin(), [8, 8, 1])
 
 
-def test_no_pokes_are_empty_arrays():
+def test_no_pokes_give_empty_arrays():
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), np.zeros((0, 3)))
-    some = reskin.simulate_pokes(reskin.draw_skin(), [[8, 8, 1]])
+    with_poke = reskin.simulate_pokes(reskin.draw_skin(), [[8, 8, 1]])
     assert (noload_uT.shape, b_uT.shape, force_N.shape) == ((0, 15), (0, 15), (0,))
-    assert (noload_uT.dtype, b_uT.dtype, force_N.dtype) == tuple(array.dtype for array in some)
+    assert (noload_uT.dtype, b_uT.dtype, force_N.dtype) == tuple(array.dtype for array in with_poke)
 
 
-def test_touch_takes_named_values():
+def test_touch_has_keyword_arguments():
     touch = reskin.touch(1, 2, depth_mm=0.5, Fx_N=0.1, Fz_N=3, pass_i=4)
     assert touch == (True, 1, 2, 0.5, 0.1, touch.Fy_N, 3, 4)
     assert np.isnan(touch.Fy_N)
     with pytest.raises(TypeError, match="unexpected keyword argument 'Fz'"):
         reskin.touch(1, 2, Fz=3)
     with pytest.raises(TypeError, match="unexpected keyword argument 'bord'"):
-        reskin.record(iter(()), port="/dev/none", bord="b1")  # before it listens
+        reskin.record(iter(()), port="/dev/none", bord="b1")  # a misspelt keyword is an error before the port is opened
 
 
-def test_open_takes_loaded_models(model):  # noqa: F811
+def test_open_accepts_loaded_models(model):  # noqa: F811
     network, universal = reskin.load_model(model), reskin.load_universal()
     for models, name in (
         ([network], "1 network"), ([network, str(model), network], "3 networks"), ((model, model), "2 networks"),
@@ -116,7 +117,7 @@ def test_open_takes_loaded_models(model):  # noqa: F811
         reskin.open("/dev/none", model=None)
 
 
-def test_loaded_model_predicts_as_its_network(model):  # noqa: F811
+def test_loaded_model_predicts_like_its_network(model):  # noqa: F811
     b_uT = rng_for(0, "api").normal(500, 100, (4, 15)).astype(np.float32)
 
     loaded = reskin.load_model(str(model)).zero(b_uT[:2].tolist())
@@ -125,7 +126,7 @@ def test_loaded_model_predicts_as_its_network(model):  # noqa: F811
     noload_uT = b_uT[:2].mean(axis=0, dtype=np.float64)
     np.testing.assert_array_equal(predicted, read_network(model)((b_uT[2:] - noload_uT).astype(np.float32)))
     np.testing.assert_array_equal(loaded.predict(b_uT[2].tolist()), predicted[0])
-    with pytest.raises(ReskinError, match="the model has no no-load reading"):
+    with pytest.raises(ReskinError, match="the no-load reading is missing"):
         reskin.load_model(model).predict(b_uT)
     with pytest.raises(ReskinError, match=r"fields of shape \(2,\) do not fit the 15 channels"):
         loaded.predict([1.0, 2.0])

@@ -1,4 +1,4 @@
-"""Tests of `reskin check-cache`: damaged objects of DVC's cache are moved away and restored where possible."""
+"""Tests of `reskin check-cache`: damaged objects are moved out of DVC's cache and restored if possible."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ def md5(content: bytes) -> str:
 
 @pytest.fixture
 def root(tmp_path, monkeypatch) -> Path:
-    """Return a checkout whose outputs (a folder of two files, a file, a recording) are in DVC's cache."""
+    """Return a checkout with a folder of two files, a file and a recording, all of which are in DVC's cache."""
     subprocess.run(["git", "init", "-q"], cwd=tmp_path, check=True)
     subprocess.run([sys.executable, "-m", "dvc", "init", "-q"], cwd=tmp_path, check=True)
     (tmp_path / "dvc.yaml").write_text("stages: {}\n")
@@ -64,7 +64,8 @@ def check(root: Path) -> tuple[int, str]:
 
 
 def test_intact_cache_has_no_damaged_objects(root):
-    next(root.glob(".dvc/cache/files/md5/??")).joinpath(".tmpXYZ.tmp").write_bytes(b"ha")  # left by a killed DVC
+    # a temporary file left by a killed DVC
+    next(root.glob(".dvc/cache/files/md5/??")).joinpath(".tmpXYZ.tmp").write_bytes(b"ha")
     assert check(root) == (0, "DVC's cache: 5 objects, 0 of them damaged\n")
 
 
@@ -96,7 +97,7 @@ def test_edited_output_is_kept(root):
     assert (root / FOLDS).read_bytes() == b"by hand"
 
 
-def test_files_of_a_folder_with_a_damaged_list_are_kept(root):
+def test_folder_whose_list_is_damaged_is_not_deleted(root):
     name = cache.read_yaml(root / LOCK)["stages"]["train_multi@one"]["outs"][0]["md5"]
     put_in_cache(root, name, b"[")
     assert f"It was moved to {cache.DAMAGED}/{name}. Run: dvc repro train_multi@one" in check(root)[1]
@@ -110,6 +111,6 @@ def test_damaged_recording_is_kept(root):
     assert (root / cache.DAMAGED / md5(b"recorded")).read_bytes() == b"rec0rded"
 
 
-def test_unused_object_is_only_moved(root):
+def test_damaged_unused_object_is_moved(root):
     put_in_cache(root, "0" * 32, b"of an older run")
     assert "No output in dvc.lock uses it" in check(root)[1]

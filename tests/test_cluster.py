@@ -1,4 +1,4 @@
-"""Tests of training on a Dask cluster: a scheduler with two workers on this machine."""
+"""Tests of training on a Dask cluster (a scheduler and two workers on this machine)."""
 
 import importlib.util
 import json
@@ -25,7 +25,7 @@ from tests.models.example_jobs import example_data
 from tests.models.test_runner import equal_results, jobs
 
 ROOT = Path(__file__).resolve().parents[1]
-# As deploy/dask.sh starts workers.
+# Options with which deploy/dask.sh starts workers.
 CLI = "import pipeline.cluster; from distributed.cli.dask_{0} import main; main()"
 START_MAX_s = 120.0
 HERE_ONLY = ["--host", "127.0.0.1", "--no-dashboard"]
@@ -46,7 +46,7 @@ def dask_process(kind: str, *options: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory) -> Iterator[str]:
-    """Yield the address of a scheduler with two single-threaded workers."""
+    """Start a scheduler and two single-threaded workers; yield the scheduler's address."""
     reason = "Dask is not installed: pip install -c constraints.txt -e '.[dask]'"
     distributed = pytest.importorskip("distributed", reason=reason)
     file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
@@ -87,7 +87,8 @@ def test_sweep_on_two_workers_equals_a_local_one(address, tmp_path, monkeypatch)
         assert equal_results(a, b)
     assert [i for _, _, i in ran] == list(range(6))
     assert len({process for process, _, _ in ran} - {os.getpid()}) == 2
-    assert {folder for _, folder, _ in ran} == {os.getcwd()}  # paths in stages are relative
+    # workers run in this working directory, because paths in stages are relative
+    assert {folder for _, folder, _ in ran} == {os.getcwd()}
 
 
 def test_error_on_a_worker_is_raised_here(address, monkeypatch):
@@ -124,14 +125,14 @@ def test_workers_with_other_arithmetic_are_an_error(workers, expected):
 def test_lost_scheduler_is_an_error():
     pytest.importorskip("distributed", reason="Dask is not installed")
     submitted, future = Future(), Future()
-    submitted.cancel()  # as Dask does with all calls after losing the scheduler
+    submitted.cancel()  # after losing the scheduler, Dask cancels all calls
     cluster._copy_outcome(future, "tcp://there", submitted)
     with pytest.raises(ParamsError, match="Lost the Dask scheduler at tcp://there. Finished training runs are cached"):
         future.result(0)
 
 
 def import_fresh(file: Path) -> ModuleType:
-    """Import a module afresh, as a newly started process would."""
+    """Import a module again from its file, as a new process would."""
     spec = importlib.util.spec_from_file_location("cluster_of_a_copy", file)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

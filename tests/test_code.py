@@ -1,4 +1,4 @@
-"""Tests of the digest of a module: code changes it; comments and line breaks do not."""
+"""Tests of the digest of a module: it changes with the code, but not with comments and line breaks."""
 
 import pytest
 
@@ -58,7 +58,7 @@ def test_data_file_of_the_same_name_belongs_to_the_module(monkeypatch, tmp_path)
 def test_imports_are_followed_within_the_packages():
     names = code.imported("reskin.models.train")
     assert {"reskin.models.train", "reskin.seeds"} <= set(names)
-    assert {"reskin", "reskin.models"} <= set(names)  # whose __init__ runs first
+    assert {"reskin", "reskin.models"} <= set(names)  # packages, whose __init__.py runs first
     assert all(name.split(".")[0] in code.PACKAGES for name in names)
 
 
@@ -75,7 +75,7 @@ def test_computing_stages_import_only_display_modules_of_the_report(stage):
     assert imported <= DISPLAY
 
 
-def test_editor_backups_change_nothing(monkeypatch, tmp_path):
+def test_backup_files_of_editors_do_not_change_the_digest(monkeypatch, tmp_path):
     before = digest(monkeypatch, tmp_path, SOURCE)
     (tmp_path / "pipeline/one.py~").write_text("old")
     (tmp_path / "pipeline/one.py.orig").write_text("old")

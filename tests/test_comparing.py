@@ -1,4 +1,4 @@
-"""Tests of `reskin compare`: its command line, and which values and verdicts differ."""
+"""Tests of `reskin compare`: arguments, and the printed differences of values and verdicts."""
 
 import subprocess
 
@@ -25,7 +25,7 @@ def write(reports, accuracy_pct: float, *, verdict: str = "yes", device: str = X
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """Return a checkout with a committed accuracy of 80 %."""
+    """Return a git checkout whose committed reports have an accuracy of 80 %."""
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     for name in ("quick", "lab"):
@@ -43,7 +43,7 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def rows(output: str) -> list[list[str]]:
-    """Return the cells of the tables in an output."""
+    """Return the cells of each table row in an output."""
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in output.splitlines() if line[:1] == "|"]
 
 
@@ -73,7 +73,7 @@ def test_difference_lists_machines_and_sizes(checkout):
     assert "0 verdicts changed" in summary
 
 
-def test_last_digit_is_a_difference(checkout):
+def test_difference_in_the_last_digit_is_listed(checkout):
     write(checkout / "reports/quick", 80.00000000000001)
     code, output = run("quick")
     assert code == 1

@@ -1,4 +1,4 @@
-"""Tests of the scripts and programs that start servers and clusters."""
+"""Tests of the deployment scripts, and of the helpers that start and stop servers."""
 
 import os
 import subprocess
@@ -47,7 +47,7 @@ def test_program_and_children_end_with_the_block(tmp_path):
         raise ZeroDivisionError
     group = int((tmp_path / "group").read_text())
     with pytest.raises(ProcessLookupError):
-        for _ in range(100):  # until init has reaped the processes
+        for _ in range(100):  # waits until init has removed the ended processes
             os.killpg(group, 0)
             time.sleep(0.05)
 

@@ -1,4 +1,4 @@
-"""Tests of the description of captures, with synthetic readings whose noise, steps and forces are known."""
+"""Tests of the description of captures, on synthetic readings with known noise, LSB and forces."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ REST_uT = np.array([300.0, -400.0, 0.0, 1000.0, 0.0, -2500.0], np.float32)
 
 
 def example_readings(*, uT_per_N=100.0, noise_uT=(3.0, 5.0), force_N=2.0, places=True, known_force=True):
-    """Return readings of two chips, the second a quarter as sensitive as the first."""
+    """Return readings of two chips; the second chip is a quarter as sensitive as the first."""
     rng, readings_n = rng_for(0, "made"), INDENTATIONS_N * READINGS_N
     forces_N = force_N * np.repeat(rng.uniform(0.9, 1.1, INDENTATIONS_N), READINGS_N)
     shape = np.array([0, 0, 4.0, 0, 0, 1.0]) / np.sqrt(17)
@@ -38,7 +38,7 @@ def test_fields_noise_steps_and_forces_are_recovered():
     found = describe(example_readings())
     assert found["field_at_rest_chip_median_uT"] == pytest.approx((500 + np.hypot(1000, 2500)) / 2)
     assert found["field_at_rest_channel_max_uT"] == 2500
-    assert found["noise_xy_uT"] == pytest.approx(3.0, rel=0.05)  # 1600 degrees of freedom: 2 %
+    assert found["noise_xy_uT"] == pytest.approx(3.0, rel=0.05)  # 1600 degrees of freedom: standard error 2 %
     assert found["noise_z_uT"] == pytest.approx(5.0, rel=0.05)
     assert found["step_xy_uT"] == pytest.approx(0.2, rel=1e-3)
     assert found["step_z_uT"] == pytest.approx(0.3227, rel=1e-3)
@@ -49,24 +49,24 @@ def test_fields_noise_steps_and_forces_are_recovered():
 
 
 def test_random_walk_at_rest_grows_with_the_root_of_the_contact_count():
-    still = example_readings()
+    without_walk = example_readings()
     steps_uT = 0.5 * rng_for(0, "walk").standard_normal((INDENTATIONS_N, 6))
     drifting = replace(
-        still, noload_uT=REST_uT + np.repeat(np.cumsum(steps_uT, axis=0), READINGS_N, axis=0).astype(np.float32)
+        without_walk, noload_uT=REST_uT + np.repeat(np.cumsum(steps_uT, axis=0), READINGS_N, axis=0).astype(np.float32)
     )
     found = describe(drifting)
     assert found["rest_changes_in_1_uT"] == pytest.approx(0.5, rel=0.05)
     assert found["rest_changes_in_10_uT"] == pytest.approx(0.5 * np.sqrt(10), rel=0.1)
-    assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)  # 4 x 6 changes only
+    assert found["rest_changes_in_100_uT"] == pytest.approx(0.5 * 10, rel=0.35)  # only 4 x 6 changes
     assert "rest_changes_in_1000_uT" not in found
-    assert describe(still)["rest_changes_in_100_uT"] == 0
+    assert describe(without_walk)["rest_changes_in_100_uT"] == 0
 
 
 def test_recording_without_clock_has_no_rate():
     assert "rate_hz" not in describe(replace(example_readings(), t_s=np.full(INDENTATIONS_N * READINGS_N, np.nan)))
 
 
-def test_motion_between_stops_is_not_noise():
+def test_motion_between_stops_is_not_counted_as_noise():
     line = example_readings()
     moved = replace(line, indentation=line.indentation // 2, x_mm=(line.indentation % 2).astype(np.float32))
     assert describe(moved)["noise_z_uT"] == describe(line)["noise_z_uT"]
@@ -102,14 +102,14 @@ def test_captures_of_one_skin_count_once():
     assert summary["b"] == {"mean": 7.0, "least": 7.0, "most": 7.0, "n": 1}
 
 
-def test_growth_with_force_is_over_all_captures_of_a_skin():
+def test_growth_with_force_uses_all_captures_of_a_skin():
     summary = over_skins([("s0", {"change_at_1_N_uT": 200.0}), ("s0", {"change_at_3_N_uT": 500.0}), ("s1", {"a": 1.0})])
     assert summary["change_at_3_N_over_1_N"]["mean"] == pytest.approx(2.5)
     assert summary["change_at_3_N_over_1_N"]["n"] == 1
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=9))
-def test_mean_is_between_least_and_most(values):
+def test_mean_is_between_minimum_and_maximum(values):
     one = over_skins([(f"s{i}", {"a": value}) for i, value in enumerate(values)])["a"]
     assert one["least"] - 1e-6 <= one["mean"] <= one["most"] + 1e-6
 

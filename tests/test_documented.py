@@ -1,4 +1,4 @@
-"""The docs name all parameters, columns and numbers, and only files that exist."""
+"""Tests that the docs name all parameters, columns and numbers, and only files that exist."""
 
 import re
 from collections.abc import Iterator
@@ -21,10 +21,10 @@ from reskin.simulation.defaults import NOMINAL
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS = [ROOT / "params.yaml", NOMINAL, *sorted((ROOT / "pipeline/scenes").glob("*.yaml"))]
-# Sections whose keys are names of rows.
+# Sections whose keys are names of entries (such as recipes or boards), not parameters.
 NAMED = {"recipes", "adaptations", "labellings", "boards", "protocols", "variants", "rules"}
 
-# Names of rows, boards, captures and stages, which need no documentation.
+# Names of rows, boards, captures and stages, which are not documented individually.
 NAME = re.compile(r".* .*|[0-9]+|[bf][0-9](_s[0-9].*)?|board[0-9].*|(ingest|simulate).*|knn-.*|shape|released")
 
 
@@ -34,7 +34,7 @@ def code_words(page: str) -> set[str]:
 
 
 def keys(settings: Any, names_depth: int = 0) -> Iterator[str]:
-    """Yield the keys of nested settings, except for names of rows, which the next `names_depth` levels have."""
+    """Yield the keys of nested settings; the keys of the first `names_depth` levels are names and are omitted."""
     for key, value in settings.items() if isinstance(settings, dict) else ():
         if not names_depth:
             yield key
@@ -95,5 +95,5 @@ def test_scene_and_recipe_of_the_docs_are_valid():
 )
 def test_files_in_docs_exist(page):
     files = re.findall(r"`((?:reskin|pipeline|tests)/[\w./-]+)`", page.read_text(encoding="utf-8"))
-    examples = re.compile(r".*/(test_)?(repeat|tiny)[./].*")  # examples to add
+    examples = re.compile(r".*/(test_)?(repeat|tiny)[./].*")  # files of examples, which users create
     assert sorted({name for name in files if not (ROOT / name).exists() and not examples.match(name)}) == []

@@ -1,4 +1,4 @@
-"""Tests of dvc.yaml: stages depend on their code and declare the paths in their commands."""
+"""Tests of dvc.yaml: stages depend on digests of their code and declare the paths in their commands."""
 
 import shutil
 import subprocess
@@ -46,7 +46,7 @@ def test_report_depends_on_every_data_file_of_tables_pages_and_experiments():
     assert {file for file in data if file.suffix in code.DATA} <= read
 
 
-def test_caption_reruns_only_the_report(monkeypatch):
+def test_edited_caption_reruns_only_the_report(monkeypatch):
     monkeypatch.setattr(code, "normalised", lambda file, content: b"other" if file == "manual.yaml" else b"same")
     code.digest.cache_clear()
     other = {stage: digests_of(stage)[MANUAL] for stage in ("manual", "report")}
@@ -65,7 +65,7 @@ def test_paths_of_commands_are_declared(name):
     outs = [one if isinstance(one, str) else next(iter(one)) for key in ("outs", "plots") for one in stage.get(key, [])]
     params = [next(iter(one)) for one in stage.get("params", [])]
     declared = [*stage["deps"], *outs, *params]
-    paths = [word for word in stage["cmd"].split() if "/" in word]  # test_settings checks the keys of params
+    paths = [word for word in stage["cmd"].split() if "/" in word]  # test_settings.py checks the keys of params
     unknown = [p for p in paths if not any(d == p or d.startswith(f"{p}/") or p.startswith(f"{d}/") for d in declared)]
     assert unknown == []
 
@@ -84,6 +84,7 @@ def test_ignored_recordings_are_tracked_by_dvc(tmp_path):
     (capture / "readings.csv").write_text("x\n")
     (tmp_path / "data/raw/lab/one.dvc").write_text("outs:\n- path: one\n  md5: d41d8cd98f00b204e9800998ecf8427e.dir\n")
     with Repo(str(tmp_path)) as repo:
-        assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]  # pushed by DVC
+        # tracked, so `dvc push` includes the recording
+        assert [stage.path_in_repo for stage in repo.index.stages] == ["data/raw/lab/one.dvc"]
     status = subprocess.check_output(["git", "status", "--porcelain", "-uall", "data"], cwd=tmp_path, text=True)
     assert status == "?? data/raw/lab/one.dvc\n"

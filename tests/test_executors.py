@@ -17,14 +17,14 @@ def test_calls_run_in_separate_processes(monkeypatch):
         assert executor.submit(os.getpid).result() != os.getpid()
 
 
-def test_cpu_time_of_ended_workers_is_counted(monkeypatch):
+def test_cpu_time_includes_ended_workers(monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
     with make_executor(imports="json") as executor:
         executor.submit(burn, 0.3).result()
     before_s = children_s()
     end_workers()
     assert children_s() - before_s >= 0.3
-    end_workers()  # has no effect without workers
+    end_workers()  # a second call has no effect
 
 
 def children_s() -> float:
@@ -87,12 +87,13 @@ def test_call_time_is_the_median_after_a_warm_up(monkeypatch):
 
     def call() -> None:
         calls.append(len(calls))
-        now_s[0] += 1000.0 if len(calls) == 1 else float(len(calls))  # a cold call, then 2 s, 3 s, ...
+        # the first call takes 1000 s, the next ones 2 s, 3 s, ...
+        now_s[0] += 1000.0 if len(calls) == 1 else float(len(calls))
 
     monkeypatch.setattr(job, "perf_counter", lambda: now_s[0])
     median_s = job.median_call_s(call)
     assert len(calls) == job.REPEATS_N + 1
-    assert median_s == (2 + job.REPEATS_N + 1) / 2  # the median of 2 .. 26 s
+    assert median_s == (2 + job.REPEATS_N + 1) / 2  # median of 2 s to 26 s
 
 
 def test_single_slow_call_does_not_change_the_median(monkeypatch):

@@ -1,4 +1,4 @@
-"""Tests of fetching public recordings: checked and added once; errors leave no files."""
+"""Tests of `reskin fetch`: public recordings are checked and added once; errors leave no files."""
 
 import errno
 import os
@@ -35,7 +35,7 @@ SOURCES = fetching.read_sources(ROOT)
 
 
 def boards(folder: Path) -> dict[str, bytes]:
-    """Return two recordings, one per board, with line ends that git would change."""
+    """Return two recordings, one per board, with line ends that git would convert."""
     folder.mkdir()
     text = (write(folder, *PRESSES) / lab.READINGS).read_text().replace("\n", "\r\n")
     return {"board1.csv": text.encode(), "board2.csv": text.replace("160.0000", "160.4000").encode()}
@@ -56,7 +56,7 @@ def source_of(files: dict[str, bytes], home: str, commit: str | None, **changes:
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory) -> SimpleNamespace:
-    """Return a checkout whose plan has no scenes, and a repository of two recordings, one changed by a later commit."""
+    """Return a checkout without scenes, and a repository of two recordings, one of which a later commit changes."""
     root, away = copy_checkout(tmp_path_factory.mktemp("checkout")), tmp_path_factory.mktemp("away")
     plan.use(root, [])
     with (root / SCENES / "small.yaml").open("w") as stream:
@@ -71,7 +71,7 @@ def example(tmp_path_factory) -> SimpleNamespace:
 
 @pytest.fixture
 def root(example, tmp_path) -> Path:
-    """Return a checkout whose only source is that repository."""
+    """Return a checkout whose only source of recordings is the repository of `example`."""
     root = shutil.copytree(example.root, tmp_path / "checkout", symlinks=True)
     write_source(root, source_of(example.files, example.url, example.commit))
     return root
@@ -103,7 +103,7 @@ def fetched_files(root: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def without_adding(monkeypatch) -> None:
-    """Fetch without adding the recordings, which takes seconds."""
+    """Replace the step that adds fetched recordings, because adding takes seconds."""
     monkeypatch.setattr(fetching, "_add_all", lambda *_: None)
     monkeypatch.setattr(fetching, "_say_what_runs", lambda *_: None)
 
@@ -172,7 +172,8 @@ def test_missing_commit_is_an_error(root, example):
 
 
 def test_wrong_checksum_is_an_error(root, example):
-    write_source(root, source_of(example.files, example.url, None))  # the newest commit, in which one file differs
+    # without a commit: the newest, in which one file differs
+    write_source(root, source_of(example.files, example.url, None))
     other, right = sha256(b"edited\n").hexdigest(), sha256(example.files["board1.csv"]).hexdigest()
     assert_refused(root, f"data/board1.csv: sha256 must be {right} .*; got {other} .7 bytes.*--from takes a git mirror")
 
@@ -215,7 +216,7 @@ def test_consent_can_be_given_on_the_command_line(root, example, monkeypatch):
     assert done.stdout.endswith("Not added.\n")
 
 
-def test_archives_are_checked_as_converted_tables(root, tmp_path):
+def test_checksum_of_an_archive_is_that_of_the_converted_table(root, tmp_path):
     rows = [
         f"{i},{phase},{4 * i},2,{','.join(f'{value * (1 + i):.4f}' for value in range(20))},0.000000,0.000000,{force}"
         for i in range(2)
@@ -298,7 +299,7 @@ def test_sources_have_recordings_and_a_known_scene_or_a_note(name):
 @pytest.mark.parametrize("name", SOURCES)
 def test_real_recordings_match_their_checksums_and_are_read(name, shared_data, tmp_path):
     fetching.download(SOURCES[name], str(shared_data / name), tmp_path / name)
-    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # rows, as in data/README.md
+    counts = {"lab": 7150, "ini": 23300, "eflesh": 4805, "eflash7": 268}  # numbers of rows, as in data/README.md
     readers = {"lab": lab, "ini": ini, "eflesh": eflesh, "eflash7": eflash7}
     for recording in SOURCES[name].recordings[:1]:
         labels = CaptureNames(recording.board, recording.skin, None)

@@ -48,7 +48,7 @@ def test_readings_are_written_reproducibly(tmp_path):
 
 
 def test_capture_without_readings_is_an_error(tmp_path):
-    with pytest.raises(SchemaError, match="no readings left"):
+    with pytest.raises(SchemaError, match="all readings of the capture were dropped"):
         io.write_readings(tmp_path / "c0.parquet", [], {})
     assert list(tmp_path.iterdir()) == []
 
@@ -70,7 +70,7 @@ def test_failed_write_keeps_the_old_file(tmp_path):
 
 def test_os_errors_name_the_right_file(tmp_path):
     def names_in_errors(*names: Path) -> tuple[str, ...]:
-        """Return the file named for EACCES, ENOSPC and EIO when writing a.txt fails with `names` in the error."""
+        """Return the file named in our errors if writing a.txt raises EACCES, ENOSPC and EIO with the files `names`."""
         found = []
         for number in (errno.EACCES, errno.ENOSPC, errno.EIO):
             metadata = (names[0], None, names[1]) if len(names) == 2 else names
@@ -82,7 +82,8 @@ def test_os_errors_name_the_right_file(tmp_path):
     source, temporary = tmp_path / "source", tmp_path / f".a.txt.{os.getpid()}.tmp"
     assert names_in_errors(source) == ("source", "source", "source")
     assert names_in_errors(temporary) == ("a.txt", "a.txt", "a.txt")
-    assert names_in_errors(source, temporary) == ("a.txt", "a.txt", "source")  # EIO may concern either file of a copy
+    # EIO may be caused by either file of a copy
+    assert names_in_errors(source, temporary) == ("a.txt", "a.txt", "source")
     assert names_in_errors() == ("a.txt", "a.txt", "")
 
 
@@ -165,7 +166,7 @@ def test_broken_safetensors_are_an_error(tmp_path):
 
 
 def flip_bits(file: Path) -> Iterator[int]:
-    """Flip one bit of each byte in turn, and yield the index of the byte."""
+    """For each byte of a file, flip one bit, yield the index of the byte, and restore the byte."""
     content_before = file.read_bytes()
     for i in range(len(content_before)):
         content = bytearray(content_before)
@@ -187,20 +188,20 @@ def test_flipped_bits_of_tensors_are_detected(tmp_path):
             continue
         assert all(np.array_equal(found[name], tensors[name]) for name in tensors)
         assert {name: metadata[name] for name in ("format", "trial")} == {"format": "1", "trial": "x"}
-    assert detected_n > file.stat().st_size - 8  # a flip in the key of the digest goes undetected
+    assert detected_n > file.stat().st_size - 8  # flips in the name of the digest's key are not detected
 
 
 def test_flipped_bits_of_tables_are_detected(tmp_path):
     file = tmp_path / "c0.parquet"
     io.write_readings(file, [readings()], {"rows_n": 6})
     before, chunks = repr(io.read_table(file).to_pydict()), pq.read_metadata(file).row_group(0)
-    end, detected_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0  # metadata follow after this byte
+    end, detected_n = chunks.column(chunks.num_columns - 1).data_page_offset, 0  # file metadata start after this byte
     for i in flip_bits(file):
         try:
             assert repr(io.read_table(file).to_pydict()) == before or i > end
         except SchemaError as error:
             detected_n += i <= end and "c0.parquet: the file is not readable as Parquet" in str(error)
-    assert detected_n > end // 2  # the other bits are in page headers and do not affect the values
+    assert detected_n > end // 2  # the other bytes are in page headers, and their bits do not affect the values
 
 
 def test_tensors_without_digest_are_read(tmp_path):

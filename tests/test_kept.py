@@ -1,4 +1,4 @@
-"""Tests of cached arrays."""
+"""Tests of arrays that are cached in files beside the code."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def cached_files(package):
     return sorted((package / "__pycache__").glob("*"))
 
 
-def test_cached_array_round_trips(package):
+def test_cached_array_is_loaded_unchanged(package):
     array = np.random.default_rng(0).normal(size=(3, 2))
     assert io.load_cached_array(package, "flow 1") is None
     io.save_cached_array(package, "flow 1", array)

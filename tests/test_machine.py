@@ -1,4 +1,4 @@
-"""Tests of operating-system errors, which become one line; programming errors pass unchanged."""
+"""Tests of error messages: operating-system errors become one line; programming errors are not caught."""
 
 import errno
 import os
@@ -34,7 +34,7 @@ def test_os_errors_are_explained(error, message):
 @pytest.mark.parametrize(
     "error", [FileNotFoundError(errno.ENOENT, "No such file", "x"), ValueError("ours"), KeyError(1)]
 )
-def test_other_errors_pass_unchanged(error):
+def test_other_errors_are_not_caught(error):
     with pytest.raises(type(error)), explaining("split"):
         raise error
 

@@ -1,4 +1,4 @@
-"""Tests of merging clones in which two people added recordings."""
+"""Tests of `reskin merge`, for clones in which two people added recordings."""
 
 import shutil
 import subprocess
@@ -30,7 +30,7 @@ def entry(skin: str, board: str, *fingerprints: str) -> Entry:
 
 
 def add_and_commit(root: Path, name: str, skin: str, board: str, scene: str = "shared") -> None:
-    """Make and commit the changes that `reskin add` and `dvc repro` make to files in git."""
+    """Change the files in git as `reskin add` and `dvc repro` do, and commit them."""
     write_registry(root, with_entry(read_registry(root), scene, name, entry(skin, board), allow_copy=False))
     plan.use(root, sorted({*plan.read_plan(root / PLAN).scenes, scene}))
     lock = YAML(typ="safe").load((root / "dvc.lock").read_text())
@@ -79,7 +79,7 @@ def test_registry_plan_and_lock_have_both_recordings(root):
     assert list(plan.check(root).stages["ingest"]) == ["shared-mine", "shared-yours"]
     stages = YAML(typ="safe").load((root / "dvc.lock").read_text())["stages"]
     assert {"report@quick", "ingest@shared-mine", "ingest@shared-yours"} <= stages.keys()
-    assert stages["report@shared"] == {"cmd": "with mine"}  # our entry, unmerged; DVC runs it again
+    assert stages["report@shared"] == {"cmd": "with mine"}  # only our entry, so DVC will run the stage again
     assert (root / "reports/shared/tables/lobo.md").read_text() == "with mine\n"
     assert git(root, "diff", "--name-only", "--diff-filter=U") == ""
     git(root, "commit", "-qm", "Merge")
@@ -127,7 +127,7 @@ def test_added_scenes_are_planned_and_removed_ones_are_not():
     assert merge.merge_scenes([], ["mine"], ["mine", "yours"]) == ["mine", "yours"]
 
 
-def test_hand_written_files_are_not_merged(root):
+def test_conflicts_in_files_written_by_hand_are_not_merged(root):
     git(root, "checkout", "-qb", "theirs")
     (root / PARAMS).write_text("theirs: 1\n")
     git(root, "commit", "-qam", "Change a parameter")
@@ -145,15 +145,15 @@ def test_merge_without_conflict_is_an_error(root):
 
 
 def test_removed_and_replaced_captures_are_not_restored():
-    kept, gone, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
-    base = Registry(captures={"scene": {"kept": kept, "gone": gone, "replaced": old}})
+    kept, removed, old, new = (entry(name, name) for name in ("s1", "s2", "s3", "s4"))
+    base = Registry(captures={"scene": {"kept": kept, "gone": removed, "replaced": old}})
     theirs = Registry(captures={"scene": {"kept": kept, "replaced": new}})
     assert merge.merge_registries(base, base, theirs) == theirs
     assert merge.merge_registries(base, theirs, base) == theirs
     assert merge.merge_registries(base, theirs, theirs) == theirs
 
 
-def test_lock_entries_come_from_one_side():
+def test_each_lock_entry_comes_from_one_side():
     base, changed = {"a": {"in": 1, "out": 1}, "b": 1}, {"a": {"in": 2, "out": 2}}
     assert merge.merge_stages(base, base, changed) == (changed, [])
     assert merge.merge_stages(base, changed, base) == (changed, [])

@@ -1,4 +1,4 @@
-"""Tests that training is equal to the last bit on all processors with AVX2, and that the user's settings are kept."""
+"""Tests that training is equal bit for bit on all processors with AVX2, and that variables set by the user are kept."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ needs_avx2 = pytest.mark.skipif("avx2" not in cpu_flags(), reason="nothing is se
 
 @cache
 def digests_under(*settings: str) -> str:
-    """Return digests of tiny training runs in a new process with these environment variables."""
+    """Return the digests of tests.arithmetic, run in a new process with these environment variables."""
     inherited = {
         name: value for name, value in os.environ.items() if name not in VARIABLES and not name.startswith("MKL")
     }
@@ -36,7 +36,7 @@ def digests_under(*settings: str) -> str:
 @pytest.mark.parametrize(
     "settings",
     [
-        ("MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41"),  # as on a processor unknown to MKL and oneDNN
+        ("MKL_CBWR=COMPATIBLE", "ONEDNN_MAX_CPU_ISA=SSE41"),  # code that MKL and oneDNN use on unknown processors
         ("MKL_ENABLE_INSTRUCTIONS=AVX2",),
         ("OMP_NUM_THREADS=3", "MKL_NUM_THREADS=3"),
     ],
@@ -62,17 +62,18 @@ def test_affine_equals_pytorch():
         (affine(*ours) * weights).sum().backward()
         (torch.matmul(theirs[0], theirs[1]).add(theirs[2]) * weights).sum().backward()
         for one, other in zip(ours, theirs, strict=True):
-            torch.testing.assert_close(one.grad, other.grad)  # float64: sums of at most 21 products of size 1
+            # tolerance: float64 sums of at most 21 products of about 1
+            torch.testing.assert_close(one.grad, other.grad)
         torch.testing.assert_close(affine(*ours), torch.matmul(theirs[0], theirs[1]) + theirs[2])
 
 
-def test_affine_overflow_is_infinite():
+def test_overflow_of_affine_is_infinite():
     assert affine(torch.full((2, 3), 1e30), torch.full((3, 1), 1e30), torch.zeros(1, 1)).isinf().all()
 
 
 @given(st.floats(-80, 80, width=32))
 def test_exp_equals_numpy_in_float32(value):
-    # 80 x log2(e) = 115 is rounded to 2^-18: an error of at most 3e-6 of the power of two.
+    # Tolerance: 80 log2(e) = 115 is rounded to 2^-18, a relative error of at most 3e-6 of the result.
     assert float(exp(torch.tensor([value]))) == pytest.approx(np.exp(np.float64(value)), rel=5e-6)
 
 

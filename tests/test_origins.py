@@ -1,4 +1,4 @@
-"""Tests of reading files from repositories, mirrors and folders at a given commit."""
+"""Tests of reading the files of a given commit from a repository, a mirror or a folder."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from pipeline.manage.fetch import Origin, open_origin
 from reskin.errors import CaptureError
 from tests import repositories
 
-# Line ends that git would change, binary data, a name that a shell would expand, a name that git would quote.
+# Files with line ends that git would convert, binary data, a name that a shell would expand, a name that git quotes.
 FILES = {
     "data/crlf.csv": b"a,b\r\n1,2\r\n",
     "data/lf.csv": b"a,b\n1,2\n",
@@ -55,14 +55,14 @@ def test_mirror_can_be_any_kind_of_clone(tmp_path, home, scratch, kind):
     assert contents(open_origin(str(where), commit, scratch)) == FILES
 
 
-def test_folder_has_its_files(home, scratch):
+def test_folder_is_read_as_it_is(home, scratch):
     repositories.commit(home, FILES)
     assert contents(open_origin(str(home / "data"), "0" * 40, scratch)) == {
         path.removeprefix("data/"): content for path, content in FILES.items() if path.startswith("data/")
     }
 
 
-def test_older_commit_has_its_own_bytes(tmp_path, home, scratch):
+def test_older_commit_has_its_bytes(tmp_path, home, scratch):
     first = repositories.commit(home, FILES)
     repositories.commit(home, {"data/lf.csv": b"edited\n"})
     url = repositories.bare(home, tmp_path / "mirror.git", filters=True)
@@ -81,7 +81,7 @@ def test_old_server_is_read_by_branches(tmp_path, home, scratch, monkeypatch):
     repositories.commit(home, {"data/lf.csv": b"edited\n"})
     url = repositories.bare(home, tmp_path / "mirror.git", filters=False)
     for name, value in {"COUNT": "1", "KEY_0": "protocol.version", "VALUE_0": "0"}.items():
-        monkeypatch.setenv(f"GIT_CONFIG_{name}", value)  # the old protocol offers branches and tags only
+        monkeypatch.setenv(f"GIT_CONFIG_{name}", value)  # the old protocol offers only branches and tags
     assert open_origin(url, first, scratch).read("data/lf.csv") == FILES["data/lf.csv"]
 
 
@@ -91,7 +91,7 @@ def test_only_needed_files_are_transferred(tmp_path, home, scratch):
     url = repositories.bare(home, tmp_path / "mirror.git", filters=True)
     origin = open_origin(url, commit, scratch)
     origin.read("data/lf.csv")
-    # Git marks missing objects with a question mark.
+    # Git lists missing objects with a question mark.
     (fetched,) = scratch.iterdir()
     missing = repositories.git(fetched, "rev-list", "--objects", "--missing=print", commit).splitlines()
     assert f"?{repositories.git(home, 'rev-parse', f'{commit}:large.bin')}" in missing
@@ -141,7 +141,7 @@ def test_folder_is_read_without_git(tmp_path, home, scratch, monkeypatch):
         ("data/raw/a.csv", "data/raw/a.csv"),
         ("raw/a.csv", "data/raw/a.csv"),
         ("home/data/old/a.csv", "data/old/a.csv"),
-        ("elsewhere/a.csv", "data/old/a.csv"),  # the first of two paths of equal length
+        ("elsewhere/a.csv", "data/old/a.csv"),  # of two paths of equal length, the first
         ("raw/ba.csv", None),
         ("raw", None),
     ],

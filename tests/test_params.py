@@ -9,7 +9,7 @@ from reskin.errors import ParamsError
 from tests.scenes import ADAPTATIONS, SECTIONS, SPLIT_SETTINGS, TRAINING, check, recorded_scene, scene_with
 
 ROOT = Path(__file__).resolve().parents[1]
-ADAPTED = ("lobo", "triplet", "adapt")  # experiments that the adaptation experiments need
+ADAPTED = ("lobo", "triplet", "adapt")  # adaptation and the experiments that it needs
 LEARNING = ("models", "curve", "study")
 
 
@@ -111,7 +111,7 @@ def test_removed_experiment_removes_section_and_protocol(dropped):
     settings = read_yaml(ROOT / "pipeline/scenes/ci.yaml")
     settings["experiments"].remove(dropped)
     settings.pop(dropped)
-    if dropped == "drift":  # variation uses its captures too
+    if dropped == "drift":  # variation also uses the captures of drift
         parse_scene(settings, "ci.yaml")
         return
     with pytest.raises(ParamsError, match="no experiment uses drag of simulate.protocols"):
@@ -155,7 +155,7 @@ def test_scene_with_all_experiments():
     assert checked.curves == {
         "pokes": "sweep_pokes", "sensors": "sweep_sensors", "baselines": "train_classical", "labels": "few_labels"
     }  # fmt: skip
-    assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}  # experiments with folds
+    assert set(checked.with_folds) == {"lobo", "transfer", "sensors", "labels"}  # names of experiments with folds
 
 
 def test_scene_with_one_experiment():

@@ -1,4 +1,4 @@
-"""Tests of the safe pickle decoder for plain values and NumPy arrays, and of archives of samples."""
+"""Tests of the safe pickle decoder (plain values, NumPy arrays), and of archives of samples from the lab's rig."""
 
 import hashlib
 import os
@@ -46,7 +46,7 @@ def test_numpy_values_become_lists(kind, protocol):
 
 
 class CommandPickle:
-    """An object whose pickle runs a command when loaded."""
+    """An object whose pickle would run a command when loaded."""
 
     def __init__(self, command: str) -> None:
         self.command = command
@@ -62,7 +62,7 @@ def test_pickled_commands_are_not_run(tmp_path, protocol):
         decode(pickle.dumps([CommandPickle(command)], protocol), "a")
     assert not (tmp_path / "ran").exists()
     pickle.loads(pickle.dumps([CommandPickle(command)], protocol))
-    assert (tmp_path / "ran").exists()  # pickle itself runs it
+    assert (tmp_path / "ran").exists()  # Python's pickle does run the command
 
 
 @given(st.binary(max_size=200) | st.binary(max_size=50).map(lambda tail: pickle.dumps([1, {"a": 2.5}], 4)[:-1] + tail))
@@ -77,12 +77,12 @@ def sample(indent: int, place, fields, forces) -> dict:
 
 def archive_of(**samples) -> bytes:
     stream = BytesIO()
-    np.savez(stream, **samples)  # a list of dicts becomes an array of objects, which NumPy pickles
+    np.savez(stream, **samples)  # NumPy pickles a list of dicts as an array of objects
     return stream.getvalue()
 
 
 def archive_of_csv(text: str) -> bytes:
-    """Return an archive with the rows of a lab CSV, as the rig writes it."""
+    """Return an archive as the lab's rig writes it, with the rows of a lab CSV."""
     parts: dict[str, list] = {"noload": [], "contact": []}
     for line in text.splitlines()[1:]:
         indent, phase, *cells = line.split(",")
@@ -129,9 +129,12 @@ def test_archive_becomes_a_lab_recording(tmp_path):
     [
         (b"", "not a .npz with samples under bl_arr and cont_arr: BadZipFile"),
         (archive_of(bl_arr=[sample(0, [0, 0], FIELDS, [0, 0, 0])]), "cont_arr.npy"),
-        (archive_of(bl_arr=[1.5], cont_arr=[1.5]), "the array holds float64, not objects"),
+        (archive_of(bl_arr=[1.5], cont_arr=[1.5]), "the array contains float64, not objects"),
         (archive_of(bl_arr=[{"a": 1}], cont_arr=[{"a": 1}]), "KeyError 'Indent'"),
-        (archive_of(bl_arr=[sample(0, [0, 0], [1.0], [0, 0, 0])], cont_arr=[{}]), "a sample of 2 places, 1 fields"),
+        (
+            archive_of(bl_arr=[sample(0, [0, 0], [1.0], [0, 0, 0])], cont_arr=[{}]),
+            "a sample has 2 coordinates, 1 readings",
+        ),
         (
             archive_of(bl_arr=[sample(0, [0, 0], ["x"] * 20, [0, 0, 0])], cont_arr=[{}]),
             "ValueError Unknown format code",
@@ -146,7 +149,7 @@ def test_invalid_archive_is_an_error(archive, message):
 
 
 def test_real_samples_give_the_recorded_file(shared_data):
-    """The archive is rebuilt from the recorded values, as the original is not available."""
+    """The original archive is not available, so an archive is built from the recorded values."""
     file = shared_data / "lab/board1_depth1.csv"
     known = {entry.path: entry.sha256 for entry in read_sources(ROOT)["lab"].files}
     again = to_lab_csv(archive_of_csv(file.read_text()), "a")
@@ -156,6 +159,6 @@ def test_real_samples_give_the_recorded_file(shared_data):
 def test_nested_references_are_converted_once():
     nested: list = []
     for _ in range(60):
-        nested = [nested, nested]  # 2^60 paths
+        nested = [nested, nested]  # 2^60 paths through the references
     found = decode(pickle.dumps(nested, 4), "a")
     assert found[0] is found[1]

@@ -127,7 +127,7 @@ def checkout(folder: Path, planned: str = "{}") -> Path:
     return folder
 
 
-def test_use_writes_only_the_plan(tmp_path):
+def test_scenes_use_writes_only_the_plan(tmp_path):
     root = checkout(tmp_path)
     others = [root / PARAMS, *(root / SCENES).iterdir()]
     before = [file.read_bytes() for file in others]
@@ -153,7 +153,7 @@ def test_unknown_scene_is_an_error(tmp_path):
 
 
 def simulated_checkout(tmp_path, **changes):
-    """Return a checkout whose scene `one` is a copy of ci with changes in section simulate."""
+    """Return a function that creates a checkout with scene `one`: a copy of ci with changes in section simulate."""
     root = checkout(tmp_path)
     shutil.copy(ROOT / PARAMS, root)
     shutil.copy(ROOT / SCENES / "ci.yaml", root / SCENES / "one.yaml")
@@ -176,7 +176,7 @@ def test_each_protocol_has_a_folder_and_stages(tmp_path):
     stages = plan.check(root).stages
     protocols = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
     assert set(stages["simulate"]) == {"one", *(f"one-{protocol}" for protocol in protocols)}
-    assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}  # an SD card has no probe file
+    assert set(stages["ingest_simulated"]) == set(stages["simulate"]) - {"one-log"}  # an SD card log has no probe log
     assert stages["describe"] == ["one"]
     assert stages["drift"] == {"one": "one-wear"}
 
@@ -216,5 +216,5 @@ def test_dvc_checkout_keeps_outputs_of_other_scenes(tmp_path):
     run(root, "dvc", "repro", "simulate@ci")
     run(root, "reskin", "scenes", "use", "quick")
     run(root, "dvc", "repro", "simulate@quick")
-    run(root, "dvc", "checkout", check=False)  # fails: other stages of quick never ran
+    run(root, "dvc", "checkout", check=False)  # exits with an error, because other stages of quick never ran
     assert sorted(path.name for path in (root / "data/raw").iterdir() if path.is_dir()) == ["ci", "quick"]

@@ -1,4 +1,4 @@
-"""Tests of `reskin predict` and its errors, with a network of constant output."""
+"""Tests of `reskin predict`, with a network whose output is constant."""
 
 import json
 
@@ -40,7 +40,7 @@ def model(tmp_path):
 
 
 def log_of(chips_n=5):
-    """Return time, field (two decimals) and temperature of the frames of a log."""
+    """Return times, fields (two decimals) and temperatures of the frames of a log."""
     frames_n = QUIET_N + TOUCHED_N
     touched = np.arange(frames_n) >= QUIET_N
     noise_uT = 3 * rng_for(0, "log").standard_normal((frames_n, 3 * chips_n))
@@ -55,7 +55,7 @@ def write_log(folder, chips_n=5, scale=1.0):
 
 
 def write_stream(folder, wire):
-    """Write the same frames to a capture folder, as `reskin record` does."""
+    """Write the frames of `log_of` to a capture folder, as `reskin record` does."""
     t_s, b_uT, temperature_degC = log_of()
     stream = encode(Frames(b_uT, temperature_degC, t_s, np.zeros(len(t_s), np.int64)), wire)
     ends = np.cumsum([len(line) + 1 for line in stream.split(b"\n")[:-1]])
@@ -85,7 +85,7 @@ def test_fields_in_mT_are_refused(tmp_path, model):
         predict(write_log(tmp_path, scale=1e-3), model, tmp_path / "out.csv")
 
 
-def test_unsuitable_tables_and_labelled_recordings_raise(tmp_path, model):
+def test_unsuitable_tables_and_labelled_recordings_are_an_error(tmp_path, model):
     io.write_table(tmp_path / "x.parquet", pa.table({"x": [1.0]}))
     with pytest.raises(CaptureError, match="not the columns of reskin decode: x"):
         predict(tmp_path / "x.parquet", model, tmp_path / "out.csv")
@@ -106,24 +106,24 @@ def test_every_line_has_a_row_and_contacts_have_estimates(tmp_path, model):
     np.testing.assert_allclose([float(row[0]) for row in rows], (1 + np.arange(len(rows))) / RATE_HZ)
 
 
-def test_a_collapsed_model_raises(tmp_path, model):
+def test_collapsed_model_is_an_error(tmp_path, model):
     io.write_json(model.with_suffix(".json"), CARD | {"collapsed": True})
     with pytest.raises(ReskinError, match="the model has collapsed"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
     assert not (tmp_path / "out.csv").exists()
 
 
-def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
+def test_unsuitable_inputs_are_an_error_and_nothing_is_written(tmp_path, model):
     log, out = write_log(tmp_path), tmp_path / "out.csv"
     four = tmp_path / "four"
     four.mkdir()
     cases = [
-        (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model 15"),
+        (write_log(four, chips_n=4), model, out, "the log has 12 channels, but the model has 15"),
         (log, tmp_path / "other.safetensors", out, r"model file not found. Models in this folder: model\.safetensors"),
-        (log, model, log, "is the log, the model or its card"),
-        (log, model, model, "is the log, the model or its card"),
-        (log, model, model.with_suffix(".json"), "is the log, the model or its card"),
-        (log, model, tmp_path / "four" / ".." / "model.json", "is the log, the model or its card"),
+        (log, model, log, "is the log, the model or the model's card"),
+        (log, model, model, "is the log, the model or the model's card"),
+        (log, model, model.with_suffix(".json"), "is the log, the model or the model's card"),
+        (log, model, tmp_path / "four" / ".." / "model.json", "is the log, the model or the model's card"),
         (tmp_path / "none.csv", model, out, r"none\.csv: file not found"),
     ]
     files = (log, model, model.with_suffix(".json"))
@@ -148,17 +148,17 @@ def test_inputs_that_do_not_fit_raise_and_nothing_is_written(tmp_path, model):
         ({"input": CARD["input"] | {"channels_n": 14}}, "input.channels_n must be a multiple of 3; got 14"),
         (
             {"input": CARD["input"] | {"channels_n": 12}},
-            "inputs raw give 12 inputs, but the weights are for 15",
+            "inputs raw are 12 inputs, but the weights are for 15",
         ),
         (
             {"recipe": {"inputs": "shape", "architecture": "paper"}},
-            "inputs shape give 16 inputs, but the weights are for 15",
+            "inputs shape are 16 inputs, but the weights are for 15",
         ),
         ({"recipe": {"inputs": "spectrum", "architecture": "paper"}}, "recipe.inputs must be 'raw' or 'shape'"),
         ({"recipe": {"inputs": "raw"}}, "recipe.architecture is missing"),
     ],
 )
-def test_a_wrong_card_raises(tmp_path, model, change, message):
+def test_wrong_card_is_an_error(tmp_path, model, change, message):
     model.with_suffix(".json").write_text(json.dumps(CARD | change))
     with pytest.raises(ReskinError, match=message) as refused:
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
@@ -166,19 +166,19 @@ def test_a_wrong_card_raises(tmp_path, model, change, message):
 
 
 @pytest.mark.parametrize("lacking", ["input", "recipe", "output", "format"])
-def test_an_incomplete_card_raises(tmp_path, model, lacking):
+def test_incomplete_card_is_an_error(tmp_path, model, lacking):
     model.with_suffix(".json").write_text(json.dumps({name: CARD[name] for name in CARD if name != lacking}))
     with pytest.raises(ReskinError, match=f"{lacking} (is missing|None is not supported)"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
-def test_a_card_that_is_not_a_mapping_raises(tmp_path, model):
+def test_card_that_is_not_a_mapping_is_an_error(tmp_path, model):
     model.with_suffix(".json").write_text("[1]")
     with pytest.raises(ReskinError, match="format None is not supported"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
 
 
-def test_a_model_without_its_card_raises(tmp_path, model):
+def test_model_without_its_card_is_an_error(tmp_path, model):
     model.with_suffix(".json").unlink()
     with pytest.raises(ReskinError, match=r"model\.json: card of the model not found"):
         predict(write_log(tmp_path), model, tmp_path / "out.csv")
@@ -191,21 +191,21 @@ def test_a_model_without_its_card_raises(tmp_path, model):
             "data/models/quick/train_multi/lobo.paper.b0.seed0.safetensors",
             "`reskin scenes use quick` and then `make re",
         ),
-        ("mine/one.safetensors", "Give the path of a trained"),
+        ("mine/one.safetensors", "Use the path of a trained"),
     ],
 )
-def test_a_missing_model_names_the_scene_that_trains_it(tmp_path, path, remedy):
+def test_error_for_a_missing_model_names_the_scene_that_trains_it(tmp_path, path, remedy):
     with pytest.raises(ReskinError, match=f"model file not found.*{remedy}"):
         load_model(tmp_path / path)
 
 
-def test_wrong_model_file_is_an_error_without_advice_to_delete_it(tmp_path, model):
+def test_error_for_a_wrong_model_file_does_not_suggest_deleting_it(tmp_path, model):
     (tmp_path / "net.pt").write_bytes(b"PK" + bytes(100))
     cases = {
         tmp_path / "net.pt": "not a trained model",
-        model.with_suffix(".json"): f"not a trained model.* Give {model}",
+        model.with_suffix(".json"): f"not a trained model.* Use {model}",
         tmp_path: r"this is a folder.* model\.safetensors",
-        FILE: "this is the universal model. Use it without --model",
+        FILE: "this is the universal model. Omit --model",
     }
     for file, message in cases.items():
         with pytest.raises(ReskinError, match=f"{file}: {message}") as refused:
@@ -213,7 +213,7 @@ def test_wrong_model_file_is_an_error_without_advice_to_delete_it(tmp_path, mode
         assert "delete" not in str(refused.value)
 
 
-def test_a_log_that_starts_in_contact_raises(tmp_path, model):
+def test_log_that_starts_in_contact_is_an_error(tmp_path, model):
     log = write_log(tmp_path)
     first, *rows = log.read_text().splitlines(keepends=True)
     log.write_text("".join([first, *rows[QUIET_N - 50 :]]))
@@ -221,7 +221,7 @@ def test_a_log_that_starts_in_contact_raises(tmp_path, model):
         predict(log, model, tmp_path / "out.csv")
 
 
-def test_without_a_model_the_universal_model_is_used(tmp_path):
+def test_universal_model_is_the_default(tmp_path):
     predict(write_log(tmp_path), None, tmp_path / "out.csv")
     rows = [line.split(",") for line in (tmp_path / "out.csv").read_text().splitlines()[1:]]
     touched = [row for row in rows if row[-1] == "1"]
@@ -230,7 +230,7 @@ def test_without_a_model_the_universal_model_is_used(tmp_path):
 
 
 def write_presses(folder, chips_on_n=0, factor=1.0):
-    """Write the log of presses on a simulated skin; chips may be read in another order, and changes scaled."""
+    """Write a log of presses on a simulated skin, with rotated chips and scaled field changes."""
     places = np.column_stack([rng_for(0, "places").uniform(3, 13, (12, 2)), np.full(12, 1.0)])
     noload_uT, b_uT, _ = simulate_pokes(draw_skin(seed=3), places, seed=3)
     rest_uT = noload_uT.mean(axis=0)
@@ -264,4 +264,4 @@ def test_summary_counts_misfits_and_forces_at_the_limit(tmp_path, model, capsys)
     output = capsys.readouterr().out
     assert "120 of 120 readings in contact are at a limit of the model's force range" in output
     assert "force_at_limit_readings_n 120" in output
-    assert "unknown_skin_readings_n" not in predict(log, model, out)  # of the universal model only
+    assert "unknown_skin_readings_n" not in predict(log, model, out)  # reported for the universal model only

@@ -1,4 +1,4 @@
-"""Tests of the printed position of a stage among all stages."""
+"""Tests of the position of a stage among all stages, which each stage prints."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ ORDER = ["code", "split@tiny", "ingest@tiny-tiny_1", "report@tiny"]
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch) -> Path:
-    """Change to a checkout with dvc.yaml and a plan, and return it."""
+    """Create a checkout with dvc.yaml and a plan, change to it, and return its folder."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pipeline").mkdir()
     (tmp_path / "pipeline/plan.yaml").write_text("scenes: {tiny: [lobo]}\n")
@@ -31,7 +31,7 @@ def test_stage_prints_its_position(checkout, monkeypatch, stage, line):
     assert progress.stage_position() == line
 
 
-def test_order_is_read_again_when_the_plan_changes(checkout, monkeypatch):
+def test_positions_follow_a_changed_plan(checkout, monkeypatch):
     for stages in (ORDER, ORDER[:2]):
         monkeypatch.setattr(progress, "_ask_dvc", lambda stages=stages: stages)
         assert progress.stages_in_order() == stages
@@ -50,7 +50,7 @@ def test_stage_outside_dvc_prints_nothing(monkeypatch):
     assert progress.stage_position() is None
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
 def test_table_2_precedes_other_protocols(tmp_path, monkeypatch):
     root = copy_checkout(tmp_path)
     run(root, "reskin", "scenes", "use", "ci")

@@ -1,4 +1,4 @@
-"""Tests of `reskin record` with a pseudo-terminal as the serial port, for each way in which a recording can end."""
+"""Tests of how a recording by `reskin record` can end, with a pseudo-terminal as the serial port."""
 
 import os
 import signal
@@ -30,7 +30,7 @@ from tests.board.signals import make_frames
 from tests.stages.checkout import ROOT
 
 FRAMES = make_frames(200, 5, seed=0)
-LONG_S = 120.0  # time-out, long enough on a busy machine
+LONG_S = 120.0  # time limit, long enough for a busy machine
 
 
 @pytest.fixture

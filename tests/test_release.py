@@ -1,4 +1,4 @@
-"""Tests of the release: the files of the wheel, the version, licences and required packages."""
+"""Tests of the release: files in the wheel, version, licences, required packages."""
 
 import re
 import subprocess
@@ -18,7 +18,7 @@ from reskin.errors import ParamsError, explaining, require
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-CORE = (  # works outside a checkout
+CORE = (  # modules that work outside a checkout
     "reskin.cli", "reskin", "reskin.api", "reskin.recordings.recorder", "reskin.recordings.decode", "reskin.board.find",
     "reskin.predicting", "reskin.live.emulator", "reskin.live.server",
 )  # fmt: skip
@@ -35,7 +35,7 @@ OPTIONAL = (
     "sklearn",
     "torch",
 )
-# Imports the core as if the optional packages were not installed.
+# Program that imports the modules of CORE as if optional packages were not installed.
 WITHOUT_OPTIONAL = """
 import importlib, sys
 
@@ -54,7 +54,7 @@ print(load_universal().zero([0.0] * 15).predict([[0.0] * 15]).shape)
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
-    """Return the files that setuptools puts into a wheel."""
+    """Return the names of the files that setuptools puts into the wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     arguments = ["-q", "egg_info", "-e", str(folder), "build_py", "-d", str(folder / "lib")]
     subprocess.run(
@@ -66,7 +66,7 @@ def wheel(tmp_path_factory) -> Path:
     return folder / "lib"
 
 
-def test_wheel_holds_the_library_only(wheel):
+def test_wheel_contains_only_the_library(wheel):
     names = {str(file.relative_to(wheel)) for file in wheel.rglob("*") if file.is_file()}
     files = [file.relative_to(ROOT) for file in (ROOT / "reskin").rglob("*.*")]
     assert names == {str(file) for file in files if not any(part.startswith((".", "__pyc")) for part in file.parts)}
@@ -78,7 +78,7 @@ def test_wheel_holds_the_library_only(wheel):
     } <= names
 
 
-def test_foreign_scripts_have_a_licence(wheel):
+def test_third_party_scripts_have_a_licence(wheel):
     foreign = [file for file in wheel.rglob("*.js") if len(max(file.read_text().splitlines(), key=len)) > 500]
     assert [file.name for file in foreign if not list(file.parent.glob(f"{file.name}.LICENSE*"))] == []
 
@@ -129,7 +129,7 @@ def test_version_is_the_same_everywhere():
 
 
 def test_licences_are_compatible():
-    assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # an unneeded exception fails too
+    assert set(incompatible(closure(wanted("dev")))) == set(TOLERATED)  # also fails if an exception is no longer needed
     assert closure(wanted()).keys() & TOLERATED.keys() == set()
 
 
@@ -172,5 +172,5 @@ def test_checkout_commands_are_listed():
 def test_checkout_commands_raise_outside_a_checkout(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["reskin", name, "any.csv"])
-    with pytest.raises(ParamsError, match=f"reskin {name} works in a checkout of the project"):
+    with pytest.raises(ParamsError, match=f"reskin {name} must be run in a checkout of the project"):
         add_checkout_commands()

@@ -1,4 +1,4 @@
-"""Tests of comparing two runs: equality, names of values and changed verdicts."""
+"""Tests of the comparison of two runs: equality, names of values, changed verdicts."""
 
 import pytest
 from hypothesis import given, settings
@@ -18,7 +18,7 @@ NESTED = st.recursive(
     max_leaves=9,
 )
 NUMBERS = st.dictionaries(st.sampled_from(NAMES), NESTED, max_size=4)
-FEW = settings(max_examples=40, deadline=None)  # drawing nested values takes milliseconds
+FEW = settings(max_examples=40, deadline=None)  # few examples, because drawing nested values takes milliseconds
 
 
 @FEW
@@ -50,7 +50,7 @@ def test_values_are_counted_once_and_symmetrically(one, other):
         ("a", "b", None),
     ],
 )  # fmt: skip
-def test_any_difference_counts(old, new, relative):
+def test_any_difference_is_counted(old, new, relative):
     (difference,) = compare({"shear": {"mean": old}}, {"shear": {"mean": new}}).differing
     assert difference.name == "shear.mean"
     assert difference.relative == (None if relative is None else pytest.approx(relative))
@@ -65,7 +65,7 @@ def test_nan_equals_nan():
     assert compare({"a": float("nan")}, {"a": float("nan")}).reproduced
 
 
-def test_additional_row_does_not_shift_other_rows():
+def test_additional_row_does_not_change_the_names_of_others():
     rows = [{"method": "ridge", "labels_n": n, "accuracy_pct": float(n)} for n in (0, 10)]
     done = compare({"labels": rows}, {"labels": [{"method": "ridge", "labels_n": 5, "accuracy_pct": 50.0}, *rows]})
     assert done.differing == []
@@ -95,7 +95,7 @@ def test_changed_labels_are_paired_by_position():
         (True, False, None), (1.0, 2.0, None),
     ],
 )  # fmt: skip
-def test_verdict_is_the_leading_word(old, new, verdicts):
+def test_verdict_is_the_first_word_of_the_text(old, new, verdicts):
     (difference,) = compare({"cell": old}, {"cell": new}).differing
     assert difference.verdicts == verdicts
 

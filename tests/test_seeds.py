@@ -18,5 +18,5 @@ def test_different_names_or_seeds_have_different_streams(seed, one, other):
     assert seed_for(seed, *one) != seed_for(seed + 1, *one)
 
 
-def test_names_are_not_concatenated():
+def test_joined_names_have_another_stream():
     assert seed_for(0, "a", "bc") != seed_for(0, "ab", "c")

@@ -1,4 +1,4 @@
-"""Tests that the params of a stage cover the settings that it reads, and that an override reruns its readers."""
+"""Tests of `params` in dvc.yaml: they cover the settings that a stage reads, so overrides rerun the right stages."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -22,11 +22,11 @@ from tests.stages.checkout import copy_checkout
 ROOT = Path(__file__).resolve().parents[1]
 FLOW = read_yaml(ROOT / "dvc.yaml")["stages"]
 SCENE, SKIN = f"{SCENES}/ci.yaml", str(NOMINAL.relative_to(ROOT))
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of DVC's own libraries
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # warnings of libraries that DVC uses
 
 
 class RecordingMapping(Mapping[str, Any]):
-    """A mapping that records which keys are read."""
+    """A nested mapping that records which keys are read."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.values_by_key, self.read = values, set[str]()
@@ -46,7 +46,7 @@ class RecordingMapping(Mapping[str, Any]):
 
 
 def declared_sections(stage: str) -> tuple[set[str], set[str]]:
-    """Return the sections of a scene and the shared sections that dvc.yaml lists for a stage."""
+    """Return the sections that dvc.yaml lists for a stage: those of the scene, and those of params.yaml."""
     scene_sections: set[str] = set()
     shared: set[str] = set()
     for entry in FLOW[stage]["do"].get("params", []):
@@ -82,7 +82,7 @@ def scene_runs(scene: str, stage: str) -> bool:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """Return a checkout that runs scene ci."""
+    """Return a copy of the checkout whose plan has scene ci."""
     folder = copy_checkout(tmp_path_factory.mktemp("settings"))
     plan.use(folder, ["ci"])
     return folder
@@ -90,7 +90,7 @@ def root(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def stages(root) -> list[Any]:
-    """Return the stages as DVC builds them from dvc.yaml and the plan."""
+    """Return the stages that DVC builds from dvc.yaml and the plan."""
     from dvc.repo import Repo
 
     with Repo(str(root)) as repo:
@@ -98,7 +98,7 @@ def stages(root) -> list[Any]:
 
 
 def parameter_values(root: Path, stages: list[Any]) -> dict[str, str]:
-    """Return the parameter values that DVC compares, by stage."""
+    """Return the parameter values of each stage, which DVC compares with those of the last run."""
     from dvc.dependency.param import read_param_file
 
     return {
@@ -113,7 +113,7 @@ def parameter_values(root: Path, stages: list[Any]) -> dict[str, str]:
 
 @contextmanager
 def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
-    """Change files as `dvc exp run -S file:key=value` does; restore them at the end."""
+    """Yield a function that changes a file as `dvc exp run -S file:key=value` does; restore the files at the end."""
     from dvc.utils.hydra import apply_overrides
 
     before = {file: (root / file).read_bytes() for file, _ in overrides}
@@ -128,14 +128,14 @@ def override_files(root: Path, *overrides: tuple[str, str]) -> Iterator[None]:
 
 FURTHER_PROTOCOLS = ("wear", "flexible", "hand", "drag", "sleeve", "glass", "grip", "press", "log")
 SIMULATE = {"simulate@ci", *(f"simulate@ci-{protocol}" for protocol in FURTHER_PROTOCOLS)}
-# Stages that read adaptations, recipes, or the skin's physics; `SIMULATING` draws skins itself.
+# Stages that read adaptations, recipes or the physics of the skin; stages in `SIMULATING` draw skins themselves.
 ADAPTING = {"adapt", "sweep_pokes", "sweep_sensors", "manual", "flexible"}
 TRAINING = {"train_single", "train_multi", "train_triplet", "few_labels", "drift", "shear", "sleeve", "ambient"}
-FINGERPRINTED = {"audit", "report"}  # compare the physics' fingerprint with that of scene tuning
+FINGERPRINTED = {"audit", "report"}  # compare the fingerprint of the physics with that of scene tuning
 SIMULATING = {
     "flexible", "sensitivity", "logs", "sleeve", "contacts", "ambient", "gripper", "runtime", "neglected_effects",
 }  # fmt: skip
-# File, override, the stages that DVC reruns. Each section of params.yaml is one dependency of a stage.
+# File, override, stages that DVC reruns. A stage depends on whole sections of params.yaml.
 OVERRIDES: list[tuple[str, str, set[str]]] = [
     (PARAMS, "recipes.slow.rate_max=0.001", TRAINING | ADAPTING),
     (PARAMS, "adaptations.paper.rate_max=0.0005", {"few_labels", *ADAPTING}),
@@ -182,13 +182,13 @@ YAML_OF_DVC = [ROOT / "dvc.yaml", ROOT / PARAMS, NOMINAL, ROOT / PLAN, *sorted((
 
 @pytest.mark.parametrize("file", YAML_OF_DVC, ids=lambda file: file.name)
 def test_dvc_files_have_no_anchors_or_merge_keys(file):
-    # It is unclear whether an override changes one copy or all copies of an alias.
+    # With aliases, it would be unclear whether an override changes one copy or all copies.
     tokens = [type(token).__name__ for token in YAML(pure=True).scan(file.read_text())]
     assert {"AnchorToken", "AliasToken"} & set(tokens) == set()
     assert not re.search(r"^\s*<<\s*:|[{,]\s*<<\s*:", file.read_text(), re.MULTILINE)
 
 
-def test_stage_fails_only_on_its_own_sections(root):
+def test_stage_checks_only_the_sections_that_it_reads(root):
     with override_files(root, (SCENE, "shear.repeats_n=0")):
         read_settings("ci", root).section(Training, "train_multi")
         with pytest.raises(ParamsError, match="shear: repeats_n must be greater than or equal to 1; got 0"):
@@ -197,7 +197,7 @@ def test_stage_fails_only_on_its_own_sections(root):
             plan.check(root)
 
 
-def test_control_follows_its_adaptation(root):
+def test_control_has_the_settings_of_its_adaptation(root):
     with override_files(root, (PARAMS, "adaptations.paper.rate_max=0.5")):
         adapt = read_settings("ci", root).section(Adaptations, "adapt")
     assert {name: one.rate_max for name, one in adapt.recipes.items()} == {"paper": 0.5, "control": 0.5}

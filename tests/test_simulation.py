@@ -1,4 +1,4 @@
-"""Tests of the check that the protocols of a scene fit the experiments that read them."""
+"""Tests of the check that a scene's protocols have the kind, boards and skins that the experiments need."""
 
 import pytest
 

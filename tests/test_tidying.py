@@ -1,4 +1,4 @@
-"""Tests of `reskin scenes tidy`, which removes outputs of experiments that a scene no longer runs."""
+"""Tests of `reskin scenes tidy`: outputs of experiments that a scene no longer has are removed."""
 
 import shutil
 from pathlib import Path
@@ -22,7 +22,7 @@ WRITTEN = {
 
 @pytest.fixture
 def root(tmp_path) -> Path:
-    """Return a checkout: scene one ran drift and protocol `gone` and now runs lobo; scene two is not in the plan."""
+    """Return a checkout: scene `one` ran drift and protocol `gone` and now has only lobo; `two` is not in the plan."""
     folder = checkout(tmp_path / "checkout")
     plan.use(folder, ["one"])
     for path in WRITTEN.values():
@@ -53,7 +53,8 @@ def test_tidy_removes_only_stale_outputs(root):
 
 def test_file_of_a_planned_stage_is_kept(root):
     lock = YAML(typ="safe").load((root / tidy.LOCK).read_text())
-    lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]  # contains outputs of train_multi
+    # this folder also contains outputs of train_multi
+    lock["stages"]["drift@one"]["outs"] = [{"path": "data/models/one"}]
     with (root / tidy.LOCK).open("w") as stream:
         YAML().dump(lock, stream)
     assert tidy.stale_outputs(root, plan.check(root))["drift@one"] == []
@@ -64,7 +65,7 @@ def test_scenes_with_a_common_prefix_are_distinguished(root):
     assert set(tidy.stale_outputs(root, plan.check(root))) == {"drift@one"}
 
 
-def test_running_experiment_has_no_stale_outputs(root):
+def test_experiment_in_the_scene_has_no_stale_outputs(root):
     with (root / SCENES / "one.yaml").open("w") as stream:
         YAML().dump(scene_with("lobo", "drift"), stream)
     plan.use(root, ["one"])

@@ -19,7 +19,7 @@ from reskin import io
 
 @pytest.fixture(scope="module")
 def empty_store(tmp_path_factory) -> Path:
-    """Return a store without runs; tests copy it, because creating one takes seconds."""
+    """Return an MLflow store without runs; tests copy this store, because creating a store takes seconds."""
     store = tmp_path_factory.mktemp("store") / "mlflow.db"
     mlflow.MlflowClient(f"sqlite:///{store}").search_experiments()
     return store
@@ -45,7 +45,8 @@ def silent_server() -> Iterator[str]:
 @pytest.fixture
 def dead_address() -> str:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"http://127.0.0.1:{server.getsockname()[1]}"  # the socket closes on return
+        # the socket is closed on return, so nobody listens at the address
+        return f"http://127.0.0.1:{server.getsockname()[1]}"
 
 
 def write_model(models: Path, name: str, key: str, accuracy_pct: float = 50.0) -> None:
@@ -89,7 +90,7 @@ def runs(root: Path, query: str) -> list:
     return list(client.search_runs([client.get_experiment_by_name("ci").experiment_id], query))
 
 
-def test_each_training_is_published_once(tmp_path):
+def test_each_training_run_is_published_once(tmp_path):
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 2, "kept_n": 0, "superseded_n": 0}
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 0}
     children = runs(tmp_path, "tags.kind = 'training'")
@@ -110,12 +111,12 @@ def test_each_training_is_published_once(tmp_path):
     contexts = {one.tags[0].value: one.dataset.name for one in client.get_run(run.info.run_id).inputs.dataset_inputs}
     assert contexts == {part: f"ci, {run.data.tags['fold']}, {part}" for part in ("train", "test")}
 
-    # Other settings: the new result is current, the old one is kept.
+    # After a change of settings, the new result is current, and the old result is kept.
     assert write(tmp_path, b0="k0", b1="k9") == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
     current = runs(tmp_path, "tags.kind = 'training' and tags.current = 'true'")
     assert sorted(run.data.tags["cell"] for run in current) == ["k0", "k9"]
 
-    # An incomplete run of a killed process is replaced; restored settings make the old result current.
+    # An incomplete run of a killed process is replaced. With restored settings, the old result is current again.
     client.set_terminated(next(run.info.run_id for run in current if run.data.tags["cell"] == "k9"), "KILLED")
     assert write(tmp_path, b0="k0", b1="k9")["new_n"] == 1
     assert write(tmp_path, b0="k0", b1="k1") == {"new_n": 0, "kept_n": 2, "superseded_n": 2}
@@ -125,7 +126,7 @@ def test_each_training_is_published_once(tmp_path):
 
 def test_new_score_replaces_the_old_and_dropped_experiments_are_not_current(tmp_path):
     write(tmp_path, b0="k0", b1="k1")
-    # The same training with a new score.
+    # The same training run with a new score.
     write_model(tmp_path / "models", "b1", "k1", accuracy_pct=77.0)
     counts = publish({"train_multi": tmp_path / "models"}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     assert counts == {"new_n": 1, "kept_n": 1, "superseded_n": 2}
@@ -150,7 +151,7 @@ def test_report_run_has_figures_page_and_numbers(tmp_path):
     curve = client.get_metric_history(run.info.run_id, "drift.each.accuracy_pct")
     assert [(point.step, point.value) for point in curve] == [(5, 90.0), (10, 80.0)]
 
-    # Changed costs update the files of the report; a changed number creates a new report.
+    # Changed costs only update files of the report's run; a changed number creates a new run.
     write_report(tmp_path / "reports", seconds=2.0)
     publish({}, {}, tmp_path / "reports", scene="ci", root=tmp_path)
     (same,) = runs(tmp_path, "tags.stage = 'report'")
@@ -177,7 +178,7 @@ CURVES = {old: {"sweep_pokes": [("adapted", 0, {"accuracy_pct": pct})]} for old,
 
 
 def publish_state(root: Path, old: bool, reported: bool = True) -> dict:
-    """Write and publish the old or the new state of a workspace; unless `reported`, leave the reports as they are."""
+    """Write old or new results to a workspace and publish them; update the reports only if `reported`."""
     io.remove(root / "models")
     write_model(root / "models", "b0", "k0" if old else "k9", accuracy_pct=50.0 if old else 51.0)
     if reported:
@@ -193,7 +194,7 @@ def test_restored_state_becomes_current_without_new_runs(tmp_path):
     publish_state(tmp_path, old=True)
     first = current(tmp_path)
     publish_state(tmp_path, old=False)
-    assert len(first) == 4  # a training, its stage, a sweep, the report
+    assert len(first) == 4  # runs of a training, its stage, a sweep, the report
     assert current(tmp_path) & first == set()
     client = mlflow.MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
     before = {run.info.run_id: history_points_n(client, run) for run in runs(tmp_path, "")}
@@ -254,10 +255,10 @@ def test_unreachable_server_is_reported_within_seconds(kind, request, tmp_path, 
     start_s = time.monotonic()
     with pytest.raises(TrackingUnavailable, match="`reskin publish` sends them when it is back"):
         write(tmp_path, b0="k0")
-    assert time.monotonic() - start_s < 15  # the time-out is 2 s; MLflow's own retries take 20 s
+    assert time.monotonic() - start_s < 15  # the time limit is 2 s; MLflow's retries would take 20 s
 
 
-def test_probe_creates_no_store(tmp_path):
+def test_check_of_the_store_does_not_create_it(tmp_path):
     probe(None)
     probe(f"sqlite:///{tmp_path / 'somewhere.db'}")
     assert not (tmp_path / "somewhere.db").exists()
@@ -292,7 +293,7 @@ def test_failure_during_publishing_is_reported(tmp_path, monkeypatch):
 
 
 def test_slow_server_is_abandoned_and_resumed(tmp_path, monkeypatch):
-    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # with 2 s per run: a limit of 0 s for two runs
+    monkeypatch.setattr(tracking, "PATIENCE_S", -2.0 * 2)  # plus 2 s per run: the time limit for two runs is 0 s
     with pytest.raises(TrackingUnavailable, match="took longer than 0 s"):
         write(tmp_path, b0="k0", b1="k1")
     monkeypatch.undo()

@@ -1,4 +1,4 @@
-"""Tests of `reskin verify-reports`, which compares reports of a rerun, or finished reports, with the last commit."""
+"""Tests of `reskin verify-reports`: reports of a new run, or finished reports, are compared with the last commit."""
 
 import json
 import subprocess
@@ -22,7 +22,7 @@ def write(reports, accuracy_pct, score=80.0, model="network"):
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """Return a checkout with a committed accuracy of 80 %."""
+    """Return a git checkout whose committed reports have an accuracy of 80 %."""
     write(tmp_path / "reports/quick", 80.0)
     io.write_text(tmp_path / "dvc.yaml", "stages: {}\n")
     for name in ("quick", "lab"):
@@ -52,13 +52,13 @@ def run_command(*arguments: str) -> tuple[int, str]:
 def test_finished_reports_are_compared_with_the_commit(checkout, tmp_path_factory, changed, status, expected):
     other = tmp_path_factory.mktemp("other")
     write(other / "quick", *changed)
-    write(checkout / "reports/quick", 0.0)  # the working tree is not compared
+    write(checkout / "reports/quick", 0.0)  # reports in the working tree must be ignored
     code, output = run_command("quick", "--against", str(other))
     assert code == status
     assert expected in output
 
 
-def test_rerun_starts_from_the_commit_and_is_kept(checkout, monkeypatch):
+def test_rerun_starts_from_the_commit_and_its_clone_is_kept(checkout, monkeypatch):
     def run(clone, environment, *arguments, quiet=False):
         if arguments[0] == "dvc":
             assert not list((clone / "reports/quick").glob("*"))

@@ -1,6 +1,6 @@
 """Add a recording to a scene: write it to data/raw/<scene>/<capture>/, track it with DVC, register it, plan its scene.
 
-The whole recording is read and checked first. If adding fails or is stopped, nothing is left behind.
+The whole recording is read and checked first. If adding fails or is stopped, all changes are undone.
 """
 
 import hashlib
@@ -25,11 +25,14 @@ from reskin.simulation.defaults import nominal
 
 RAW = "data/raw"
 INDENTATIONS = "data/indentations"
-COMPARED_N = 3  # number of latest captures of the scene whose places are compared with a new capture's
+COMPARED_N = 3  # the places of a new capture are compared with those of this many latest captures of the scene
 
 
 def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Header:
-    """Check and write a prepared recording, track it with DVC, register it and plan its scene; undo all on failure."""
+    """Check and write a prepared recording, track it with DVC, register it, and add its scene to the plan.
+
+    On failure, all of this is undone.
+    """
     require_idle(root)
     header, files = prepared
     settings = read_scene(root, plan.scene_file(root, scene, remedy="To create it, add --like ini.").stem)
@@ -57,7 +60,7 @@ def add(root: Path, scene: str, prepared: Prepared, *, allow_copy: bool) -> Head
 
 
 def remove(root: Path, scene: str, capture: str) -> None:
-    """Remove a capture from its scene: its entry and its stage, then its raw files and its readings."""
+    """Remove a capture from the registry and the plan, then delete its raw files and its readings."""
     after = without_capture(read_registry(root), scene, capture)
     running = read_plan(root / PLAN).scenes
     with io.restoring(root / REGISTRY, root / PLAN):
@@ -79,16 +82,19 @@ def _check_free(target: Path, registered: bool) -> None:
 
 
 def _read_through(folder: Path, header: Header, limit: float, policy: FaultPolicy) -> tuple[str, ...]:
-    """Read a whole capture as ingestion does; return hashes that are equal for copies with other names or layouts."""
-    _, blocks, account = open_capture(folder, policy)
+    """Read a whole capture as stage ingest does; return its fingerprints: SHA-256 of the readings and of the stream.
+
+    Copies of a recording with other names or in another layout have a fingerprint in common.
+    """
+    _, blocks, counts = open_capture(folder, policy)
     rows_n, readings = 0, hashlib.sha256()
     for block in blocks:
         rows_n += len(block)
         readings.update(block.b_uT.tobytes())
-    check_losses(account, limit, folder.name)
+    check_losses(counts, limit, folder.name)
     if rows_n == 0:
-        raise CaptureError(f"{folder.name}: no readings are left; counts: {dict(account)}. Check its files.")
-    faults = [f"{key.removeprefix('fault_')} {n}" for key, n in account.items() if key.startswith("fault_")]
+        raise CaptureError(f"{folder.name}: no readings are left; counts: {dict(counts)}. Check its files.")
+    faults = [f"{key.removeprefix('fault_')} {n}" for key, n in counts.items() if key.startswith("fault_")]
     if faults:
         say(f"warning: capture {folder.name} has faults: {', '.join(faults)}")
     return (readings.hexdigest(), *(header.files[name] for name in (STREAM_FILE,) if name in header.files))
@@ -98,7 +104,7 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
     """Warn if the orientation of chips, labels or skin seems to differ from section `compare` of the scene."""
     from pipeline.experiments.compare import (
         Compare,
-        find_departure,  # imported late: the physics takes seconds
+        find_departure,  # imported late: importing the physics takes seconds
     )
     from reskin.physics.skin import SkinDesign
 
@@ -113,12 +119,15 @@ def _warn_of_departures(folder: Path, scene: Scene, skin: Mapping[str, Any], pol
 
 
 def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPolicy) -> None:
-    """Warn if places seem rotated, mirrored, or with x and y swapped, compared with the scene's other captures."""
+    """Warn if a capture's places seem rotated, mirrored or with x and y swapped.
+
+    They are compared with the latest of `others`, the names of the scene's other captures.
+    """
     orientations = []
-    own = presses_of(open_capture(folder, policy)[1])
+    presses = presses_of(open_capture(folder, policy)[1])
     for other in others[-COMPARED_N:]:
         if (folder.parent / other).is_dir():
-            orientations.append(other_orientation(own, presses_of(open_capture(folder.parent / other, policy)[1])))
+            orientations.append(other_orientation(presses, presses_of(open_capture(folder.parent / other, policy)[1])))
     most_common = max(set(orientations), key=orientations.count, default=None)
     if most_common is not None:
         say(
@@ -129,7 +138,7 @@ def _warn_of_other_labels(folder: Path, others: Sequence[str], policy: FaultPoli
 
 @contextmanager
 def _naming_sources(target: Path, files: Mapping[str, bytes | Path]) -> Iterator[None]:
-    """Make errors name the user's own files instead of their copies, which are removed."""
+    """Replace paths of copied files in errors by the paths of the user's files, because the copies are deleted."""
     try:
         yield
     except ReskinError as error:
@@ -150,6 +159,7 @@ def _removing_on_failure(target: Path) -> Iterator[None]:
 
 
 def _remove_files(target: Path) -> None:
+    """Delete a capture's folder, its .dvc file and its line in .gitignore, and the scene's folder if it is empty."""
     io.remove(target)
     io.remove(target.with_name(f"{target.name}.dvc"))
     if target.parent.is_dir():
@@ -163,7 +173,7 @@ def _remove_files(target: Path) -> None:
 
 def _track(folder: Path, root: Path) -> None:
     """Track a folder with DVC, as `dvc add` does, but in this process, because starting another one takes seconds."""
-    from dvc.exceptions import DvcException  # imported late: it takes a second
+    from dvc.exceptions import DvcException  # imported late: the import takes a second
     from dvc.repo import Repo
 
     try:
@@ -172,4 +182,4 @@ def _track(folder: Path, root: Path) -> None:
             repo.add([str(folder)])
     except (DvcException, OSError) as error:
         reason = " ".join(str(error).split())[-300:]
-        raise CaptureError(f"dvc add {folder.relative_to(root)} failed: {reason}. See above.") from None
+        raise CaptureError(f"dvc add {folder.relative_to(root)} failed: {reason}. See DVC's messages above.") from None

@@ -20,19 +20,19 @@ from reskin.errors import SchemaError
 
 DAMAGED = ".reskin/damaged"  # the folder of objects that were set aside
 FOLDER = ".dir"  # suffix of an object that lists the files of a folder
-OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # other files are remains of a killed DVC process
+OBJECT = re.compile(r"[0-9a-f]{30}(\.dir)?")  # names of objects; other files remain from a killed DVC process
 READ_ONLY = 0o444  # the permissions that DVC gives objects
 
 
 class Use(NamedTuple):
-    """An output that contains an object, and the command that restores it."""
+    """An output that contains an object of the cache, and the command that restores the output."""
 
     command: str
     path: Path
 
 
 def check(root: Path, echo: Callable[[str], None]) -> int:
-    """Check the MD5 of every object; set damaged ones aside and remove their copies; return 1 if any is damaged."""
+    """Check the MD5 of every object, and set damaged objects aside; return exit status 1 if any object is damaged."""
     require_idle(root)
     cache = _cache_of(root)
     files = (file for file in sorted(cache.glob("[0-9a-f][0-9a-f]/*")) if OBJECT.fullmatch(file.name))
@@ -47,7 +47,11 @@ def check(root: Path, echo: Callable[[str], None]) -> int:
 
 
 def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
-    """Move an object away; restore it from an intact output, or remove its copies so that their stages run again."""
+    """Move a damaged object away, and repair the cache; return a sentence that says what was done.
+
+    The object is restored from an intact output. If there is none, its damaged copies are deleted from outputs, so that
+    the stages of these outputs run again.
+    """
     damaged_md5, aside = _md5(file), root / DAMAGED / name
     outputs = [(use.path, _md5(use.path)) for use in uses if use.path.is_file()]
     aside.parent.mkdir(parents=True, exist_ok=True)
@@ -68,14 +72,14 @@ def _set_aside(root: Path, name: str, file: Path, uses: Sequence[Use]) -> str:
 
 
 def _uses(root: Path, objects: Mapping[str, Path]) -> dict[str, list[Use]]:
-    """List the outputs that contain each object, by the object's name, including files of folders."""
+    """List the outputs that contain each object, by the object's name; files in output folders count as outputs."""
     uses: dict[str, list[Use]] = defaultdict(list)
     for command, path, name in _outputs(root):
         uses[name].append(Use(command, path))
         if name.endswith(FOLDER) and name in objects:
             try:
                 listed: list[dict[str, Any]] = io.read_json(objects[name])
-            except SchemaError:  # the list is damaged too, and reported as such
+            except SchemaError:  # this list of files is damaged, and reported as a damaged object
                 continue
             for entry in listed:
                 uses[entry["md5"]].append(Use(command, path / entry["relpath"]))
@@ -99,7 +103,7 @@ def _md5(file: Path) -> str:
 
 
 def _cache_of(root: Path) -> Path:
-    from dvc.repo import Repo  # imported late: it takes a second
+    from dvc.repo import Repo  # imported late: the import takes a second
 
     with Repo(str(root)) as repo:
         return Path(repo.cache.local.path)

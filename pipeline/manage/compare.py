@@ -19,13 +19,13 @@ from pipeline import plan
 from pipeline.stage import say
 from reskin.errors import ReskinError, SchemaError
 
-LABEL_N = 3  # maximum number of leading texts and counts that name a row
+LABEL_N = 3  # a row of a list is named by at most this many of its leading texts and counts
 LISTED_N = 10  # number of largest differences to list
-# Verdicts that cells begin with; the first three are from results before 2026-11.
+# Verdicts at the beginning of cells; yes, no and inconclusive occur only in results from before 2026-11.
 VERDICT = re.compile(
     r"(yes|no|inconclusive( \(one board\))?|supported|contradicted|undecided|not judged \([^)]*\))(?![\w ])"
 )
-MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance: possible causes of a difference
+MACHINE = ("device", "versions", "trained", "git")  # keys of the provenance that may explain a difference
 EXPECTED = (
     "With the code, settings and versions (constraints.txt) of the committed run, values are equal on every x86-64 "
     "processor with AVX2; a GPU or other versions may differ. If none of these explains a difference, please report it."
@@ -38,7 +38,10 @@ Echo = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Difference:
-    """A value that differs. Names look like `table2.multi.accuracy_pct.mean` or `sweep_pokes[65].mse_xy_mm2.sd`."""
+    """A value that differs between two runs.
+
+    Names look like `table2.multi.accuracy_pct.mean` or `sweep_pokes[65].mse_xy_mm2.sd`.
+    """
 
     name: str
     committed: Leaf
@@ -46,7 +49,7 @@ class Difference:
 
     @property
     def relative(self) -> float | None:
-        """The difference relative to the larger of two numbers (0 to 2); None if one is not a number."""
+        """The absolute difference divided by the larger magnitude (0 to 2); None unless both values are numbers."""
         old, new = self.committed, self.fresh
         if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in (old, new)):
             return None
@@ -61,7 +64,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The values that differ, the names that only one run has, and the number of equal values by section."""
+    """The values that differ, the names that only one of two runs has, and the number of equal values by section."""
 
     equal: Counter[str]
     differing: list[Difference]
@@ -114,7 +117,7 @@ def leaves(value: Any) -> Iterator[tuple[str, Leaf]]:
 
 
 def _pairs(old: Any, new: Any, name: str) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the name of every value that one of the sides has, and its values on both sides."""
+    """Yield the name, the old and the new value of every value in `old` or `new`; a missing value is `MISSING`."""
     present = [value for value in (old, new) if value is not MISSING]
     if all(isinstance(value, Mapping) for value in present):
         before, after = ({} if value is MISSING else value for value in (old, new))
@@ -177,7 +180,7 @@ class Report:
 
 
 def compare_scene(root: Path, scene: str, against: str, echo: Echo) -> int:
-    """Compare `reports/<scene>` with those of a revision or a folder; return the exit status.
+    """Compare `reports/<scene>` with the scene's report in a git revision or a folder; return the exit status.
 
     If a scene cannot be compared, this prints the error and returns its exit status, so that other scenes are still
     compared.
@@ -201,7 +204,7 @@ def read_folder(path: Path, scene: str) -> Report:
     candidates = (start, start / scene, start / "reports" / scene)
     folder = next((candidate for candidate in candidates if (candidate / "numbers.json").is_file()), None)
     if folder is None:
-        remedy = "Name reports/<scene> of another checkout."
+        remedy = "Use the path of reports/<scene> in another checkout."
         raise SchemaError(f"{path}: no {scene}/numbers.json there. {remedy}")
     files = [file for pattern in ("*.json", "tables/*.csv") for file in sorted(folder.glob(pattern))]
     return _parse(f"in {folder}", {str(file.relative_to(folder)): file.read_text("utf-8") for file in files})
@@ -221,13 +224,13 @@ def read_revision(root: Path, scene: str, revision: str) -> Report:
 
 
 def _git(root: Path, *arguments: str) -> str:
-    """Run git in the checkout and return its output; empty if it fails."""
+    """Run git in the checkout and return its output; an empty string if git fails."""
     completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
     return "" if completed.returncode else completed.stdout
 
 
 def _parse(where: str, texts: Mapping[str, str]) -> Report:
-    """Parse the files of a report by name."""
+    """Parse the files of a report; `texts`: their contents by file name."""
     numbers = json.loads(texts["numbers.json"])
     provenance = numbers.get("provenance", {}) | json.loads(texts.get("provenance.json", "{}"))
     tables = {
@@ -307,5 +310,5 @@ def print_comparison(scene: str, committed: Report, fresh: Report, echo: Echo) -
 
 def _show(value: object) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {one}" for name, one in value.items())
+        return ", ".join(f"{name} {item}" for name, item in value.items())
     return "unknown" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -32,7 +32,7 @@ from reskin.recordings.preparing import CaptureNames, Prepared
 SOURCES = "pipeline/fetch.yaml"
 FETCHED = "data/fetched"
 COPIES_N = 4  # copies of each file on disk: as fetched, in data/raw, in DVC's cache, and one in reserve
-USE_FROM = "--from takes a git mirror, or a folder of the files."
+USE_FROM = "--from takes a git mirror or a folder that contains the files."
 Say = Callable[[str], None]
 
 
@@ -46,7 +46,7 @@ RelativePath = Annotated[str, AfterValidator(_check_relative)]
 
 
 class File(Strict):
-    """One file: its path in the repository (`at`) and on disk (`path`), and its size and hash on disk."""
+    """A file to fetch: its path in the repository (`at`) and on disk (`path`), and its size and hash on disk."""
 
     path: RelativePath
     at: str
@@ -65,7 +65,7 @@ class Recording(Strict):
 
 
 class Source(Strict):
-    """A public set of recordings; if it has no scene, it is fetched but not added, and `note` says why."""
+    """A public set of recordings. If `scene` is None, they are fetched but not added, and `note` gives the reason."""
 
     home: str
     commit: Annotated[str, Field(pattern=r"^[0-9a-f]{40}$")] | None
@@ -114,7 +114,7 @@ def fetch(root: Path, name: str | None, where: str | None, *, agree: Callable[[s
         say(f"{name}: {source.size}; licence: {source.terms}\nhome: {source.home}, {commit}")
         if where is not None:
             say(f"taken from: {where}")
-        if source.licence is None and not agree("It has no licence. Fetch it, for use here only?"):
+        if source.licence is None and not agree("These files have no licence. Fetch them, for use here only?"):
             remedy = "Nothing was fetched. Answer y on a terminal, or add --yes."
             raise ParamsError(f"reskin fetch {name}: the use of files without a licence was not confirmed. {remedy}")
         download(source, where or source.home, folder)
@@ -133,9 +133,10 @@ def download(source: Source, where: str, folder: Path) -> None:
     """Read and check the files of a source, and replace a folder with them; on failure, leave the folder unchanged."""
     try:
         with io.replacing(folder) as temporary:
-            needed, free = COPIES_N * sum(file.bytes_n for file in source.files), shutil.disk_usage(folder.parent).free
-            if free < needed:
-                what = f"needs {needed / 1e6:.0f} MB of free disk space; {free / 1e6:.0f} MB are free"
+            needed_B = COPIES_N * sum(file.bytes_n for file in source.files)
+            free_B = shutil.disk_usage(folder.parent).free
+            if free_B < needed_B:
+                what = f"needs {needed_B / 1e6:.0f} MB of free disk space; {free_B / 1e6:.0f} MB are free"
                 raise CaptureError(f"{folder.parent.absolute()}: {what}. Free some disk space, and run it again.")
             with TemporaryDirectory(prefix=".git-", dir=folder.parent) as scratch:
                 origin = open_origin(where, source.commit, Path(scratch))
@@ -169,7 +170,7 @@ def _read_checked(origin: "Origin", file: File) -> bytes:
 
 
 def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> None:
-    """Add each recording that its scene does not have yet; recordings stay added if a later one fails."""
+    """Add the recordings of a source that the scene does not have yet; if one fails, earlier ones stay added."""
     added_n = 0
     try:
         for recording in source.recordings:
@@ -188,7 +189,10 @@ def _add_all(root: Path, scene: str, source: Source, folder: Path, say: Say) -> 
 
 
 def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
-    """Find the capture of a scene that has the same files, or the same name if its files are not on disk."""
+    """Return the name of the scene's capture with the same files as a prepared recording; None if there is none.
+
+    A capture whose files are not on disk is compared by its name.
+    """
     header, files = prepared
     hashes = {
         name: sha256(io.read_bytes(file) if isinstance(file, Path) else file).hexdigest()
@@ -205,6 +209,7 @@ def _find_added(root: Path, scene: str, prepared: Prepared) -> str | None:
 
 
 def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Say) -> None:
+    """Say whether the scene is in the plan, and what to run next; `before`: the scenes planned before the fetch."""
     running = list(read_plan(root / PLAN).scenes)
     if scene not in running:
         return say(
@@ -218,14 +223,14 @@ def _say_what_runs(root: Path, scene: str, before: Mapping[str, object], say: Sa
 
 @dataclass(frozen=True)
 class Origin:
-    """A folder, or a git repository at a commit: its name in errors, the paths of its files, and how to read one."""
+    """A folder, or a git repository at a commit: its name in errors, its files, and how to read a file."""
 
     name: str
     paths: Sequence[str]
     read: Callable[[str], bytes]
 
     def find(self, wanted: str) -> str | None:
-        """Return the path that shares the most trailing parts with `wanted`; None if no file has that name."""
+        """Return the path that shares the most trailing parts with path `wanted`; None if no file has the same name."""
 
         def common_n(path: str) -> int:
             parts = zip(reversed(PurePosixPath(path).parts), reversed(PurePosixPath(wanted).parts), strict=False)
@@ -249,7 +254,10 @@ def open_origin(where: str, commit: str | None, scratch: Path) -> Origin:
 
 
 def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
-    """Fetch only the commit, and its files when they are read; if the server cannot do that, fetch all commits."""
+    """Fetch one commit, without its files, which are fetched when they are read.
+
+    If the server does not support this, the whole repository is fetched.
+    """
     repository, whole = scratch / "partial", scratch / "whole"
     try:
         _git("init", "--quiet", "--bare", str(repository))
@@ -262,7 +270,7 @@ def _open_repository(url: str, commit: str | None, scratch: Path) -> Origin:
     try:
         _git("fetch", "--quiet", "--filter=blob:none", "--depth=1", "origin", commit, repository=repository)
     except subprocess.CalledProcessError:
-        try:  # with all files, because a partial clone would search for a missing commit endlessly
+        try:  # a full clone, because git in a partial clone would search for a missing commit endlessly
             repository = whole
             _git("clone", "--quiet", "--mirror", url, str(whole))
             _git("cat-file", "-e", f"{commit}^{{commit}}", repository=whole)

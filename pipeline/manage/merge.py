@@ -26,7 +26,7 @@ from reskin.errors import ParamsError
 
 LOCK = "dvc.lock"
 RESOLVED = (REGISTRY, PLAN, LOCK)
-REPORTS = "reports/"  # written by stages; our version is kept until the next `dvc repro`
+REPORTS = "reports/"  # our version of reports is kept until the next `dvc repro` writes them again
 SIDES = ("1", "2", "3")  # git's stage numbers of base, ours and theirs
 Versions = tuple[dict[str, Any], dict[str, Any], dict[str, Any]]
 
@@ -42,15 +42,15 @@ def merge(root: Path) -> str:
     with io.restoring(*files):
         if REGISTRY in unmerged:
             write_registry(root, merge_registries(*_registries(root, unmerged[REGISTRY])))
-        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # needed even if only captures changed
-        both = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
+        plan.use(root, _scenes(root, unmerged.get(PLAN)))  # the plan also depends on captures
+        changed_stages = _merge_lock(root, unmerged[LOCK]) if LOCK in unmerged else []
     deleted = {name for name in unmerged if name.startswith(REPORTS) and "2" not in unmerged[name]}
     for name in unmerged:
         if name.startswith(REPORTS):
             command = ["rm", "--quiet"] if name in deleted else ["checkout", "--ours"]
             _git(root, *command, "--", name)
     _git(root, "add", "--all", "--", *(name for name in unmerged if name not in deleted), PLAN)
-    changed = f" {len(both)} stages that both sides ran may run again." if both else ""
+    changed = f" {len(changed_stages)} stages that both sides ran may run again." if changed_stages else ""
     captures_n = sum(map(len, read_registry(root).captures.values()))
     return f"resolved {', '.join(unmerged)}: {captures_n} captures.{changed} Now: git commit, dvc pull, dvc repro"
 
@@ -90,7 +90,7 @@ def merge_stages(
 
 
 def merge_scenes(base: Sequence[str], ours: Sequence[str], theirs: Sequence[str]) -> list[str]:
-    """Return the scenes to run: ours, without the scenes removed in theirs, and with the scenes added there."""
+    """Return the scenes to run: ours, without the scenes that theirs removed, and with the scenes that theirs added."""
     added = [name for name in theirs if name not in ours and name not in base]
     return [name for name in ours if name in theirs or name not in base] + added
 
@@ -105,13 +105,15 @@ def _registries(root: Path, blobs: Mapping[str, str]) -> tuple[Registry, Registr
 
 
 def _scenes(root: Path, blobs: Mapping[str, str] | None) -> list[str]:
+    """Return the scenes of the merged plan; without a conflict (None), those of the plan on disk."""
     if blobs is None:
         return list(read_plan(root / PLAN).scenes)
     return merge_scenes(*(list(content.get("scenes", {})) for content in _versions(root, blobs)))
 
 
 def _merge_lock(root: Path, blobs: Mapping[str, str]) -> list[str]:
-    from dvc.utils.serialize import dumps_yaml  # DVC's own format; imported late: it takes a second
+    """Merge the versions of dvc.lock; return the names of stages that both sides changed."""
+    from dvc.utils.serialize import dumps_yaml  # DVC's own format; imported late: the import takes a second
 
     base, ours, theirs = _versions(root, blobs)
     stages, both = merge_stages(*(content.get("stages", {}) for content in (base, ours, theirs)))
@@ -120,7 +122,7 @@ def _merge_lock(root: Path, blobs: Mapping[str, str]) -> list[str]:
 
 
 def _versions(root: Path, blobs: Mapping[str, str]) -> Versions:
-    """Read the three versions of a YAML file; a missing one is empty."""
+    """Read the base, our and their version of a YAML file from git; a missing version is an empty mapping."""
     from dvc.utils.serialize import loads_yaml
 
     base, ours, theirs = (
@@ -139,11 +141,11 @@ def _unmerged(root: Path) -> dict[str, dict[str, str]]:
     return unmerged
 
 
-def _git(root: Path, *words: str) -> str:
+def _git(root: Path, *arguments: str) -> str:
     """Run git in the checkout, and return its output."""
     if not which("git"):
         raise ParamsError("reskin merge needs git: install it.")
-    completed = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+    completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
     if completed.returncode:
-        raise ParamsError(f"git {words[0]} failed: {' '.join(completed.stderr.split())[-300:]}")
+        raise ParamsError(f"git {arguments[0]} failed: {' '.join(completed.stderr.split())[-300:]}")
     return completed.stdout

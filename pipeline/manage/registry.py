@@ -38,7 +38,7 @@ def read_registry(root: Path) -> Registry:
 def with_capture(
     registry: Registry, scene: str, header: Header, fingerprints: tuple[str, ...], *, allow_copy: bool
 ) -> Registry:
-    """Return the registry with one more capture; raise `CaptureError` for a copy or a contradiction."""
+    """Return the registry with one more capture; raise `CaptureError` if it copies or contradicts another."""
     entry = Entry(
         board=header.board, skin=header.skin, layout=header.layout, chips_n=header.chips_n,
         fingerprints=fingerprints, copy_of=None,
@@ -47,7 +47,7 @@ def with_capture(
 
 
 def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, allow_copy: bool) -> Registry:
-    """Add an entry, possibly one made in another clone, by the rules of `with_capture`."""
+    """Return the registry with one more entry, which may come from another clone; see `with_capture`."""
     captures, where = registry.captures.get(scene, {}), f"capture {capture}"
     original = next(
         (name for name, other in captures.items() if set(other.fingerprints) & set(entry.fingerprints)), None
@@ -74,14 +74,14 @@ def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
     """Return the registry without a capture, and without its scene if that has no other capture."""
     if scene not in registry.captures:
         guess, known = did_you_mean(scene, registry.captures), ", ".join(sorted(registry.captures)) or "none"
-        raise CaptureError(f"no scene {scene} has recorded captures.{guess} Scenes that have some: {known}.")
+        raise CaptureError(f"scene {scene} has no recorded captures.{guess} Scenes with recorded captures: {known}.")
     captures = registry.captures[scene]
     if capture not in captures:
         known = ", ".join(sorted(captures)) or "none"
         raise CaptureError(f"scene {scene} has no capture {capture}. Its captures: {known}.")
-    left = {name: entry for name, entry in captures.items() if name != capture}
+    remaining = {name: entry for name, entry in captures.items() if name != capture}
     others = {name: entries for name, entries in registry.captures.items() if name != scene}
-    return Registry(captures=others | ({scene: left} if left else {}))
+    return Registry(captures=others | ({scene: remaining} if remaining else {}))
 
 
 def write_registry(root: Path, registry: Registry) -> None:
@@ -93,6 +93,7 @@ def write_registry(root: Path, registry: Registry) -> None:
 
 
 def _refuse_copy(where: str, original: str, before: Entry, entry: Entry, allow_copy: bool) -> None:
+    """Raise `CaptureError` for a copy of capture `original`, unless it has another board or skin and is allowed."""
     relabelled = (before.board, before.skin) != (entry.board, entry.skin)
     if relabelled and allow_copy:
         return

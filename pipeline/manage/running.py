@@ -7,7 +7,7 @@ from reskin import io
 from reskin.errors import ParamsError, SchemaError
 
 DVC_FILES = Path(".dvc/tmp")
-LOCK, RWLOCK = "lock", "rwlock"  # DVC locks the first between stages, and lists users in the second
+LOCK, RWLOCK = "lock", "rwlock"  # DVC locks file `lock` between stages, and lists running processes in `rwlock`
 
 
 def require_idle(root: Path) -> None:
@@ -24,10 +24,10 @@ def require_idle(root: Path) -> None:
 
 
 def _users(rwlock: Path) -> set[int]:
-    """Return the live processes among those in DVC's file; a killed process leaves its entries behind."""
+    """Return the ids of running processes in DVC's file `rwlock`, which may also list processes that were killed."""
     try:
         content = io.read_json(rwlock)
-    except SchemaError:  # no such file yet, or a broken one, which DVC itself refuses
+    except SchemaError:  # the file is missing, or broken, in which case DVC itself does not run
         return set()
     entries = [
         *content.get("write", {}).values(),

@@ -19,9 +19,9 @@ LOCK = "dvc.lock"
 
 
 def stale_outputs(root: Path, plan: Plan) -> dict[str, list[Path]]:
-    """List the stages that ran here and are no longer in the plan, each with the files that only it wrote.
+    """List the stages that ran here and are no longer in the plan, with their outputs that no planned stage writes.
 
-    dvc.lock is committed, so it also lists stages that ran only in other clones; these have no outputs here.
+    Stages in dvc.lock without outputs on disk are left out: they ran only in other clones.
     """
     if not (root / LOCK).exists():
         return {}
@@ -39,7 +39,7 @@ def stale_outputs(root: Path, plan: Plan) -> dict[str, list[Path]]:
 
 
 def tidy(root: Path, plan: Plan) -> dict[str, list[Path]]:
-    """Remove stale outputs, and their stages from dvc.lock; return what was removed."""
+    """Delete stale outputs, and remove their stages from dvc.lock; return the deleted outputs by stage."""
     require_idle(root)
     stale = stale_outputs(root, plan)
     for paths in stale.values():

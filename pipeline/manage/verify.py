@@ -25,7 +25,7 @@ def verify(root: Path, names: Sequence[str], against: Path | None, echo: Echo) -
     """Compare each scene's rerun, or its reports in `against`, with the last commit; return the exit status."""
     for name in names:
         plan.scene_file(root, name)
-    # These reports are read first, so that errors are found before the rerun, which takes hours.
+    # Committed reports are read before the rerun, which takes hours, so that errors in them are found early.
     committed = {name: read_revision(root, name, "HEAD") for name in names}
     if against is None:
         rerun(root, names)
@@ -41,12 +41,12 @@ def rerun(root: Path, names: Sequence[str]) -> None:
         clone = Path(temporary) / "clone"
         _git(root, "clone", "--quiet", ".", str(clone))
         _bring_recordings(root, clone, names)
-        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # because stages run `python`
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # stages run `python`
         environment = {**QUIET, **os.environ, "PYTHONPATH": str(clone), "PATH": path}
         _run(clone, environment, "pipeline", "scenes", "use", *names, quiet=True)
         for name in names:
-            _clear(clone / "reports" / name)  # otherwise a scene that does not run would pass
-        # Forced, so that no cache of this machine replaces a stage. Stage publish does not run.
+            _clear(clone / "reports" / name)  # otherwise committed reports could pass as new ones
+        # --force: every stage runs, even if this machine's cache contains its outputs. Stage publish does not run.
         _run(clone, environment, "dvc", "repro", "--quiet", "--force", *(f"report@{name}" for name in names))
         for name in names:
             with io.replacing(root / VERIFIED / name) as folder:
@@ -70,23 +70,23 @@ def _bring_recordings(root: Path, clone: Path, names: Sequence[str]) -> None:
             shutil.copytree(root / RAW / name, clone / RAW / name, dirs_exist_ok=True)
 
 
-def _run(clone: Path, environment: Mapping[str, str], *words: str, quiet: bool = False) -> None:
-    to = subprocess.DEVNULL if quiet else None
-    command = [sys.executable, "-m", *words]
-    with subprocess.Popen(command, cwd=clone, env=environment, stdout=to, process_group=0) as running:
+def _run(clone: Path, environment: Mapping[str, str], *arguments: str, quiet: bool = False) -> None:
+    stdout = subprocess.DEVNULL if quiet else None
+    command = [sys.executable, "-m", *arguments]
+    with subprocess.Popen(command, cwd=clone, env=environment, stdout=stdout, process_group=0) as process:
         try:
-            running.wait()
+            process.wait()
         except BaseException:
-            os.killpg(running.pid, signal.SIGTERM)  # also ends DVC's stages, which would continue in a deleted folder
+            os.killpg(process.pid, signal.SIGTERM)  # also ends DVC's stages, which would continue in a deleted folder
             raise
-    if running.returncode:
+    if process.returncode:
         raise SchemaError(
-            f"`{' '.join(words)}` failed in a clone of the last commit (exit status {running.returncode})."
+            f"`{' '.join(arguments)}` failed in a clone of the last commit (exit status {process.returncode})."
         )
 
 
-def _git(root: Path, *words: str) -> str:
-    completed = subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=False)
+def _git(root: Path, *arguments: str) -> str:
+    completed = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, check=False)
     if completed.returncode:
-        raise SchemaError(f"git {words[0]} failed: {completed.stderr.strip()[-300:]}")
+        raise SchemaError(f"git {arguments[0]} failed: {completed.stderr.strip()[-300:]}")
     return completed.stdout

@@ -27,10 +27,10 @@ METRICS = {
 }  # fmt: skip
 UNITS = {"pct": "%", "mm2": "mm²", "N2": "N²", "mm": "mm", "N": "N", "hz": "Hz"}
 CLAIM = "claim: "
-NEAR = 0.10  # assumed: relative tolerance where the paper gives no sd
-SIZEABLE = 0.5  # assumed: a difference is sizeable if it is at least this fraction of the paper's, else negligible
-SIGNIFICANT = 0.05  # convention: largest significant p-value, after adjustment for the family of claims
-PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a smaller difference than this
+NEAR = 0.10  # assumed: relative tolerance if the paper gives no sd
+SIZEABLE = 0.5  # assumed: a gain is sizeable if it is at least this fraction of the paper's difference
+SIGNIFICANT = 0.05  # convention: a claim of the family is significant if its adjusted p-value is at most this
+PLATEAU_POINTS = 1.0  # assumed: "seems to plateau" means a difference of less than this, in percentage points
 NONE = "–"
 NOT_RUN = "not run in this scene"
 NOT_REACHED = "not reached in this scene"
@@ -56,7 +56,7 @@ MEANING = (
     "single number to compare, and the result is in the tables or figures named in the column `shown in`."
 )
 CLAIMS_MEANING = f"{VERDICTS} {FAMILY}"
-NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # in the text of a reason
+NAMED_NUMBER = re.compile(r"\{([\w.]+)\}")  # the name of a number in the text of a reason
 
 
 class Reach(Strict):
@@ -68,7 +68,7 @@ class Reach(Strict):
 
 
 class Row(Strict):
-    """One result of the paper: its section, its number or words, and the path of our result in numbers.json.
+    """A row of the checklist: one result of the paper, and the path of our result in numbers.json.
 
     The rule says how our result is judged:
 
@@ -91,7 +91,7 @@ class Row(Strict):
     paper: str | None = None  # the dotted name of a constant of `pipeline.report.paper`
     says: str | None = None  # the paper's words, if it gives no number
     ours: str | None = None
-    experiment: str | None = None  # the experiment that computes `ours`, if it omits this number in small scenes
+    experiment: str | None = None  # the experiment that computes `ours`, if this number is missing in small scenes
     rule: Literal[
         "near", "at_most", "at_least", "positive", "gain", "sizeable", "each", "slight", "plateau", "finding", "input",
         "setting", "target", "view",
@@ -112,7 +112,7 @@ class Row(Strict):
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict on a claim, its criterion, whether our mean meets it, the adjusted p-value, and notes."""
+    """The verdict on a claim, the criterion, whether our mean meets the criterion, the adjusted p-value, and notes."""
 
     verdict: str = NONE
     criterion: str = NONE
@@ -184,7 +184,7 @@ def claims_table(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def adjusted_p_values(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[str, float]:
-    """Compute the p-values of the family of claims, adjusted by Holm's method, by row id."""
+    """Compute the p-values of the family of claims, adjusted by Holm's method; return them by row id."""
     p_values = {row.id: claim_p_value(row, *_paper_and_ours(numbers, row)) for row in rows if row.family}
     return statistics.holm({name: p for name, p in p_values.items() if p is not None})
 
@@ -192,9 +192,9 @@ def adjusted_p_values(numbers: Mapping[str, Any], rows: Sequence[Row]) -> dict[s
 def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
     """Compute the p-value of a claim about differences over boards; None if too few boards were compared.
 
-    A claim about every number of training skins has one p-value per number. It holds only if all parts hold, so its
-    p-value is the largest of them. If some parts significantly contradict the claim, its p-value is the smallest
-    p-value of these parts, with Bonferroni's correction for the number of all parts.
+    A claim about every number of training skins has one p-value per number of skins. The claim holds only if it holds
+    for every number, so the p-value of the claim is the largest one. If the results for some numbers significantly
+    contradict the claim, its p-value is the smallest p-value of these, with Bonferroni's correction for all numbers.
     """
     if isinstance(ours, Sequence):
         parts = [contrast["accuracy_pct"] for contrast in ours]
@@ -214,7 +214,7 @@ def claim_p_value(row: Row, printed: Any, ours: Any) -> float | None:
 
 
 def adjust(judgement: Judgement, p_adjusted: float) -> Judgement:
-    """Add the adjusted p-value to the judgement of a claim; without significance, the claim becomes undecided."""
+    """Add the adjusted p-value to the judgement of a claim; a verdict that is not significant becomes undecided."""
     verdict = judgement.verdict
     if verdict in (SUPPORTED, CONTRADICTED) and p_adjusted > SIGNIFICANT:
         verdict = UNDECIDED
@@ -315,7 +315,7 @@ def _yes(holds: bool) -> str:
 
 
 def _paper_and_ours(numbers: Mapping[str, Any], row: Row) -> tuple[Any, Any]:
-    """Return the paper's number and ours."""
+    """Return the paper's number and our result; None if the row has no such number."""
     printed = look_up(numbers, row.paper) if row.paper else None
     return printed, resolve(numbers, row.ours) if row.ours else None
 
@@ -344,7 +344,7 @@ def look_up(numbers: Mapping[str, Any], name: str) -> Any:
 
 
 def mean_of(value: Any) -> float | None:
-    """Return the mean of a summary or of a pair (mean, sd), or a plain number; None for anything else."""
+    """Return a number as a float: the mean of a summary or of a pair (mean, sd), or a plain number; else None."""
     if isinstance(value, Mapping):
         return value.get("mean")
     if isinstance(value, tuple):
@@ -362,7 +362,7 @@ def _paper_in_interval(printed: Any, ours: Any) -> str:
 
 
 def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
-    """Return a note on the size of our experiment and of the paper's."""
+    """Return a note that compares the size of our experiment with the paper's; empty if the row names no sizes."""
     if row.reach is None or ours is None:
         return []
     ours_n, paper_n = resolve(numbers, row.reach.ours), look_up(numbers, row.reach.paper)
@@ -370,6 +370,7 @@ def _reach(numbers: Mapping[str, Any], row: Row, ours: Any) -> list[str]:
 
 
 def _reason(numbers: Mapping[str, Any], row: Row, judgement: Judgement) -> list[str]:
+    """Return the row's possible reason, with its numbers filled in, if our mean does not meet the criterion."""
     why = row.why or (row.why_simulated if numbers["provenance"]["source"] == "simulated" else "")
     if not why or judgement.met != "no":
         return []
@@ -387,7 +388,7 @@ def _show_ours(row: Row, ours: Any) -> str:
 
 
 def _show(row: Row, value: Any) -> str:
-    """Write a number with its unit (from the last part of the path `ours` that names one); differences get a sign."""
+    """Write a number with its unit, which a part of the path `ours` names; differences get a sign."""
     ends = [part.rsplit("_", 1)[-1] for part in reversed((row.ours or "").split("."))]
     unit = next((UNITS[end] for end in ends if end in UNITS), "")
     if row.rule in DIFFERENCES:

@@ -33,7 +33,10 @@ Rows = Sequence[Row]
 
 
 def cost_pages(runtime: Row, source: str) -> dict[str, str]:
-    """Draw and tabulate errors against costs: text by file name. Methods that were not timed here are in no figure."""
+    """Draw and tabulate errors against run times; return texts by file name.
+
+    Methods without times on this machine are left out of figures.
+    """
     texts = {f"{name}.md": to_markdown(table) for name, table in cost_tables(runtime, source).items()}
     for name, (key, cost) in TRADE_OFFS.items():
         if any(key in row for row in runtime.get("learning", [])):
@@ -49,7 +52,10 @@ def cost_pages(runtime: Row, source: str) -> dict[str, str]:
 
 
 def cost_tables(runtime: Row, source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the costs of stages, and the errors and costs of methods, adaptation and timed studies, by name."""
+    """Tabulate the costs of stages, and the errors and costs of methods, adaptation and timed studies.
+
+    Return the tables by name.
+    """
     methods = [
         {"method": row["method"], "inputs": row["inputs"], "training, s": _time(row, "train_s")}
         | {"per reading, µs": _time(row, "inference_us"), "source": source}
@@ -81,7 +87,7 @@ def stage_costs(stages: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
             "stage": name,
             "computed, s": f"{cost['computed_s']:.1f}",
             "last run, s": f"{cost['seconds']:.1f}",
-            "last run, CPU s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # older costs lack it
+            "last run, CPU s": f"{cost['cpu_s']:.1f}" if "cpu_s" in cost else "–",  # missing in older records of costs
             "training runs": str(cost["trainings_n"]),
             "reused training runs": str(cost["reused_n"]),
             "peak memory per process, MB": f"{cost['peak_process_memory_MB']:.0f}",
@@ -115,7 +121,7 @@ def _time(row: Row, name: str) -> str:
 
 @dataclass(frozen=True)
 class Point:
-    """A method or setting in a figure of error against cost; in `trade_off`, only the Pareto front has labels."""
+    """A method or setting in a figure of error against cost; `trade_off` labels only the Pareto front."""
 
     name: str
     label: str
@@ -157,7 +163,7 @@ def trade_off_points(rows: Rows, key: str) -> list[Point]:
 
 
 def adaptation(rows: Rows, source: str) -> str:
-    """Draw the error after adaptation against its duration; each label is the number of pokes."""
+    """Draw the error after adaptation against the duration of the adaptation; labels are the numbers of pokes."""
     timed = sorted((row for row in rows if "seconds" in row), key=lambda row: row["pokes_n"])
     points = [Point("", str(row["pokes_n"]), (row["seconds"], row["mse_xy_mm2"]["mean"]), look_of(1)) for row in timed]
     with drawing(7.6, 4.2) as figure:
@@ -204,7 +210,7 @@ def front(points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def quadratures(rows: Rows, choice: Mapping[str, Any], source: str) -> str:
-    """Draw the study of quadratures: the error limit, the cheapest rule below the limit, and the rule in use."""
+    """Draw error against run time of quadratures; mark the error limit, the cheapest rule below it, and that in use."""
     study = rows[0]["study"]
     rings = {}
     if choice["setting"]:
@@ -223,7 +229,7 @@ def quadratures(rows: Rows, choice: Mapping[str, Any], source: str) -> str:
 
 
 def integrators(rows: Rows) -> str:
-    """Draw the study of integrators, with one panel per ratio of the slowest to the fastest relaxation."""
+    """Draw error against run time of integrators, with one panel per ratio of slowest to fastest relaxation."""
     return draw_study(rows, title="Error of the relaxed force against run time", error="rms error / rms force")
 
 
@@ -236,10 +242,10 @@ def draw_study(
     limit: float | None = None,
     rings: Mapping[str, tuple[str, str, str]] | None = None,
 ) -> str:
-    """Draw error against median time on logarithmic axes, with one panel per study and the failures below.
+    """Draw error against median time on logarithmic axes, with one panel per study; list failures below the panels.
 
     Each method has its own colour and marker, and a line joins its Pareto front. `limit` is drawn as a line. `rings`
-    maps a label to the study, method and setting of the point to ring. Rows that were not timed are left out.
+    maps a label to the study, method and setting of a point that gets a ring. Rows that were not timed are left out.
     """
     studies = list(dict.fromkeys(row["study"] for row in rows))
     methods = [name for name in dict.fromkeys(row["method"] for row in rows) if name != REFERENCE]

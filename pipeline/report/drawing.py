@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 MARKS_MAX_N = 150  # a line or scatter with more marks gets no titles, which would make the file too large
-USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")  # how Matplotlib writes marks: many, a few
+# Matplotlib writes the marks of an artist as <use> tags if there are many, and as <path> tags if there are few.
+USE, PATH = re.compile(r"<(use) [^>]*/>"), re.compile(r"<(path) [^>]*/>")
 GROUP = re.compile(r"<g[ >]|</g>")
-Titles = Mapping[str, list[str]]  # by id of a group: one title per mark, in order; one title for a line without marks
+# Titles by id of an SVG group: one title per mark, in order, or one title for a line without marks.
+Titles = Mapping[str, list[str]]
 Format = Callable[[float], str]
 FONTS = ("DejaVu Sans", "Verdana", "sans-serif")  # Verdana, the fallback, has letters of the same width
 # Removed from the file: indentation, metadata, comments, and the digits of coordinates beyond a hundredth of a point.
@@ -47,10 +49,10 @@ def name_marks(figure: Any) -> Titles:
 
 
 def put_titles(svg: str, titles: Titles) -> str:
-    """Write titles into the groups with their ids, except into groups whose number of marks differs."""
+    """Write titles into the SVG groups with the given ids, unless the numbers of marks and titles of a group differ."""
     for name, texts in titles.items():
         before, head, after = svg.partition(f'<g id="{name}">')
-        if head:  # else nothing was drawn
+        if head:  # the group is missing if nothing was drawn
             end = _group_end(after)
             svg = before + head + _with_titles(after[:end], texts) + after[end:]
     return svg
@@ -65,7 +67,7 @@ def _with_titles(group: str, texts: list[str]) -> str:
 
 
 def _group_end(text: str) -> int:
-    """Return the position of the tag that closes the group in which the text starts."""
+    """Return the position of the tag that closes a group; the text starts inside the group."""
     depth = 1
     for tag in GROUP.finditer(text):
         depth += -1 if tag[0] == "</g>" else 1
@@ -103,7 +105,7 @@ def _scatter_titles(scatter: Any, x: Format, y: Format) -> list[str]:
 
 
 def _with_bars(texts: list[str], container: Any) -> list[str]:
-    """Add to each text the ends of the mark's error bar."""
+    """Append the ends of each mark's error bar to its title."""
     side = 1 if container.has_yerr else 0
     ends = [ends[:, side] for bars in container.lines[2] for ends in bars.get_segments()]
     if len(ends) != len(texts):
@@ -117,7 +119,7 @@ def _title(name: str, *values: str) -> str:
 
 
 def _value_format(axes: Any, which: str) -> Format:
-    """Return a function that writes a value with the label of its axis, or as the name of the nearest named tick."""
+    """Return a function that writes a value on an axis: `label = value`, or the name of the nearest named tick."""
     axis, siblings = getattr(axes, f"{which}axis"), getattr(axes, f"get_shared_{which}_axes")().get_siblings(axes)
     labels = [labelled.get_label_text() for labelled in (axis, *(getattr(other, f"{which}axis") for other in siblings))]
     name = " ".join(next((label for label in labels if label), which).split())
@@ -147,13 +149,13 @@ def drawing(width_in: float, height_in: float) -> Iterator[Any]:
 def svg(figure: Any) -> str:
     """Write a figure as SVG text whose marks show their values on hover.
 
-    It contains no date and no version, so the same data give the same bytes.
+    The text contains no date and no version, so that equal data give equal bytes.
     """
     buffer, titles = io.StringIO(), name_marks(figure)
     _lay_out(figure)
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = COORDINATES.sub(lambda found: DIGITS_BEYOND_2.sub("", found[0]), REMOVED.sub("", buffer.getvalue()))
-    # Matplotlib writes one font family for formulas. The others are added, lest browsers fall back to a serif font.
+    # Matplotlib writes one font family for formulas. The others are added, or else browsers may use a serif font.
     return put_titles(text.replace(f"'{FONTS[0]}'\"", f"'{FONTS[0]}', '{FONTS[1]}', {FONTS[2]}\""), titles)
 
 
@@ -161,7 +163,7 @@ def _lay_out(figure: Any) -> None:
     """Lay out the axes once, then turn the layout engine off, so that saving does not lay them out again."""
     from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-    FigureCanvasSVG(figure)  # this canvas measures texts as the file will show them
+    FigureCanvasSVG(figure)  # this canvas measures texts at the size that they have in the file
     figure.dpi = SVG_DPI
     figure.get_layout_engine().execute(figure)
     figure.set_layout_engine(None)

@@ -16,7 +16,7 @@ from pipeline.stages import module_name
 
 
 def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Make the tables of every experiment with results in numbers.json, by the name of the table."""
+    """Make the tables of every experiment with results in numbers.json; return them by name."""
     tables: dict[str, pd.DataFrame] = {}
     for key, module in _modules(numbers).items():
         tables |= module.tables(numbers[key], source)
@@ -26,7 +26,7 @@ def experiment_tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.D
 def experiment_figures(numbers: Mapping[str, Any], plot_data: Mapping[str, Any], source: str) -> dict[str, str]:
     """Draw the figures of every experiment with results in numbers.json: SVG text by file name.
 
-    plot_data: data that only figures show, by the experiment's key in numbers.json.
+    plot_data: data that are only in figures, by the experiment's key in numbers.json.
     """
     figures: dict[str, str] = {}
     for key, module in _modules(numbers).items():

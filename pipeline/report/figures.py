@@ -17,15 +17,15 @@ from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2
 HEADLINE = "headline.svg"
 OFFSET = 0.17  # fraction of a row's height by which our score is above the row's middle, and the paper's below it
 WORST_MM = 2.0  # end of the colour scale of all error maps: twice the error that counts as correct
-GRID_MM = 16.0  # the paper's grid of places, from 0 to here
-TICK_MM = 4.0  # at every other place of the grid
+GRID_MM = 16.0  # the paper's grid of places extends from 0 to this in x and y
+TICK_MM = 4.0  # distance between ticks of axes: two places of the grid
 MARK_PT = 18.0  # side of a mark that nearly fills a cell of the grid
 SKIN_MM = (-2.0, 18.0)  # extent of the skin around the grid: "20mm x 20mm" (paper section 2)
 # Centres of the five chips under the skin, in the frame of the labels (paper section 2), and the side of a chip.
 CHIPS_MM = ((8.0, 8.0), (1.0, 8.0), (15.0, 8.0), (8.0, 1.0), (8.0, 15.0))
 CHIP_MM = 3.0
 RANGES = {"accuracy_pct": (0.0, 100.0), "mse_xy_mm2": (0.0, np.inf)}  # metrics in figures, with their possible range
-LINEAR_BELOW_N = 65  # pokes; the axis is linear below, because a logarithmic axis cannot show 0
+LINEAR_BELOW_N = 65  # pokes; the axis is linear below this number, because a logarithmic axis cannot show 0
 BARS = (
     "Bars: 95 % interval over boards. Two or three boards: lowest to highest value.\n"
     "One board: sd over seeds. Paper: printed sd. Bars are cut at impossible values."
@@ -112,7 +112,7 @@ def _finish_headline(figure: Any, title: str, *, ncols: int) -> None:
 
 
 def error_grids(predictions: Iterable[pa.Table], recipe: str, scene: str) -> Iterator[tuple[str, str]]:
-    """Draw a map of the position errors of a recipe for each experiment with predictions: file name and SVG text."""
+    """Draw the position errors of a recipe as a map for each experiment with predictions; yield file name and SVG."""
     for table in predictions:
         for experiment in table["question"].unique().to_pylist():
             wanted = pc.and_(pc.equal(table["question"], experiment), pc.equal(table["recipe"], recipe))
@@ -170,6 +170,7 @@ def _draw_skin(axes: Any) -> None:
 
 
 def _places(table: pa.Table, side: str) -> Any:
+    """Return x and y in mm of every row; `side`: `true` or `predicted`."""
     return np.stack([np.asarray(table[f"{side}_{axis}_mm"], np.float64) for axis in "xy"], axis=1)
 
 
@@ -185,7 +186,7 @@ class Line:
 
 
 def learning_figures(numbers: Mapping[str, Any], source: str) -> Iterator[tuple[str, str]]:
-    """Draw each sweep that the scene ran: file name and SVG text."""
+    """Draw each sweep that the scene ran; yield file name and SVG text."""
     for name, draw in {"sweep_pokes": sweep_pokes, "sweep_sensors": sweep_sensors}.items():
         if name in numbers:
             yield f"{name}.svg", draw(numbers[name], source)
@@ -218,8 +219,8 @@ def sweep_sensors(rows: Rows, source: str) -> str:
 def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     """Compute means and the lengths of their error bars (down, up), which show the interval over boards.
 
-    With few boards, bars reach from the smallest to the largest value. Without boards, as in the paper, their length is
-    one sd. All bars are clipped to possible values.
+    With few boards, bars reach from the smallest to the largest value. For statistics that are not over boards,
+    such as the paper's, bars extend one standard deviation to each side. All bars are clipped to possible values.
     """
     means = np.array([row[metric]["mean"] for row in scores])
     ends = np.array([_ends(row[metric]) for row in scores]).clip(*RANGES[metric])
@@ -227,6 +228,7 @@ def bars(scores: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ends(stat: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the lower and the upper end of an error bar."""
     sd = stat.get("sd", stat.get("sd_seeds", 0.0))
     values = stat.get("values", (stat["mean"] - sd, stat["mean"] + sd))
     low, high = stat.get("ci95", (min(values), max(values)))
@@ -264,6 +266,6 @@ def _draw_lines(axes: Any, lines: Sequence[Line], metric: str) -> None:
         look = {"linewidth": 1, "markersize": 5, "capsize": 2, "elinewidth": 0.8, **line.look}
         axes.errorbar(line.counts, means, lengths, transform=axes.transData + shift, label=line.name, **look)
         ends += [*(means - lengths[0]), *(means + lengths[1])]
-    # Matplotlib does not set the limits of an axis from shifted data.
+    # The limits are set here, because Matplotlib does not compute them from shifted data.
     margin = 0.05 * (max(ends) - min(ends)) or 1.0
     axes.set_ylim(min(ends) - margin, max(ends) + margin)

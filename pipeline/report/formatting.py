@@ -10,7 +10,8 @@ import pandas as pd
 from pipeline.report.paper import ADAPTED_POKES_N, TABLE_2, TABLE_2_ROWS, Number
 from pipeline.statistics import negate
 
-Stat = Mapping[str, Any]  # mean and n; where known, sd and ci95 ([low, high]), or the values of a few boards
+# Keys `mean` and `n`; if known, also `sd`, and `ci95` ([low, high]) or `values` (one value per board, for few boards).
+Stat = Mapping[str, Any]
 Results = Mapping[str, Any]  # numbers.json of one scene
 COLUMNS = {"accuracy_pct": "accuracy, %", "mse_xy_mm2": "MSE_xy, mm²", "mse_f_N2": "MSE_F, N²", "r2_f": "R² of F"}
 FORCE_METRICS = ("mse_f_N2", "r2_f")  # an offset of positions does not change them
@@ -38,7 +39,7 @@ UNIVERSAL = ("universal", 0)  # in experiment population: rows of the whole univ
 
 
 def show(value: Stat | None) -> str:
-    """Write a mean with three significant digits, its interval over boards (or else its sd) and its sd over seeds."""
+    """Write a mean with three digits, its interval over boards or else its standard deviation, and that over seeds."""
     if value is None:
         return "–"
     if "ci95" in value or "values" in value:
@@ -47,7 +48,7 @@ def show(value: Stat | None) -> str:
 
 
 def show_deviation(value: Stat) -> str:
-    """Write a mean with its standard deviations over n and over seeds, if known."""
+    """Write a mean with its standard deviations over the n values and over seeds, if these are known."""
     over_n = f" ± {value['sd']:.2g}" if "sd" in value else ""
     return f"{_three_digits(value['mean'])}{over_n}{_show_seeds(value)}"
 
@@ -61,7 +62,7 @@ def show_interval(value: Stat) -> str:
 
 
 def show_digits(value: Stat, digits: int) -> str:
-    """Write a mean with `digits` decimals, and its interval over boards and its sd over seeds, if known."""
+    """Write a mean with `digits` decimals, and its interval over boards and standard deviation over seeds, if known."""
     mean, *ends = [f"{number:.{digits}f}" for number in (value["mean"], *value.get("ci95", value.get("values", ())))]
     if not ends:
         return f"{mean}{_show_seeds(value)}"
@@ -95,19 +96,19 @@ def _three_digits(value: float) -> str:
 
 
 def scores(row: Mapping[str, Any], titles: Mapping[str, str] = COLUMNS) -> dict[str, str]:
-    """Write every metric of a row under its title."""
+    """Write every metric of a row, as cells by title of column."""
     return {title: show(row.get(metric)) for metric, title in titles.items()}
 
 
 def scored(row: Mapping[str, Any]) -> dict[str, str]:
-    """Write every metric of a row, and n."""
+    """Write every metric of a row, and n, as cells by title of column."""
     return scores(row) | {"n": n_of(row)}
 
 
 def beside(
     row: Mapping[str, Any], printed: Mapping[str, str], show: Callable[[Stat | None], str], *, paper: str = "paper"
 ) -> dict[str, str]:
-    """Write every metric of a row beside the paper's, and n."""
+    """Write every metric of a row, the paper's value for it (`printed`), and n, as cells by title of column."""
     cells: dict[str, str] = {}
     for metric, title in COLUMNS.items():
         cells |= {f"{title} (ours)": show(row.get(metric))}
@@ -154,7 +155,7 @@ def rounded(value: Any, digits: int = 6) -> Any:
 
 @dataclass(frozen=True)
 class Model:
-    """A row of table 2: its title, a short title, and the paper's scores, which are empty if it gives none."""
+    """A row of table 2: its title, a short title, and the paper's scores (empty if the paper has no such row)."""
 
     title: str
     short: str
@@ -200,6 +201,6 @@ def control_of(numbers: Results) -> dict[str, Any]:
 
 
 def is_pooled(numbers: Results) -> bool:
-    """Return whether any leave-one-board-out model was trained on several skins."""
+    """Return whether any leave-one-board-out model was trained on several skins; True if there are no such models."""
     boards = numbers["lobo"]["by_board"].values() if "lobo" in numbers else ()
     return not boards or max(board["trained_on_skins_n"] for board in boards) > 1

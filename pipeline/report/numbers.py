@@ -38,17 +38,19 @@ Row = Mapping[str, Any]
 Points = Mapping[str, Sequence[dict[str, Any]]]
 Seconds = Sequence[Row]  # times of training runs: name, train_s, one_reading_s
 
-CONTROL = "control"  # the recipe of adaptation that fine-tunes equally long without the new skin's pokes
+CONTROL = "control"  # the recipe of adaptation that fine-tunes for as many steps, without the new skin's pokes
+# Pairs of rows of table 2: the scores of the first minus those of the second are computed.
 PAIRS = (
     ("multi", "single"), ("triplet", "multi"), ("adapted", "triplet"), ("adapted", CONTROL), (CONTROL, "triplet"),
     ("adapted", "multi"),
 )  # fmt: skip
-PAPERS_SPLITS = ("single_random", "single_temporal")  # the first that exists is compared with the paper's numbers
-STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # hold out whole indentations or passes
+PAPERS_SPLITS = ("single_random", "single_temporal")  # the first of these that the scene ran is compared with the paper
+STRICTER = {"by_indentation": "single_indentation", "by_pass": "single_pass"}  # splits by indentation or pass
 SWEPT = ("multi", "triplet", "adapted")
 TRAINED_IN = {"lobo": "train_multi", "triplet": "train_triplet", "adapt": "adapt"}
 NETWORKS = {METHODS.get(experiment, "network"): experiment for experiment in TRAINED_IN}  # experiment by method
 OWN_POKES = "its own"  # in experiment reference_methods: the method receives unlabelled pokes of the tested skin
+# By experiment: the key of its sweep in numbers.json, and the key of the count on the x axis.
 AXES = {"pokes": ("sweep_pokes", "pokes_n"), "sensors": ("sweep_sensors", "skins_n"), "labels": ("labels", "labels_n")}
 SINGLE = {
     "by_reading": "single_random", "by_indentation": "single_indentation", "by_pass": "single_pass",
@@ -56,7 +58,7 @@ SINGLE = {
 }  # fmt: skip
 POLICIES = ("initial", "regular", "each")
 HOVER = ("hover", "hover_network")  # methods that predict the position of a tip that does not touch the skin
-SEEN_PCT = 25.0  # assumed: with this accuracy without contact, the chips sense the tip itself
+SEEN_PCT = 25.0  # assumed: if a hovering tip is located with this accuracy, the chips sense the tip itself
 DRIFT_METRICS = ("accuracy_pct", "mse_f_N2")
 TOUCHES_METRICS = ("single_touches_pct", "mean_left_over_pct")
 SETTINGS = ("scene", "source", "seed")  # keys of the provenance that do not differ between repeats of a run
@@ -110,7 +112,7 @@ def sweep_curves(points: Points) -> dict[str, list[tuple[str, int, dict[str, flo
 
 
 def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, Any]:
-    """Join the errors of methods with their training times on this machine; untimed methods get no time."""
+    """Join the errors of methods with their training times on this machine; untimed methods have no times."""
     joined: dict[str, Any] = {}
     if "baselines" in numbers:
         joined["learning"] = [row | _times(row, seconds) for row in numbers["baselines"]]
@@ -131,7 +133,7 @@ def learning_times(numbers: Row, seconds: Mapping[str, Seconds]) -> dict[str, An
 
 
 def _lobo(rows: pd.DataFrame) -> dict[str, Any]:
-    """Summarise networks of the leave-one-board-out experiment with registered positions, and for each board."""
+    """Summarise networks of experiment lobo: scores with registered positions over boards, and scores by board."""
     by_board = {
         str(board): {
             "trained_on_skins_n": int(group["trained_on_skins_n"].iloc[0]),
@@ -162,7 +164,7 @@ def _single(table: pd.DataFrame, headline: str) -> dict[str, Any]:
 
 
 def _variants(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Summarise every recipe of every experiment with models: over pairs, over repeats on one skin, or over boards."""
+    """Summarise every recipe of experiments of kind `models`: over pairs, over repeats on one skin, or over boards."""
     numbers: dict[str, dict[str, Any]] = {}
     names = [experiment.name for experiment in EXPERIMENTS.values() if experiment.kind == "models"]
     models = table[table["question"].isin(names)]
@@ -203,8 +205,8 @@ def _sweeps(table: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6a.
 
-    The comparisons are: the fewest pokes with none; the number at which the paper's plateau begins with none; and the
-    most pokes with that number.
+    Three differences are computed: fewest pokes minus no pokes; the number of pokes at which the paper's plateau begins
+    minus no pokes; and most pokes minus the number at which the plateau begins.
     """
     groups = {int(n): group for n, group in _groups(by_skin(rows), "pokes_n")}
     if 0 not in groups or len(groups) < 2:
@@ -222,8 +224,8 @@ def contrasts_of_pokes(rows: pd.DataFrame) -> dict[str, Any]:
 def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute paired differences over boards for the paper's statements on its figure 6b.
 
-    The comparisons are: the most training skins with the fewest; adapted networks with the other networks; and the gain
-    from adaptation with the fewest skins with the gain with the most.
+    Three kinds of differences are computed: most training skins minus fewest; adapted networks minus other networks;
+    and the gain from adaptation with the fewest training skins minus the gain with the most.
     """
     groups = {
         (method, int(n)): group for (method, n), group in _groups(by_skin(rows), ["method", "trained_on_skins_n"])
@@ -245,6 +247,7 @@ def contrasts_of_sensors(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """Summarise the scores of each recipe of each experiment over boards."""
     for (_, recipe), group in _groups(rows, ["question", "recipe"], sort=False):
         first = group.iloc[0]
         names = {"method": first["method"], "inputs": first["inputs"], "name": recipe}
@@ -253,6 +256,7 @@ def _methods(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
 
 
 def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """Summarise the scores of each method over boards, by number of labels."""
     for (method, inputs), group in _groups(rows, ["method", "inputs"], sort=False):
         for labels_n, labelled in _groups(group, "labels_n"):
             parts = {places: over_boards(labelled, places) for places in (AS_LABELLED, REGISTERED)}
@@ -261,7 +265,7 @@ def _labels(rows: pd.DataFrame) -> Iterator[dict[str, Any]]:
 
 
 def _constant_force(rows: pd.DataFrame) -> dict[str, Any]:
-    """Score the mean tested force as a constant prediction; its MSE is the force variance, MSE_F / (1 - R^2)."""
+    """Score a constant prediction, the mean tested force; its MSE is the variance of the force, MSE_F / (1 - R^2)."""
     tested = whole(rows).dropna(subset=["r2_f"])
     tested = tested[tested["r2_f"] < 1]
     variance_N2 = (tested["mse_f_N2"] / (1 - tested["r2_f"])).groupby(tested["board"]).mean()
@@ -297,19 +301,20 @@ def _median_times(timed: Seconds, prefix: str) -> dict[str, float]:
     }
 
 
-def add_up(accounts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Add up the counts of all captures (keys that end in `_n`); `lost_bytes_n` is the number of all skipped bytes."""
+def add_up(ingest_counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """Add up the counts of captures (keys that end in `_n`); `lost_bytes_n` is the total number of skipped bytes."""
     total = Counter({"captures_n": 0})
-    for account in accounts:
-        total.update({"captures_n": 1} | {name: count for name, count in account.items() if name.endswith("_n")})
+    for counts in ingest_counts:
+        total.update({"captures_n": 1} | {name: count for name, count in counts.items() if name.endswith("_n")})
     skipped = [count for name, count in total.items() if name.startswith("skipped_") and name.endswith("_bytes_n")]
     return {**total, "lost_bytes_n": sum(skipped)} if skipped else dict(total)
 
 
 def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
-    """Summarise, by experiment and predictor, positions predicted from readings before the contact, over folds.
+    """Summarise the scores of positions that were predicted from readings before the contact.
 
-    For each fold (a skin), the scores of a hovering tip are listed. `seen` says whether the chips sense the tip itself.
+    `before_touch`: scores by experiment and predictor, summarised over folds. `hover`: for each fold (a skin), scores
+    of the position of a hovering tip, and `seen`, whether the chips sense the tip itself.
     """
     before: dict[str, dict[str, Any]] = {}
     hover: dict[str, dict[str, Any]] = {}
@@ -320,17 +325,17 @@ def before_touch_numbers(tables: Iterable[pa.Table]) -> dict[str, Any]:
                 before.setdefault(experiment, {})[predictor] = scores
                 continue
             for row in rows.to_dict("records"):
-                own = hover.setdefault(str(row["fold"]), {name: row[name] for name in ("hover_uT", "touch_uT")})
-                own[predictor] = {name: row[name] for name in ("accuracy_pct", "mse_xy_mm2")}
+                skin_scores = hover.setdefault(str(row["fold"]), {name: row[name] for name in ("hover_uT", "touch_uT")})
+                skin_scores[predictor] = {name: row[name] for name in ("accuracy_pct", "mse_xy_mm2")}
                 if predictor == "hover":
-                    own["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
+                    skin_scores["seen"] = bool(row["accuracy_pct"] >= SEEN_PCT)
     return ({"before_touch": before} if before else {}) | ({"hover": hover} if hover else {})
 
 
 def count_trainings(
     cards: Sequence[Row], points: Mapping[str, Sequence[Row]], experiments: Mapping[str, Row]
 ) -> dict[str, dict[str, int]]:
-    """Count training runs by experiment: all, those that collapsed, and the collapsed ones that had to be kept."""
+    """Count training runs by experiment: all, those that collapsed, and collapsed runs that were kept."""
     trainings: dict[str, list[Row]] = {}
     for card in cards:
         trainings.setdefault(card["question"], []).append(card)
@@ -341,7 +346,7 @@ def count_trainings(
 
 
 def lost_by_protocol(losses: Mapping[str, Row]) -> dict[str, dict[str, Any]]:
-    """Add up the counts of captures for each protocol except the main one, and list counts of rows left out."""
+    """Add up the counts of captures for each protocol except the main one; `left_out`: counts of unused rows."""
     by_protocol: dict[str, dict[str, Any]] = {}
     for experiment, lost in losses.items():
         protocol = EXPERIMENTS[experiment].protocol
@@ -380,8 +385,8 @@ def _stage_cost(cost: Row) -> dict[str, float]:
 
 
 def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split the numbers of a run into numbers.json, equal for every repeat of the run, and provenance.json."""
-    own = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
+    """Split the numbers of a run into numbers.json, which is equal for repeats of the run, and provenance.json."""
+    run_provenance = {name: value for name, value in numbers["provenance"].items() if name not in SETTINGS}
     costs: dict[str, Any] = {"stages": numbers["runtime"]["stages"]}
     studies: dict[str, Any] = {}
     for name, value in numbers["runtime"].items():
@@ -391,18 +396,18 @@ def split(numbers: Row) -> tuple[dict[str, Any], dict[str, Any]]:
         elif name != "stages":
             studies[name] = value
     settings = {name: numbers["provenance"][name] for name in SETTINGS}
-    return {**numbers, "provenance": settings, "runtime": studies}, {**own, "runtime": costs}
+    return {**numbers, "provenance": settings, "runtime": studies}, {**run_provenance, "runtime": costs}
 
 
 def join(numbers: Row, provenance: Row) -> dict[str, Any]:
     """Join numbers.json and provenance.json of a run: the inverse of `split`."""
-    own = {name: value for name, value in provenance.items() if name != "runtime"}
+    run_provenance = {name: value for name, value in provenance.items() if name != "runtime"}
     costs = provenance["runtime"]
     runtime = {**numbers["runtime"], **costs}
     for name, value in runtime.items():
         if isinstance(value, list):
             runtime[name] = [row | times for row, times in zip(numbers["runtime"][name], costs[name], strict=True)]
-    return {**numbers, "provenance": {**numbers["provenance"], **own}, "runtime": runtime}
+    return {**numbers, "provenance": {**numbers["provenance"], **run_provenance}, "runtime": runtime}
 
 
 def headline_scores(numbers: Row) -> dict[str, Any]:
@@ -421,7 +426,7 @@ def headline_scores(numbers: Row) -> dict[str, Any]:
         "single_sensor": {
             name: _means(numbers[experiment]) for name, experiment in SINGLE.items() if experiment in numbers
         },
-        "drift_end": {  # the last window of each policy, which is already a mean over networks
+        "drift_end": {  # of each policy, the last window, whose scores are means over networks
             policy: {name: drift[policy][-1][name] for name in DRIFT_METRICS if name in drift[policy][-1]}
             for policy in POLICIES
             if policy in drift

@@ -22,11 +22,11 @@ from reskin.code import ROOT, file_of
 from reskin.config import Strict, parse, read_yaml
 from reskin.errors import SchemaError
 
-Captions = dict[str, str]  # by name of a table or figure
+Captions = dict[str, str]  # captions by the name of the table or figure
 PAGE_FILE = Path(__file__).with_name("page.yaml")
 NO_NUMBER = ("–", "see file", "")  # cells of the checklist that contain no number
-FURTHER = "further"  # the section of tables and figures that no other section names
-OPEN = {"table2", "labels", "claims"}  # tables that are open when the page loads; the reader opens the others
+FURTHER = "further"  # key of the section of tables and figures that no other section names
+OPEN = {"table2", "labels", "claims"}  # tables that are unfolded when the page loads; all others are folded
 BESIDE_N = 4  # a section lists at most this many results of the paper; the checklist has all
 SUMMARY = "Main scores on held-out boards"
 SOURCES = {
@@ -40,7 +40,7 @@ NO_BREAK = "\u00a0"
 NUMBER = re.compile(r"[-+−]?\d[\d.,]*(e[-+]?\d+)?( ± [\d.e+-]+)?( \(seeds\))?( (%|mm|N|mm²|N²|Hz|s|µT))?|–?")
 LONG = 40  # characters; a column with a longer cell is wide
 SVG_SIZE_PT = re.compile(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"')
-LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # in a figure whose unit is the point
+LETTERS_PT = re.compile(r"font(?:-size)?: ([\d.]+)px")  # font sizes in an SVG; its unit, px, is the point here
 PX_PER_PT = 4 / 3
 WIDE_PT = 500.0  # a wider figure gets its own row
 LEGIBLE_PX = 8.0  # smallest legible letters; a figure scrolls before its letters become smaller
@@ -65,7 +65,7 @@ class Section(Strict):
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure as the page shows it: its file, its size, and the width below which its letters become illegible."""
+    """A figure on the page: its file, its size, and the width below which its letters become illegible."""
 
     file: str
     width_px: int
@@ -81,7 +81,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Table:
-    """A table as the page shows it; each column looks like `number` (aligned right), `text` or `text long`."""
+    """A table on the page; `looks` has the style of each column: `number` (aligned right), `text` or `text long`."""
 
     name: str
     caption: str
@@ -93,7 +93,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Entry:
-    """A scene as the page of all scenes shows it."""
+    """A scene on the page of all scenes: its name, counts of captures, main scores and headline figure."""
 
     scene: str
     about: str
@@ -124,7 +124,7 @@ def page(numbers: Mapping[str, Any], tables: Mapping[str, pd.DataFrame], figures
 def run_page(numbers: Mapping[str, Any], costs: Mapping[str, str]) -> str:
     """Render the page of one run (commit, machine, versions, times), which the scene's page embeds.
 
-    numbers: joined with their provenance. costs: text of the other files in the page's folder, by file name.
+    numbers: numbers.json joined with provenance.json. costs: text of the other files in the folder, by file name.
     """
     source = numbers["provenance"]["source"]
     tables = cost_tables(numbers["runtime"], source)
@@ -166,7 +166,7 @@ def _entry(numbers: Mapping[str, Any], headlines: Mapping[str, str]) -> Entry:
 
 
 def template(name: str) -> Template:
-    """Load a template from this folder."""
+    """Load a Jinja template from the folder of this module."""
     environment = Environment(loader=PackageLoader("pipeline.report", "."), autoescape=True, undefined=StrictUndefined)
     environment.tests["number_text"] = NUMBER.fullmatch
     environment.filters["unbroken"] = unbroken
@@ -174,8 +174,8 @@ def template(name: str) -> Template:
 
 
 def unbroken(text: str) -> str:
-    """Keep a number and its deviation on one line, and likewise the ends of an interval."""
-    return UNBROKEN.sub(lambda found: found[0].replace(" ", NO_BREAK), text)
+    """Use non-breaking spaces between a number and its deviation, and within an interval and its unit."""
+    return UNBROKEN.sub(lambda match: match[0].replace(" ", NO_BREAK), text)
 
 
 def read_sections() -> list[Section]:
@@ -210,7 +210,7 @@ def counts_of(numbers: Mapping[str, Any]) -> str:
 
 
 def beside_paper(section: Section, checklist: pd.DataFrame) -> Table | None:
-    """Select the checklist rows of a section in which we have a number; rows with verdicts come first."""
+    """Tabulate the checklist rows of a section that contain a number of ours; rows with verdicts come first."""
     rows = [row for row in _rows_of(section, checklist) if row["ours"] not in NO_NUMBER and row["note"] != ONE_SKIN]
     if not rows:
         return None
@@ -226,6 +226,7 @@ def stages_of(section: Section, checklist: pd.DataFrame) -> list[tuple[str, str]
 
 
 def _rows_of(section: Section, checklist: pd.DataFrame) -> list[dict[str, str]]:
+    """Select the checklist rows whose tables or figures the section shows."""
     if section.key == "checklist" or checklist.empty:
         return []
     cells = checklist.astype(str)
@@ -261,7 +262,7 @@ def _look(cells: "pd.Series[str]") -> str:
 def _fill(
     section: Section, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, Drawing], source: str
 ) -> dict[str, Any]:
-    """Prepare a section for the template: its heading, its sentence, and those of its tables and figures that exist."""
+    """Prepare a section for the template: heading, sentence, and those tables and figures that exist in this report."""
     captions = section.tables | section.folded
     return {
         "key": section.key,

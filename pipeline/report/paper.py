@@ -2,8 +2,7 @@
 
 from collections.abc import Mapping
 
-# mean, sd
-Number = tuple[float, float]
+Number = tuple[float, float]  # mean, standard deviation
 
 SINGLE_SENSOR: dict[str, Number] = {  # section 4: 50K samples, random 45K / 5K
     "accuracy_pct": (99.58, 0.34),
@@ -62,20 +61,20 @@ _means = {row: {name: mean for name, (mean, _) in scores.items()} for row, score
 # The gains that the paper claims: differences of its printed means. It gives no deviations of these differences.
 GAINS: dict[str, dict[str, float]] = {
     "multi_over_single": _subtract(_means["multi"], _means["single"]),  # "significantly better"
-    # "slightly affects"
+    # "slightly affects performance"
     "triplet_over_multi": {"accuracy_pct": _subtract(_means["triplet"], _means["multi"])["accuracy_pct"]},
     "adapted_over_triplet": _subtract(_means["adapted"], _means["triplet"]),  # "a sizeable improvement"
     "adapted_over_multi": _subtract(_means["adapted"], _means["multi"]),
     "by_hand": _subtract(MANUAL["after"], MANUAL["before"]),  # "clearly demonstrating the effectiveness"
 }
-FLEXIBLE: dict[str, float] = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # section 5: adapted; "about"
-FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: by how much the distance between skin and circuit board is smaller
+FLEXIBLE: dict[str, float] = {"accuracy_pct": 75.0, "mse_xy_mm2": 0.72, "mse_f_N2": 0.54}  # section 5, adapted; "about"
+FLEXIBLE_GAP_LESS_PCT = 80.0  # section 5: reduction of the distance between skin and circuit board
 SENSITIVITY_N = 0.2  # section 6, water in a shot glass: "less than 20 mL (< 0.2N) of water"
 SENSITIVITY_ML = 20.0
 LOG_RATE_HZ = 250.0  # section 6, dog shoe and glove: "logged to an SD card at 250 Hz"
 SLEEVE: dict[str, float] = {"rate_hz": 133.0, "chips_n": 40}  # section 6: "samples all 40 magnetometers at 133 Hz"
 RATE_HZ = 400.0  # sections 1 and 2: "up to 400Hz"
-FORCE_RESOLUTION_MAX_N = 0.1  # section 1: what a good skin should reach
+FORCE_RESOLUTION_MAX_N = 0.1  # section 1: requirement for a good skin
 PLACE_ACCURACY_MIN_PCT = 90.0  # section 1: "spatial resolution (1mm with 90% accuracy)"
 LASTING_CONTACTS_N = 50_000  # section 1: "perform accurate predictions even beyond 50K interactions"
 LATE_CONTACTS_N = 45_000  # figure 5b: "after 45,000 interactions"

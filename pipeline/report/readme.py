@@ -27,8 +27,8 @@ COSTS_MEANING = (
     "them run side by side, so less time passes."
 )
 TIMES = "reports/time.json"  # written by `make time-repro`
-FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README shows the second first
-Numbers = Mapping[str, Any]  # of one scene
+FULL_SIZE, HEADLINE = "paper", "quick"  # the simulated scenes that the pages show; README.md shows HEADLINE
+Numbers = Mapping[str, Any]  # the joined numbers.json and provenance.json of one scene
 
 
 def fill_pages(root: Path, *, write: bool) -> tuple[list[str], list[str]]:
@@ -77,10 +77,10 @@ def fill(texts: Mapping[str, str], blocks: Mapping[str, str]) -> dict[str, str]:
 def blocks_of(
     results: Sequence[Numbers], recorded: Sequence[Numbers], stages: Mapping[str, Any], times: Numbers | None
 ) -> dict[str, str]:
-    """Make the generated blocks of the pages, by name.
+    """Make the generated blocks of the pages; return them by name.
 
-    The last of `results` is the headline scene. README shows its scores, and the table of skins compares its skins with
-    recorded ones.
+    The last of `results` is the headline scene: README shows its scores, and the table of skins compares its simulated
+    skins with recorded ones.
     """
     labelled = [numbers for numbers in recorded if "labels" in numbers]
     compared = [numbers for numbers in recorded if "compare" in numbers]
@@ -112,7 +112,8 @@ def _summary(numbers: Numbers) -> str:
 def _tables(numbers: Numbers, names: Sequence[str]) -> str:
     """Write the named tables of a scene below a heading with its provenance."""
     provenance = numbers["provenance"]
-    # Tables are made only for the shown experiments: committed results of others may not fit the current code.
+    # Tables are made only for the experiments that are shown, because the current code may be unable to read the
+    # committed results of other experiments.
     tables = make_tables({name: part for name, part in numbers.items() if name not in ANALYSES or name in names})
     heading = (
         f"Scene `{provenance['scene']}`, **{provenance['source']}**; trained by code {provenance['trained']}, "
@@ -152,7 +153,7 @@ def costs_table(scenes: Sequence[Numbers]) -> pd.DataFrame:
 
 
 def _stages(stages: Mapping[str, Any]) -> str:
-    """Tabulate the stages of dvc.yaml with code and outputs; cells are not padded, so an edit changes one line."""
+    """Tabulate the stages of dvc.yaml with code and outputs; cells are not padded, so that an edit changes one line."""
     lines = ["| stage | code | writes |", "|---|---|---|"]
     for name, stage in stages.items():
         outs = [

@@ -152,7 +152,7 @@ CASES = {
     "area": "area", "case": "case", "should": "expected", "happened": "observed", "error": "error", "limit": "allowed",
 }  # fmt: skip
 TABLE_1 = Path(__file__).with_suffix(".yaml")  # table 1 of the paper
-LOCALISATION = "Localisation (within 1 mm, new skin)"  # our additional row
+LOCALISATION = "Localisation (within 1 mm, new skin)"  # the row that we add to table 1
 OURS = "ours, measured"
 NOT_GIVEN = "–"
 
@@ -253,10 +253,10 @@ def labels_boards_table(rows: Rows, source: str) -> pd.DataFrame:
     """List the scores on each held-out board by number of labelled indentations."""
     lines = [
         {"method": row["method"], "inputs": row["inputs"], "labels": str(row["labels_n"]), "held-out board": board}
-        | {title: f"{own[metric]:.3g}" for metric, title in COLUMNS.items() if metric in own}
+        | {title: f"{board_scores[metric]:.3g}" for metric, title in COLUMNS.items() if metric in board_scores}
         | {"source": source}
         for row in rows
-        for board, own in row.get("by_board", {}).items()
+        for board, board_scores in row.get("by_board", {}).items()
     ]
     return tabulate(lines, spread="Positions are as labelled. The networks and draws of a board are averaged.")
 
@@ -289,7 +289,7 @@ def chosen_table(choices: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _table_2(numbers: Numbers, source: str) -> pd.DataFrame:
-    """Tabulate our table 2 beside the paper's, in its order; the control and the constant force are only ours."""
+    """Tabulate our table 2 beside the paper's, in the paper's order; only ours has control and constant force."""
     rows = {model.title: (row, model.paper) for model, row in table_2_rows(numbers).values()}
     constant = numbers.get("constant_force", {}).get("table2")
     if constant:
@@ -330,15 +330,15 @@ def _single(numbers: Numbers, source: str) -> pd.DataFrame:
 def _hover(numbers: Numbers, source: str) -> pd.DataFrame:
     """List how well the position of a hovering tip is predicted, by skin, beside the scores of contacts."""
     skins, lines = numbers.get("single_skins", {}), []
-    for skin, own in numbers["hover"].items():
+    for skin, hover in numbers["hover"].items():
         contact = skins.get(skin, _means(numbers["single_temporal"]))
         line = {"skin": skin, "source": source, "contacts, within 1 mm, %": f"{contact['accuracy_pct']:.3g}"}
         line |= {
-            f"no contact, within 1 mm, % ({model})": f"{own[by]['accuracy_pct']:.3g}" if by in own else "–"
-            for by, model in (("hover", "2 nearest contacts"), ("hover_network", "network"))
+            f"no contact, within 1 mm, % ({model})": f"{hover[key]['accuracy_pct']:.3g}" if key in hover else "–"
+            for key, model in (("hover", "2 nearest contacts"), ("hover_network", "network"))
         }
-        line |= {"|dB| without contact, µT": f"{own['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{own['touch_uT']:.3g}"}
-        lines.append(line | {"tip sensed without contact": "yes" if own["seen"] else "no"})
+        line |= {"|dB| without contact, µT": f"{hover['hover_uT']:.3g}", "|dB| at 1 N, µT": f"{hover['touch_uT']:.3g}"}
+        lines.append(line | {"tip sensed without contact": "yes" if hover["seen"] else "no"})
     return tabulate(lines, meaning=HOVER_MEANING)
 
 
@@ -399,26 +399,30 @@ def _variants(variants: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def _captures(numbers: Numbers, source: str) -> pd.DataFrame:
-    """List what was read and lost in the main captures and in other protocols, whose counts of 0 are omitted."""
+    """List counts of read and lost data, for the main captures and for other protocols (without counts of 0)."""
     others = numbers.get("capture_by_protocol", {})
     lines = [
         {"protocol": protocol, "what": what, "count": str(count), "source": source}
-        for protocol, account in {"main": numbers["capture"], **others}.items()
-        for what, count in _counts(account).items()
+        for protocol, counts in {"main": numbers["capture"], **others}.items()
+        for what, count in _counts(counts).items()
         if protocol == "main" or count
     ]
     meaning = {"meaning": "Main: the captures that folds are made of. For other protocols, counts of 0 are not listed."}
     return tabulate(lines, **(meaning if others else {}))
 
 
-def _counts(account: Mapping[str, Any]) -> dict[str, int]:
-    counts = {name: count for name, count in account.items() if name != "left_out"}
-    return counts | {f"left out of training: {name}": count for name, count in account["left_out"].items()}
+def _counts(protocol_counts: Mapping[str, Any]) -> dict[str, int]:
+    """Return the counts of a protocol in one level: those of entry `left_out` get a prefix."""
+    counts = {name: count for name, count in protocol_counts.items() if name != "left_out"}
+    return counts | {f"left out of training: {name}": count for name, count in protocol_counts["left_out"].items()}
 
 
 def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
-    """Compare descriptions of skins, by title; if some are simulated and some recorded, add the ratio nearest to 1."""
-    both = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
+    """Tabulate descriptions of skins, with one column per description, by title.
+
+    If some skins are simulated and some recorded, a column has the ratio simulated / recorded that is nearest to 1.
+    """
+    both_sources = {described["source"] for described in columns.values()} == {"simulated", "recorded"}
     lines = []
     for name, title in QUANTITIES.items():
         values = {column: described["over_skins"].get(name) for column, described in columns.items()}
@@ -428,7 +432,7 @@ def skins_table(columns: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
             column: f"{value['mean']:.3g} [{value['least']:.3g} … {value['most']:.3g}] ({value['n']})" if value else "–"
             for column, value in values.items()
         }
-        if both:
+        if both_sources:
             means = [(columns[column]["source"], value["mean"]) for column, value in values.items() if value]
             ratios = [
                 a / b
@@ -456,7 +460,10 @@ def table_2_summary(numbers: Numbers) -> pd.DataFrame:
 
 
 def labels_summary(rows: Rows) -> pd.DataFrame:
-    """Tabulate scores on held-out boards with fewest and most labels: calibrated methods, then the first method."""
+    """Tabulate scores on held-out boards with the fewest and the most labels.
+
+    The methods are those that are calibrated to the skin, then the first method.
+    """
     methods = list(dict.fromkeys((row["method"], row["inputs"]) for row in rows))
     by_method = {(row["method"], row["inputs"], row["labels_n"]): row["as_labelled"] for row in rows}
     counts = {row["labels_n"] for row in rows}
@@ -484,8 +491,8 @@ def paired_table(numbers: Numbers, source: str) -> pd.DataFrame:
     known = models(numbers)
     lines = []
     for row in numbers["paired"]:
-        of, over = known[row["of"]].paper, known[row["over"]].paper
-        printed = {m: f"{of[m][0] - over[m][0]:+.4g}" for m in of if m in over and of != over}
+        first, second = known[row["of"]].paper, known[row["over"]].paper
+        printed = {m: f"{first[m][0] - second[m][0]:+.4g}" for m in first if m in second and first != second}
         cells = beside(row, printed, show_difference, paper="paper: difference of means")
         lines.append({"difference": _difference_of(row, known), "source": source} | cells)
     return tabulate(lines, spread=PAIRED)
@@ -531,7 +538,7 @@ def _checks(rows: Rows, titles: Mapping[str, str], source: str) -> pd.DataFrame:
 
 
 class Table1(Strict):
-    """Table 1 of the paper: the source that it cites for each column, and the cells of each row."""
+    """Table 1 of the paper: the source that the paper cites for each column, and the cells of each row."""
 
     columns: dict[str, str]
     rows: dict[str, tuple[str, ...]]
@@ -566,7 +573,7 @@ def table1(data: Table1, measured: Mapping[str, str]) -> pd.DataFrame:
 
 
 def measured(numbers: Numbers) -> dict[str, str]:
-    """Write our cells of table 1, by row: results or settings of the scene."""
+    """Write our cells of table 1, which are results or settings of the scene; return them by row."""
     source = numbers["provenance"]["source"]
     simulated = source == "simulated"
     described: Mapping[str, Any] = next(iter(numbers.get("described", {}).values()), {"over_skins": {}})

@@ -1,7 +1,7 @@
 """The stages of the pipeline: thin functions that read inputs, call the library, and write outputs.
 
-dvc.yaml runs a stage by `python -m pipeline STAGE --scene NAME ...`. For an experiment, the stage
-is the function in module `pipeline.experiments.NAME` that has the same name.
+dvc.yaml runs a stage by `python -m pipeline STAGE --scene SCENE ...`. The stage of an experiment is a function with the
+name of the experiment, in the module of the same name in `pipeline.experiments`.
 """
 
 from importlib import import_module
@@ -27,10 +27,10 @@ def is_stage(name: str) -> bool:
 
 
 def module_name(stage: str) -> str:
-    """Return the name of the module that holds a stage's function."""
+    """Return the name of the module that contains a stage's function."""
     return MODULES.get(stage, f"{EXPERIMENTS}.{stage}")
 
 
 def module_of(stage: str) -> ModuleType:
-    """Import the module that holds a stage's function."""
+    """Import the module that contains a stage's function."""
     return import_module(module_name(stage))

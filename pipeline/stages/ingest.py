@@ -15,22 +15,22 @@ from reskin.data.splits import Split, draw_folds, render_folds
 from reskin.recordings.fault_policy import FaultPolicy
 from reskin.recordings.ingest import check_losses, open_capture
 
-CACHE = ".reskin/readings"  # cache of ingest_many, as DVC deletes a stage's outputs before it runs
+CACHE = ".reskin/readings"  # cache of ingest_many, needed because DVC deletes a stage's outputs before the stage runs
 NO_ROWS = Rows.of_labels(boards=[], skins=[])
 
 
 def ingest(settings: Settings, raw: Path, indentations: Path) -> None:
     """Read one recorded capture, check its losses, and write its readings, one row per reading."""
     policy = settings.shared_section(FaultPolicy, "faults")
-    header, blocks, account = open_capture(raw, policy)
-    io.write_readings(indentations, blocks, account)
+    header, blocks, counts = open_capture(raw, policy)
+    io.write_readings(indentations, blocks, counts)
     try:
-        check_losses(account, settings.shared["lost_fraction_max"], str(raw))
+        check_losses(counts, settings.shared["lost_fraction_max"], str(raw))
     except ValueError:
         io.remove(indentations)
         raise
-    kept = ", ".join(f"{key} {count}" for key, count in account.items() if count)
-    say(f"{settings.scene}/{header.capture} ({header.source}): {kept}")
+    counted = ", ".join(f"{name} {count}" for name, count in counts.items() if count)
+    say(f"{settings.scene}/{header.capture} ({header.source}): {counted}")
 
 
 def ingest_simulated(settings: Settings, raw: Path, indentations: Path) -> None:
@@ -45,7 +45,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
     """Read all captures of a recorded scene in one stage.
 
     For scenes with many captures, one DVC stage per capture would take longer than reading the captures.
-    Captures that were already read, with the same bytes, code and settings, come from a cache (docs/growth.md).
+    Readings of a capture come from a cache if its bytes, the code and the settings are unchanged (docs/growth.md).
     """
     cache = home() / CACHE / settings.scene
     policy = [settings.shared["faults"], settings.shared["lost_fraction_max"]]
@@ -60,7 +60,7 @@ def ingest_many(settings: Settings, raw: Path, code: Path, indentations: Path) -
                 fresh = cache / f"{key}.parquet"
                 ingest(settings, raw / name, fresh)
                 cached[key], read_n = fresh.rename(cache / f"{key}-{io.sha256(fresh)}.parquet"), read_n + 1
-            # Not a link, because an edit of one file must not change the other.
+            # A copy instead of a link, so that an edit of one file does not change the other.
             shutil.copyfile(cached[key], folder / f"{name}.parquet")
             used.add(cached[key])
     for file in set(cache.glob("*.parquet")) - used:
@@ -89,25 +89,25 @@ def _cache_key(capture: Path, common_inputs: bytes) -> str:
 def describe(settings: Settings, indentations: Path, description: Path) -> None:
     """Describe the recordings of a scene: fields, noise, resolution and forces, summarised over its skins."""
     captures = [io.read_readings(indentations / f"{name}.parquet") for name in settings.captures_in(indentations)]
-    accounts = {
+    ingest_counts = {
         readings.capture: io.read_ingest_counts(indentations / f"{readings.capture}.parquet") for readings in captures
     }
     described = {readings.capture: describe_capture(readings) for readings in captures}
     described |= {
         name: without_rest(described[name])
-        for name, account in accounts.items()
-        if account.get("baseline_subtracted_rows_n")
+        for name, capture_counts in ingest_counts.items()
+        if capture_counts.get("baseline_subtracted_rows_n")
     }
     summary = over_skins([(readings.skin, described[readings.capture]) for readings in captures])
     readings_n = sum(map(len, captures))
     counts = {"captures_n": len(captures), "readings_n": readings_n}
-    counts["indentations_n"] = sum(account.get("indentations_n", 0) for account in accounts.values())
+    counts["indentations_n"] = sum(capture_counts.get("indentations_n", 0) for capture_counts in ingest_counts.values())
     io.write_json(description, {"counts": counts, "source": captures[0].source, "over_skins": summary})
     say(f"{settings.scene}: {indentations}: {readings_n} readings of {len(captures)} captures described")
 
 
 def split(settings: Settings, section: Split, indentations: Path, folds: Path) -> None:
-    """Draw the folds of all experiments of the scene that hold rows out."""
+    """Draw the folds of all experiments of the scene that hold out rows for testing."""
     captures = settings.captures_in(indentations)
     if not settings.held_out:
         io.write_json(folds, render_folds(captures, NO_ROWS, []))

@@ -56,7 +56,7 @@ from reskin.numerics import device as trained_on
 
 
 def table2(settings: Settings, models: Path, tables: Path) -> None:
-    """Write table 2 of the paper and its figure as soon as its networks are trained; the report contains them too."""
+    """Write table 2 of the paper and its figure as soon as their networks are trained; stage report writes them too."""
     source, name = settings["source"], settings.scene
     scores = tidy(read_cards(models, stages(TABLE_2.values(), "models")))
     numbers = {"provenance": {"scene": name, "source": source}, **learning_numbers(scores, headline=HEADLINE)}
@@ -82,15 +82,15 @@ def report(settings: Settings, indentations: Path, folds: Path, models: Path, re
     io.write_json(reports / "provenance.json", of_this_run)
     io.write_json(reports / "scores.json", headline_scores(numbers))
     with make_executor(imports="pipeline.report.experiments") as executor:  # drawing takes most of the time
-        of_experiments = executor.submit(experiment_figures, numbers, plot_data, source)
-        of_costs = executor.submit(cost_pages, numbers["runtime"], source)
+        figures_future = executor.submit(experiment_figures, numbers, plot_data, source)
+        costs_future = executor.submit(cost_pages, numbers["runtime"], source)
         tables = make_tables(numbers)
         io.write_texts(reports / "tables", table_texts(tables) | {"scores.csv": to_csv(scores)})
         predictions = [io.read_table(models / stage / "predictions.parquet") for stage in scene.model_stages]
         figures = dict(error_grids(predictions, HEADLINE, f"{name} ({source})"))
         figures |= headline_figures(numbers, source) | dict(learning_figures(numbers, source))
-        figures |= of_experiments.result()
-        costs = of_costs.result()
+        figures |= figures_future.result()
+        costs = costs_future.result()
     io.write_texts(reports / "figures", figures)
     # Seconds, commit and machine differ between equal runs, so this folder is not an output of the DVC stage.
     io.write_texts(reports / "runtime", costs | {"index.html": run_page(numbers, costs)})
@@ -111,7 +111,7 @@ class Inputs:
     studies: dict[str, Any]
     described: dict[str, Any]
     before_touch: list[pa.Table]
-    accounts: list[dict[str, Any]]
+    ingest_counts: list[dict[str, Any]]
     dropped: dict[str, int]
 
 
@@ -133,7 +133,7 @@ def read_inputs(scene: Scene, indentations: Path, folds: Path, models: Path, res
             for model_stage in scene.model_stages
             if model_stage == "train_single"
         ],
-        accounts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
+        ingest_counts=[io.read_ingest_counts(indentations / f"{name}.parquet") for name in split_of_scene["captures"]],
         dropped=split_of_scene["dropped"],
     )
 
@@ -152,7 +152,7 @@ def compute_numbers(settings: Settings, scene: Scene, inputs: Inputs, scores: pd
             "trained": ", ".join(sorted({card["git"] for card in inputs.cards})), "versions": versions(),
             "device": f"{machine()}, networks on {trained_on()}", "seconds": round(total_cost_s(costs.values()), 1),
         },
-        "capture": add_up(inputs.accounts) | {"left_out": dict(inputs.dropped)},
+        "capture": add_up(inputs.ingest_counts) | {"left_out": dict(inputs.dropped)},
         **learning_numbers(scores, headline=HEADLINE),
         **before_touch_numbers(inputs.before_touch),
         "trainings": count_trainings(inputs.cards, inputs.points, analyses),
@@ -178,10 +178,11 @@ def write_index(reports: Path) -> None:
 
 
 def publish(settings: Settings, models: Path, results: Path, reports: Path) -> None:
-    """Log training runs and report of a scene to MLflow, unless they are there; warn if it cannot be reached."""
+    """Write missing training runs and the report of a scene to MLflow; warn if MLflow cannot be reached."""
     scene, name = planned_scene(settings), settings.scene
     folders = {stage: models / stage for stage in scene.model_stages}
-    experiment = f"{name} (dvc exp)" if is_experiment() else name  # kept separate from the checkout's own results
+    # Results of `dvc exp` are in another MLflow experiment than the results of the checkout.
+    experiment = f"{name} (dvc exp)" if is_experiment() else name
     try:
         counts = write_runs(folders, read_curves(scene, results), reports, scene=experiment, root=home())
         say(f"{experiment}: MLflow runs {counts}")
@@ -190,7 +191,7 @@ def publish(settings: Settings, models: Path, results: Path, reports: Path) -> N
 
 
 def read_curves(scene: Scene, results: Path) -> Curves:
-    """Read the points of every sweep and the numbers of every experiment, as curves by stage."""
+    """Read the points of every sweep and the numbers of every analysis, as curves by stage."""
     points = {experiment: io.read_json(results / f"{stage}.json") for experiment, stage in scene.curves.items()}
     curves: dict[str, list[tuple[str, int, dict[str, float]]]]
     curves = {scene.curves[experiment]: rows for experiment, rows in sweep_curves(points).items()}
@@ -202,13 +203,13 @@ def read_curves(scene: Scene, results: Path) -> Curves:
 
 
 def planned_scene(settings: Settings) -> Scene:
-    """Parse the scene; raise if its experiments were edited since the plan was made."""
+    """Parse the scene; raise `ParamsError` if its experiments differ from those in the plan."""
     scene = parse_scene(settings.of_scene, settings.where)
     planned = read_yaml(Path(PLAN))["scenes"].get(settings.scene, [])
     if list(scene.experiments) != list(planned):
         in_one_only = ", ".join(sorted(set(scene.experiments) ^ set(planned)))
         difference = f"{in_one_only} only in one of them" if in_one_only else "their order"
-        remedy = f"Try: reskin scenes use {settings.scene}, with the names of the other scenes that run."
+        remedy = f"Try: reskin scenes use {settings.scene}, followed by the other scenes of the plan."
         raise ParamsError(f"{settings.where}: experiments differ from those in {PLAN}: {difference}. {remedy}")
     return scene
 

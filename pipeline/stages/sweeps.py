@@ -26,7 +26,7 @@ from reskin.models.recipe import HEADLINE
 class PokesSweep(Strict):
     """Section sweep_pokes: numbers of unlabelled indentations; 0 means no adaptation.
 
-    boards_n: how many of the boards are held out; these are the last ones.
+    boards_n: number of held-out boards, which are the last boards of the scene.
     """
 
     pokes_n: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
@@ -83,10 +83,11 @@ def sweep_sensors(settings: Settings, indentations: Path, folds: Path, scores: P
         "multi": settings.section(Training, "train_multi").recipes[HEADLINE],
         "triplet": settings.section(Training, "train_triplet").recipes[adaptation.base],
     }
-    # Folds with most training skins come first: a stack of networks is cached as a whole. Only in this order do
-    # the folds with all training skins form the same stacks as in `train_multi`.
+    # Networks are trained in stacks, and the cache reuses whole stacks. Folds with most training skins come first, so
+    # that the folds with all training skins form the same stacks as in stage train_multi.
     draws = sorted(data.folds_of("sensors"), key=lambda fold: -len(np.unique(data.rows.skin[fold.train])))
-    # One seed per draw is enough, because a fold's name, which determines its random generator, contains the draw.
+    # One seed per draw of skins is enough: the random numbers of a network depend on the fold's name, which contains
+    # the draw.
     jobs = [
         TrainingJob("sensors", HEADLINE, recipe, fold.name, settings.seed, 0, fold.train, fold.test, what=method)
         for method, recipe in recipes.items()

@@ -35,7 +35,7 @@ NO_LABELS = np.zeros(0, np.int64)
 def train_single(settings: Settings, section: Training, indentations: Path, folds: Path, models: Path) -> None:
     """Train on one skin at a time: splits within a skin, and transfer to other skins (paper sections 4 and 5.1).
 
-    On the folds within one skin, places that are predicted without the contact's signal are also scored.
+    On folds within one skin, predictions of the place from readings before the contact are scored too.
     """
     preload_training()
     data = read_data(settings, indentations, folds)
@@ -65,7 +65,7 @@ def train_triplet(settings: Settings, section: Training, indentations: Path, fol
 def adapt(
     settings: Settings, section: Adaptations, indentations: Path, folds: Path, pretrained: Path, models: Path
 ) -> None:
-    """Adapt the networks of train_triplet to each held-out skin with its unlabelled indentations (paper section 5)."""
+    """Adapt the networks of train_triplet to each held-out skin with its unlabelled indentations (section 5)."""
     preload_training()
     data = read_data(settings, indentations, folds)
     networks = read_pretrained(pretrained)

@@ -1,9 +1,9 @@
 """Score places that 2 nearest neighbours predict without the contact's signal, on the folds within one skin.
 
 The input is the no-load field alone, or the number of the indentation in its pass. If such a prediction is accurate,
-networks may have learnt the same from the order of the scan rather than from contacts. The hover control predicts the
-place of a hovering tip with models that were trained on contacts. Its accuracy is at chance level, unless the chips
-sense the tip itself.
+networks may have learnt places from the order of the scan rather than from contacts. The hover control predicts the
+place of a hovering tip with models that were trained on contacts. The accuracy of the hover control is at chance level,
+unless the chips sense the tip itself.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,20 +28,20 @@ from reskin.seeds import rng_for
 NEIGHBOURS = Neighbours(method="knn", inputs="raw", neighbours_n=2)
 PLACE = ("accuracy_pct", "mse_xy_mm2")
 MAGNITUDES = ("hover_uT", "touch_uT")  # median |dB| of hovering rows, and of contacts at about 1 N
-TOUCH_N = (0.8, 1.2)  # forces of these contacts
+TOUCH_N = (0.8, 1.2)  # range of forces of the contacts at about 1 N
 BY_TIME = "single_temporal"  # experiment that trains on some passes and tests on others
 
 
 @dataclass(frozen=True)
 class Scan:
-    """For each training row, the no-load field and the number of the indentation in its pass."""
+    """For each row of the scene, the no-load field and the number of the row's indentation in its pass."""
 
     noload_uT: Float32[np.ndarray, "f ch"]
     scan_i: Int64[np.ndarray, " f"]
 
 
 def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
-    """Stack the no-load fields and numbers of all contacts, in the order of the scene's rows."""
+    """Stack the no-load field and the number in the pass of every contact, in the order of the scene's rows."""
     captures = sorted(captures, key=lambda readings: readings.capture)
     kept = [contacts(readings, selection) for readings in captures]
     noload = [readings.noload_uT[keep] for readings, keep in zip(captures, kept, strict=True)]
@@ -50,7 +50,7 @@ def gather_scan(captures: Sequence[Readings], selection: Selection) -> Scan:
 
 
 def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
-    """Number the indentations of each pass from 0, including those without a contact."""
+    """Return the number of each reading's indentation in its pass, from 0; indentations without a contact count too."""
     passes, of_pass = np.unique(readings.pass_i, return_inverse=True)
     indentation = readings.indentation.astype(np.int64)
     first = np.full(len(passes), indentation.max())
@@ -60,7 +60,7 @@ def number_in_pass(readings: Readings) -> Int64[np.ndarray, " f"]:
 
 @dataclass(frozen=True)
 class Hover:
-    """Rows of a tip that hovers over a known place without contact; `pass_i` as in `Rows`."""
+    """Readings of a tip that hovers over a known place without contact; `pass_i` is numbered as in `Rows`."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     place_mm: Float32[np.ndarray, "f 2"]
@@ -75,23 +75,24 @@ def gather_hover(captures: Sequence[Readings]) -> Hover:
     """Stack the rows without force between the contacts of a pass; the place of each row is that of the next contact.
 
     A tip that descends in steps first hovers over the place of the contact. Rows before the first contact of a pass
-    are left out because they are its no-load reading, and rows after the last contact because they have no place.
+    are left out because they are the pass's no-load reading, and rows after the last contact because none follows.
     """
     parts: list[tuple[np.ndarray, ...]] = []
     passes_n: dict[str, int] = {}
     for capture in sorted(captures, key=lambda readings: readings.capture):
         before_n = passes_n.get(capture.skin, 0)
         passes_n[capture.skin] = before_n + int(capture.pass_i.max()) + 1
-        touches = np.flatnonzero(np.isfinite(capture.x_mm) & (capture.Fz_N > 0))
-        empty = np.flatnonzero(np.isnan(capture.x_mm) & (capture.Fz_N == 0))
-        after = np.searchsorted(touches, empty)
-        inside = (after > 0) & (after < len(touches))
-        empty, last, coming = empty[inside], touches[after[inside] - 1], touches[after[inside]]
-        same = (capture.pass_i[last] == capture.pass_i[empty]) & (capture.pass_i[coming] == capture.pass_i[empty])
-        empty, coming = empty[same], coming[same]
-        place_mm = np.column_stack([capture.x_mm[coming], capture.y_mm[coming]])
-        skins, pass_i = np.full(len(empty), capture.skin), capture.pass_i[empty].astype(np.int64) + before_n
-        parts.append((capture.b_uT[empty] - capture.noload_uT[empty], place_mm, skins, pass_i))
+        contact_i = np.flatnonzero(np.isfinite(capture.x_mm) & (capture.Fz_N > 0))
+        hover_i = np.flatnonzero(np.isnan(capture.x_mm) & (capture.Fz_N == 0))
+        following = np.searchsorted(contact_i, hover_i)
+        between = (following > 0) & (following < len(contact_i))
+        hover_i, previous_i, next_i = hover_i[between], contact_i[following[between] - 1], contact_i[following[between]]
+        in_pass = capture.pass_i[hover_i]
+        same_pass = (capture.pass_i[previous_i] == in_pass) & (capture.pass_i[next_i] == in_pass)
+        hover_i, next_i = hover_i[same_pass], next_i[same_pass]
+        place_mm = np.column_stack([capture.x_mm[next_i], capture.y_mm[next_i]])
+        skins, pass_i = np.full(len(hover_i), capture.skin), capture.pass_i[hover_i].astype(np.int64) + before_n
+        parts.append((capture.b_uT[hover_i] - capture.noload_uT[hover_i], place_mm, skins, pass_i))
     return Hover(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
@@ -100,8 +101,8 @@ def score_before_contact(
 ) -> pa.Table:
     """Score places predicted from the no-load field alone or from the number in the pass alone, and the hover control.
 
-    networks: trained networks by fold, which the hover control uses in addition to the nearest neighbours. Returns one
-    row per fold and input.
+    networks: trained networks by fold, which the hover control uses in addition to the nearest neighbours. The table
+    has one row per fold and input or hover control.
     """
     read = [io.read_readings(indentations / f"{name}.parquet") for name in captures]
     scan = gather_scan(read, data.settings.section(Selection, "selection"))
@@ -121,7 +122,7 @@ def score_before_contact(
 
 
 def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network]) -> list[dict[str, Any]]:
-    """Score models of contacts on the hovering rows in the test passes of a fold."""
+    """Score models that were trained on contacts on the hovering rows in the test passes of a fold."""
     rows = data.rows
     test_passes = set(zip(rows.skin[fold.test], rows.pass_i[fold.test].tolist(), strict=True))
     in_test_passes = np.array(
@@ -149,7 +150,8 @@ def _hover(data: SceneData, fold: Fold, hover: Hover, networks: Sequence[Network
 def _score(
     data: SceneData, inputs: Float32[np.ndarray, "f c"], train: np.ndarray, test: np.ndarray
 ) -> Mapping[str, float]:
-    rng = rng_for(data.settings.seed, "before-touch")  # not used by nearest neighbours
+    """Train nearest neighbours on inputs without the contact's signal, and score predicted places of test rows."""
+    rng = rng_for(data.settings.seed, "before-touch")  # `fit` needs it; nearest neighbours do not use it
     fitted = fit(NEIGHBOURS, inputs[train], data.rows.target[train], rng, weight=None)
     scores = score(data.rows.target[test], fitted.predict(inputs[test]))
     return {name: scores[name] for name in PLACE}

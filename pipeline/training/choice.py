@@ -1,12 +1,13 @@
 """Choose settings from the cards of a scene's models, which were trained with each board held out in turn.
 
 The criterion is the mean squared error of places on the held-out boards, for networks with the paper's inputs. The
-number of steps is not chosen, because each scene sets it as a budget. Every candidate is tried with the same budgets,
-and its errors are averaged over them, so that no setting wins by training longer. Settings with a collapsed training
+number of steps, the budget, is not chosen, because each scene sets it. Every candidate is tried with the same budgets,
+and the errors are averaged over budgets, so that no setting wins by training longer. Settings with a collapsed training
 run are not chosen. Settings of adaptation are chosen together with the triplet weight of the network that they start
 from, because the triplet term by itself only increases the error.
 
-The record of a choice contains a fingerprint of the simulated skin. Audits compare it with that of the current code.
+The record of a choice contains a fingerprint of the simulated skin. Audits compare this fingerprint with that of
+the current code.
 """
 
 import hashlib
@@ -26,11 +27,12 @@ from reskin.physics.skin import SkinDesign, changes_of_field, draw_skin, forces
 
 BY = "mse_xy_mm2"
 PAPER_INPUTS = "raw"
+# Settings that are listed in the descriptions of candidates.
 VARIED = (
     "steps_n", "batch_n", "rate_max", "gradient_norm_max", "weight_decay", "triplet_weight", "base",
     "unlabelled_weight",
 )  # fmt: skip
-BUDGET = ("steps_n", "base")  # not settings of the method, but a scene's number of steps and the name of a base recipe
+BUDGET = ("steps_n", "base")  # a scene's number of steps and the name of a base recipe are not settings of the method
 WHERE = "choice of settings"
 
 Card = Mapping[str, Any]
@@ -40,7 +42,7 @@ Cards = Sequence[Card]
 def choose(cards: Cards) -> dict[str, dict[str, Any]]:
     """Choose settings for every stage: `recipe_name`, `settings`, `by` (the criterion), `candidates` with scores.
 
-    The choice for `adapt` also has the error of its control: the same network, fine-tuned as long without the pokes.
+    The choice for `adapt` also has the error of the control: the same network, fine-tuned as long without pokes.
     """
     by_paper = [card for card in cards if card["recipe"]["inputs"] == PAPER_INPUTS]
     multi, triplet, tuned = ([card for card in by_paper if card["question"] == q] for q in ("lobo", "triplet", "adapt"))
@@ -65,7 +67,7 @@ def choose(cards: Cards) -> dict[str, dict[str, Any]]:
 def to_record(
     chosen: Mapping[str, Mapping[str, Any]], cards: Cards, *, source: str, seed: int, physics: str
 ) -> dict[str, Any]:
-    """Record the choice with its boards and skins, for the audit of the scenes that use it.
+    """Record the choice with its boards and skins, for the audit of the scenes that use the chosen settings.
 
     `physics` is the fingerprint of the simulated skin's settings.
     """
@@ -84,7 +86,7 @@ def settings_of(card: Card) -> dict[str, Any]:
 
 
 def without_budget(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings without the budget, which is not a setting of the method."""
+    """Return the settings without the keys in `BUDGET`, which are not settings of the method."""
     return {name: value for name, value in settings.items() if name not in BUDGET}
 
 
@@ -97,7 +99,7 @@ def _choose(cards: Cards, eligible: Cards, stage: str) -> tuple[Card, dict[str, 
     collapsed = [_key(card) for card in cards if _has_collapsed(card)]
     stable = [card for card in eligible if _key(card) not in collapsed]
     if not stable:
-        raise ParamsError(f"{WHERE}: all {what} have a collapsed training run. Try lower rates.")
+        raise ParamsError(f"{WHERE}: all {what} have a collapsed training run. Try lower learning rates.")
     candidates = _candidates(cards)
     errors = _errors(cards, candidates)
     best = min(stable, key=lambda card: (errors[card["recipe_name"]], _budget(card)))
@@ -115,35 +117,37 @@ def _errors(cards: Cards, candidates: Sequence[Mapping[str, Any]]) -> dict[str, 
     errors = {candidate["recipe_name"]: candidate[BY]["mean"] for candidate in candidates}
 
     def over_budgets(key: Mapping[str, Any]) -> float:
-        by_budget = {budget: errors[name] for name, (own, budget) in settings.items() if own == key}
+        by_budget = {budget: errors[name] for name, (other, budget) in settings.items() if other == key}
         return float(np.mean(list(by_budget.values())))  # equal candidates under two names count once
 
     return {name: over_budgets(key) for name, (key, _) in settings.items()}
 
 
 def _check_budgets(cards: Cards, stage: str) -> None:
+    """Raise `ParamsError` unless every candidate was tried with the same numbers of steps."""
     budgets_by_name = {
         card["recipe_name"]: {_budget(other) for other in cards if _key(other) == _key(card)} for card in cards
     }
     all_budgets = set().union(*budgets_by_name.values())
     for name, budgets in budgets_by_name.items():
         if budgets != all_budgets:
-            what, got = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(all_budgets)}"
+            what, tried = f"steps of {stage}'s {name}", f"{sorted(budgets)} of {sorted(all_budgets)}"
             remedy = "Try every candidate with every number of steps."
-            raise ParamsError(f"{WHERE}: {what} differ between candidates: {got}. {remedy}")
+            raise ParamsError(f"{WHERE}: {what} differ between candidates: {tried}. {remedy}")
 
 
 def _key(card: Card) -> dict[str, Any]:
-    """Return the settings without their budget; for an adaptation, with those of the network that it starts from."""
+    """Return the settings without budget; those of an adaptation include the settings of the pretrained network."""
     return without_budget(card["recipe"]) | (without_budget(settings_of(card)) if "tuning" in card else {})
 
 
 def _budget(card: Card) -> tuple[int, int]:
+    """Return the numbers of steps of training and of adaptation (0 without adaptation)."""
     return (card["recipe"]["steps_n"], card["tuning"]["settings"]["steps_n"] if "tuning" in card else 0)
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
-    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # of the first card of each recipe
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # first card by recipe
     return [
         {
             "recipe_name": name,
@@ -154,9 +158,9 @@ def _candidates(cards: Cards) -> list[dict[str, Any]]:
     ]
 
 
-# --- A fingerprint of the simulation, which is the same as long as equal indentations give equal fields and forces ---
+# --- Fingerprint of the simulation: unchanged as long as equal indentations give equal fields and forces ---
 
-RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # as in scene quick
+RULE = Quadrature(cell_m=0.8e-3, layers_n=5)  # same as in scene quick
 BOARD = BoardDesign(
     chips_xy_mm=((0.0, 0.0), (-7.0, 0.0), (0.0, -7.0), (7.0, 0.0), (0.0, 7.0)),
     chips_turn_deg=(0.0, 180.0, 270.0, 90.0, 0.0),
@@ -170,7 +174,7 @@ DIGITS = 4  # significant digits; rounding errors are smaller, and changes of th
 def fingerprint(sections: Mapping[str, Any]) -> str:
     """Return a digest of the fields and forces of two skins under fixed indentations, and of the rig and chip settings.
 
-    A refactoring does not change it; a change of the physics or of a setting does.
+    A refactoring does not change the digest; a change of the physics or of a setting does.
     """
     design = parse(SkinDesign, sections["skin"], "skin")
     spreads = parse(Spreads, sections["spreads"], "spreads")

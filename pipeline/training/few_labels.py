@@ -1,7 +1,8 @@
-"""Experiment labels: methods on a new board with no labelled indentations, with a few, and with more.
+"""Experiment labels: methods on a held-out board, with different numbers of labelled indentations of that board.
 
 Networks are trained, adapted with unlabelled indentations, and fine-tuned on labelled ones. Classical methods are
-fitted with the labelled ones. This module lists the training jobs; `pipeline.stages.universal` runs and scores them.
+fitted to the training rows and the labelled indentations. This module lists the training jobs;
+`pipeline.stages.universal` runs and scores them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,7 +60,7 @@ class FewLabels(SectionWithRows):
 
 @dataclass(frozen=True)
 class Study:
-    """Rows, folds of the experiment, seed and settings of a scene."""
+    """Inputs of the experiment: the scene's rows, the experiment's folds, the seed and the settings."""
 
     rows: Rows
     folds: Sequence[Fold]
@@ -69,7 +70,7 @@ class Study:
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry of the table of results: a method on a fold with a number of labels."""
+    """Names of one result of the experiment: a method, its inputs, a number of labels and a fold."""
 
     method: str
     inputs: str
@@ -93,7 +94,10 @@ def network_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[
 
 
 def adaptation_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
-    """List the jobs that adapt the recipes in `adapted` with all indentations of the pool, unlabelled."""
+    """List the jobs that adapt the recipes in `adapted` with all indentations of the fold's pool, without labels.
+
+    Pool: the indentations of the held-out board that are reserved for calibration and not tested.
+    """
     pairs = []
     for entry, job, trained in trained_entries:
         if job.recipe_name in study.settings.adapted:
@@ -105,7 +109,7 @@ def adaptation_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> li
 
 
 def fine_tuning_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> list[tuple[Entry, TrainingJob]]:
-    """List the jobs that fine-tune every network on every number of labelled indentations."""
+    """List the jobs that fine-tune every trained or adapted network on each number of labelled indentations."""
     pairs = []
     for entry, job, trained in trained_entries:
         for labels_n, row in _labelled_rows(study, entry.fold).items():
@@ -118,12 +122,12 @@ def fine_tuning_jobs(study: Study, trained_entries: Sequence[TrainedEntry]) -> l
 
 
 def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
-    """List the jobs that fit every classical method with every number of labelled indentations."""
-    most_n = study.settings.rows_max_n
+    """List the jobs that fit every classical method with each number of labelled indentations."""
+    rows_max_n = study.settings.rows_max_n
     return [
         (
             Entry(method.title, method.inputs, labels_n, fold),
-            ClassicalJob(f"{name}.{fold.name}.{labels_n}", method, fold.train, fold.test, row, most_n, study.seed),
+            ClassicalJob(f"{name}.{fold.name}.{labels_n}", method, fold.train, fold.test, row, rows_max_n, study.seed),
         )
         for fold in study.folds
         for name, method in study.settings.methods.items()
@@ -132,12 +136,15 @@ def classical_jobs(study: Study) -> list[tuple[Entry, ClassicalJob]]:
 
 
 def _labelled_rows(study: Study, fold: Fold) -> Mapping[int, Int64[np.ndarray, " o"]]:
-    """Draw nested sets of labelled indentations from the pool; return their rows by number of labels."""
+    """Draw labelled indentations from the fold's pool; return their rows by number of labels.
+
+    The indentations of a smaller number are also in every larger one. Pool: see `adaptation_jobs`.
+    """
     indentation, labels_n = study.rows.indentation[fold.pool], study.settings.labels_n
     order = labelling_order(study.rows, fold, study.seed)
     if max(labels_n) > len(order):
-        rule = f"at most the {len(order)} indentations of its pool"
-        remedy = "Reduce labels_n, or raise split.labels_pool_n."
+        rule = f"at most the {len(order)} indentations for calibration"
+        remedy = "Reduce labels_n, or increase split.labels_pool_n."
         raise ParamsError(f"fold labels/{fold.name}", "few_labels.labels_n", rule, max(labels_n), remedy)
     return {n: fold.pool[np.isin(indentation, order[:n])] for n in labels_n}
 

@@ -1,4 +1,4 @@
-"""Training for one scene: read its rows and folds, make and run training jobs, write models with their cards."""
+"""Training for one scene: read rows and folds, make and run training jobs, write models with JSON cards."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -32,7 +32,7 @@ from reskin.seeds import rng_for
 TRAINING_MODULE = "reskin.models.train"
 CACHE = ".reskin/cells"  # completed training runs; a cache, not an output
 
-PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe, fold and seed
+PretrainedNetworks = dict[tuple[str, str, int], Pretrained]  # by recipe, fold and number of the seed
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class SceneData:
 
 @dataclass(frozen=True)
 class AdaptationPokes:
-    """Unlabelled pokes along lines, to adapt one network to one skin; `experiment` and `what` name the job."""
+    """Unlabelled pokes, ordered in lines, that adapt one network to one skin; `experiment` and `what` name the job."""
 
     experiment: str
     skin: str
@@ -61,7 +61,7 @@ class AdaptationPokes:
 
 
 class ModelCard(TypedDict):
-    """The JSON card of a model: its training, inputs, outputs and scores."""
+    """The JSON card of a model, which describes training, inputs, outputs and scores."""
 
     format: str
     scene: str
@@ -104,7 +104,7 @@ class _HasTimes(Protocol):
 
 
 def preload_training() -> None:
-    """Start the workers' imports while the stage reads its data."""
+    """Start the workers' fork server, which imports the training module while the stage reads its data."""
     prepare_workers(TRAINING_MODULE)
 
 
@@ -146,7 +146,7 @@ def adaptation_jobs(
     experiment: str,
     pokes_n: int,
 ) -> Iterator[TrainingJob]:
-    """Make the jobs that adapt a fold's networks to each held-out skin with `pokes_n` indentations of its pool."""
+    """Make the jobs that adapt a fold's networks to each held-out skin, with `pokes_n` unlabelled indentations."""
     for skin in np.unique(data.rows.skin[fold.test]):
         for seed_i in select_pretrained(pretrained, named_recipe[1].base, fold):
             lines = pool_lines(data, fold, str(skin), pokes_n=pokes_n, seed_i=seed_i)
@@ -173,14 +173,14 @@ def adaptation_job(
 
 
 def pool_lines(data: SceneData, fold: Fold, skin: str, *, pokes_n: int, seed_i: int) -> Lines:
-    """Draw `pokes_n` indentations from a skin's pool, and order them in lines of the robot's grid."""
+    """Draw `pokes_n` of a skin's indentations that are reserved for adaptation; order them along the robot's grid."""
     pool = fold.pool[data.rows.skin[fold.pool] == skin]
     rng = rng_for(data.settings.seed, "pokes", skin, seed_i)
     return grid_lines(data.rows, take_pokes(data.rows, pool, pokes_n, rng))
 
 
 def read_pretrained(models: Path) -> PretrainedNetworks:
-    """Read the networks of train_triplet."""
+    """Read the networks that stage train_triplet wrote to folder `models`."""
     pretrained = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -192,9 +192,10 @@ def read_pretrained(models: Path) -> PretrainedNetworks:
 
 
 def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> dict[int, Pretrained]:
-    """Return the networks of one recipe and fold, by seed."""
-    own = (base, fold.name)
-    selected = {seed_i: one for (recipe, name, seed_i), one in pretrained.items() if (recipe, name) == own}
+    """Return the networks of recipe `base` and one fold, by number of the seed."""
+    selected = {
+        seed_i: network for (recipe, name, seed_i), network in pretrained.items() if (recipe, name) == (base, fold.name)
+    }
     if not selected:
         raise SchemaError(f"fold {fold.name}: no networks of recipe {base} to adapt. Run: dvc repro train_triplet")
     return selected
@@ -204,7 +205,7 @@ def select_pretrained(pretrained: PretrainedNetworks, base: str, fold: Fold) -> 
 
 
 def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list[TrainingResult]:
-    """Run the jobs that are not in the cache, record their costs, and warn of training runs that diverged."""
+    """Return the results of jobs, from the cache or by training; record costs, and warn of runs that diverged."""
     start_s, prefix = time.monotonic(), f"{data.scene} {stage}"
     with make_executor(imports=TRAINING_MODULE) as executor:
         results = run_jobs(
@@ -228,7 +229,7 @@ def train_jobs(data: SceneData, jobs: Sequence[TrainingJob], stage: str) -> list
 def write_models(
     models: Path, data: SceneData, jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], stage: str
 ) -> None:
-    """Write models, cards and predictions; times are written elsewhere, because they differ between equal runs."""
+    """Write models, cards and predictions to folder `models`, and times to a file that is not a stage output."""
     code = code_version_of(imported(module_name(stage)))
     cards = [scored_card(data, job, result) for job, result in zip(jobs, results, strict=True)]
     with io.replacing(models) as folder:
@@ -299,7 +300,7 @@ def scored_card(data: SceneData, job: TrainingJob, result: TrainingResult) -> Mo
 
 
 def score_test(data: SceneData, test: Int64[np.ndarray, " b"], predicted: Float32[np.ndarray, "b 3"]) -> dict[str, Any]:
-    """Score predictions for test rows."""
+    """Score predictions for test rows: for all rows as labelled and registered, and for each skin."""
     return score_groups(data.rows.target[test], predicted, data.rows.board[test], data.rows.skin[test])
 
 
@@ -316,7 +317,7 @@ def collapse_record(result: TrainingResult) -> dict[str, Any]:
 
 
 def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Sequence[_HasTimes]) -> None:
-    """Write the seconds that each training run and one prediction took, outside the outputs of stages."""
+    """Write the seconds of each training run and of one prediction to a file that is not an output of a stage."""
     seconds = [
         {"name": job.name, "train_s": result.seconds, "one_reading_s": result.one_reading_s}
         for job, result in zip(jobs, results, strict=True)
@@ -325,7 +326,7 @@ def write_timings(scene: str, stage: str, jobs: Sequence[_HasName], results: Seq
 
 
 def _predictions(jobs: Sequence[TrainingJob], results: Sequence[TrainingResult], rows: Rows) -> pa.Table:
-    """Tabulate true and predicted values, one row for each job and test row."""
+    """Tabulate true and predicted values, with one row per job and test row."""
     tables = []
     for job, result in zip(jobs, results, strict=True):
         names = {"question": job.experiment, "recipe": job.recipe_name, "fold": job.fold, "seed_i": job.seed_i}

@@ -1,4 +1,4 @@
-"""Predictions and scores of networks on a new skin, by variant: not adapted, adapted, control, ..."""
+"""Predictions and scores of networks on a new skin, by variant: before adaptation, adapted, control, ..."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from reskin.models.recipe import AdaptationWithBase
 from reskin.numerics import device
 
 FORCE = 2  # column of the force
-BEFORE, AFTER, CONTROL = "before", "after", "control"  # the control is trained as long, without the skin's pokes
+BEFORE, AFTER, CONTROL = "before", "after", "control"  # control: as many steps, without pokes of the skin
 Metric = Callable[[np.ndarray, np.ndarray], dict[str, float]]  # takes true and predicted x_mm, y_mm, F_N
 
 
@@ -45,7 +45,7 @@ class VariantPrediction:
 def predict_before(
     data: SceneData, fold: Fold, settings: AdaptationWithBase, starts: PretrainedNetworks, skin: str
 ) -> Iterator[VariantPrediction]:
-    """Predict a skin's test rows with the networks as they are before adaptation."""
+    """Predict a skin's test rows with each pretrained network, before adaptation."""
     from reskin.models.network import Predictor  # imports torch: only a stage that predicts needs it
 
     recipe = data.settings.section(Training, "train_triplet").recipes[settings.base]
@@ -60,7 +60,7 @@ def predict_before(
 def adapt_and_predict(
     data: SceneData, jobs: Sequence[tuple[str, TrainingJob]], stage: str
 ) -> tuple[list[VariantPrediction], dict[str, int]]:
-    """Run (variant, job) pairs; return predictions for the test rows, and counts of collapsed training runs."""
+    """Run the jobs of (variant, job) pairs; return predictions for test rows, and counts of collapsed training runs."""
     adapted = [job for _, job in jobs]
     trained = train_jobs(data, adapted, stage)
     write_timings(data.scene, stage, adapted, trained)
@@ -72,7 +72,7 @@ def adapt_and_predict(
 
 
 def bias(true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"]) -> dict[str, float]:
-    """Compute the bias of the predicted force in newtons and in percent of the mean force."""
+    """Compute the mean of (predicted - true) force, in newtons and in percent of the mean true force."""
     true_N = true[:, FORCE].astype(float)
     bias_N = float((predicted[:, FORCE].astype(float) - true_N).mean())
     return {"bias_f_N": bias_N, "bias_f_pct": 100 * bias_N / float(true_N.mean())}

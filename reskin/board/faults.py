@@ -17,36 +17,42 @@ FAILED_B_uT = (8028.16, 5194.00, 12943.36)
 FAILED_TEMPERATURE_degC = -880.49
 FAILED_TOLERANCE = 0.01  # text wires round to two decimals
 
-# The LSB of a chip with its power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
+# The LSB of a chip with power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
 RESET_LSB_XY_uT = 0.98
 RESET_LSB_Z_uT = 1.58
 LSB_TOLERANCE = 0.1  # gains of the MLX90393 differ by 20 % or more (data sheet, table 17)
 
-# A grid is visible if neighbouring values often differ by one step: in the first 200 frames of 14 real recordings, 5 %
-# or more of all gaps are one step. Without a grid, only one or two gaps are, by chance, close to the smallest gap.
+# The values of a channel are multiples of the chip's LSB: they are on a grid. Gaps are the differences between
+# neighbouring distinct values. A grid is detected if a fraction STEP_SHARE_MIN of the gaps, and at least STEPS_MIN_N
+# gaps, are one step: in the first 200 frames of 14 real recordings, 5 % or more are. Without a grid, only one or two
+# gaps are close to the smallest gap, by chance.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
-# Relative standard deviation of the gaps: 0.02 for a step of 0.242 uT with two decimals; 0.12 for gaps that are by
-# chance up to 1.5 times the smallest one.
+# Maximum relative standard deviation of the gaps that count as one step, those below 1.5 times the smallest gap. It is
+# 0.02 for an LSB of 0.242 uT written with two decimals, and 0.12 for random gaps.
 STEP_SPREAD_MAX = 0.06
-SURE_STEPS_MIN_N = 20  # so many equal gaps do not occur by chance, even if there are few values and no noise
+SURE_STEPS_MIN_N = 20  # even with few values and no noise, this many equal gaps do not occur by chance
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
-SAME_VALUE_uT = 1e-3  # float32 arithmetic may represent one value in two ways
+SAME_VALUE_uT = 1e-3  # a smaller gap is a rounding error of float32 arithmetic
 
-# Noise changes the readings of a working chip. They repeat only if the chip is read again before its next conversion
-# (1.84 ms), or if its LSB is coarse. In 14 real recordings, they repeat for at most 3 frames.
+# Because of noise, successive readings of a working chip differ. They are equal only if the chip is read again before
+# its next conversion (1.84 ms), or if its LSB is coarse. In 14 real recordings, at most 3 successive frames are equal.
 STUCK_FRAMES_MIN_N = 20
-OTHERS_MOVE_MIN = 0.5  # not 1, because without noise, readings change only while the board is pressed or released
+# A chip is stuck only if another chip changes in at least this fraction of the frames in which the chip does not. The
+# value is below 1 because, in data without noise, readings change only while the board is pressed or released.
+OTHERS_MOVE_MIN = 0.5
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
 INT16_STEPS_N = 2**15
-CLOCK_STEP_MAX_S = 1.0
-REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4  # assumed: this fraction of this many frames (0.1 s at 400 Hz)
-MISSING_STEPS = 1.6  # times the usual step of the board's clock
+CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock is a jump
+# assumed: equal frames are a fault if, in a window of 40 frames (0.1 s at 400 Hz), over 40 % equal the previous frame
+REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4
+MISSING_STEPS = 1.6  # frames are missing if a step of the board's clock exceeds the median step by this factor
 SILENCE_S = 1.0
-SILENCE_STEPS = 50.0  # times the usual time between two frames, so that a slow log does not count as silent
+# A silence must also exceed the median time between two frames by this factor, so that a slow log is not reported.
+SILENCE_STEPS = 50.0
 GARBAGE_FRAMES_N = 10  # more stray bytes than this many frames have suggest a wrong baud rate, not a torn frame
-LONG_LINE = 1.5  # times the usual length of a line of text
+LONG_LINE = 1.5  # a line of text that exceeds the median length by this factor contains stray bytes
 
 SCALE_FRAMES_N = 400  # enough to find the LSB of every good chip in real recordings; 200 may be too few
 GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of this many rows
@@ -72,10 +78,10 @@ def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 def find_lsb(
     b_uT: Float[np.ndarray, "f ch"], *, step_min_uT: float = STEP_MIN_uT, steps_min_n: int = STEPS_MIN_N
 ) -> Float[np.ndarray, "k 2"]:
-    """Estimate the step between a chip's values, in uT, along x and y, and along z; NaN if no grid is visible.
+    """Estimate the LSB of each chip in uT (first column: x and y, second: z) from its values; NaN if undetectable.
 
-    A few hundred frames are enough; no grid is visible if the settings of the chip change among them. A grid needs at
-    least `steps_min_n` gaps of one step, and a step of `step_min_uT` or more.
+    A few hundred frames are enough. The LSB is undetectable if the settings of the chip change within these frames, if
+    fewer than `steps_min_n` gaps between neighbouring values are one step, or if the step is below `step_min_uT`.
     """
     chips = np.moveaxis(_by_chip(b_uT), 1, 0)
     steps_uT = np.array(
@@ -87,8 +93,8 @@ def find_lsb(
 def reset_chips(b_uT: Float[np.ndarray, "f ch"], expected_lsb_uT: tuple[float, float] | None) -> Bool[np.ndarray, " k"]:
     """Mark the chips whose LSB is not the expected one (along x and y, and along z).
 
-    Without an expected LSB, mark the chips whose LSB differs from that of most chips or equals that of a chip after a
-    reset. A chip without a visible grid is not marked.
+    Without an expected LSB, mark the chips whose LSB differs from the median of all chips, or equals the LSB of a chip
+    after a reset. A chip whose LSB cannot be detected is not marked.
     """
     return unusual_lsb(find_lsb(b_uT), expected_lsb_uT)
 
@@ -98,10 +104,10 @@ def unusual_lsb(
 ) -> Bool[np.ndarray, " k"]:
     """Mark chips as `reset_chips` does, given the LSB that `find_lsb` returned."""
     if expected_lsb_uT is not None:
-        return _not_on_grid(lsb_uT, expected_lsb_uT)
-    after_reset = ~_not_on_grid(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
+        return _differs(lsb_uT, expected_lsb_uT)
+    after_reset = ~_differs(lsb_uT, (RESET_LSB_XY_uT, RESET_LSB_Z_uT)) & np.isfinite(lsb_uT).all(axis=1)
     usual_xy_uT, usual_z_uT = (_median(axis[np.isfinite(axis)]) for axis in lsb_uT.T)
-    return after_reset | _not_on_grid(lsb_uT, (usual_xy_uT, usual_z_uT))
+    return after_reset | _differs(lsb_uT, (usual_xy_uT, usual_z_uT))
 
 
 def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
@@ -112,14 +118,14 @@ def stuck_chips(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
 class StuckChips:
     """Find stuck chips in a recording that arrives in portions of any length.
 
-    A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th of a run of equal readings, and other chips changed
-    in at least the fraction `OTHERS_MOVE_MIN` of this run. A board on which nothing changes is not broken.
+    A reading is stuck if it is at least the `STUCK_FRAMES_MIN_N`-th in a run of equal readings, and if other chips
+    changed in at least the fraction `OTHERS_MOVE_MIN` of this run. If no chip of the board changes, no chip is stuck.
     """
 
     def __init__(self, chips_n: int) -> None:
         self._last_uT = np.full((1, chips_n, 3), np.nan)
         self._quiet_n = np.zeros(chips_n, np.int64)  # frames since each chip last changed
-        self._moved_n = np.zeros(chips_n, np.int64)  # number of these in which another chip changed
+        self._moved_n = np.zeros(chips_n, np.int64)  # number of these frames in which another chip changed
 
     def feed(self, b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
         """Process the next readings; mark those that are stuck."""
@@ -128,12 +134,12 @@ class StuckChips:
             return np.zeros(chips.shape[:2], bool)
         moves = (np.diff(np.concatenate([self._last_uT, chips]), axis=0) != 0).any(axis=2)
         frame_n = np.arange(1, len(chips) + 1)[:, None]
-        board_n = moves.any(axis=1).cumsum()[:, None]
-        begin_n = np.maximum.accumulate(np.where(moves, frame_n, 0), axis=0)
-        moved_before_n = np.concatenate([[0], board_n[:, 0]])[begin_n]
-        carried = begin_n == 0
-        quiet_n = frame_n - begin_n + carried * self._quiet_n
-        moved_n = board_n - moved_before_n + carried * self._moved_n
+        board_changes_n = moves.any(axis=1).cumsum()[:, None]
+        last_change_n = np.maximum.accumulate(np.where(moves, frame_n, 0), axis=0)
+        changes_before_n = np.concatenate([[0], board_changes_n[:, 0]])[last_change_n]
+        unchanged = last_change_n == 0
+        quiet_n = frame_n - last_change_n + unchanged * self._quiet_n
+        moved_n = board_changes_n - changes_before_n + unchanged * self._moved_n
         self._last_uT, self._quiet_n, self._moved_n = chips[-1:].astype(np.float64), quiet_n[-1], moved_n[-1]
         return (quiet_n >= STUCK_FRAMES_MIN_N - 1) & (moved_n >= OTHERS_MOVE_MIN * quiet_n)
 
@@ -161,7 +167,10 @@ class ConstantChannels:
         self._readings_n += len(chips)
 
     def describe(self) -> list[str]:
-        """List the constant channels with their values, `Bz of chip 0 (12.5 uT)`; empty for a short recording."""
+        """Describe each constant channel, as in `Bz of chip 0 (12.5 uT)`.
+
+        The list is empty if fewer than `STUCK_FRAMES_MIN_N` readings were processed.
+        """
         if self._readings_n < STUCK_FRAMES_MIN_N:
             return []
         constant = ~self._changed & self._changed.any(axis=1, keepdims=True)
@@ -177,29 +186,35 @@ def too_hot(temperature_degC: Float[np.ndarray, "f k"]) -> Bool[np.ndarray, "f k
 
 
 def saturated(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
-    """Mark the readings of a chip that are at a limit of its range."""
+    """Mark the readings of a chip in which a field component exceeds the chip's range."""
     return np.asarray((np.abs(b_uT) > B_MAX_uT).reshape(len(b_uT), b_uT.shape[1] // 3, 3).any(axis=2))
 
 
 def int16_wraps(step_uT: Float[np.ndarray, "f ch"], lsb_uT: Float[np.ndarray, "k 2"]) -> Bool[np.ndarray, "f k"]:
-    """Mark frame-to-frame steps that exceed the range of int16; chips with unknown LSB have no marks."""
+    """Mark the chips whose field steps from one frame to the next by more than 2^15 LSB, as when an int16 overflows.
+
+    Chips with an unknown LSB are not marked.
+    """
     wrap_uT = INT16_STEPS_N * lsb_uT[:, [0, 0, 1]]
     return np.asarray((np.abs(step_uT.reshape(len(step_uT), -1, 3)) > wrap_uT).any(axis=2))
 
 
 def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames that repeat the previous one, where many do; a few repeated frames are normal in a fast loop."""
+    """Mark frames that equal the previous one, if more than the fraction `REPEATED_SHARE` of the frames around them do.
+
+    A few repeated frames are normal if the firmware reads the chips faster than they measure.
+    """
     same = np.asarray((step_uT == 0).all(axis=1))
     if len(same) < REPEATED_LOOK_N:
         return np.zeros(len(same), bool)
     window = np.full(REPEATED_LOOK_N, 1 / REPEATED_LOOK_N)
-    share, inside = (np.convolve(each, window, mode="same") for each in (same, np.ones(len(same))))
-    inside[inside > 1 - 0.5 / REPEATED_LOOK_N] = 1.0  # the window is cut only at the ends
+    share, inside = (np.convolve(values, window, mode="same") for values in (same, np.ones(len(same))))
+    inside[inside > 1 - 0.5 / REPEATED_LOOK_N] = 1.0  # remove rounding errors; windows are cut only at the ends
     return np.asarray(same & (share / inside > REPEATED_SHARE))
 
 
 def clock_jumps(device_step_s: Float[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark steps of the board's clock that are negative or too long for a loop."""
+    """Mark steps of the board's clock that are negative or longer than `CLOCK_STEP_MAX_S`."""
     return np.asarray((device_step_s < 0) | (device_step_s > CLOCK_STEP_MAX_S))
 
 
@@ -213,13 +228,17 @@ def missing_frames(device_step_s: Float[np.ndarray, " f"]) -> Int[np.ndarray, " 
 
 
 def silent_gaps(step_s: Float64[np.ndarray, " f"]) -> Bool[np.ndarray, " f"]:
-    """Mark frames before which nothing arrived for a second or more, because the board was unplugged or stalled."""
+    """Mark frames before which nothing arrived for a second or more, as when the board was unplugged or stalled."""
     usual_s = np.median(step_s[np.isfinite(step_s)]) if np.isfinite(step_s).any() else np.inf
     return np.asarray(step_s > max(SILENCE_S, SILENCE_STEPS * usual_s))
 
 
 def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: int | None) -> Int[np.ndarray, " f"]:
-    """Count the stray bytes before each frame; text frames, whose length varies, are compared with the usual length."""
+    """Count the stray bytes before each frame.
+
+    For text frames, whose length varies, `frame_bytes_n` is None. Only lines longer than `LONG_LINE` times the median
+    length then contain stray bytes.
+    """
     length_n = np.diff(end_byte, prepend=first_byte)
     if frame_bytes_n is not None:
         return length_n - frame_bytes_n
@@ -228,23 +247,24 @@ def lost_bytes(end_byte: Int[np.ndarray, " f"], first_byte: int, frame_bytes_n: 
 
 
 def _step(axes_uT: list[Float[np.ndarray, " f"]], steps_min_n: int) -> float:
-    """Return the step of the grid that the values of all given axes share; NaN if there is no grid."""
+    """Return the common step between the values of all given axes; NaN if they have no common step."""
     gaps_uT = np.concatenate([np.diff(np.unique(axis[np.isfinite(axis)])) for axis in axes_uT])
     gaps_uT = gaps_uT[gaps_uT > SAME_VALUE_uT]
     if not len(gaps_uT):
         return np.nan
-    single = gaps_uT[gaps_uT < 1.5 * gaps_uT.min()]
-    equal = single.std() <= STEP_SPREAD_MAX * single.mean()
-    is_grid = equal and len(single) >= max(steps_min_n, STEP_SHARE_MIN * len(gaps_uT))
-    return float(single.mean()) if is_grid else np.nan
+    one_step_uT = gaps_uT[gaps_uT < 1.5 * gaps_uT.min()]
+    are_equal = one_step_uT.std() <= STEP_SPREAD_MAX * one_step_uT.mean()
+    is_grid = are_equal and len(one_step_uT) >= max(steps_min_n, STEP_SHARE_MIN * len(gaps_uT))
+    return float(one_step_uT.mean()) if is_grid else np.nan
 
 
 def _median(known: Float[np.ndarray, " k"]) -> float:
     return float(np.median(known)) if len(known) else np.nan
 
 
-def _not_on_grid(lsb_uT: Float[np.ndarray, "k 2"], grid_uT: tuple[float, float]) -> Bool[np.ndarray, " k"]:
-    return np.any(np.abs(lsb_uT / grid_uT - 1) > LSB_TOLERANCE, axis=1)
+def _differs(lsb_uT: Float[np.ndarray, "k 2"], expected_uT: tuple[float, float]) -> Bool[np.ndarray, " k"]:
+    """Mark the chips whose LSB differs from the expected one; an unknown LSB (NaN) is not marked."""
+    return np.any(np.abs(lsb_uT / expected_uT - 1) > LSB_TOLERANCE, axis=1)
 
 
 def _by_chip(b_uT: Float[np.ndarray, "f ch"]) -> Float[np.ndarray, "f k 3"]:
@@ -261,7 +281,7 @@ class ReadingFaults(NamedTuple):
 
     @property
     def failed_rows(self) -> Bool[np.ndarray, " f"]:
-        """Frames in which a chip was not read."""
+        """Frames in which the reading of at least one chip failed."""
         return np.asarray((self.failed_read | self.zeros).any(axis=1))
 
     @property
@@ -271,16 +291,17 @@ class ReadingFaults(NamedTuple):
 
 
 def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]) -> ReadingFaults:
-    """Mark the faults that are visible in single readings, without earlier ones."""
+    """Mark the faults that can be detected in each reading by itself."""
     failed = failed_reads(b_uT, temperature_degC)
     return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, saturated(b_uT) & ~failed)
 
 
 class ScaleWindow(NamedTuple):
-    """The LSB of each chip in `SCALE_FRAMES_N` frames, with the number of the first frame (from 1) and all times.
+    """The LSB of each chip, estimated from `SCALE_FRAMES_N` successive frames.
 
-    `unusual` marks chips whose LSB is not the expected one or differs from that of the other chips; `changed` marks
-    chips whose LSB differs from their own earlier one.
+    `first_frame` is the number of the first of these frames, counted from 1; `t_s` are the times of all of them.
+    `unusual` marks chips whose LSB is not the expected one or differs from that of the other chips. `changed` marks
+    chips whose LSB differs from the first one that was found for this chip.
     """
 
     first_frame: int
@@ -292,7 +313,7 @@ class ScaleWindow(NamedTuple):
 
 
 class Faults(NamedTuple):
-    """What `FaultDetector` found in the frames that it was fed: masks and counts by frame, or by frame and chip."""
+    """The faults in one portion of frames: masks and counts, per frame or per frame and chip."""
 
     readings: ReadingFaults
     stuck: Bool[np.ndarray, "f k"]
@@ -301,22 +322,22 @@ class Faults(NamedTuple):
     clock_jump: Bool[np.ndarray, " f"]
     unplug: Bool[np.ndarray, " f"]
     missing_frames_n: Int[np.ndarray, " f"]  # before each frame, according to the board's clock
-    torn_bytes_n: Int[np.ndarray, " f"]  # before each frame
-    garbage_bytes_n: Int[np.ndarray, " f"]  # before each frame; so many that the baud rate may be wrong
-    scale: tuple[ScaleWindow, ...]  # newly completed windows
+    torn_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame, or 0 if they are garbage
+    garbage_bytes_n: Int[np.ndarray, " f"]  # so many stray bytes that the baud rate may be wrong, or 0
+    scale: tuple[ScaleWindow, ...]  # the windows that this portion completed
 
 
 class FaultDetector:
-    """Find the faults of a stream of frames, fed in portions of any length.
+    """Find the faults in a stream of frames that arrives in portions of any length.
 
-    Ingestion and the live view both use it. It keeps at most `SCALE_FRAMES_N` frames.
+    Both ingestion and the live view use this class. It stores at most `SCALE_FRAMES_N` frames.
 
     Parameters
     ----------
     chips_n : number of chips.
     frame_bytes_n : length of a binary frame; None for text, where it varies.
     expected_lsb_uT : LSB along x and y, and along z; None if unknown.
-    steps_min_n : how many equal gaps between neighbouring values are needed to find a chip's LSB.
+    steps_min_n : minimum number of equal gaps between neighbouring values for an estimate of a chip's LSB.
     """
 
     def __init__(
@@ -348,7 +369,7 @@ class FaultDetector:
         stuck[read] = self._stuck.feed(b_uT[read])
         stuck[~sound] = False
         if sound.any():
-            # The first frame must not count as repeated.
+            # Before the first frame, insert a different field, so that the frame does not count as repeated.
             last_uT = b_uT[sound][:1] + 1 if self._last_b_uT is None else self._last_b_uT
             step_uT = np.diff(b_uT[sound], axis=0, prepend=last_uT)
             self._last_b_uT = b_uT[sound][-1:]
@@ -362,19 +383,20 @@ class FaultDetector:
         return self._constant.describe()
 
     def _find_scale(self, b_uT: Float[np.ndarray, "f ch"], t_s: Float64[np.ndarray, " f"]) -> tuple[ScaleWindow, ...]:
-        held_uT, held_s = np.concatenate([self._window_uT, b_uT]), np.concatenate([self._window_s, t_s])
+        """Estimate the LSB of each chip in every window that the next frames complete."""
+        pending_uT, pending_s = np.concatenate([self._window_uT, b_uT]), np.concatenate([self._window_s, t_s])
         windows = []
-        complete_n = len(held_uT) // SCALE_FRAMES_N * SCALE_FRAMES_N
+        complete_n = len(pending_uT) // SCALE_FRAMES_N * SCALE_FRAMES_N
         for first in range(0, complete_n, SCALE_FRAMES_N):
             rows = slice(first, first + SCALE_FRAMES_N)
-            lsb_uT = find_lsb(held_uT[rows], steps_min_n=self._steps_min_n)
+            lsb_uT = find_lsb(pending_uT[rows], steps_min_n=self._steps_min_n)
             changed = np.any(np.abs(lsb_uT / self._lsb_uT - 1) > LSB_TOLERANCE, axis=1)
             unusual = unusual_lsb(lsb_uT, self._expected_lsb_uT)
             first_frame = self._windowed_n + 1
-            windows.append(ScaleWindow(first_frame, held_s[rows], lsb_uT, self._expected_lsb_uT, unusual, changed))
+            windows.append(ScaleWindow(first_frame, pending_s[rows], lsb_uT, self._expected_lsb_uT, unusual, changed))
             self._windowed_n += SCALE_FRAMES_N
             self._lsb_uT = np.where(np.isnan(self._lsb_uT), lsb_uT, self._lsb_uT)
-        self._window_uT, self._window_s = held_uT[complete_n:].copy(), held_s[complete_n:].copy()
+        self._window_uT, self._window_s = pending_uT[complete_n:].copy(), pending_s[complete_n:].copy()
         return tuple(windows)
 
     def _find_gaps(
@@ -383,7 +405,11 @@ class FaultDetector:
         Bool[np.ndarray, " f"], Bool[np.ndarray, " f"], Int[np.ndarray, " f"], Int[np.ndarray, " f"],
         Int[np.ndarray, " f"],
     ]:  # fmt: skip
-        """Compare each frame's times and position in the stream with those of the previous frame."""
+        """Compare the times and the end byte of each frame with those of the previous frame.
+
+        Returns the masks of clock jumps and silent gaps, and the numbers of missing frames, torn bytes and garbage
+        bytes.
+        """
         if not len(frames):
             return *np.zeros((2, 0), bool), *np.zeros((3, 0), np.int64)
         last_s, last_device_s, last_byte = self._last or (float(t_s[0]), float(frames.device_s[0]), 0)

@@ -16,11 +16,11 @@ from reskin.errors import CaptureError, ParamsError
 from reskin.physics.chip import GAINS, steps_uT
 
 BAUD = 115200  # USB ports ignore the baud rate
-LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the steps of its chips
+LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the LSB of its chips
 REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
 BOARDS_MAX_N = 16  # opened at the same time
-LSB_TOLERANCE = 0.05  # gains differ by 20 % or more
+LSB_TOLERANCE = 0.05  # relative; the LSBs of two gains differ by 20 % or more
 Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
 
@@ -76,7 +76,7 @@ def find_board(names: Sequence[str] | None = None) -> DetectedBoard:
 
 
 def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
-    """Return the boards that are connected; raise `CaptureError` if there are none."""
+    """Return all boards that are connected; raise `CaptureError` if there are none."""
     results = scan_ports(names)
     boards = [board for board in results if board.problem is None]
     if not boards:
@@ -112,7 +112,8 @@ def recognise(port: str, chunks: Sequence[Chunk]) -> DetectedBoard:
     if not formats:
         return DetectedBoard(port, f"no frame in {len(data)} bytes: wrong baud rate, or not a board")
     decoded = [(decode_all(data, wire, chips_n, port)[0], wire, chips_n) for wire, chips_n in formats]
-    # Text may have temperatures first or last. Temperatures vary less than fields, so choose the least variation.
+    # Text frames have the temperature of a chip first or last. Temperatures vary less than fields, so choose the format
+    # in which they vary least.
     frames, wire, chips_n = min(decoded, key=lambda item: float(item[0].temperature_degC.std(dtype=np.float64)))
     with np.errstate(over="ignore"):  # a frame may contain any finite number
         lsb_uT = [_median(axis) for axis in faults.find_lsb(frames.b_uT).T]
@@ -125,7 +126,7 @@ def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
 
 
 def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
-    """Return the rate of the frames after the first chunk, whose bytes may have been waiting in the port."""
+    """Return the frame rate after the first chunk, whose bytes may have been waiting in the port."""
     later_n = int((frames.end_byte > len(chunks[0][0])).sum())
     elapsed_s = chunks[-1][1] - chunks[0][1]
     return later_n / elapsed_s if elapsed_s > 0 else np.nan
@@ -138,29 +139,30 @@ def find_replugged_port(
     pause: Callable[[float], None] = time.sleep,
     timeout_s: float = REPLUG_TIMEOUT_S,
 ) -> str:
-    """Ask the user to unplug and replug a board, and return the name of the port that disappears and comes back.
+    """Ask the user to unplug a board and plug it in again; return the name of the port that then appears.
 
-    Waits up to `timeout_s` seconds for each of the two steps. The name may differ after replugging. The port is not
-    read, so any serial device is accepted. If several ports appear, the first by name is returned.
+    Waits up to `timeout_s` seconds for each of the two steps. The port's name may differ after replugging. The port is
+    not read, so any serial device is accepted. If several ports appear, the first by name is returned.
     """
     say("Unplug the board.")
     before = set(names())
-    gone = _wait(lambda: before - set(names()), pause, timeout_s, "disappeared")
-    say(f"{', '.join(sorted(gone))} disappeared. Plug it in again.")
-    left = before - gone
-    return min(_wait(lambda: set(names()) - left, pause, timeout_s, "appeared"))
+    unplugged = _wait(lambda: before - set(names()), pause, timeout_s, "disappeared")
+    say(f"{', '.join(sorted(unplugged))} disappeared. Plug it in again.")
+    remaining = before - unplugged
+    return min(_wait(lambda: set(names()) - remaining, pause, timeout_s, "appeared"))
 
 
-def _wait(change: Callable[[], set[str]], pause: Callable[[float], None], timeout_s: float, what: str) -> set[str]:
+def _wait(find_ports: Callable[[], set[str]], pause: Callable[[float], None], timeout_s: float, what: str) -> set[str]:
+    """Call `find_ports` until it returns ports, and return them; raise `CaptureError` after `timeout_s`."""
     for _ in range(round(timeout_s / POLL_S)):
-        if ports := change():
+        if ports := find_ports():
             return ports
         pause(POLL_S)
     raise CaptureError(f"no port {what} within {timeout_s:g} s. Does the board have a serial port?")
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:
-    """Raise `ParamsError` unless each of several boards has its own port."""
+    """Raise `ParamsError` if a port is named twice, or unless there are 1 to `BOARDS_MAX_N` ports."""
     if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
         rule = f"1 to {BOARDS_MAX_N}, each named once"
         raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Name each port once.")

@@ -14,7 +14,7 @@ from serial.tools import list_ports
 
 from reskin.errors import CaptureError
 
-READ_TIMEOUT_s = 0.1  # maximum delay until a stop request, silence or the end of the duration is noticed
+READ_TIMEOUT_s = 0.1  # also the maximum delay until a stop request, a silence or the end of the duration is noticed
 READ_BYTES_MAX_N = 65536
 SOCKET = "socket://"
 
@@ -24,7 +24,7 @@ Device = SerialBase  # an open port
 def open_port(port: str, baud: int) -> Device:
     """Open a serial port, exclusively for this process, or connect to `socket://host:port`.
 
-    Both boards and force gauges are opened by this function. Bytes that were waiting in the port are discarded. A
+    This function opens the ports of boards and of force gauges. Bytes that were waiting in the port are discarded. A
     socket becomes non-blocking; use `read_waiting` to read from serial ports and sockets.
     """
     check_name(port)
@@ -51,7 +51,7 @@ def check_name(port: str) -> None:
             reason = f"its port number is missing. Write {SOCKET}HOST:PORT."
     elif "://" in port:  # pyserial has more schemes, some of which load code
         reason = f"the only supported URL is {SOCKET}HOST:PORT."
-    elif os.path.isdir(port):  # never raises, as `Path.is_dir` may for COM3
+    elif os.path.isdir(port):  # unlike `Path.is_dir`, never raises for names such as COM3
         reason = f"it is a folder. {found_ports()}"
     elif os.path.isfile(port):
         reason = "it is a file. Read files with reskin decode or reskin predict."
@@ -61,7 +61,7 @@ def check_name(port: str) -> None:
 
 def read_waiting(device: Device, bytes_max_n: int = READ_BYTES_MAX_N) -> bytes:
     """Return the bytes that are waiting or arrive within `READ_TIMEOUT_s`; raise `OSError` if the board is gone."""
-    if isinstance(device, serial.Serial):  # sleep until a byte arrives, then read all that are waiting
+    if isinstance(device, serial.Serial):  # wait for one byte, then read all bytes that are waiting
         first = device.read(min(1, bytes_max_n))
         waiting_n = min(device.in_waiting, READ_BYTES_MAX_N, bytes_max_n) - 1 if first else 0
         return first + device.read(waiting_n) if waiting_n > 0 else first

@@ -1,4 +1,4 @@
-"""Read a port in its own thread; after a board was unplugged, reopen its port when it is back."""
+"""Read a port in a thread; after the board was unplugged, reopen the port once the board is plugged in again."""
 
 import threading
 import time
@@ -9,7 +9,7 @@ from reskin.board.find import BAUD, Chunk
 from reskin.board.port import Device, open_port, read_waiting
 from reskin.errors import CaptureError
 
-QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz; then the oldest chunks are dropped
+QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz; from a longer queue, the oldest chunks are dropped
 RETRY_S = 0.5
 PLUGGED_IN = b""  # a chunk that marks the beginning of a new stream
 
@@ -23,7 +23,10 @@ class ChunkWriter(Protocol):
 
 
 class Reader:
-    """Queue the chunks that arrive at a port, with their times; `missed_bytes_n` counts dropped bytes."""
+    """Read a port in a thread, and queue the chunks with their times of arrival.
+
+    `missed_bytes_n` counts the bytes that were dropped because the queue was full.
+    """
 
     def __init__(self, port: str, baud: int = BAUD) -> None:
         self.port, self.baud = port, baud
@@ -32,14 +35,18 @@ class Reader:
         self.taken_s = 0.0  # when `take` was last called, in unix seconds
         self.writer: ChunkWriter | None = None
         self.writer_problem = ""
-        self._clock_s = time.time() - time.monotonic()  # the system's clock may be adjusted during reading
+        # Unix time minus monotonic time, determined once, because the system's clock may be adjusted during reading.
+        self._clock_s = time.time() - time.monotonic()
         self._chunks: deque[Chunk] = deque()
         self._arrived = threading.Condition()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._read, name=f"reader of {port}", daemon=True)
 
     def start(self, *, must_exist: bool) -> None:
-        """Begin to read. With `must_exist`, open the port immediately, and raise `CaptureError` if this fails."""
+        """Begin to read in the thread.
+
+        With `must_exist`, the port is opened before the thread starts, and `CaptureError` is raised if this fails.
+        """
         self._device = open_port(self.port, self.baud) if must_exist else None
         self._thread.start()
 
@@ -49,6 +56,7 @@ class Reader:
         self.write_to(None)
 
     def unix_s(self) -> float:
+        """Return the current unix time, which never goes backwards."""
         return self._clock_s + time.monotonic()
 
     def take(self, wait_s: float) -> list[Chunk]:
@@ -62,7 +70,7 @@ class Reader:
         return chunks
 
     def write_to(self, writer: ChunkWriter | None) -> None:
-        """Write later chunks to `writer`, or to no recording; close the previous recording."""
+        """From now on, write chunks to `writer`, or to no recording if it is None; close the previous recording."""
         with self._arrived:
             previous, self.writer, self.writer_problem = self.writer, writer, ""
         if previous is not None:
@@ -75,7 +83,7 @@ class Reader:
                 device = device or self._plug_in()
                 self.plugged_in = self.was_plugged_in = True
                 if chunk := read_waiting(device):
-                    self._keep(chunk)
+                    self._queue_chunk(chunk)
             except (OSError, CaptureError) as error:
                 self.plugged_in, self.problem = False, str(error)
                 if device is not None:
@@ -87,12 +95,13 @@ class Reader:
 
     def _plug_in(self) -> Device:
         device = open_port(self.port, self.baud)
-        self._keep(PLUGGED_IN)
+        self._queue_chunk(PLUGGED_IN)
         return device
 
-    def _keep(self, chunk: bytes) -> None:
+    def _queue_chunk(self, chunk: bytes) -> None:
         with self._arrived:
-            now_s = self.unix_s()  # within the lock, so that a chunk is never older than a `take` that missed it
+            # The time is read within the lock, so that a chunk that `take` missed is never older than that call.
+            now_s = self.unix_s()
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)
             while self.waiting_bytes_n > QUEUE_BYTES_MAX_N:
@@ -104,6 +113,6 @@ class Reader:
             if writer is not None:
                 try:
                     writer.write(chunk, now_s)
-                except OSError as error:  # a full disk ends only the recording, not the reading
+                except OSError as error:  # for example a full disk: end the recording, but continue to read the port
                     self.writer, self.writer_problem = None, f"cannot be written any more: {error.strerror}"
                     writer.close()

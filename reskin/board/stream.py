@@ -1,7 +1,7 @@
 """Split a byte stream into frames, without I/O; every byte belongs to a frame or is counted as lost.
 
-No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). Frames are found
-from the bytes alone, so that it does not matter how the stream was divided into reads.
+No format marks the start of a frame, and CR LF may be part of a float (34.513275 degC contains it). The result depends
+only on the bytes, not on how the stream was divided into reads.
 """
 
 import re
@@ -18,12 +18,13 @@ from reskin.errors import CaptureError
 
 BLOCK_LINES_N = 8192
 CHIPS_MAX_N = 64  # the same limit as in the header of a capture
+# The counts that `FrameStream.account` returns.
 ACCOUNT = ("bytes_n", "frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n",
            "skipped_resync_bytes_n", "skipped_truncated_bytes_n")  # fmt: skip
 
 # An MLX90393 measures up to 50 mT (data sheet) in steps above 0.1 uT. These limits are used only if the positions of CR
-# LF allow more than one division into frames. A frame is not dropped because a value is outside the limits:
-# failed reads are outside too, see `faults`.
+# LF allow more than one division into frames. Values outside the limits do not drop a frame: the values of a failed
+# read are outside too, see `faults`.
 TEMPERATURE_MIN_degC, TEMPERATURE_MAX_degC = -50.0, 125.0
 B_MAX_uT = 6e4
 VALUE_MIN = 1e-3  # in uT or degC; smaller values, except 0, are below the chip's LSB
@@ -33,19 +34,19 @@ SEARCH_FRAMES_N = 64  # a search uses the bytes of this many frames at once
 
 @dataclass(frozen=True)
 class _Scan:
-    """Result of a scan: frames, counts (keys of `ACCOUNT`), settled bytes, and whether a frame follows these bytes."""
+    """Result of scanning a buffer for frames."""
 
     frames: Frames
-    count: Counter[str]
-    settled_n: int
-    at_boundary: bool
+    count: Counter[str]  # keys of `ACCOUNT`
+    settled_n: int  # number of first bytes that need not be scanned again
+    at_boundary: bool  # whether a frame begins after the settled bytes
 
 
 class FrameStream:
-    """Incremental decoder: return frames as soon as they are certain, and keep the bytes that are not settled yet.
+    """Incremental decoder: returns frames as soon as they are certain, and stores the bytes that are undecided.
 
-    `_find_runs` defines which bytes are a binary frame. A text frame is a line of exactly 4 k numbers with two
-    decimals. A stream is assumed to begin with a frame, so a first line that was cut inside its first number is
+    `_find_runs` defines which bytes are a binary frame. A text frame is a line of exactly 4 k numbers with two decimals
+    for k chips. A stream is assumed to begin with a frame, so a first line that was cut inside its first number is
     decoded as a frame with a wrong number.
     """
 
@@ -68,17 +69,21 @@ class FrameStream:
         return self._advance(b"", final=True)
 
     def account(self) -> dict[str, int]:
-        """Count bytes and frames; once closed, `frame_bytes_n` and all `skipped_*_bytes_n` add up to `bytes_n`."""
+        """Return the counts of bytes and frames so far.
+
+        Once the stream is closed, `frame_bytes_n` and all `skipped_*_bytes_n` add up to `bytes_n`.
+        """
         return {name: self._count[name] for name in ACCOUNT}
 
     def _advance(self, data: bytes, final: bool) -> Frames:
+        """Scan the undecided bytes and `data` for frames; if `final`, no more bytes follow."""
         buffer = self._rest + data if self._rest else data
         offset = self._count["bytes_n"] - len(self._rest)
         scan = self._scan(np.frombuffer(buffer, np.uint8), self._at_boundary, final, self._wire, self._chips_n)
         self._rest, self._at_boundary = (b"" if final else buffer[scan.settled_n :]), scan.at_boundary
         self._count.update(scan.count, bytes_n=len(data), frames_n=len(scan.frames))
-        found_n = scan.count["frame_bytes_n"] + scan.count["skipped_not_finite_bytes_n"]
-        self._count["skipped_resync_bytes_n"] += scan.settled_n - found_n
+        accounted_n = scan.count["frame_bytes_n"] + scan.count["skipped_not_finite_bytes_n"]
+        self._count["skipped_resync_bytes_n"] += scan.settled_n - accounted_n
         self._count["skipped_truncated_bytes_n"] += len(buffer) - scan.settled_n if final else 0
         return replace(scan.frames, end_byte=scan.frames.end_byte + offset)
 
@@ -93,7 +98,7 @@ def decode_all(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[Frame
 
 
 def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
-    """Return the error for a stream without frames, given its first bytes; it names the formats that would fit them."""
+    """Return the error for a stream without frames; it suggests formats that fit `data`, the stream's first bytes."""
     hint = " or ".join(f"{fit} with {k} chips" for fit, k in matching_formats(data))
     remedy = "Wrong baud rate, chip count or wire format?" + (f" It fits {hint}." if hint else "")
     if not data:
@@ -104,7 +109,10 @@ def no_frame(where: str, data: bytes, wire: Wire, chips_n: int) -> CaptureError:
 
 
 def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
-    """List the formats in which most of the first 16 KiB of `data` is frames, for the smallest number of chips."""
+    """List the formats (wire format, number of chips) that decode most of the first 16 KiB of `data` into frames.
+
+    If this is possible with several numbers of chips, only the formats with the smallest number are listed.
+    """
     data = data[:16384]
     for chips_n in range(1, min(CHIPS_MAX_N, len(data) // 16) + 1):  # every format has 16 bytes or more per chip
         streams = {wire: FrameStream(wire, chips_n) for wire in get_args(Wire)}
@@ -119,6 +127,7 @@ def matching_formats(data: bytes) -> list[tuple[Wire, int]]:
 def _scan_binary(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, wire: Wire, chips_n: int
 ) -> _Scan:
+    """Find and decode binary frames; drop and count those with values that are not finite."""
     record = wires.record_type(wire, chips_n)
     runs, settled_n, at_boundary = _find_runs(octets, at_boundary, final, record)
     frames, finite = wires.decode_runs(octets, runs, wire, chips_n)
@@ -136,12 +145,12 @@ def _scan_binary(
 def _find_runs(
     octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: bool, record: np.dtype[np.void]
 ) -> tuple[list[Run], int, bool]:
-    """Find the runs of frames; also return how many bytes are settled and whether a frame begins after them.
+    """Find the runs of consecutive frames; also return how many bytes are settled, and whether a frame follows them.
 
-    A frame is accepted directly if it begins where the previous one ended (or the stream began) and ends with CR LF,
-    unless CR LF is also in its payload *and* its values are implausible. In this case, and after an interruption, the
-    next frame is searched: it has CR LF before it and at its end. If several positions fit, the one with the most
-    plausible chips in two frames is chosen; of equally good ones, the first.
+    A frame is accepted directly if it begins where the previous frame ended (or the stream began) and ends with CR LF,
+    unless CR LF is also in its payload *and* its values are implausible. In this case, and after stray bytes, the next
+    frame is searched: it has CR LF before it and at its end. If several positions fit, the one with the most plausible
+    chips in this frame and the next is chosen; among equally plausible positions, the first.
     """
     runs: list[Run] = []
     position = 0
@@ -166,7 +175,7 @@ def _find_runs(
 
 
 def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
-    """Count the frames from the first byte on that can be accepted without looking at later bytes."""
+    """Count the successive frames, from the first byte on, that are accepted directly (see `_find_runs`)."""
     sure_n, frames_n = 0, len(octets) // record.itemsize
     while sure_n < frames_n:
         block_n = min(frames_n - sure_n, BLOCK_FRAMES_N)
@@ -179,6 +188,7 @@ def _sure_frames_n(octets: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void
 
 
 def _sure_in_block_n(block: UInt8[np.ndarray, " bytes"], record: np.dtype[np.void]) -> int:
+    """Return the result of `_sure_frames_n` for a block of whole frames."""
     rows = block.reshape(-1, record.itemsize)
     closed = (rows[:, -2] == CR) & (rows[:, -1] == LF)
     closed_n = len(rows) if closed.all() else int(closed.argmin())
@@ -197,8 +207,8 @@ def _search(
 ) -> tuple[int, bool]:
     """Return the number of bytes to skip, and whether a frame begins after them; if not, more bytes are needed.
 
-    The two bytes before the first undecided start are not skipped: when the window is searched again with more bytes,
-    they may be the end of a frame.
+    The two bytes before the first possible start of a frame are not skipped, because they may be the CR LF of a frame
+    when the window is searched again with more bytes.
     """
     length_n, window_n = record.itemsize, len(window)
     ended = np.zeros(window_n + 2 * length_n + 1, bool)  # a frame may have ended before this byte
@@ -217,13 +227,13 @@ def _search(
     )
     best_i = int((here_n + next_n).argmax())
     start = int(starts[best_i])
-    # What follows a CR LF in a frame's payload may look like a frame, but the frame after it is more plausible.
+    # The bytes after a CR LF in a payload may look like a frame; then the frame that follows them is more plausible.
     is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
     return start + length_n * int(is_tail), True
 
 
 def _terminators(octets: UInt8[np.ndarray, " bytes"]) -> Bool[np.ndarray, " pairs"]:
-    """Mark the bytes that begin a CR LF."""
+    """Mark each CR that is followed by LF."""
     return (octets[:-1] == CR) & (octets[1:] == LF)
 
 
@@ -246,7 +256,7 @@ def _scan_lines(octets: UInt8[np.ndarray, " bytes"], at_boundary: bool, final: b
     settled_n = int(line_end[-1]) if len(line_end) else 0
     parts: list[Frames] = []
     count: Counter[str] = Counter()
-    # The rest of a line that is too long may look like a frame, but is not one.
+    # Unless a frame begins at the first byte, skip the first line: the end of an overlong line may look like a frame.
     for first in range(0 if at_boundary else 1, len(line_end), BLOCK_LINES_N):
         base = int(line_end[first - 1]) if first else 0
         ends = line_end[first : first + BLOCK_LINES_N] - base

@@ -14,17 +14,21 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 CR, LF, TAB, MINUS, DOT, ZERO = b"\r\n\t-.0"
 Wire = Literal["binary", "binary-clock", "text-xyzt", "text-txyz"]
 TEXT_WIRES = ("text-xyzt", "text-txyz")
-NUMBERS_PER_CHIP_N = 4  # a temperature and a field
+NUMBERS_PER_CHIP_N = 4  # a temperature and three components of the field
 INTEGER_DIGITS_MAX_N = 10  # Arduino's print() writes "ovf" above 4294967040
 NUMBER_BYTES_MAX_N = len("-4294967040.00\t")
-BLOCK_FRAMES_N = 4096  # so that a block and the values computed from it fit into the processor's cache
+BLOCK_FRAMES_N = 4096  # a block of this length and the values computed from it fit into the processor's cache
 
 Run = tuple[int, int]  # first byte, number of consecutive frames
 
 
 @dataclass(frozen=True)
 class Frames:
-    """Decoded frames in order; `end_byte` counts the stream's bytes up to a frame's end; unknown `device_s` is NaN."""
+    """Decoded frames, in the order of the stream.
+
+    `end_byte` is the number of bytes from the start of the stream to the end of each frame. `device_s` is the time on
+    the board's clock, or NaN in formats without a clock.
+    """
 
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
@@ -35,7 +39,7 @@ class Frames:
         return len(self.end_byte)
 
     def where(self, rows: Bool[np.ndarray, " f"]) -> "Frames":
-        """Keep the frames that `rows` marks."""
+        """Return the frames that `rows` marks."""
         return Frames(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
@@ -49,7 +53,10 @@ def concatenate(parts: Sequence[Frames], chips_n: int) -> Frames:
 
 
 def record_type(wire: Wire, chips_n: int) -> np.dtype[np.void]:
-    """Describe a binary frame: T, X, Y, Z of each chip as float32 LE, CR LF; 16 k + 2 bytes, 4 more with a clock."""
+    """Return the data type of a binary frame: T, X, Y, Z of each chip as little-endian float32, then CR LF.
+
+    A frame of k chips has 16 k + 2 bytes, and 4 more with the board's clock.
+    """
     clock = [("device_s", "<f4")] if wire == "binary-clock" else []
     return np.dtype([*clock, ("txyz", "<f4", (chips_n, NUMBERS_PER_CHIP_N)), ("end", "S2")])
 
@@ -100,7 +107,7 @@ def decode_runs(
     for first_byte, frames_n in _blocks(runs, record.itemsize):
         rows, stop_byte = slice(row_i, row_i + frames_n), first_byte + frames_n * record.itemsize
         records = octets[first_byte:stop_byte].view(record)
-        # Copied once, because reading unaligned floats is slow; with mode "clip", `take` writes without a buffer.
+        # Copy once, because reading unaligned floats is slow. In mode "clip", `take` writes to `out` without a buffer.
         values = np.ascontiguousarray(records["txyz"]).reshape(frames_n, -1)
         values.take(b_i, axis=1, out=frames.b_uT[rows], mode="clip")
         values.take(temperature_i, axis=1, out=frames.temperature_degC[rows], mode="clip")
@@ -142,7 +149,8 @@ def _numbers(
     line_end: Int64[np.ndarray, " f"],
 ) -> tuple[Float64[np.ndarray, "f c"], Bool[np.ndarray, " f"]]:
     """Read the number around each decimal point; the mask marks lines that consist of numbers and tabs only."""
-    # Unsigned bytes wrap around, so that other characters are above 9. A point may end the line, so append two zeros.
+    # Unsigned bytes wrap around, so other characters than digits are above 9. Two zeros are appended, because a point
+    # may be the last byte.
     digit = np.append(octets, np.zeros(2, np.uint8)) - np.uint8(ZERO)
     stop = dot + 3
     previous_stop = np.column_stack([line_start, stop[:, :-1]])  # where the previous number ends
@@ -168,7 +176,7 @@ def _numbers(
 def _ends_well(
     octets: UInt8[np.ndarray, " bytes"], stop: Int64[np.ndarray, " f"], line_end: Int64[np.ndarray, " f"]
 ) -> Bool[np.ndarray, " f"]:
-    """Return whether a line ends with its last number, an optional tab, an optional CR, and LF."""
+    """Mark the lines that end with the last number, an optional tab, an optional CR, and LF."""
     returns = (octets[line_end - 2] == CR) & (stop <= line_end - 2)
     rest_n = line_end - 1 - returns - stop
     tab = octets[np.minimum(stop, line_end - 1)] == TAB
@@ -176,11 +184,13 @@ def _ends_well(
 
 
 def _allocate(frames_n: int, chips_n: int) -> Frames:
+    """Allocate frames with uninitialised values and an unknown (NaN) `device_s`."""
     b_uT, temperature_degC = (np.empty((frames_n, n), np.float32) for n in (3 * chips_n, chips_n))
     return Frames(b_uT, temperature_degC, np.full(frames_n, np.nan), np.empty(frames_n, np.int64))
 
 
 def _blocks(runs: Sequence[Run], frame_bytes_n: int) -> Iterator[Run]:
+    """Divide runs into runs of at most `BLOCK_FRAMES_N` frames."""
     for first_byte, frames_n in runs:
         for done_n in range(0, frames_n, BLOCK_FRAMES_N):
             yield first_byte + done_n * frame_bytes_n, min(BLOCK_FRAMES_N, frames_n - done_n)

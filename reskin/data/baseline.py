@@ -7,10 +7,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int64, Shaped
 
-# These three values were tuned on all passes of one recording (scene `eflesh`), so that recording cannot test them.
-STATES_N = 10  # a reading is compared with this many latest states: five contacts and the free states between them
-SIMILAR_MIN_N = 4  # a state is free of contact if it is similar to this many of the states, including itself
-# Readings are similar if their distance is below this multiple of the median distance of successive no-load readings.
+# These three values were tuned on all passes of the recording of scene `eflesh`, so this recording cannot test them.
+# `follow_free` compares a reading with this many latest states: usually five contacts and five contact-free states.
+STATES_N = 10
+SIMILAR_MIN_N = 4  # a state is free of contact if it is similar to this many of the latest states, including itself
+# Two readings are similar if their distance is below this multiple of the median distance between the no-load readings
+# of successive indentations.
 SIMILAR_FACTOR = 2.0
 
 
@@ -20,7 +22,10 @@ def subtract(b_uT: Float32[np.ndarray, "f ch"], noload_uT: Float32[np.ndarray, "
 
 
 def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
-    """Number the runs of equal labels from 0, such as the indentations or passes of a capture in order of time."""
+    """Return for each row the number of its run of equal labels, counted from 0.
+
+    `label` is, for example, the indentation or pass of each row of a capture, in order of time.
+    """
     return np.cumsum(np.concatenate([[0], label[1:] != label[:-1]])).astype(np.int64)[: len(label)]
 
 
@@ -32,14 +37,14 @@ def initial(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray,
 def regular(
     noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"], *, regular_n: int
 ) -> Float32[np.ndarray, "f ch"]:
-    """Use a new no-load reading every `regular_n` indentations ("at regular intervals")."""
+    """Use a new no-load reading only every `regular_n` indentations (paper section 4: "at regular intervals")."""
     rank_i = rank(indentation)
     _, first_i = np.unique(rank_i, return_index=True)  # the first row of each indentation
     return noload_uT[first_i[rank_i - rank_i % regular_n]]
 
 
 def each(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> Float32[np.ndarray, "f ch"]:
-    """Use the no-load reading that was taken before each contact."""
+    """Use for each row the no-load reading that was taken before the row's contact."""
     return noload_uT
 
 
@@ -50,27 +55,29 @@ def free(
     *,
     within_uT: float,
 ) -> Float32[np.ndarray, "f ch"]:
-    """Use the latest reading that `follow_free` classifies as free of contact; at first, the first no-load reading.
+    """Use for each row the latest earlier reading that `follow_free` classifies as free of contact.
 
-    The readings are processed in the order in which a board sends them: for each indentation, its no-load reading, then
-    its rows.
+    The first baseline is the first no-load reading. The readings are processed in the order in which a board sends
+    them: for each indentation, first the no-load reading, then the rows in contact. Two readings are similar if their
+    distance is below `within_uT`.
     """
     rank_i = rank(indentation)
-    begins = np.concatenate([[True], rank_i[1:] != rank_i[:-1]])
-    order = [
-        part for row_i in range(len(b_uT)) for part in ([noload_uT[row_i]] if begins[row_i] else []) + [b_uT[row_i]]
-    ]
-    baselines_uT = list(follow_free(order, within_uT))
-    order_i = np.arange(len(b_uT)) + np.cumsum(begins)  # index of each row in `order`
-    return np.stack([baselines_uT[i - 1] for i in order_i])
+    is_first_row = np.concatenate([[True], rank_i[1:] != rank_i[:-1]])  # of an indentation
+    readings_uT: list[np.ndarray] = []
+    for row_i in range(len(b_uT)):
+        readings_uT += [noload_uT[row_i], b_uT[row_i]] if is_first_row[row_i] else [b_uT[row_i]]
+    baselines_uT = list(follow_free(readings_uT, within_uT))
+    reading_i = np.arange(len(b_uT)) + np.cumsum(is_first_row)  # index of each row in `readings_uT`
+    return np.stack([baselines_uT[i - 1] for i in reading_i])
 
 
 def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Float[np.ndarray, " ch"]]:
-    """Yield the baseline after each reading, using only the readings; the first one must be free of contact.
+    """Yield the current baseline after each reading, inferred from the readings alone.
 
-    Consecutive similar readings, such as those of a held press, form one state, however long it lasts. A state is
-    classified as free of contact if it is similar to enough of the latest states, because presses differ from each
-    other. During a long contact, such as that of a sliding finger, the baseline does not change.
+    The first reading must be free of contact. Consecutive similar readings, such as those of a press that is held, form
+    one state of any duration. Different presses give different readings, but readings without contact are similar.
+    Therefore, a state is classified as free of contact if it is similar to at least `SIMILAR_MIN_N` of the latest
+    states. During a long contact, such as that of a sliding finger, the baseline does not change.
     """
     states: deque[np.ndarray] = deque(maxlen=STATES_N)
     baseline_uT: np.ndarray | None = None
@@ -86,7 +93,7 @@ def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Fl
 
 
 def alike_within_uT(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.ndarray, " f"]) -> float:
-    """Return the distance below which readings are similar.
+    """Return the distance in uT below which two readings are similar; the threshold of `follow_free`.
 
     This is `SIMILAR_FACTOR` times the median distance between the no-load readings of successive indentations.
     """
@@ -96,4 +103,5 @@ def alike_within_uT(noload_uT: Float32[np.ndarray, "f ch"], indentation: Int[np.
 
 
 def _distance_uT(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the root mean square, over the channels, of the difference of two readings."""
     return float(np.sqrt(np.mean((a - b) ** 2)))

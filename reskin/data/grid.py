@@ -1,6 +1,6 @@
-"""The paper's poking protocol: a grid of 65 points, poked at one depth after the other, in several passes.
+"""The paper's poking protocol: in each pass, all 65 points of a grid are poked at one depth after another.
 
-Places are in the coordinate frame of the labels: 0 to 16 mm, with the centre of the skin at (8, 8) mm.
+Places are in the coordinates of the labels: x and y from 0 to 16 mm, with the centre of the skin at (8, 8) mm.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int32
 # "a 9x9 grid (excluding 4 points per corner; a total of 65 indentations)"; the paper's "16cm" is a typo for 16 mm.
 SIDE_POINTS_N = 9
 PITCH_MM = 2.0
-BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns that cross no excluded corner
+BETWEEN_CORNERS = range(2, SIDE_POINTS_N - 2)  # indices of the rows and columns that have no excluded points
 CENTRE_MM = (SIDE_POINTS_N - 1) * PITCH_MM / 2
 SKIN_MM = (20.0, 20.0)  # sides of the paper's skin, from the authors' CAD
 
@@ -32,16 +32,19 @@ class Protocol:
 
 
 def points_mm() -> Float64[np.ndarray, "65 2"]:
-    """Return (x, y) of the grid points in snake order: row by row, every second row with decreasing x."""
+    """Return x and y of the grid points in mm, row by row; x increases in row 0, decreases in row 1, and so on."""
     points = []
     for row_i in range(SIDE_POINTS_N):
-        row = range(SIDE_POINTS_N)[:: -1 if row_i % 2 else 1]
-        points += [(column_i, row_i) for column_i in row if column_i in BETWEEN_CORNERS or row_i in BETWEEN_CORNERS]
+        columns = range(SIDE_POINTS_N) if row_i in BETWEEN_CORNERS else BETWEEN_CORNERS
+        points += [(column_i, row_i) for column_i in columns[:: -1 if row_i % 2 else 1]]
     return np.array(points) * PITCH_MM
 
 
 def protocol(depths_mm: Sequence[float], passes_n: int) -> Protocol:
-    """Return the pokes of the paper's protocol: in each pass, every point at the first depth, then at the next, ..."""
+    """Return all pokes of the paper's protocol in order of time.
+
+    In each pass, all points are poked at the first depth, then all points at the second depth, and so on.
+    """
     xy_mm = points_mm()
     points_n, depths_n = len(xy_mm), len(depths_mm)
     pokes_n = points_n * depths_n

@@ -1,8 +1,8 @@
-"""Pokes along lines, whose order along the lines is their only label.
+"""Pokes along straight lines; the only label of a poke is its rank along the line.
 
 This is the paper's method (section 5): "indent in a straight line and incrementally index these points". Here, the
-index is derived from the places of a robot's grid. The places themselves are discarded: `Lines` contains only row
-numbers, lines and indices.
+index is derived from the places of a robot's grid. The places are then discarded: `Lines` contains only row numbers,
+line numbers and indices.
 """
 
 from collections.abc import Sequence
@@ -17,20 +17,20 @@ from reskin.data.rows import TARGETS, Rows, stack
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-PLACE_STEP_MM = 0.1  # assumed: coordinates are rounded to this step, and equal ones count as the same place
-PLACES_MIN_N = 2  # a line with one place has no order
+PLACE_STEP_MM = 0.1  # assumed: places whose coordinates are equal after rounding to this step are the same place
+PLACES_MIN_N = 2  # a line with a single place has no order
 X, Y = TARGETS.index("x_mm"), TARGETS.index("y_mm")
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Pokes by line and index, without place and force; sorted by line, then index, then row number.
+    """Rows assigned to lines, without place and force; sorted by line, then index along the line, then row number.
 
-    A row number may occur in two lines, because a place of a grid is on a line along x and on one along y.
+    A row number may occur in two lines, because a grid point is on a line along x and on a line along y.
     """
 
-    row: Int64[np.ndarray, " p"]  # row numbers
-    line_i: Int32[np.ndarray, " p"]  # counted from 0 over all skins
+    row: Int64[np.ndarray, " p"]  # row number in `Rows` or in a capture
+    line_i: Int32[np.ndarray, " p"]  # number of the line, counted from 0 over all skins
     order_i: Int32[np.ndarray, " p"]  # index along the line; equal for all readings at one place
 
     def __len__(self) -> int:
@@ -38,11 +38,11 @@ class Lines:
 
 
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
-    """Index the chosen pokes along the grid lines of each skin, in both directions.
+    """Assign the chosen row numbers to the grid lines of each skin, along x and along y, with an index along the line.
 
-    Of the labels, only the skin and the commanded place are used. The index is the rank of a coordinate among all
-    distinct coordinates of the skin's chosen pokes, so a place that is missing on one line leaves a gap. Lines with a
-    single place have no order and are left out.
+    Of the labels, only the skin and the commanded place are used. The index along a line in x is the rank of the row's
+    x among all distinct x of the skin's chosen rows (for lines in y, likewise). A line without a row at one of these
+    coordinates therefore has a gap in its indices. Lines with a single place have no order and are left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
@@ -57,10 +57,11 @@ def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
 
 
 def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, " f"]) -> Lines:
-    """Index the readings of a capture of manual pokes: each pass is a line, and the index counts its indentations.
+    """Assign the readings of a capture of manual pokes to lines: one line per pass.
 
-    `row` is the number of the reading in the capture. A lost indentation leaves a gap. Lines with a single indentation
-    have no order and are left out.
+    The index along the line is the number of the indentation within the pass, from 0; an indentation that is missing
+    leaves a gap. `Lines.row` is the number of the reading in the capture. Lines with a single indentation have no order
+    and are left out.
     """
     order_i = indentation.astype(np.int64)
     for line in np.unique(pass_i):
@@ -69,16 +70,17 @@ def hand_lines(pass_i: Int32[np.ndarray, " f"], indentation: Int32[np.ndarray, "
 
 
 def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
-    """Return stacked rows of manual pokes, whose places and forces are unknown, and the lines of each skin.
+    """Stack the readings of captures of manual pokes, and assign them to lines.
 
-    The row numbers in the lines refer to the returned rows.
+    Returns the rows, whose places and forces are unknown (NaN), and the lines of each skin, by the skin's name. The row
+    numbers in the lines refer to the returned rows.
     """
     parts: list[Rows] = []
     lines: dict[str, Lines] = {}
     for readings in captures:
         if readings.skin in lines:
             what = f"skin {readings.skin} has manual pokes in another capture too"
-            raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two.")
+            raise ParamsError(f"capture {readings.capture}: {what}. Remove one of the two captures.")
         lines[readings.skin] = shift_rows(hand_lines(readings.pass_i, readings.indentation), sum(map(len, parts)))
         f = len(readings)
         parts.append(
@@ -97,18 +99,19 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
 
 
 def shift_rows(lines: Lines, rows_n: int) -> Lines:
-    """Return the lines with row numbers increased by `rows_n`, for rows that were stacked below `rows_n` others."""
+    """Increase the row numbers of lines by `rows_n`, because their rows are stacked below `rows_n` other rows."""
     return replace(lines, row=lines.row + rows_n)
 
 
 def take_pokes(
     rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " d"]:
-    """Choose indentations from one skin's pool, evenly over the places; return all their rows, sorted.
+    """Draw `indentations_n` indentations of one skin, evenly over the places; return their row numbers, sorted.
 
-    Only the place of each indentation (that of its first row) is used. In the first round, one indentation is drawn for
-    each place; in the second round, another one, and so on. The last round covers only some places, chosen at random.
-    For the same state of `rng`, a smaller choice is a subset of a larger one.
+    `pool` are the row numbers to draw from. Of the labels, only the place of an indentation's first row is used. In the
+    first round, one indentation is drawn for each place; in the second round, another one, and so on. The last round
+    may cover only some places, chosen at random. If a call with the same state of `rng` draws fewer indentations, these
+    are a subset.
     """
     _check_pool(rows, pool, indentations_n)
     indentations, first = np.unique(rows.indentation[pool], return_index=True)
@@ -120,7 +123,7 @@ def take_pokes(
 
 
 def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
-    """Count the visits of each place from 0, in the given order.
+    """Return for each element the number of earlier elements with the same place.
 
     >>> _visit_numbers(np.array([1, 0, 1, 1, 0]))
     array([0, 0, 1, 2, 1])
@@ -133,14 +136,15 @@ def _visit_numbers(place_i: Int64[np.ndarray, " c"]) -> Int64[np.ndarray, " c"]:
 
 
 def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:
+    """Return x and y in multiples of `PLACE_STEP_MM`, rounded."""
     return np.round(target[:, [X, Y]].astype(np.float64) / PLACE_STEP_MM).astype(np.int64)
 
 
 def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], order_i: Int64[np.ndarray, " p"]) -> Lines:
-    """Drop lines with a single place, number the other lines from 0, and sort."""
+    """Make `Lines` from the key of each row's line: drop lines with a single place, number the others, and sort."""
     line_i = np.unique(line, axis=0, return_inverse=True)[1].ravel()
     places = np.unique(np.stack([line_i, order_i], axis=1), axis=0)
-    has_order = np.bincount(places[:, 0]) >= PLACES_MIN_N  # by line
+    has_order = np.bincount(places[:, 0]) >= PLACES_MIN_N  # one element per line
     keep = has_order[line_i]
     row, line_i, order_i = row[keep], (np.cumsum(has_order) - 1)[line_i[keep]], order_i[keep]
     in_order = np.lexsort((row, order_i, line_i))
@@ -148,6 +152,7 @@ def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], orde
 
 
 def _check_pool(rows: Rows, pool: Int64[np.ndarray, " c"], indentations_n: int) -> None:
+    """Raise if the pool has rows of several skins, or fewer than `indentations_n` indentations."""
     skins, pool_n = np.unique(rows.skin[pool]), len(np.unique(rows.indentation[pool]))
     if len(skins) > 1:
         raise ParamsError(

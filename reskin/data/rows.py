@@ -15,24 +15,25 @@ from reskin.errors import ParamsError
 from reskin.schema import Readings
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
-UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` does not renumber these
-SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # targets for dragged lines (paper section 4)
+UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # concatenated by `stack` as they are
+SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # if the indenter is dragged along lines (paper section 4)
 
 
 class Selection(Strict):
-    """Which readings are in contact: those with a known place whose force is unknown or at least `force_min_N`."""
+    """Definition of contact: the place of the reading is known, and the force is unknown or at least `force_min_N`."""
 
     force_min_N: float
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Stacked rows of a scene, with the captures in order of name.
+    """The readings in contact from all captures of a scene, one reading per row; captures are in order of name.
 
     `db_uT` is the field change relative to the no-load reading of the same indentation. `target` has columns x_mm, y_mm
-    and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` numbers the
-    passes consecutively over the captures of a skin, and `indentation` the indentations over the captures of the scene;
-    all readings of an indentation have the same number. `dropped` counts the readings that were left out, by reason.
+    and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` is the
+    number of the pass, counted over all captures of a skin. `indentation` is the number of the indentation, counted
+    over all captures of the scene; all readings of an indentation have the same number. `dropped` counts the readings
+    that are not in contact, by reason.
     """
 
     capture: np.ndarray
@@ -51,20 +52,23 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Create rows without readings, one per indentation, for examples of folds; the default of `pass_i` is 0."""
+        """Create rows whose readings and targets are 0, one row per indentation, for examples of folds.
+
+        Without `pass_i`, all rows are in pass 0.
+        """
         f = len(boards)
-        empty, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
+        zeros, passes = np.zeros((f, 3), np.float32), np.array(pass_i if pass_i is not None else [0] * f, np.int32)
         labels = np.array(["c"] * f), np.array(boards), np.array(skins)
-        return cls(*labels, empty, empty, passes, np.arange(f), {})
+        return cls(*labels, zeros, zeros, passes, np.arange(f), {})
 
 
 def load_rows(files: Sequence[Path], selection: Selection) -> Rows:
-    """Read the captures of a scene and stack their rows."""
+    """Read the captures of a scene from files, and stack their readings in contact."""
     return gather([io.read_readings(file) for file in files], selection)
 
 
 def gather(captures: Sequence[Readings], selection: Selection, *, targets: Sequence[str] = TARGETS) -> Rows:
-    """Stack the readings in contact of a scene's captures, and count the dropped ones.
+    """Stack the readings in contact from a scene's captures; count the other readings in `Rows.dropped`.
 
     `targets` are the columns of `Readings` that become `Rows.target`.
     """
@@ -101,9 +105,10 @@ def gather(captures: Sequence[Readings], selection: Selection, *, targets: Seque
 
 
 def stack(above: Rows, below: Rows) -> Rows:
-    """Stack two sets of rows.
+    """Return the rows `above`, followed by the rows `below`.
 
-    Row numbers of `above` do not change. The indentations of `below` are renumbered to follow those of `above`.
+    The row numbers of `above` do not change. The indentations of `below` are renumbered to follow those of `above`.
+    `dropped` is that of `above`.
     """
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
         above_n, below_n = above.db_uT.shape[1], below.db_uT.shape[1]
@@ -124,7 +129,7 @@ def contacts(readings: Readings, selection: Selection) -> np.ndarray:
 
 
 def _number_consecutively(indentations: list[np.ndarray]) -> Int64[np.ndarray, " f"]:
-    """Renumber the indentations of each capture to follow those of the previous capture."""
+    """Number the indentations of all captures from 0; the numbers of a capture follow those of the previous capture."""
     before_n, renumbered = 0, []
     for numbers in indentations:
         distinct, index = np.unique(numbers, return_inverse=True)
@@ -134,6 +139,7 @@ def _number_consecutively(indentations: list[np.ndarray]) -> Int64[np.ndarray, "
 
 
 def _check_one_kind(captures: Sequence[Readings]) -> None:
+    """Raise if the captures differ in number of chips or in source, or if a skin is on two boards."""
     first = captures[0]
     boards: dict[str, str] = {}
     for readings in captures:

@@ -1,7 +1,7 @@
-"""Folds, which hold out boards, skins, readings, indentations or passes, and the file `folds.json`.
+"""Draw folds, which hold out boards, skins, readings, indentations or passes; convert them to and from `folds.json`.
 
-scikit-learn draws the random splits. For folds that hold out skins, this module checks that no skin or board is both
-trained on and held out.
+scikit-learn draws the random splits. In folds that hold out skins, no skin and no board may be both trained on and held
+out; this module checks that.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,7 +19,7 @@ from reskin.data.rows import Rows
 from reskin.errors import ParamsError, SchemaError
 from reskin.seeds import rng_for, seed_for
 
-# The unit that each experiment on a single skin holds out at random.
+# What each experiment on a single skin holds out at random.
 WITHIN_SKIN = {"single_random": "readings", "single_indentation": "indentations", "single_pass": "passes"}
 SAME_SKIN = {"single_temporal", *WITHIN_SKIN}  # experiments that test on the skin that was trained on
 ONE_SKIN = {"transfer", *SAME_SKIN}  # experiments whose networks are trained on one skin
@@ -32,7 +32,10 @@ Sides = tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]  # train and tes
 
 
 class Split(Strict):
-    """How folds are drawn; each setting is required if the scene runs its experiment, and must be None otherwise."""
+    """Settings for drawing folds.
+
+    A setting is required if the scene runs the experiment that uses it, and must be None otherwise.
+    """
 
     random_test_fraction: Fraction | None = None
     random_repeats_n: Count | None = None
@@ -40,7 +43,7 @@ class Split(Strict):
     transfer_skins_n: Count | None = None
     sensors_skins_n: Annotated[tuple[Count, ...], Field(min_length=1)] | None = None
     sensors_draws_n: Count | None = None
-    pool_passes_n: Count | None = None  # the first passes of each held-out skin are its pool
+    pool_passes_n: Count | None = None  # number of first passes of each held-out skin that adaptation may use
     labels_pool_n: Count | None = None  # number of indentations of each held-out skin that may be labelled
     labels_draws_n: Count | None = None
 
@@ -54,9 +57,10 @@ class Split(Strict):
 
 @dataclass(frozen=True)
 class Fold:
-    """Row numbers (in `Rows`) of the training rows, the test rows, and the pool (pokes on the held-out skins).
+    """Row numbers (in `Rows`) of the training rows, the test rows, and the pool.
 
-    Adaptation may use the pool. No method is scored on the pool, so that all methods are scored on the same rows.
+    The pool contains the pokes on the held-out skins that adaptation may use. No method is tested on the pool, so that
+    all methods are tested on the same rows.
     """
 
     experiment: str
@@ -72,7 +76,7 @@ class Fold:
 
     @property
     def draw_i(self) -> int:
-        """Which random draw of the pool this is; only for folds of experiment `labels`."""
+        """Number of the random draw of the pool, from 0; only for folds of experiment `labels`."""
         return int(self.name.rpartition(DRAW)[2])
 
 
@@ -96,7 +100,8 @@ def draw_folds(rows: Rows, experiments: Iterable[str], split: Split, seed: int) 
     b1 [3 4] [0] [1 2]
     b2 [0 1 2] [3] [4]
 
-    With fewer sensors, every board is held out in turn. Within a draw, a larger training set contains the smaller ones:
+    Experiment `sensors` holds out every board in turn, and trains on 1, 2, ... skins of the other boards. Within a
+    draw, a larger training set contains the smaller ones:
 
     >>> rows = Rows.of_labels(["b1", "b1", "b2", "b3"], ["s1", "s2", "s3", "s4"])
     >>> show(draw_folds(rows, ["sensors"], Split(sensors_skins_n=(1, 2), sensors_draws_n=1), 0))
@@ -124,11 +129,12 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on k skins, test on a board with none of them; one fold per board, k and draw (paper figure 6b).
+    """Train on k skins of the other boards, test on the held-out board; one fold per board, k and draw (figure 6b).
 
-    Every board is held out in turn and has its own draws. Within a draw, the skins of a smaller k are a subset of those
-    of a larger one. If k is the number of all skins of the other boards, there is a single fold, which equals that of
-    `lobo` and has the same name, so that its training runs are reused.
+    Every board is held out in turn and has separate random draws. Within a draw, the training skins for a smaller k are
+    a subset of those for a larger k. If k is the number of all skins of the other boards, there is a single fold for
+    the board. It equals the fold of experiment `lobo` and has the same name, so that training runs of `lobo` are
+    reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None
@@ -150,42 +156,44 @@ def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def few_labels(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Hold out a board as in `lobo`, with a random pool of its indentations to label; one fold per board and draw.
+    """Hold out a board as in experiment `lobo`, and draw a pool of its indentations; one fold per board and draw.
 
-    The whole pool is excluded from the test, even if only some of it is labelled, so that the test rows are the same
-    for all numbers of labels.
+    The pool contains the indentations that may be labelled. All of them are excluded from the test rows, even if only
+    some are labelled, so that the test rows are the same for all numbers of labels.
     """
     assert split.labels_pool_n is not None
     assert split.labels_draws_n is not None
-    plain = split.model_copy(update={"pool_passes_n": None})
+    without_pool = split.model_copy(update={"pool_passes_n": None})
     folds = []
-    for whole in leave_one_board_out(rows, plain, seed):
-        skins = np.unique(rows.skin[whole.test])
+    for board_fold in leave_one_board_out(rows, without_pool, seed):
+        skins = np.unique(rows.skin[board_fold.test])
         for draw_i in range(split.labels_draws_n):
             pools = []
             for skin in skins:
-                on_skin, rng = whole.test[rows.skin[whole.test] == skin], rng_for(seed, "labels", str(skin), draw_i)
+                on_skin = board_fold.test[rows.skin[board_fold.test] == skin]
+                rng = rng_for(seed, "labels", str(skin), draw_i)
                 pools.append(take_pokes(rows, on_skin, split.labels_pool_n, rng))
             pool = np.sort(np.concatenate(pools))
-            test = np.setdiff1d(whole.test, pool)
+            test = np.setdiff1d(board_fold.test, pool)
             if not len(test):
                 what, rule = "split.labels_pool_n", "less than the number of indentations per skin"
                 remedy = "Reduce it, or record more."
-                raise ParamsError(f"fold labels/{whole.name}", what, rule, split.labels_pool_n, remedy)
-            folds.append(Fold("labels", f"{whole.name}{DRAW}{draw_i}", whole.train, test, pool))
+                raise ParamsError(f"fold labels/{board_fold.name}", what, rule, split.labels_pool_n, remedy)
+            folds.append(Fold("labels", f"{board_fold.name}{DRAW}{draw_i}", board_fold.train, test, pool))
     return folds
 
 
 def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"]:
-    """Draw the order in which indentations of a fold's pool are labelled; with n labels, the first n are labelled."""
+    """Draw the order in which the indentations of a fold's pool are labelled; with n labels, the first n are used."""
     return rng_for(seed, "labelled", fold.name).permutation(np.unique(rows.indentation[fold.pool]))
 
 
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on one skin, test on the skins of boards without training skins; one fold per training skin.
+    """Train on one skin, test on all skins of other boards; one fold per training skin.
 
-    If other experiments adapt to a pool, these folds do not test on the pool either, so that all experiments are scored
-    on the same rows.
+    Boards with a training skin of any fold are not tested on, so that the test rows are the same for all folds. With
+    `split.pool_passes_n`, the passes of the pool are excluded from the test rows here too, so that all experiments are
+    tested on the same rows.
 
     The paper trains on 3 skins, one at a time, and tests on 9 others. Here, with 6 boards of 3 skins each, the training
     skins are the first skins of the first three boards, and the test skins are all skins of the other three.
@@ -206,9 +214,9 @@ def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarray, np.ndarray], split: Split) -> Fold:
-    """Make a fold from training rows and held-out rows.
+    """Make a fold from `sides`: the numbers of the training rows and of the held-out rows.
 
-    The first `split.pool_passes_n` passes of each held-out skin are the pool, and its other passes are tested on.
+    The first `split.pool_passes_n` passes of each held-out skin are the pool, and the later passes are the test rows.
     """
     train, held = sides
     pooled = np.zeros(len(held), bool)
@@ -229,8 +237,8 @@ def hold_out_skins(rows: Rows, experiment: str, name: str, sides: tuple[np.ndarr
 def within_first_skin(rows: Rows, split: Split, seed: int, *, experiment: str) -> list[Fold]:
     """Hold out random readings, indentations or passes of the first skin, at least one; one fold per repetition.
 
-    The paper holds out readings (section 4). Readings of the same indentation are then in both training and test, so
-    the accuracy is overestimated.
+    The paper holds out readings (section 4). Readings of the same indentation are then in both the training and the
+    test rows, so the accuracy is overestimated.
     """
     assert split.random_test_fraction is not None
     assert split.random_repeats_n is not None
@@ -266,10 +274,10 @@ def last_passes(rows: Rows, split: Split, seed: int) -> list[Fold]:
 def draw_sides(
     group: Shaped[np.ndarray, " f"], *, test_fraction: float, repeats_n: int, state: int, what: str, where: str
 ) -> list[Sides]:
-    """Split rows at random into training and test, `repeats_n` times.
+    """Split rows at random into training and test rows, `repeats_n` times.
 
-    Rows with the same `group` stay together, and at least one group is tested on. Error messages name the groups by
-    `what` and their setting by `where`.
+    Rows with the same `group` are never separated, and at least one group is in the test rows. In error messages,
+    `what` describes the groups and `where` the experiment; `state` is the random seed.
     """
     from sklearn.model_selection import GroupShuffleSplit  # imported late: takes a second, and few stages need it
 
@@ -280,7 +288,7 @@ def draw_sides(
 
 
 def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
-    """Return the rounded number of held-out groups; raise `ParamsError` unless training and test have at least one."""
+    """Return how many of `all_n` groups to test on; raise `ParamsError` unless training and test have one or more."""
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         remedy = "Record more, change the fraction, or remove the experiment from the scene."
@@ -291,6 +299,7 @@ def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
 
 
 def _check_disjoint(rows: Rows, fold: Fold) -> None:
+    """Raise if a board or a skin of the training rows is also in the test rows or in the pool."""
     held = np.concatenate([fold.test, fold.pool])
     for what, labels in (("board", rows.board), ("skin", rows.skin)):
         both = np.intersect1d(np.unique(labels[fold.train]), np.unique(labels[held]))
@@ -316,7 +325,7 @@ SIDES = ("train", "test", "pool")
 
 
 def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> dict[str, Any]:
-    """Convert folds to JSON values: half-open ranges of row numbers, and the boards and skins of each side."""
+    """Convert folds to JSON values; row numbers become half-open ranges, and boards and skins are listed too."""
     content: list[dict[str, Any]] = []
     for fold in folds:
         sides = {side: getattr(fold, side) for side in SIDES}
@@ -330,10 +339,11 @@ def render_folds(captures: Sequence[str], rows: Rows, folds: Sequence[Fold]) -> 
 
 
 def parse_folds(content: dict[str, Any], rows: Rows, where: str) -> list[Fold]:
-    """Convert JSON values to folds; raise `SchemaError` if the folds were drawn from other rows."""
+    """Convert the JSON values of `folds.json` to folds; raise `SchemaError` if they were drawn from other rows."""
     if content["rows_n"] != len(rows):
         raise SchemaError(
-            f"{where}: drawn from {content['rows_n']} rows, but its captures have {len(rows)}. Run stage split again."
+            f"{where}: the folds were drawn from {content['rows_n']} rows, but the captures have {len(rows)} rows. Run "
+            "stage split again."
         )
     return [
         Fold(fold["experiment"], fold["name"], *(from_ranges(fold[side]) for side in SIDES))

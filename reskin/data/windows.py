@@ -1,6 +1,7 @@
-"""Windows of captures in order of time, for several baseline policies (experiment `drift`, paper section 4).
+"""Cut captures into windows of time, with several baseline policies (experiment `drift`, paper section 4).
 
-A window is a range of units (indentations or passes). A part is one window of one skin with one baseline policy.
+A unit is an indentation or a pass. A window is a range of successive units. A part is the rows of one window of one
+capture, with the baselines of one policy.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +20,10 @@ TRAIN = -1  # index of the training window; test windows are numbered from 0
 
 @dataclass(frozen=True)
 class Windows:
-    """Half-open ranges of units for training and for each test; units after the last complete window are left out."""
+    """The training window and the test windows, as half-open ranges of units.
+
+    `left_out_units_n` counts the units after the last complete window, over all captures.
+    """
 
     train: tuple[int, int]
     tests: tuple[tuple[int, int], ...]
@@ -28,25 +32,26 @@ class Windows:
 
 @dataclass(frozen=True)
 class Part:
-    """The rows of a window, and the number of their first row in the stack of all parts."""
+    """One window of one capture, with the baselines of one policy, and its position in the stack of all parts."""
 
     policy: str
     window_i: int
     readings: Readings
     rows: Rows
     noload_off_uT: float  # rms over rows and channels of (baseline - no-load reading before the contact)
-    first_row_i: int
+    first_row_i: int  # number of the part's first row in the stack
 
     @property
     def row_i(self) -> Int64[np.ndarray, " f"]:
-        """Row numbers in the stack."""
+        """The numbers of the part's rows in the stack of all parts."""
         return np.arange(self.first_row_i, self.first_row_i + len(self.rows))
 
 
 def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
-    """Use the first `train_n` units for training, and `test_n` units after every `every_n` units for a test.
+    """Return the training window, the first `train_n` units, and the test windows, each of `test_n` units.
 
-    `units_n` is the length of each capture in units; all windows are within the shortest capture.
+    Test windows begin at units `every_n`, 2 `every_n`, 3 `every_n`, ... `units_n` is the length of each capture in
+    units; all windows are within the shortest capture.
 
     >>> make_windows([23], train_n=5, test_n=2, every_n=5)
     Windows(train=(0, 5), tests=((5, 7), (10, 12), (15, 17), (20, 22)), left_out_units_n=0)
@@ -70,7 +75,7 @@ def take(readings: Readings, rows: Bool[np.ndarray, " f"]) -> Readings:
 
 
 def check_one_per_skin(captures: Sequence[Readings]) -> None:
-    """Raise if a skin has several captures, because their order in time is unknown."""
+    """Raise if several captures have the same skin, because their order in time is unknown."""
     names: dict[str, list[str]] = {}
     for readings in captures:
         names.setdefault(readings.skin, []).append(readings.capture)
@@ -88,26 +93,30 @@ def make_parts(
     windows: Windows,
     selection: Selection,
 ) -> list[Part]:
-    """Make one part per capture, policy and window; each capture comes with the unit number of each of its rows.
+    """Make one part per capture, policy and window.
 
-    A policy is applied to the whole capture, including the rows that the windows and the selection leave out.
+    `captures` are pairs of a capture and the unit number of each of its rows. A policy is applied to the whole capture,
+    including the rows that are not in a window or not in `selection`.
     """
     parts: list[Part] = []
     next_i = 0
     for readings, unit_i in captures:
         for policy, choose_baseline in policies.items():
-            changed = replace(readings, noload_uT=choose_baseline(readings))
-            difference_uT = (changed.noload_uT - readings.noload_uT).astype(float)
+            with_baseline = replace(readings, noload_uT=choose_baseline(readings))
+            difference_uT = (with_baseline.noload_uT - readings.noload_uT).astype(float)
             for window_i, (start, end) in enumerate((windows.train, *windows.tests), TRAIN):
-                inside = (unit_i >= start) & (unit_i < end)
-                window, rms_uT = take(changed, inside), float(np.sqrt((difference_uT[inside] ** 2).mean()))
+                in_window = (unit_i >= start) & (unit_i < end)
+                window, rms_uT = take(with_baseline, in_window), float(np.sqrt((difference_uT[in_window] ** 2).mean()))
                 parts.append(Part(policy, window_i, window, gather([window], selection), rms_uT, next_i))
                 next_i += len(parts[-1].rows)
     return parts
 
 
 def stack(parts: Sequence[Part]) -> Rows:
-    """Stack the rows of all parts; count the dropped rows of only one policy, because all policies drop the same."""
+    """Stack the rows of all parts.
+
+    The dropped rows are counted for only one policy, because they are the same for all policies.
+    """
     arrays = [field.name for field in fields(Rows) if field.name != "dropped"]
     stacked = {name: np.concatenate([getattr(part.rows, name) for part in parts]) for name in arrays}
     dropped = [part.rows.dropped for part in parts if part.policy == parts[0].policy]

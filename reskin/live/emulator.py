@@ -1,4 +1,7 @@
-"""An emulated board: sends a capture or a simulation to a pseudo-terminal or TCP socket, with optional faults."""
+"""An emulated board: sends the bytes of a capture or a simulation to a pseudo-terminal or TCP socket.
+
+Faults, such as a stuck chip or an unplugged cable, can be injected.
+"""
 
 import os
 import re
@@ -32,13 +35,14 @@ from reskin.simulation.defaults import NOMINAL, SHARED, nominal
 from reskin.simulation.settings import MAIN, parse_simulation
 
 NOMINAL_SOURCE = "nominal"
-SEED = 2021  # for a simulation whose file has no seed
-TOUCH_PROTOCOL = "log"  # touches with pauses between them; of all protocols, it resembles manual use the most
+SEED = 2021  # default seed of a simulation, if the scene's YAML file has none
+TOUCH_PROTOCOL = "log"  # touches with pauses between them, similar to manual use
 
-START_S, DURATION_S = 3.0, 1.0  # defaults of a fault
-TORN_EVERY_N, TORN_BYTES_N = 10, 7
-CRLF_TEMPERATURE_degC = 34.513275  # as float32 it contains the bytes 0D 0A
-FULL_SCALE_uT, WRAP_uT = 50_000.0, 2**16 * 0.15  # range of the chip; range of int16 at its finest step
+START_S, DURATION_S = 3.0, 1.0  # default start and duration of a fault
+TORN_EVERY_N, TORN_BYTES_N = 10, 7  # fault `torn`: every 10th frame loses its last 7 bytes
+CRLF_TEMPERATURE_degC = 34.513275  # as float32, this number contains the bytes 0D 0A
+FULL_SCALE_uT = 50_000.0  # largest field that a chip can measure
+WRAP_uT = 2**16 * 0.15  # field range of an int16 at the chip's finest resolution, 0.15 uT per step
 MAGNET_uT = 400.0
 HOT_degC = 150.0
 CLOCK_JUMP_S = 3600.0
@@ -48,8 +52,9 @@ VALUE_FAULTS = (
 BYTE_FAULTS = ("repeated", "dropped", "torn", "wrong-baud")
 FAULTS = (*VALUE_FAULTS, *BYTE_FAULTS, "stall", "unplug")
 
-TICK_S = 0.1  # longest delay before the player reacts to `stop`
-LATE_MAX_S = 0.1  # if sending is blocked for longer, the script is delayed instead of catching up
+TICK_S = 0.1  # longest time until `play` reacts to its event `stop`
+# If sending is blocked for longer than this, all later frames are delayed. After a shorter block, `play` catches up.
+LATE_MAX_S = 0.1
 BATCH_MAX_N = 256  # maximum number of overdue frames that are sent at once
 HOST = "127.0.0.1"
 TCP_PORT_MAX = 65535
@@ -59,28 +64,30 @@ Source = Literal["simulated", "recorded"]
 
 @dataclass(frozen=True)
 class Script:
-    """A byte stream to send: its frames, the bytes of each frame (a piece), and the time at which each piece is due."""
+    """A byte stream to send: decoded frames, the bytes of each frame (a piece), and the due time of each piece."""
 
     source: Source
     wire: Wire
     frames: Frames
     pieces: list[bytes]
-    t_s: Float64[np.ndarray, " f"]  # due time of each piece since the start
-    unplugged_s: dict[int, float] = field(default_factory=dict)  # time unplugged before a piece, by index of the piece
+    t_s: Float64[np.ndarray, " f"]  # due time of each piece, from the start of the script
+    # Index of a piece -> time for which the board is unplugged before this piece is sent.
+    unplugged_s: dict[int, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.pieces)
 
     @property
     def duration_s(self) -> float:
-        """Duration of one repetition in a loop: up to the time when the first frame is due again."""
+        """Time from the first frame to the repetition of the first frame, when the script is sent in a loop."""
         return float(self.t_s[-1] * len(self) / max(len(self) - 1, 1)) if len(self) else 0.0
 
 
 def read_script(source: str) -> Script:
-    """Read a capture, or simulate one.
+    """Create a script from a recorded capture or from a simulation.
 
-    `source` is the folder of a capture, `nominal`, or the YAML file of a scene with a section `simulate`.
+    `source` is the folder of a capture, `nominal` (the nominal skin), or the YAML file of a scene with a section
+    `simulate`.
     """
     folder = Path(source)
     if (folder / HEADER_FILE).is_file():
@@ -94,13 +101,13 @@ def read_script(source: str) -> Script:
             raise ParamsError(f"{source}: not a simulated scene. Use the folder of one of its captures.")
         return simulate(scene["simulate"], scene.get("seed", SEED), source)
     raise ParamsError(
-        f"{source}: not the folder of a capture (with {HEADER_FILE}), {NOMINAL_SOURCE}, or the YAML file of a "
-        f"simulated scene. Try: {NOMINAL_SOURCE}"
+        f"{source}: the source must be the folder of a capture (with {HEADER_FILE}), {NOMINAL_SOURCE}, or the YAML "
+        f"file of a simulated scene. Try: {NOMINAL_SOURCE}"
     )
 
 
 def read_capture(folder: Path) -> Script:
-    """Read a recorded stream or an SD card log; the readings of a log are encoded as binary frames."""
+    """Create a script from a recorded byte stream or an SD card log; readings of a log are encoded as binary frames."""
     header = read_header(folder)
     if header.layout == "sd-card":
         t_s, b_uT, temperature_degC, _ = sd_card.read_log(folder / LOG_FILE)
@@ -115,13 +122,16 @@ def read_capture(folder: Path) -> Script:
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     frames, t_s = frames.where(timed), t_s[timed]
-    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames belong to the piece of the second
+    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames are sent with the second
     pieces = [data[first:last] for first, last in pairwise(edges)]
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
 
 
 def simulate(section: Mapping[str, Any], seed: int, where: str) -> Script:
-    """Simulate the first skin of a section `simulate`, with protocol `log` if the section has it, else the grid."""
+    """Create a script by simulating the first skin of a scene's section `simulate`.
+
+    The protocol is `log` if the section has it, or else the scan over a grid of places.
+    """
     simulation = parse_simulation(section, {name: nominal(name) for name in SHARED}, f"{where}: simulate")
     protocol = TOUCH_PROTOCOL if TOUCH_PROTOCOL in simulation.protocols else MAIN
     board, skin = list_captures(simulation, protocol)[0]
@@ -136,7 +146,7 @@ def _binary_script(source: Source, b_uT: np.ndarray, temperature_degC: np.ndarra
 
 
 def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
-    """Encode frames as the firmware does; return the bytes of each frame."""
+    """Encode frames in a wire format of the firmware; return the bytes of each frame."""
     data = encode(frames, wire)
     if wire in TEXT_WIRES:
         return data.splitlines(keepends=True)
@@ -145,7 +155,7 @@ def encode_pieces(frames: Frames, wire: Wire) -> list[bytes]:
 
 
 class Fault(NamedTuple):
-    """A fault to inject."""
+    """A fault to inject, and the time in the script at which it occurs."""
 
     name: str
     start_s: float
@@ -168,7 +178,7 @@ def parse_fault(text: str) -> Fault:
 
 
 def inject(script: Script, fault: Fault) -> Script:
-    """Return the script with a fault added. Faults of a single chip affect chip 1, or the only chip of a board."""
+    """Return a copy of the script with a fault. Faults of a single chip affect chip 1, or the only chip of a board."""
     inside = (script.t_s >= fault.start_s) & (script.t_s < fault.start_s + fault.duration_s)
     if not inside.any():
         raise ParamsError(
@@ -193,7 +203,7 @@ def inject(script: Script, fault: Fault) -> Script:
 
 
 def _change_values(frames: Frames, fault: str) -> None:
-    """Change the measured values of these frames in place."""
+    """Apply a fault to the measured values of all these frames, in place."""
     b_uT, temperature_degC = frames.b_uT.reshape(len(frames), -1, 3), frames.temperature_degC
     chip_i = min(1, temperature_degC.shape[1] - 1)
     match fault:
@@ -211,19 +221,19 @@ def _change_values(frames: Frames, fault: str) -> None:
         case "int16-wrap":
             b_uT[::2, chip_i, 2] -= WRAP_uT * np.sign(b_uT[::2, chip_i, 2])
         case "magnet":
-            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated about z only, so the change in z is the same for all
+            b_uT[:, :, 2] += MAGNET_uT  # chips are rotated only about z, so all of them measure the same change of Bz
         case "too-hot":
             temperature_degC[:, chip_i] = HOT_degC
         case "crlf":
             temperature_degC[:, chip_i] = CRLF_TEMPERATURE_degC
         case "clock-jump":
             if np.isnan(frames.device_s).all():
-                raise ParamsError("--fault: clock-jump needs frames with a clock. Use a binary-clock capture.")
+                raise ParamsError("--fault: clock-jump needs a capture with a clock. Use one in format binary-clock.")
             frames.device_s[:] += CLOCK_JUMP_S
 
 
 def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
-    """Return pieces as a bad connection would deliver them."""
+    """Apply a fault of the connection to the bytes of all these frames."""
     if fault == "repeated":
         return [2 * piece for piece in pieces]
     if fault == "dropped":
@@ -235,7 +245,7 @@ def _change_bytes(pieces: list[bytes], fault: str) -> list[bytes]:
 
 
 class EmulatedPort:
-    """A port that sends bytes: a pseudo-terminal or a TCP server."""
+    """Base class of emulated ports, which send bytes to a reader: a pseudo-terminal or a TCP server."""
 
     name: str
 
@@ -248,25 +258,25 @@ class EmulatedPort:
         raise NotImplementedError
 
     def unplug(self) -> None:
-        """Remove the port: when the board is unplugged, and at the end to clean up."""
+        """Remove the port, to emulate an unplugged board or to clean up at the end."""
         raise NotImplementedError
 
     def send(self, data: bytes, stop: threading.Event) -> int:
-        """Send bytes as fast as they are read, until `stop` is set; return how many were sent."""
+        """Send bytes as fast as the reader accepts them, until `stop` is set; return the number of bytes sent."""
         raise NotImplementedError
 
     def was_opened(self) -> bool:
-        """Return whether a reader has opened the port since the last call."""
+        """Return whether a reader has opened the port since the last call of this method."""
         opened, self._opened = self._opened, False
         return opened
 
 
 class Terminal(EmulatedPort):
-    """A pseudo-terminal. A link gives it a name that stays the same after unplugging and plugging in again."""
+    """A pseudo-terminal. With a symbolic link, its name does not change when the board is unplugged and plugged in."""
 
     def __init__(self, link: Path | None = None) -> None:
         if not hasattr(os, "openpty"):
-            raise ParamsError("--port: this system has no pseudo-terminals. Try: --port tcp")
+            raise ParamsError("--port: this operating system has no pseudo-terminals. Try: --port tcp")
         if link is not None and link.exists() and not link.is_symlink():
             raise ParamsError(f"--port: {link} is an existing file, not a link. Choose another name.")
         self._link = link
@@ -285,7 +295,7 @@ class Terminal(EmulatedPort):
             )
         self._open_ends = self._far, self._near = os.openpty()
         tty.setraw(self._near)
-        # Opening a terminal flushes it, and packet mode reports the flush: this shows when a reader opens it.
+        # A reader that opens the terminal flushes it. In packet mode, the flush is reported to this process.
         fcntl.ioctl(self._far, termios.TIOCPKT, struct.pack("i", 1))
         self._flushed = termios.TIOCPKT_FLUSHREAD
         os.set_blocking(self._far, False)
@@ -297,9 +307,9 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            self._link.unlink(missing_ok=True)  # another emulator may create it meanwhile
-        for end in self._open_ends:
-            os.close(end)
+            self._link.unlink(missing_ok=True)  # first: another emulator may create this link after the close
+        for descriptor in self._open_ends:
+            os.close(descriptor)
         self._open_ends = ()
 
     def send(self, data: bytes, stop: threading.Event) -> int:
@@ -307,7 +317,7 @@ class Terminal(EmulatedPort):
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
-                if readable:  # data from the reader is ignored
+                if readable:  # data that the reader sends are ignored, except for the first byte, the packet status
                     self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
                     sent_n += os.write(self._far, data[sent_n:])
@@ -332,9 +342,9 @@ class TcpServer(EmulatedPort):
         self._client: socket.socket | None = None
 
     def unplug(self) -> None:
-        for end in (self._client, self._server):
-            if end is not None:
-                end.close()
+        for connection in (self._client, self._server):
+            if connection is not None:
+                connection.close()
 
     def send(self, data: bytes, stop: threading.Event) -> int:
         sent_n = 0
@@ -347,7 +357,7 @@ class TcpServer(EmulatedPort):
                 sent_n += self._client.send(data[sent_n:])
             except TimeoutError:
                 continue
-            except OSError:  # the reader has disconnected: wait for the next one
+            except OSError:  # the reader has disconnected: wait for another reader
                 if self._client is not None:
                     self._client.close()
                 self._client = None
@@ -365,19 +375,17 @@ def make_port(kind: str) -> EmulatedPort:
         return TcpServer(int(number or 0))
     if Path(kind).parent.is_dir() and "/" in kind:
         return Terminal(Path(kind))
-    raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT, or ./NAME for a link to create. Try: pty")
+    raise ParamsError(f"--port: {kind} is not pty, tcp, tcp:PORT, or ./NAME of a link to create. Try: pty")
 
 
 def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: float = 1.0, loop: bool = False) -> int:
-    """Send the pieces of a script to a port when they are due.
+    """Send each piece of a script to a port at its due time.
 
     Parameters
     ----------
-    script : the pieces to send
-    port : the port to send them to
     stop : event that another thread sets to end sending
-    speed : factor by which to speed up the script; with `math.inf`, sends as fast as the reader reads
-    loop : whether to restart the script at its end and whenever a reader opens the port
+    speed : factor by which due times are divided; with `math.inf`, the script is sent as fast as the reader reads
+    loop : whether to restart the script at its end, and whenever a reader opens the port
 
     Returns
     -------
@@ -391,7 +399,7 @@ def play(script: Script, port: EmulatedPort, stop: threading.Event, *, speed: fl
                 port.unplug()
                 stop.wait(script.unplugged_s[i])
                 port.plug_in()
-                replugged = True  # when a reader opens the port again, the script continues
+                replugged = True  # the next opening of the port does not restart the script
             now_s, due_s = time.monotonic() - start_s, float(script.t_s[i]) / speed
             if due_s > now_s:
                 stop.wait(min(due_s - now_s, TICK_S))
@@ -421,7 +429,7 @@ def _end_of_batch(script: Script, first: int, script_s: float) -> int:
 
 @contextmanager
 def playing(script: Script) -> Iterator[str]:
-    """Send a script in a loop from another thread; yield the name of its port."""
+    """Send a script in a loop from another thread; yield the name of the emulated port."""
     port, stop = (Terminal() if hasattr(os, "openpty") else TcpServer()), threading.Event()
     player = threading.Thread(target=play, args=[script, port, stop], kwargs={"loop": True}, daemon=True)
     player.start()

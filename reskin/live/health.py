@@ -1,4 +1,4 @@
-"""Alarms of a running board: faults by name and chip, a low frame rate, and external fields."""
+"""Alarms of a running board: faults of the data, a low frame rate, and external magnetic fields."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ from reskin.board.faults import STEPS_MIN_N, FaultDetector, Faults, find_reading
 from reskin.board.wire import Frames, concatenate
 from reskin.recordings.fault_policy import Action, FaultPolicy
 
-BATCH_FRAMES_N = 40  # frames per check for faults that span several frames: 0.1 s with five chips
+BATCH_FRAMES_N = 40  # frames per check for faults that span several frames; 0.1 s for a board with five chips
 RATE_WINDOW_S = 1.0
-SLOW_FRACTION = 0.7  # assumed: frames are missing if the rate is below this fraction of the usual rate
-USUAL_GAIN = 1e-4  # weight of each new rate in the exponential mean of the usual rate: about half a minute at 400 Hz
+SLOW_FRACTION = 0.7  # assumed: frames are missing if the frame rate is below this fraction of the usual rate
+USUAL_GAIN = 1e-4  # weight of a new rate in the running mean that is the usual rate: time constant 25 s at 400 Hz
 ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrence
-# A field change is external if the fraction of |dB|^2 that is not common to all chips is smaller. For all presses of
-# scenes `quick` and `lab`, this fraction is 0.45 or more.
+# A field change is external if the fraction of |dB|^2 that is not common to all chips is below this limit. For all
+# presses of scenes `quick` and `lab`, the fraction is 0.45 or more.
 RESIDUAL_FRACTION_MAX = 0.2
-COMMON_MIN_uT = 50.0  # about the strength of the earth's field
+COMMON_MIN_uT = 50.0  # smallest external field that raises an alarm; about the strength of the earth's field
 
-# A controller uses each reading at once, so a saturated reading must not be converted to a place and a force.
+# Default policy for live readings. Saturated readings are dropped, because a controller would use a wrong estimate.
 LIVE_POLICY = FaultPolicy(
     failed_read="drop", zeros="drop", stuck="drop", too_hot="drop", saturated="drop", torn="drop", wrong_baud="drop",
     constant_channel="flag", chip_reset="flag", int16_wrap="flag", repeated="flag", dropped="flag", clock_jump="flag",
@@ -40,22 +40,25 @@ class Alarm:
 
 
 class Health:
-    """The alarms of a board since it was plugged in."""
+    """Detects faults in the frames of a running board, and stores its alarms and its frame rate."""
 
     def __init__(self, chips_n: int, policy: FaultPolicy = LIVE_POLICY) -> None:
         self.policy = policy
         self.alarms: dict[str, Alarm] = {}
         self.rate_hz = self._usual_hz = np.nan
         self._chips_n = chips_n
-        # An alarm needs less evidence than the rejection of a capture.
+        # Fewer steps are required than for the rejection of a recorded capture, because an alarm has no lasting effect.
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
-        self._stuck = False  # whether a chip was stuck at the end of the last batch and the policy drops such frames
+        self._stuck = False  # whether frames are dropped because a chip was stuck at the end of the last batch
         self._arrivals: deque[tuple[float, int]] = deque()
         self._arrived_n = 0
 
     def note(self, name: str, count_n: int, now_s: float, fault: str | None = None) -> None:
-        """Add `count_n` to an alarm. Its action is that of the policy for `fault`; `flag` if no fault is given."""
+        """Add `count_n` occurrences to an alarm, which is created if necessary.
+
+        The alarm's action is that of the policy for `fault`, or `flag` if no fault is given.
+        """
         if count_n:
             action: Action = getattr(self.policy, fault) if fault is not None else "flag"
             alarm = self.alarms.setdefault(name, Alarm(name, 0, now_s, now_s, action))
@@ -66,9 +69,10 @@ class Health:
         return [alarm for alarm in list(self.alarms.values()) if now_s - alarm.last_s <= ACTIVE_S]
 
     def feed(self, frames: Frames, now_s: float) -> Bool[np.ndarray, " f"]:
-        """Check the next frames for faults; return the mask of usable frames: without faults that the policy drops.
+        """Check the next frames for faults; return the mask of frames that the policy does not drop.
 
-        Faults of single readings are detected at once, the others once per `BATCH_FRAMES_N` frames.
+        Faults of single readings are detected immediately. Faults that span several frames are detected once per
+        `BATCH_FRAMES_N` frames.
         """
         readings = find_reading_faults(frames.b_uT, frames.temperature_degC)
         faulty = self._note_chips("failed I2C reads", readings.failed_read, now_s, "failed_read")
@@ -76,14 +80,16 @@ class Health:
         faulty |= self._note_chips("temperature out of range", readings.too_hot, now_s, "too_hot")
         faulty |= self._note_chips("field at the end of the range", readings.saturated, now_s, "saturated")
         self._measure_rate(len(frames), now_s)
-        self._batch.append(frames.where(~readings.faulty_rows))  # a failed read must not hide faults that span frames
+        self._batch.append(frames.where(~readings.faulty_rows))  # without failed reads, which would hide a stuck chip
         if sum(map(len, self._batch)) >= BATCH_FRAMES_N:
             batch, self._batch = concatenate(self._batch, self._chips_n), []
             self._note_batch(self._detector.feed(batch, np.full(len(batch), now_s)), now_s)
         return np.asarray(~faulty & (not self._stuck))
 
     def feed_change(self, db_uT: Float[np.ndarray, " ch"], turn: Float64[np.ndarray, "k 3 3"], now_s: float) -> None:
-        """Raise an alarm if all chips measure nearly the same field change: an external field, or a rotated board.
+        """Raise an alarm if all chips measure nearly the same field change.
+
+        The cause is then an external field or a rotation of the board, and not a press.
 
         `turn` rotates the axes of each chip to those of the board.
         """
@@ -104,13 +110,16 @@ class Health:
             self._note_chips("step differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_chips(self, name: str, mask: Bool[np.ndarray, "f k"], now_s: float, fault: str) -> Bool[np.ndarray, " f"]:
-        """Add a fault to the alarms of the affected chips; return the mask of the frames that the policy drops."""
+        """Add a fault to the alarm of each affected chip; return the mask of the frames that the policy drops."""
         for chip_i in np.flatnonzero(mask.any(axis=0)):
             self.note(f"chip {chip_i}: {name}", int(mask[:, chip_i].sum()), now_s, fault)
         return np.asarray(mask.any(axis=1)) & (getattr(self.policy, fault) != "flag")
 
     def _measure_rate(self, frames_n: int, now_s: float) -> None:
-        """Measure the frame rate over one second. Frames have no numbers, so only a low rate reveals missing frames."""
+        """Measure the frame rate over one second, and raise an alarm if it is low.
+
+        Frames are not numbered, so missing frames can be detected only by a low rate.
+        """
         self._arrivals.append((now_s, frames_n))
         self._arrived_n += frames_n
         while now_s - self._arrivals[0][0] > RATE_WINDOW_S:

@@ -1,4 +1,4 @@
-"""Record a board into a capture, with labels from prompts, a robot's CSV file, a force gauge or a program."""
+"""Record a board to a capture folder, with labels from prompts, a robot's CSV file, a force gauge or a program."""
 
 import sys
 import time
@@ -29,25 +29,25 @@ SILENCE_S = NO_FRAME_S = 5.0
 
 
 class RecordingResult(NamedTuple):
-    """A finished recording."""
+    """The folder of a finished recording, and a summary for the user."""
 
     folder: Path
     summary: str
-    error: Exception | None  # the error that ended the labels, if any
+    error: Exception | None  # exception from the source of labels, which ended the recording
 
 
 def label_source(
     labels: str | None, gauge: str | None, scan: str | None, *, dwell_s: float, say: Callable[[str], object]
 ) -> LabelSource | None:
-    """Return the source of labels that the options of `reskin record` describe; None if they describe none.
+    """Create the source of labels from options of `reskin record`; return None if no labels are requested.
 
     Parameters
     ----------
-    labels : places to prompt for, such as `grid:5x5:4`, or a CSV file to which a robot's program appends labels
+    labels : places for which the user is prompted, such as `grid:5x5:4`, or a CSV file to which a robot appends labels
     gauge : port of a force gauge, `PORT` or `PORT@BAUD`
     scan : order of the prompts, "random" or "snake"; the default is "random"
-    dwell_s : how long a prompted label is valid
-    say : called with each prompt
+    dwell_s : time for which a label from a prompt is valid
+    say : called with the text of each prompt
     """
     port, _, baud = (gauge or "").partition("@")
     if baud and not baud.isdecimal():
@@ -78,13 +78,13 @@ def record_board(
     baud: int = BAUD,
     names: Mapping[str, str] | None = None,
 ) -> RecordingResult:
-    """Record until the user stops it, `seconds` have passed, the labels end, or the board is unplugged.
+    """Record a board until the user stops it, `seconds` have passed, the labels end, or the board is unplugged.
 
     Parameters
     ----------
     board : the port and its wire format
     labels : source of labels during the recording, if any
-    folder : the capture's folder, which must be new; the default is captures/DATE-TIME
+    folder : folder to create for the capture; the default is captures/DATE-TIME
     seconds : maximum duration
     baud : baud rate; USB ports ignore it
     names : values for the capture's header: names of the board and the skin, and the order of places, under the keys

@@ -1,7 +1,7 @@
-"""The web server of `reskin live`: the page, and one websocket for each board on it.
+"""The web server of `reskin live`: an HTML page, and one websocket per page and board.
 
-By default, only this machine can connect; on any other address, requests need a token. A client chooses only among
-fixed pages, boards and buttons, so it cannot influence which files are read or written.
+By default, only this machine can connect. If the server listens on another address, requests need a token. A client can
+request only fixed files, boards and button actions, so it cannot choose which files are read or written.
 """
 
 import asyncio
@@ -37,11 +37,11 @@ HEADERS = {
 
 
 class Server:
-    """Serves the page of one or more boards. If the token is empty, only requests to a local host name are accepted."""
+    """Serves the page of one or more boards. If the token is empty, only requests to a local host name are allowed."""
 
     def __init__(self, sessions: Sequence[Session], token: str) -> None:
         self._sessions, self._token = sessions, token
-        self._sockets: list[set[web.WebSocketResponse]] = [set() for _ in sessions]  # one socket per page and board
+        self._sockets: list[set[web.WebSocketResponse]] = [set() for _ in sessions]  # open sockets of each board
 
     def application(self) -> web.Application:
         @web.middleware
@@ -57,12 +57,12 @@ class Server:
         return app
 
     def check(self, request: web.Request) -> None:
-        """Raise `HTTPForbidden` if the token is wrong, or if the host or the origin is not allowed."""
+        """Raise `HTTPForbidden` if the token is wrong, or if the request's host or origin is not allowed."""
         token = request.query.get("token") or request.cookies.get(COOKIE, "")
         origin = request.headers.get("Origin")
         if self._token and not hmac.compare_digest(token.encode(errors="replace"), self._token.encode()):
-            raise web.HTTPForbidden(text="this page needs its token: use the address that reskin live printed\n")
-        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # protects from DNS rebinding
+            raise web.HTTPForbidden(text="token missing or wrong: use the address that reskin live printed\n")
+        if not self._token and not LOCAL_HOST.fullmatch(request.host):  # protects against DNS rebinding
             raise web.HTTPForbidden(text="this page is served as localhost and 127.0.0.1 only\n")
         if origin is not None and origin.partition("://")[2] != request.host:
             raise web.HTTPForbidden(text="this page accepts no requests from other sites\n")
@@ -74,7 +74,7 @@ class Server:
         return response
 
     async def _connect(self, request: web.Request) -> web.StreamResponse:
-        """Serve a websocket until either side closes it: send the new data of a board, and receive button presses."""
+        """Serve one websocket until it is closed: send new data of a board, and receive button presses."""
         index = request.query.get("board", "0")
         if index not in map(str, range(len(self._sessions))):
             raise web.HTTPNotFound(text="there is no such board\n")
@@ -85,7 +85,7 @@ class Server:
         sockets.add(socket)
         try:
             await socket.prepare(request)
-            async with asyncio.TaskGroup() as group:  # an error while sending or receiving ends both
+            async with asyncio.TaskGroup() as group:  # an error in sending or receiving ends both tasks
                 sending = group.create_task(self._send(session, socket))
                 async for message in socket:
                     if message.type == WSMsgType.TEXT:
@@ -96,7 +96,7 @@ class Server:
         return socket
 
     async def _send(self, session: Session, socket: web.WebSocketResponse) -> None:
-        """Send new data at most 30 times per second. A slow page receives fewer messages; none are queued for it."""
+        """Send a board's new data to a page at most 30 times per second, or less often if the page is slow."""
         after_bin, sent_state, next_state_s, clock = 0, "", 0.0, asyncio.get_running_loop().time
         with suppress(ConnectionError):
             while not socket.closed:
@@ -118,7 +118,7 @@ class Server:
 
 
 def receive(session: Session, text: str) -> None:
-    """Handle a message from a page: the name of a pressed button, or the number of a message that has been drawn."""
+    """Handle a JSON message from a page: the name of a pressed button, or the number of a message that was drawn."""
     with suppress(ValueError, RecursionError):
         message = json.loads(text)
         if isinstance(message, dict):

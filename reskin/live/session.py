@@ -1,4 +1,4 @@
-"""One board on the page of `reskin live`: the estimating thread, the messages to pages, and the button actions."""
+"""One board on the page of `reskin live`: the thread that estimates, messages to the page, and button actions."""
 
 import re
 import struct
@@ -22,15 +22,15 @@ from reskin.recordings.stream_recorder import CaptureWriter
 from reskin.seeds import rng_for
 
 POLL_S = 0.1
-# With several boards, frames are collected for this time before estimation: estimating them together is cheaper, and
-# pages are not redrawn more often than this anyway.
+# With several boards, frames are collected for this time and then estimated together, which needs less computing time.
+# The delay is not visible, because pages are redrawn at most 30 times per second.
 GATHER_S = 0.02
 
-WINDOW_S, BIN_S = 10.0, 0.02  # must equal those in page/trace.js
+WINDOW_S, BIN_S = 10.0, 0.02  # duration and bin width of traces; must equal the values in page/trace.js
 BINS_N = round(WINDOW_S / BIN_S)
-LATENCIES_N = 4000  # number of latencies kept for statistics: those of the last ten seconds at 400 Hz
-UNCONFIRMED_MAX_N = 64  # messages that were sent and are not yet confirmed as drawn
-HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins, time of the last reading since start
+LATENCIES_N = 4000  # number of latest latencies in the statistics; 10 s at 400 Hz
+UNCONFIRMED_MAX_N = 64  # largest number of sent messages for which a confirmation is awaited
+HEAD = struct.Struct("<IHHd")  # message number, number of chips, number of bins, time of the last reading
 NUMBERS_N = 12  # x_mm, y_mm, F_N, sd x, sd y, contact, rate, lost bytes, and four latencies in ms
 
 PRESSES_N = 12
@@ -39,7 +39,7 @@ READINGS_MIN_N = 4  # contacts with fewer readings do not count as presses
 
 
 class Traces:
-    """Force and field changes of the last ten seconds: minimum and maximum of each 20 ms bin, in a ring buffer."""
+    """Minimum and maximum of the force and of the field changes in 20 ms bins, for the last ten seconds."""
 
     def __init__(self, layout: Layout, start_s: float) -> None:
         self._layout, self._start_s = layout, start_s
@@ -58,7 +58,7 @@ class Traces:
         return int(self._bin.max())
 
     def add(self, estimates: Estimates, now_s: float) -> None:
-        """Add estimates that became ready at `now_s`."""
+        """Add estimates to the bins of their arrival times; `now_s` is the time at which they were computed."""
         self._last = estimates
         self.to_estimate_s.extend((now_s - estimates.t_s).tolist())
         chips_uT = np.linalg.norm(estimates.db_uT.reshape(len(estimates), -1, 3), axis=2)
@@ -72,9 +72,9 @@ class Traces:
             self._high[i] = np.fmax(self._high[i], np.fmax.reduce(rows))
 
     def message(self, after_bin: int, *, rate_hz: float, lost_bytes_n: int) -> bytes:
-        """Return a message with the last reading and the bins from `after_bin` on; empty before the first reading.
+        """Return a binary message with the last reading and the bins from `after_bin` on; b"" before the first reading.
 
-        Bin `after_bin` itself is sent again, because readings may have been added to it.
+        Bin `after_bin` was already sent and is sent again, because readings may have been added to it.
         """
         last = self._last
         if last is None:
@@ -83,7 +83,7 @@ class Traces:
         self._unconfirmed.append((self._message_i, float(last.t_s[-1])))
         newest = self.newest_bin
         numbers = np.arange(max(after_bin, newest - BINS_N + 1, 0), newest + 1)
-        numbers = numbers[self._bin[numbers % BINS_N] == numbers]  # the slot of a bin without readings has an older bin
+        numbers = numbers[self._bin[numbers % BINS_N] == numbers]  # without bins that have no readings
         i = numbers % BINS_N
         latencies_ms = [
             1e3 * np.percentile(times_s, [50, 99]) if times_s else np.full(2, np.nan)
@@ -97,26 +97,26 @@ class Traces:
             np.array(now),
             *latencies_ms,
             change_uT.ravel(),
-            numbers * BIN_S - t_s,  # relative: float32 cannot resolve 20 ms days after the start
+            numbers * BIN_S - t_s,  # relative to t_s, because float32 cannot resolve 20 ms after days
             self._low[i].ravel(),
             self._high[i].ravel(),
         ]
         return head + np.concatenate(parts).astype("<f4").tobytes()
 
     def confirm(self, message_i: int, now_s: float) -> None:
-        """Record the latency of a message that a page has drawn."""
+        """Record the time from the arrival of a reading until a page has drawn the message with this reading."""
         for sent_i, t_s in self._unconfirmed:
             if sent_i == message_i:
                 self.to_screen_s.append(now_s - t_s)
 
 
 class Presses:
-    """Collects the strongest reading of each contact until there are enough presses to calibrate to."""
+    """Collects presses for calibration: of each contact, the field change with the largest magnitude."""
 
     def __init__(self, presses_n: int = PRESSES_N) -> None:
         self.presses_n = presses_n
         self._strongest_uT: list[Float64[np.ndarray, " ch"]] = []
-        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # strongest reading so far of the current contact
+        self._current_uT: Float64[np.ndarray, " ch"] | None = None  # largest field change so far of the current contact
         self._readings_n = 0
 
     def __len__(self) -> int:
@@ -128,12 +128,12 @@ class Presses:
 
     @property
     def instruction(self) -> str:
-        """What the user must do next."""
+        """Instruction to the user for the next press."""
         return f"press {len(self) + 1} of {self.presses_n}, anywhere"
 
     @property
     def next_mm(self) -> list[float] | None:
-        """The place to press next; None for any place."""
+        """x and y in mm of the place to press next; None if the user may press anywhere."""
         return None
 
     @property
@@ -141,7 +141,7 @@ class Presses:
         return np.array(self._strongest_uT)
 
     def add(self, estimates: Estimates) -> None:
-        """Add the next readings; faulty readings are skipped, so they do not end a contact."""
+        """Add the next readings. Faulty readings (NaN) are skipped and do not end a contact."""
         known = np.isfinite(estimates.db_uT).all(axis=1)
         for db_uT, contact in zip(estimates.db_uT[known].astype(np.float64), estimates.contact[known], strict=True):
             if contact:
@@ -155,7 +155,10 @@ class Presses:
 
 
 class GuidedPresses(Presses):
-    """Presses at grid places that the page shows in random order; every second press is held out to test the result."""
+    """Presses at grid places, which the page shows in random order.
+
+    Every second press is held out from the calibration, to measure the error after it.
+    """
 
     def __init__(self) -> None:
         grid_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2)
@@ -175,11 +178,11 @@ class GuidedPresses(Presses):
         return np.arange(self.presses_n) % 2 == 1
 
 
-ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # by name of the button
+ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # name of a button -> the presses that it requests
 
 
 class Session:
-    """A board with its own polling thread, its traces, its recording and its calibration."""
+    """One board on the page: a thread that polls it, the traces, the current recording, and the calibration."""
 
     def __init__(
         self, port: str, models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True
@@ -209,7 +212,7 @@ class Session:
         self.skin.reader.stop()
 
     def _run(self) -> None:
-        """Poll and estimate until `stop` is called; an error ends the thread and appears as an alarm on the page."""
+        """Poll the board and estimate until `stop` is called; an error ends the thread and is shown as an alarm."""
         try:
             while not self._stop.is_set():
                 estimates = self.skin.poll(POLL_S)
@@ -223,13 +226,13 @@ class Session:
                     self._stop.wait(GATHER_S)
         except ReskinError as error:
             self._error = str(error)
-        except Exception as error:  # any error of a model
+        except Exception as error:  # an unexpected error, such as one in a model
             self._error = f"estimation stopped: {error!r}"
 
     def _adapt(self, estimates: Estimates) -> None:
-        """Collect presses if a button requested them; calibrate when they are complete.
+        """Collect presses if a button requested them; calibrate the universal model when there are enough.
 
-        Bytes that arrive during the calibration are kept by the reader.
+        Bytes that arrive during the calibration stay in the reader's buffer.
         """
         presses, estimator = self._presses, self.skin.estimator
         if presses is not None and isinstance(estimator, UniversalEstimator):
@@ -240,14 +243,14 @@ class Session:
                         self._adapted = estimator.label(presses.place_mm, presses.db_uT, presses.held_out)
                     else:
                         self._adapted = estimator.adapt(presses.db_uT)
-                except SchemaError as error:  # the presses are unusable
+                except SchemaError as error:  # no press changed the field
                     self._adapted = str(error)
                 with self._button_lock:  # a button may have replaced the presses during the calibration
                     if self._presses is presses:
                         self._presses = None
 
     def message(self, after_bin: int) -> tuple[bytes, int]:
-        """Return the next binary message for a page that has the bins before `after_bin`, and the newest bin."""
+        """Return the next binary message, with the bins from `after_bin` on, and the number of the newest bin."""
         with self._lock:
             if self.traces is None:
                 return b"", 0
@@ -256,7 +259,7 @@ class Session:
             return data, self.traces.newest_bin
 
     def state(self) -> dict[str, Any]:
-        """Return the JSON message for pages: texts, alarms and the board's layout. `page/live.js` reads these keys."""
+        """Return the JSON message for `page/live.js`, with texts, alarms and the board's layout."""
         skin, detected, presses = self.skin, self.skin.detected, self._presses
         state: dict[str, Any] = {
             "what": self.source if self._alone else str(self), "zeroed": skin.zeroed,
@@ -284,7 +287,7 @@ class Session:
         return state
 
     def confirm(self, message_i: object) -> None:
-        """Record the latency of a message that a page has drawn."""
+        """Record the latency of message number `message_i`, which a page has drawn; ignore anything but an integer."""
         if isinstance(message_i, int) and self.traces is not None:
             with self._lock:
                 self.traces.confirm(message_i, self.skin.reader.unix_s())
@@ -304,7 +307,7 @@ class Session:
     def _begin_recording(self) -> None:
         """Start writing the byte stream to a new capture."""
         folder, detected = new_folder(), self.skin.detected
-        if not self._alone:  # recordings of several boards may begin in the same second
+        if not self._alone:  # two boards may start recording in the same second
             folder = folder.with_name(f"{folder.name}-{re.sub(r'[^A-Za-z0-9]+', '-', detected.port).strip('-')}")
         try:
             part, header = begin_capture(
@@ -329,6 +332,6 @@ class Session:
 def open_sessions(
     ports: Sequence[str], models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY
 ) -> list[Session]:
-    """Create one session per port; the sessions share only the weights of the models."""
+    """Create one session per port. Sessions share the weights of the models, but not the calibration."""
     check_ports(ports, models, "--port")
     return [Session(port, models, source, fault_policy, alone=len(ports) == 1) for port in ports]

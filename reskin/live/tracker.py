@@ -1,7 +1,7 @@
 """Estimate contacts on a running board: bytes from its port -> frames -> field changes -> place and force.
 
-`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes, so that none are
-lost if the controller is slow; the caller's thread decodes the bytes and estimates.
+`reskin.open` returns a `LiveSkin`, or `LiveSkins` for several ports. One thread per port reads bytes, so that no bytes
+are lost if the controller is slow. The controller's own thread decodes the bytes and estimates.
 """
 
 import threading
@@ -43,14 +43,15 @@ from reskin.universal.model import MISFIT_MAX, Universal
 
 NOLOAD_S = 1.0  # time without contact over which the no-load reading is averaged
 NOLOAD_FRAMES_MAX_N = 10_000
-HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18  # the wire format is detected when either amount of data has arrived
+# The wire format is detected when data for `HEAD_S` seconds, or `HEAD_BYTES_MAX_N` bytes, have arrived.
+HEAD_S, HEAD_BYTES_MAX_N = 0.5, 2**18
 SILENT_S = 0.3  # after this time without data, a controller receives a contact whose values are NaN
-OPENING_S = 10.0  # longest time for the detection and the no-load reading when a port is opened
-ENDS_KEPT_N = 256  # number of recent chunks whose ends are kept, for the arrival times of frames that are decoded later
-FRAME_BYTES_MIN_N = 16  # smallest size of a frame per chip, over all wire formats
+OPENING_S = 10.0  # longest time for format detection and the no-load reading after a port is opened
+ENDS_KEPT_N = 256  # number of latest chunks whose end and arrival time are stored; a frame may end in an earlier chunk
+FRAME_BYTES_MIN_N = 16  # bytes per chip of a frame in the wire format with the shortest frames
 SPACING_MM = 5.0  # spacing of chips on the page if their positions are unknown
-# Largest plausible input of a network, in standard deviations over its training rows. Assumed; the largest observed
-# value is 6 in scene `quick`, and 7 for the boards of scene `lab` with that scene's models.
+# Assumed limit of a network's inputs, in standard deviations of its training data. The largest observed input is 6 in
+# scene `quick` and 7 in scene `lab`, each with models of the same scene.
 UNKNOWN_SDS = 10.0
 
 WAITING = "waiting for data"
@@ -61,15 +62,15 @@ Models = Sequence[Network] | Universal  # with an empty sequence, no place or fo
 
 
 class Prediction(NamedTuple):
-    """Predictions for readings in contact."""
+    """Predictions for f readings in contact."""
 
     target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
     sd_mm: Float64[np.ndarray, "f 2"]  # standard deviation of the place; NaN if unknown
-    unknown: Bool[np.ndarray, " f"]  # whether the reading is unlike the skins that the model was trained on
+    unknown: Bool[np.ndarray, " f"]  # whether a reading is outside the model's training distribution
 
 
 class NetworkEstimator:
-    """The mean prediction of trained networks. `sd_mm` is the spread between the networks, not their error."""
+    """Predicts the mean of several trained networks, with the standard deviation between the networks as `sd_mm`."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         self.channels_n: int = networks[0].card["input"]["channels_n"]
@@ -78,7 +79,7 @@ class NetworkEstimator:
         self._inputs = [
             (VIEW[network.card["recipe"]["inputs"]], Scaler.of_arrays(network.tensors)) for network in networks
         ]
-        for network in networks:  # imports torch and builds the network now, not at the first contact
+        for network in networks:  # so that torch is imported and the network is built before the first contact
             network(np.zeros((1, network.card["input"]["channels_n"]), np.float32))
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
@@ -92,10 +93,10 @@ class NetworkEstimator:
 
 
 class UniversalEstimator:
-    """The universal model, calibrated to the board's no-load field and to presses in addition to its own calibration.
+    """Predicts with a copy of a universal model, which is further calibrated to no-load readings and to presses.
 
-    The given model is not changed. New presses replace those of an earlier call, so that the user can repeat bad
-    presses.
+    The model that was passed is not changed. The presses of a call replace those of an earlier call, so that the user
+    can repeat bad presses.
     """
 
     channels_n = CHANNELS_N
@@ -103,19 +104,23 @@ class UniversalEstimator:
 
     def __init__(self, model: Universal) -> None:
         self._given_model = model
-        # Zeros until the first no-load reading, unless the model already has one.
+        # Until the first call of `set_noload`: the no-load field of the model, or zeros if the model has none.
         self._noload_uT = model.noload_uT if model.zeroed else np.zeros(CHANNELS_N)
         self._presses_uT = np.zeros((0, CHANNELS_N))  # field changes for presses at unknown places
         self._labelled_mm, self._labelled_uT = np.zeros((0, 2)), np.zeros((0, CHANNELS_N))
         self._calibrate()
 
     def set_noload(self, b_uT: Float[np.ndarray, "f ch"]) -> None:
-        """Set the no-load field to the mean of readings without contact, and recalibrate."""
+        """Set the no-load field to the mean of f readings without contact, and recalibrate."""
         self._noload_uT = b_uT.mean(axis=0, dtype=np.float64)
         self._calibrate()
 
     def adapt(self, db_uT: Float[np.ndarray, "n ch"]) -> str:
-        """Calibrate to presses at unknown places; return a summary of standard deviation and misfit before and after.
+        """Calibrate to the field changes of presses at unknown places.
+
+        Returns
+        -------
+        A text for the user, with the standard deviation of places and the misfit before and after.
 
         Raises
         ------
@@ -136,9 +141,13 @@ class UniversalEstimator:
     def label(
         self, place_mm: Float[np.ndarray, "n 2"], db_uT: Float[np.ndarray, "n ch"], held_out: Bool[np.ndarray, " n"]
     ) -> str:
-        """Calibrate to presses at known places; return a summary of the error at held-out presses before and after.
+        """Calibrate to presses at known places, except for those that are held out.
 
-        The forces were not measured, so the model's own estimates are used as force labels.
+        The forces were not measured, so the model's estimates are used as force labels.
+
+        Returns
+        -------
+        A text for the user, with the median error of the place at held-out presses before and after.
 
         Raises
         ------
@@ -174,27 +183,27 @@ class UniversalEstimator:
         if len(self._labelled_uT):
             b_uT = self._labelled_uT + self._noload_uT
             model.label(self._labelled_mm, model.estimate(b_uT).force_N, b_uT, keep=True)
-        model.estimate(self._noload_uT)  # makes the model do its preparations now, not at the first contact
+        model.estimate(self._noload_uT)  # the first estimate of a model is slow, so do it before the first contact
         self._model = model
 
 
 def check_ports(ports: Sequence[str], models: Models, where: str) -> None:
-    """Raise ParamsError if a port is invalid or named twice, or if a model calibrated to one skin has several ports."""
+    """Raise ParamsError for an invalid or repeated port, and for several ports with a model calibrated to one skin."""
     find.check_named_once(ports, where)
-    for port in ports:  # only the names are checked: an unplugged board may be plugged in later
+    for port in ports:  # the port need not exist: an unplugged board may be plugged in later
         check_name(port)
     if len(ports) > 1 and isinstance(models, Universal) and models.presses_n:
         raise ParamsError(
-            f"{where}: a model that is calibrated to one skin ({models.presses_n} presses) cannot estimate for "
-            f"{len(ports)} boards. Open only that board, or omit the model."
+            f"{where}: the model is calibrated to one skin ({models.presses_n} presses) and cannot be used for "
+            f"{len(ports)} boards. Open only the board of that skin, or omit the model."
         )
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Positions of a board's chips, in the coordinate frame of the labels."""
+    """Positions of a board's chips and of the skin, in the coordinate system of the labels x_mm and y_mm."""
 
-    known: bool  # False: the positions are unknown, and chips are shown in a row
+    known: bool  # whether the positions are known; if not, `chips_mm` is a row of chips for the display
     chips_mm: Float64[np.ndarray, "k 2"]
     turn: Float64[np.ndarray, "k 3 3"]  # rotation from each chip's axes to the board's axes
     corner_mm: tuple[float, float]  # lower left corner of the skin
@@ -202,10 +211,10 @@ class Layout:
 
 
 def layout_of(chips_n: int) -> Layout:
-    """Return the layout of the nominal board with this number of chips; if there is none, arrange the chips in a row.
+    """Return the layout of the nominal board with this number of chips; without such a board, a layout with one row.
 
-    The byte stream does not identify the board, so a board with five chips is assumed to be the paper's board, and one
-    with forty chips its sleeve.
+    The byte stream does not identify the board. A board with five chips is assumed to be the paper's board, and a board
+    with forty chips the paper's sleeve.
     """
     for name, settings in nominal("boards").items():
         design = parse(BoardDesign, settings["design"], f"nominal board {name}")
@@ -226,26 +235,26 @@ def layout_of(chips_n: int) -> Layout:
 class Contact(NamedTuple):
     """One reading of a board, with its estimate.
 
-    Without contact, the place is NaN and the force 0. Without a usable reading, place and force are NaN, and `alarms`
-    gives the reason, such as a failed read, or a board that is silent or unplugged.
+    Without contact, the place is NaN and the force is 0. If the reading is not usable, place and force are NaN, and
+    `alarms` contains the reason, such as a failed read, or a board that is silent or unplugged.
     """
 
     t_s: float  # unix time at which the last byte of the reading arrived
     x_mm: float
     y_mm: float
     F_N: float
-    sd_mm: tuple[float, float]  # of x and y: of the universal model, or between networks (NaN for a single network)
+    sd_mm: tuple[float, float]  # standard deviations of x and y (between networks; NaN for a single network)
     b_uT: Float32[np.ndarray, " ch"]
-    alarms: tuple[str, ...]  # current problems of the board; empty if there are none
+    alarms: tuple[str, ...]  # current problems of the board
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """Frames that were decoded together, in the order of arrival, with their estimates."""
+    """Frames from one call of `LiveSkin.poll`, in the order of arrival, with their estimates."""
 
     t_s: Float64[np.ndarray, " f"]
     b_uT: Float32[np.ndarray, "f ch"]
-    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading is taken, and for faulty frames
+    db_uT: Float32[np.ndarray, "f ch"]  # NaN before the no-load reading, and for faulty frames
     target: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N, as in `Contact`; NaN without a model
     sd_mm: Float64[np.ndarray, "f 2"]
     contact: Bool[np.ndarray, " f"]
@@ -255,10 +264,10 @@ class Estimates:
 
 
 class LiveSkin:
-    """A skin on a port, returned by `reskin.open`.
+    """Contacts of the skin on one port, returned by `reskin.open`.
 
-    Use it in a `with` statement, which opens the port and takes the no-load reading. Iterating over it yields the
-    latest contact; iterating over `every()` yields the contact of every reading.
+    Use a `LiveSkin` in a `with` statement, which opens the port and takes the no-load reading. Iteration over a
+    `LiveSkin` yields the latest contact; iteration over `every()` yields the contact of every reading.
     """
 
     def __init__(
@@ -267,7 +276,7 @@ class LiveSkin:
         self.port, self.fault_policy = port, fault_policy
         self.detected = find.DetectedBoard(port, WAITING)
         self.description = port  # once detected: port, wire format and scale
-        self.account: Counter[str] = Counter()  # the counts of `FrameStream`, over all streams since the start
+        self.account: Counter[str] = Counter()  # sum of the counts of all `FrameStream`s since the start
         self.reader = Reader(port, baud)
         self.estimator: NetworkEstimator | UniversalEstimator | None = None
         if isinstance(models, Universal):
@@ -280,7 +289,7 @@ class LiveSkin:
         self._restart_noload()
 
     def __enter__(self) -> "LiveSkin":
-        """Open the port, detect the wire format, and take the no-load reading, while nothing touches the skin."""
+        """Open the port, detect the wire format, and take the no-load reading. Nothing may touch the skin meanwhile."""
         self.reader.start(must_exist=True)
         try:
             end_s = self.reader.unix_s() + OPENING_S
@@ -300,9 +309,9 @@ class LiveSkin:
         self.reader.stop()
 
     def __iter__(self) -> Iterator[Contact]:
-        """Yield the contact of the latest reading, never the same one twice; readings that became outdated are skipped.
+        """Yield the contact of the latest reading, skipping older readings; never yield a reading twice.
 
-        Yields a contact whose values are NaN if no data arrives for `SILENT_S` or the board is unplugged.
+        Yields a contact whose values are NaN if no data arrives for `SILENT_S` or if the board is unplugged.
         """
         while True:
             yield self._contact(self.poll(SILENT_S, latest=True), -1)
@@ -310,7 +319,7 @@ class LiveSkin:
     def every(self) -> Iterator[Contact]:
         """Yield the contact of every reading.
 
-        If the caller falls two minutes behind, the oldest readings are lost and counted in `reader.missed_bytes_n`.
+        If the caller is two minutes late, the oldest bytes are discarded and counted in `reader.missed_bytes_n`.
         """
         while True:
             estimates = self.poll(SILENT_S)
@@ -318,12 +327,12 @@ class LiveSkin:
                 yield self._contact(estimates, i)
 
     def zero(self) -> None:
-        """Take a new no-load reading from the next second without contact; may be called from any thread."""
-        self._noload_requested = True  # only a request, because only the polling thread may change the collected frames
+        """Request a new no-load reading, from the next second without contact. May be called from any thread."""
+        self._noload_requested = True  # the polling thread takes the reading, because it collects the frames
 
     @property
     def zeroed(self) -> bool:
-        """Whether the no-load reading has been taken."""
+        """Whether there is a no-load reading and no new one is requested."""
         return self.noload_uT is not None and not self._noload_requested
 
     @property
@@ -333,12 +342,15 @@ class LiveSkin:
 
     @property
     def lost_bytes_n(self) -> int:
-        """Number of bytes read too late or outside frames; a frame that was cut by opening the port does not count."""
+        """Number of bytes that were discarded or were not in a complete frame.
+
+        The rest of a frame that was being sent when the port was opened is not counted.
+        """
         skipped_n = sum(count for name, count in self.account.items() if name.startswith("skipped_"))
         return skipped_n + self.reader.missed_bytes_n - self._partial_first_bytes_n
 
     def alarms(self) -> tuple[str, ...]:
-        """Return the current alarms."""
+        """Return the texts of all current alarms of the port, the model and the board."""
         alarms = []
         if self.reader.problem and not self.reader.plugged_in:
             alarms.append(f"{'unplugged' if self.reader.was_plugged_in else 'not open'}: {self.reader.problem}")
@@ -352,7 +364,7 @@ class LiveSkin:
         return tuple(alarms)
 
     def poll(self, wait_s: float, *, latest: bool = False) -> Estimates | None:
-        """Decode the data that has arrived, and estimate.
+        """Decode all bytes that have arrived, and estimate place and force for the frames.
 
         Parameters
         ----------
@@ -384,7 +396,7 @@ class LiveSkin:
         return self._estimate(frames, t_s, sound)
 
     def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Collect chunks until there are enough to detect the wire format; then return all of them."""
+        """Collect chunks until they suffice to detect the wire format, and return all of them; return [] before."""
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
@@ -399,18 +411,18 @@ class LiveSkin:
         self.description = f"{detected.port}: {detected.format}, {detected.scale}"
         self.health, self.layout = Health(detected.chips_n, self.fault_policy), layout_of(detected.chips_n)
         self._start_stream(detected)
-        self.detected = detected  # set last, because other threads then use the attributes set above
+        self.detected = detected  # set last: other threads use the attributes above as soon as a board is detected
         return chunks
 
     def _reject_model(self, estimator: NetworkEstimator | UniversalEstimator, chips_n: int) -> None:
-        """Handle a model for another number of chips.
+        """Handle a model that does not fit the board's number of chips.
 
-        Networks raise `SchemaError`, because the user chose them. The universal model may be the default, so it is only
-        disabled, with an alarm.
+        For networks, raise `SchemaError`, because the user chose them. The universal model may be the default, so it is
+        only disabled, with an alarm.
         """
         if isinstance(estimator, NetworkEstimator):
             raise SchemaError(
-                f"{self.port}: the board has {3 * chips_n} channels, but the model {estimator.channels_n}. "
+                f"{self.port}: the board has {3 * chips_n} channels, but the model has {estimator.channels_n}. "
                 "Use a model that was trained on such boards."
             )
         self.estimator = None
@@ -423,7 +435,7 @@ class LiveSkin:
         self._ends: deque[tuple[int, float]] = deque([(0, self.reader.unix_s())], maxlen=ENDS_KEPT_N)
 
     def _decode(self, chunks: list[Chunk]) -> tuple[Frames, Float64[np.ndarray, " f"]]:
-        """Return the frames in the chunks and their arrival times; a board plugged in again starts a new stream."""
+        """Return the frames in the chunks, and their arrival times; start a new stream where a board was plugged in."""
         starts = [i for i, (chunk, _) in enumerate(chunks) if chunk == PLUGGED_IN]
         parts = []
         for first, last in pairwise([0, *starts, len(chunks)]):
@@ -446,15 +458,15 @@ class LiveSkin:
         return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
     def _count_bytes(self, now_s: float) -> None:
-        """Add the stream's counts since the last call to `account`, and raise alarms for lost bytes."""
+        """Add the counts of the stream since the last call to `account`, and raise alarms for lost bytes."""
         frame_min_n = FRAME_BYTES_MIN_N * self.detected.chips_n
         counted = Counter(self._stream.account())
         new, at_start, self._counted = counted - self._counted, not self._counted["frames_n"], counted
         self.account += new
         lost_n = sum(count for name, count in new.items() if name.startswith("skipped_"))
         frame_n = new["frame_bytes_n"] / new["frames_n"] if new["frames_n"] else frame_min_n
-        # The port was opened in the middle of a frame, whose bytes do not count as lost. One more byte may be skipped,
-        # because the next frame cannot be recognised from the last byte of the cut frame alone.
+        # If the port was opened in the middle of a frame, the rest of this frame is not counted as lost. One more byte
+        # may be skipped, because one byte of the cut frame is not enough to recognise the next frame.
         if at_start and self._first_bytes_n + lost_n <= frame_n + 1:
             self._first_bytes_n += lost_n
             self._partial_first_bytes_n += lost_n
@@ -466,13 +478,13 @@ class LiveSkin:
 
     def _restart_noload(self) -> None:
         self.noload_uT: Float64[np.ndarray, " ch"] | None = None
-        self._contact_uT = np.inf  # threshold of |dB| for a contact
+        self._contact_uT = np.inf  # readings with a larger |dB| are in contact
         self._quiet: list[Frames] = []
         self._quiet_from_s = np.inf
-        self._noload_requested = False  # set last, so that a request during this call is not forgotten
+        self._noload_requested = False  # set last: this call also fulfils a request that arrives during it
 
     def _take_noload(self, frames: Frames, t_s: Float64[np.ndarray, " f"]) -> None:
-        """Collect frames for one second; if nothing moved, use their mean as the no-load reading."""
+        """Collect frames for one second. If the field did not change, their mean becomes the no-load reading."""
         if self._noload_requested:
             self._restart_noload()
         self._quiet.append(frames)
@@ -482,8 +494,8 @@ class LiveSkin:
         if len(b_uT) < 2 or (duration_s < NOLOAD_S and len(b_uT) < NOLOAD_FRAMES_MAX_N):
             return
         self._quiet, self._quiet_from_s = [], np.inf
-        with suppress(CaptureError):  # something moved: try again with the next second
-            # Times are assumed to be evenly spaced, because all frames of a chunk have the same arrival time.
+        with suppress(CaptureError):  # from `quiet_start` if the field changed; then the next second is tried
+            # Evenly spaced times replace the arrival times, which are equal for all frames of a chunk.
             b_uT = b_uT[: quiet_start(np.linspace(0, duration_s, len(b_uT)), b_uT, where=self.port)]
             if self.estimator is not None:
                 self.estimator.set_noload(b_uT)
@@ -519,7 +531,7 @@ class LiveSkin:
 
 
 class LiveSkins:
-    """Skins on several ports. Iterating over it yields tuples of their latest contacts, in the order of the ports."""
+    """Contacts of the skins on several ports. Iteration yields tuples of the latest contacts, in the order of ports."""
 
     def __init__(self, skins: Sequence[LiveSkin]) -> None:
         self.skins = skins
@@ -533,7 +545,7 @@ class LiveSkins:
         ]
 
     def __enter__(self) -> "LiveSkins":
-        """Open all ports and take all no-load readings simultaneously; if one port fails, close all of them."""
+        """Open all ports and take all no-load readings simultaneously; if one port fails, close all ports."""
         with self._open_ports as ports, ThreadPoolExecutor(len(self.skins)) as pool:
             for opening in [pool.submit(ports.enter_context, skin) for skin in self.skins]:
                 opening.result()
@@ -549,7 +561,7 @@ class LiveSkins:
         self._open_ports.close()
 
     def __iter__(self) -> Iterator[tuple[Contact, ...]]:
-        """Yield the latest contacts of all boards whenever a board has a new one; values of silent boards are NaN."""
+        """Yield the latest contacts of all boards whenever one board has a new contact; silent boards have NaN."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._error or (self._new and None not in self._latest))

@@ -1,8 +1,9 @@
 """Domain-adversarial training (Ganin et al., JMLR 2016), a reference method for adaptation.
 
-A second network, the discriminator, predicts from the features whether a reading is from a known skin or from the new
-one, and the features are trained to mislead it. With weight 0, this is the control. The module has its own training
-loop, because the two-skin batches and the discriminator cannot be expressed as a loss term in `reskin.models.train`.
+A second network, the discriminator, predicts from the features of the first network whether a reading is from a known
+skin or from the new skin. The first network is trained so that the discriminator fails. With weight 0, the features are
+not affected by the discriminator, which is the control. This module has a separate training loop, because batches from
+two sets of skins and a second network are not possible in `reskin.models.train`.
 """
 
 from dataclasses import dataclass
@@ -21,17 +22,15 @@ from reskin.models.train import AdamW, clip_gradients, one_cycle
 
 DISCRIMINATOR_WIDTH = 64  # assumed
 MOMENTUM = 0.5  # with a larger value, the two opposing networks oscillate (Radford et al., ICLR 2016)
-RAMP_RATE = (
-    10.0  # at fraction p of the training, the weight is multiplied by 2 / (1 + exp(-10 p)) - 1, as in Ganin et al.
-)
-# A `Stack` requires that the output of its third layer has `FEATURES_N` values.
+RAMP_RATE = 10.0  # of `ramp`, from Ganin et al.
+# The third layer has `FEATURES_N` outputs, as required by `Stack`.
 DISCRIMINATOR_WIDTHS = (FEATURES_N, DISCRIMINATOR_WIDTH, DISCRIMINATOR_WIDTH, FEATURES_N, 1)
 DISCRIMINATOR = tuple(Layer(in_n, out_n, out_n > 1) for in_n, out_n in pairwise(DISCRIMINATOR_WIDTHS))
 
 
 @dataclass(frozen=True)
 class Domains:
-    """Scaled inputs and targets of the known skins, and scaled inputs of the new skin."""
+    """Training data: scaled inputs and targets of the known skins, and scaled inputs of the new skin."""
 
     known: Float32[np.ndarray, "n c"]
     target: Float32[np.ndarray, "n t"]
@@ -39,13 +38,17 @@ class Domains:
 
 
 def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: np.random.Generator) -> Weights:
-    """Train one network from random weights; half of each batch is from the known skins, half from the new skin."""
+    """Train one network from random initial weights, and return its weights.
+
+    Each batch has equal numbers of readings from the known skins and from the new skin. `weight` is the final weight of
+    the discriminator's gradient, which is reversed for the features.
+    """
     torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
     layers = paper_layers(domains.known.shape[1], domains.target.shape[1])
     net = Stack(layers, [draw_weights(layers, rng)])
     discriminator = Stack(DISCRIMINATOR, [draw_weights(DISCRIMINATOR, rng)])
     optimizer = AdamW([*net.parameters(), *discriminator.parameters()], schedule.weight_decay)
-    known, target, new = (torch.from_numpy(part)[None] for part in (domains.known, domains.target, domains.new))
+    known, target, new = (torch.from_numpy(rows)[None] for rows in (domains.known, domains.target, domains.new))
     is_new = torch.cat([torch.zeros(schedule.batch_n), torch.ones(schedule.batch_n)])[None, :, None]
     for step_i in range(schedule.steps_n):
         row = torch.from_numpy(rng.integers(known.shape[1], size=schedule.batch_n))
@@ -69,10 +72,12 @@ def reverse_gradient(values: Float[torch.Tensor, "m b d"], weight: float) -> Flo
     return (1 + weight) * values.detach() - weight * values
 
 
-def ramp(part: float) -> float:
-    """Return the factor of the weight at a fraction of the training: 0 at first, so that features can form.
+def ramp(fraction: float) -> float:
+    """Return the factor of the discriminator's weight after a fraction p of the training: 2 / (1 + exp(-10 p)) - 1.
 
-    >>> [round(ramp(part), 2) for part in (0.0, 0.1, 1.0)]
+    The factor starts at 0, so that the network first learns features that predict the targets.
+
+    >>> [round(ramp(fraction), 2) for fraction in (0.0, 0.1, 1.0)]
     [0.0, 0.46, 1.0]
     """
-    return float(2 / (1 + np.exp(-RAMP_RATE * part)) - 1)
+    return float(2 / (1 + np.exp(-RAMP_RATE * fraction)) - 1)

@@ -1,7 +1,7 @@
-"""Reference methods for adaptation that align two skins by a linear map in closed form.
+"""Reference methods for adaptation, which map the inputs of one skin to those of another by a fitted affine map.
 
-Matching the mean and the standard deviation of each channel, or the covariance of the channels (CORAL), needs no
-labels. Direct standardisation needs pairs of readings at the same places.
+Two methods need no labels: matching the mean and the standard deviation of each channel, and matching the covariance of
+the channels (CORAL). Direct standardisation needs pairs of readings of both skins at the same places.
 """
 
 from dataclasses import dataclass
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-CORAL_RIDGE = 1.0  # added to every variance of standardised inputs (Sun, Feng & Saenko, AAAI 2016)
-SD_MIN = 1e-6  # lower limit of standard deviations, so that a constant channel can be divided by it
-RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # in units of (mean square of a channel) * (number of pairs)
+CORAL_RIDGE = 1.0  # added to each variance of standardised inputs (Sun, Feng & Saenko, AAAI 2016)
+SD_MIN = 1e-6  # lower limit of standard deviations, which avoids a division by zero for constant channels
+RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # candidates; unit: (mean square of a channel) * (number of pairs)
 Inputs = Float[np.ndarray, "n c"]
 
 
@@ -24,51 +24,51 @@ class Map:
     after: Float[np.ndarray, " c"]
 
     def __call__(self, inputs: Inputs) -> Inputs:
-        """Map inputs of skin `of` to inputs of skin `to`."""
+        """Map inputs of the source skin to inputs of the target skin."""
         return (inputs - self.before) @ self.matrix + self.after
 
 
-def match_channels(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"]) -> Map:
-    """Fit the map that matches the mean and the standard deviation of each channel."""
-    return Map(of.mean(axis=0), np.diag(_sd(to) / _sd(of)), to.mean(axis=0))
+def match_channels(source: Float[np.ndarray, "n c"], target: Float[np.ndarray, "m c"]) -> Map:
+    """Fit the map that gives each channel of the source skin the mean and the standard deviation of the target skin."""
+    return Map(source.mean(axis=0), np.diag(_sd(target) / _sd(source)), target.mean(axis=0))
 
 
-def coral(of: Float[np.ndarray, "n c"], to: Float[np.ndarray, "m c"], ridge: float = CORAL_RIDGE) -> Map:
-    """Fit the map that whitens inputs, recolours them with the other skin's covariance, and matches the means (CORAL).
+def coral(source: Float[np.ndarray, "n c"], target: Float[np.ndarray, "m c"], ridge: float = CORAL_RIDGE) -> Map:
+    """Fit the map that gives inputs of the source skin the covariance and the mean of the target skin (CORAL).
 
-    With both skins in units of the standard deviations of `of`, the matrix is C_of^-1/2 C_to^1/2, where `ridge` times
-    the identity is added to each covariance C.
+    With both skins in units of the standard deviations of `source`, the matrix is C_source^-1/2 C_target^1/2, where
+    `ridge` times the identity is added to each covariance C.
     """
-    scale = _sd(of)
-    covariances = [np.cov(side / scale, rowvar=False) + ridge * np.eye(of.shape[1]) for side in (of, to)]
+    scale = _sd(source)
+    covariances = [np.cov(side / scale, rowvar=False) + ridge * np.eye(source.shape[1]) for side in (source, target)]
     matrix = _power(covariances[0], -0.5) @ _power(covariances[1], 0.5)
-    return Map(of.mean(axis=0), matrix / scale[:, None] * scale, to.mean(axis=0))
+    return Map(source.mean(axis=0), matrix / scale[:, None] * scale, target.mean(axis=0))
 
 
-def direct(of: Float[np.ndarray, "p c"], to: Float[np.ndarray, "p c"], ridge: float) -> Map:
-    """Fit the linear map from inputs to paired inputs of another skin (direct standardisation, Wang & Kowalski 1991).
+def direct(source: Float[np.ndarray, "p c"], target: Float[np.ndarray, "p c"], ridge: float) -> Map:
+    """Fit a linear map to p pairs of inputs at the same places (direct standardisation, Wang & Kowalski 1991).
 
     The map is the identity plus a ridge regression of the differences within pairs, so that it is the identity in
-    directions without data. There is no constant term, because without contact the field change of every skin is zero.
+    directions without data. There is no constant term, because the field change without contact is zero for any skin.
     """
-    none = np.zeros(of.shape[1])
-    gain = np.linalg.solve(of.T @ of + _penalty(of, ridge), of.T @ (to - of))
-    return Map(none, np.eye(of.shape[1]) + gain, none)
+    origin = np.zeros(source.shape[1])
+    gain = np.linalg.solve(source.T @ source + _penalty(source, ridge), source.T @ (target - source))
+    return Map(origin, np.eye(source.shape[1]) + gain, origin)
 
 
-def choose_ridge(of: Float[np.ndarray, "p c"], to: Float[np.ndarray, "p c"]) -> float:
+def choose_ridge(source: Float[np.ndarray, "p c"], target: Float[np.ndarray, "p c"]) -> float:
     """Choose the ridge of `direct` by leave-one-out cross-validation over the pairs."""
 
     def error(ridge: float) -> float:
-        hat = of @ np.linalg.solve(of.T @ of + _penalty(of, ridge), of.T)
-        off = (to - of) - hat @ (to - of)
-        return float(((off / (1 - np.diag(hat))[:, None]) ** 2).sum())
+        leverage = source @ np.linalg.solve(source.T @ source + _penalty(source, ridge), source.T)
+        residual = (target - source) - leverage @ (target - source)
+        return float(((residual / (1 - np.diag(leverage))[:, None]) ** 2).sum())
 
     return min(RIDGES, key=error)
 
 
-def _penalty(of: Float[np.ndarray, "p c"], ridge: float) -> Float[np.ndarray, "c c"]:
-    return ridge * (of**2).sum() / of.shape[1] * np.eye(of.shape[1])
+def _penalty(source: Float[np.ndarray, "p c"], ridge: float) -> Float[np.ndarray, "c c"]:
+    return ridge * (source**2).sum() / source.shape[1] * np.eye(source.shape[1])
 
 
 def _sd(inputs: Inputs) -> Float[np.ndarray, " c"]:

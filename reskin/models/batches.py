@@ -1,4 +1,4 @@
-"""Training data of a stack of networks: scaled rows, initial weights, and the batches of each step."""
+"""Prepare the training data of a stack of networks: scaled rows, initial weights, and the batches of each step."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ AXES_N = 3
 
 @dataclass(frozen=True)
 class LabelledRows:
-    """Scaled inputs and targets; `points` are for sampling triplets, and None if the recipe has no triplet loss."""
+    """Scaled inputs and targets; `points` are for sampling triplets (None if the recipe has no triplet loss)."""
 
     inputs: Float32[np.ndarray, "n c"]
     targets: Float32[np.ndarray, "n t"]
@@ -28,10 +28,10 @@ class LabelledRows:
 
 @dataclass(frozen=True)
 class UnlabelledRows:
-    """Scaled inputs whose only label is their order along lines.
+    """Scaled inputs of unlabelled pokes, of which only the order along lines is known.
 
-    `points` are the points of the lines, for sampling triplets. A row may be on two lines, so `row` contains the row
-    number of each point.
+    `points` are the points of all lines, for sampling triplets, and `row` contains the number of the row in `inputs`
+    for each point. A row may be a point of two lines.
     """
 
     inputs: Float32[np.ndarray, "p c"]
@@ -41,7 +41,7 @@ class UnlabelledRows:
 
 @dataclass(frozen=True)
 class PreparedJob:
-    """One network of a stack: its initial weights, its random generator, and its scaled rows.
+    """Initial weights, random generator and scaled training rows of one network of a stack.
 
     `unlabelled` (for adaptation) and `few_labels` (for fine-tuning) are rows of a new skin.
     """
@@ -54,13 +54,13 @@ class PreparedJob:
 
 
 def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
-    """Scale the rows of a job and draw its initial weights.
+    """Scale the training rows of a job and draw initial weights; return them, and the scaler.
 
-    The scaler is fitted to the training rows. Adaptation and fine-tuning start from a trained network, and use its
-    scaler and its weights.
+    The scaler is fitted to the training rows. Adaptation and fine-tuning use the scaler and the weights of the trained
+    network from which they start.
     """
     recipe, target = job.recipe, data.target[job.train]
-    # The name of the random stream does not include the recipe, so that all recipes have the same initial weights and
+    # The names of the random generator do not include the recipe, so that all recipes have the same initial weights and
     # the same batches.
     retry = ("again", job.attempt_i) if job.attempt_i else ()
     rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
@@ -68,8 +68,9 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
         view = VIEW[recipe.inputs](data.db_uT[job.train])
         scaler = FIT[recipe.scaling](view, target)
         layers = LAYERS[recipe.architecture](view.shape[1], target.shape[1])
-        # The outputs of the released network have a ReLU. With a random output bias, about one in three networks would
-        # start with an output that is always 0 and never learns. So the output bias is the mean of the scaled target.
+        # The initial output bias is the mean of the scaled target. With a random bias, about one in three networks of
+        # the released architecture, which has a ReLU on the outputs, would have an output that is always 0 and never
+        # learns.
         known = ~np.isnan(target).all(axis=0)
         mean = np.zeros(target.shape[1], np.float32)
         mean[known] = np.nanmean(scaler.encode_target(target)[:, known], axis=0, dtype=np.float64)
@@ -80,7 +81,7 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     unlabelled = few_labels = None
     if job.loss_weights.unlabelled:
         assert isinstance(job.tuning, Adaptation)
-        lines = job.tuning.lines  # the only data of the new skin: field changes and their order along lines
+        lines = job.tuning.lines  # the order of the pokes; besides the field changes, the only data of the new skin
         row, point_row = np.unique(lines.row, return_inverse=True)
         view = VIEW[recipe.inputs](data.db_uT[row])
         points = triplet_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
@@ -111,15 +112,15 @@ def virtual_boards(
     settings: Augmentation,
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
-    """Copy all rows `copies_n` times, as if other boards had measured them.
+    """Copy all rows `copies_n` times, and change the field changes as if other boards had measured them.
 
-    For each copy of a skin, the gains of the channels and the tilts of the chips are drawn at random. Noise is drawn
-    for each reading.
+    For each copy of a skin, random gains of the channels and tilts of the chips are drawn. Noise is drawn for each
+    reading.
 
     Returns
     -------
-    db_uT : field changes; row i of copy c is row c * f + i
-    skin : number of the virtual skin of each row
+    db_uT : field changes [v ch], v = copies_n * f; row c * f + i is the copy c of row i
+    skin : number of the virtual skin of each row; each copy of a skin has a different number
     """
     from scipy.spatial.transform import Rotation  # imported late, because few recipes have virtual boards
 
@@ -140,18 +141,21 @@ def virtual_boards(
 
 
 Batch = dict[str, torch.Tensor]
-# For each tensor of a batch, the name of the rows from which it is gathered.
+# Name of a tensor of a batch -> name of the array in `BatchSampler.rows` from which the tensor is gathered.
 _SOURCE = {
     "inputs": "inputs", "targets": "targets", "positive": "inputs", "negative": "inputs",
     "unlabelled": "unlabelled", "unlabelled_positive": "unlabelled", "unlabelled_negative": "unlabelled",
     "few_labels": "few_labels", "few_labels_targets": "few_labels_targets",
 }  # fmt: skip
-# One generator per kind of draw, so that adding a loss term does not change the draws for the other terms.
+# Each loss term has separate random generators, so that adding a loss term does not change the draws of the others.
 _STREAMS = ("labelled", "pairs", "unlabelled", "few_labels")
 
 
 class BatchSampler:
-    """Draws batches from the rows of a stack, which are concatenated over its networks and stored on the device."""
+    """Draws batches for all networks of a stack.
+
+    The rows of the networks are concatenated and stored on the device.
+    """
 
     def __init__(self, jobs: Sequence[PreparedJob], batch_n: int, device: str) -> None:
         self.jobs, self.batch_n, self.device = jobs, batch_n, device
@@ -169,12 +173,12 @@ class BatchSampler:
         self.first_row = {name: np.cumsum([0, *map(len, values)])[:-1] for name, values in rows.items()}
 
     def sample(self, steps_n: int) -> Iterator[Batch]:
-        """Draw the batches of `steps_n` steps; each tensor has dimensions [m b ...].
+        """Draw the batches of `steps_n` steps; each tensor has dimensions [networks, rows of a batch, ...].
 
-        A batch contains `inputs` and `targets` of labelled rows. With a triplet loss, it also contains `positive` and
-        `negative`, which form triplets with the anchors `inputs`; with unlabelled rows, the triplets `unlabelled` (the
-        anchors), `unlabelled_positive` and `unlabelled_negative`; with a few labelled rows of the new skin,
-        `few_labels` and `few_labels_targets`.
+        A batch contains `inputs` and `targets` of labelled rows. If the recipe has a triplet loss, `positive` and
+        `negative` form triplets with `inputs` as the anchors. For adaptation, `unlabelled` (the anchors),
+        `unlabelled_positive` and `unlabelled_negative` are triplets of unlabelled rows of the new skin. For
+        fine-tuning, `few_labels` and `few_labels_targets` are the inputs and targets of labelled rows of the new skin.
         """
         shape = (steps_n, self.batch_n)
         drawn = [_draw_rows(job, shape, rngs) for job, rngs in zip(self.jobs, self.rngs, strict=True)]

@@ -1,4 +1,4 @@
-"""Classical regression methods: reference methods for the networks, trained on the same folds."""
+"""Classical regression methods, which are trained on the same folds as the networks, as reference methods."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -26,13 +26,13 @@ from reskin.seeds import rng_for
 
 
 class _Method(Strict):
-    """Base class of the settings of a method: the view of the inputs (see `reskin.models.inputs`)."""
+    """Base class of the settings of a method. `inputs` is a view of the field change (`reskin.models.inputs.VIEW`)."""
 
     inputs: Literal["raw", "shape"]
 
 
 class Ridge(_Method):
-    """Linear ridge regression. `alpha` weights the penalty relative to the sum of standardised squared errors."""
+    """Linear ridge regression. `alpha` is the weight of the penalty relative to the sum of scaled squared errors."""
 
     title: ClassVar[str] = "ridge"
     method: Literal["ridge"]
@@ -40,7 +40,7 @@ class Ridge(_Method):
 
 
 class CubicRidge(_Method):
-    """Ridge regression on all products of up to three inputs: 815 products of 15 inputs, 968 products of 16."""
+    """Ridge regression on all products of up to three inputs: 815 products for 15 inputs, 968 products for 16."""
 
     title: ClassVar[str] = "cubic ridge"
     method: Literal["cubic_ridge"]
@@ -48,7 +48,7 @@ class CubicRidge(_Method):
 
 
 class Neighbours(_Method):
-    """Mean over the nearest training rows, weighted by (row weight / distance)."""
+    """Mean of the targets of the nearest training rows, with weights (row weight / distance)."""
 
     title: ClassVar[str] = "k nearest neighbours"
     method: Literal["knn"]
@@ -86,16 +86,16 @@ Classical = Annotated[Ridge | CubicRidge | Neighbours | RbfRidge | Boosting, Fie
 
 @dataclass(frozen=True)
 class _Part:
-    """A regressor for those targets (columns 0, 1, 2) that are known in the same training rows."""
+    """A regressor for targets that are known in the same training rows."""
 
-    targets: list[int]
+    targets: list[int]  # columns of the targets: 0 is x, 1 is y, 2 is the force
     regressor: Any  # has methods fit(inputs, target, weight) and predict(inputs)
     rows_n: int
 
 
 @dataclass(frozen=True)
 class FittedRegressor:
-    """A fitted method, and the scaler that was fitted to its training rows."""
+    """A fitted method: one regressor per group of targets, and the scaler, fitted to the same training rows."""
 
     scaler: Scaler
     parts: tuple[_Part, ...]
@@ -125,10 +125,10 @@ def fit(
     *,
     weight: Float32[np.ndarray, " n"] | None,
 ) -> FittedRegressor:
-    """Fit a method to the rows whose targets (mm, mm, N) are known.
+    """Fit a method to rows; the targets are x in mm, y in mm and the force in N, and unknown targets are NaN.
 
     Targets that are known in different rows are fitted separately. `weight` is the weight of each row in the loss, or
-    in the mean over nearest neighbours. The scaler ignores it.
+    in the mean over nearest neighbours. It is not used for fitting the scaler.
     """
     assert weight is None or (weight > 0).all()
     _check_rows(settings, inputs, target)
@@ -150,13 +150,16 @@ def fit(
 
 
 def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
-    """Scale inputs that are constant in training to 0; with the smallest scale, they would dominate the distances."""
+    """Set the scale of constant inputs to infinity, so that they are scaled to 0.
+
+    With the smallest scale, an input that is constant in training but not in the test would dominate all distances.
+    """
     constant = scaler.input_scale <= SCALE_FLOOR
     return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
 
 
 def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], Int64[np.ndarray, " a"]]]:
-    """Group the targets that are known in the same rows; return each group with its rows."""
+    """Group the targets that are known in the same rows; return the columns and the row numbers of each group."""
     known = ~np.isnan(target)
     together: dict[bytes, list[int]] = {}
     for i in np.flatnonzero(known.any(axis=0)):
@@ -167,11 +170,11 @@ def _group_targets(target: Float32[np.ndarray, "n 3"]) -> list[tuple[list[int], 
 def _thin(
     rows_n: int, most_n: int, weight: Float[np.ndarray, " n"] | None, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
-    """Draw `most_n` of `rows_n` rows without replacement; return their row numbers and weights.
+    """Draw `most_n` of `rows_n` rows without replacement; return the row numbers and the weights of the drawn rows.
 
-    All rows that have more than the smallest weight are kept, because they are the few labelled rows of a new skin.
-    Their weight is reduced by the same factor as the number of the other rows, so that their fraction of the total
-    weight does not change.
+    All rows with more than the smallest weight are kept, because they are the few labelled rows of a new skin. Their
+    weight is multiplied by the kept fraction of the other rows, so that their fraction of the total weight is
+    unchanged.
     """
     if weight is None:
         return np.sort(rng.choice(rows_n, most_n, replace=False)), None
@@ -192,14 +195,14 @@ def _check_rows(settings: Classical, inputs: Float32[np.ndarray, "n c"], target:
     least_n = settings.neighbours_n if isinstance(settings, Neighbours) else 1
     if fewest_n < least_n:
         rule = f"{least_n} or more for each target"
-        raise TrainingError(settings.method, "training rows", rule, fewest_n, "Record more.")
+        raise TrainingError(settings.method, "training rows", rule, fewest_n, "Record more indentations.")
     if not np.isfinite(inputs).all():
         broken_n = int((~np.isfinite(inputs)).any(axis=1).sum())
         raise TrainingError(f"{settings.method}: the inputs of {broken_n} rows are not finite. Remove these rows.")
 
 
-BLOCK_ROWS_N = 4096  # rows per block, to limit memory: the kernel of a block and 6000 training rows takes 200 MB
-_THREADS = ThreadpoolController()  # created once, because finding the libraries takes 3 ms; limiting them takes 15 us
+BLOCK_ROWS_N = 4096  # rows per block, to limit memory: the kernel matrix with 6000 training rows takes 200 MB
+_THREADS = ThreadpoolController()  # created once, because its creation takes 3 ms, and each use only 15 us
 
 
 def one_thread() -> Any:
@@ -215,8 +218,8 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
         case CubicRidge():
             return _BlockwiseCubicRidge(settings.alpha)
         case Neighbours(neighbours_n=k):
-            # A k-d tree is fast, because readings vary along few directions. By default, scikit-learn would use brute
-            # force for 16 or more inputs.
+            # A k-d tree is fast, because readings vary along few directions. With 16 or more inputs, scikit-learn would
+            # use brute force by default.
             return _WeightedNeighbours(KNeighborsRegressor(k, weights="distance", algorithm="kd_tree"))
         case RbfRidge():
             return KernelRidge(kernel="rbf", alpha=settings.alpha, gamma=settings.gamma)
@@ -232,7 +235,10 @@ def make_regressor(settings: Classical, rng: np.random.Generator) -> Any:
 
 
 class _BlockwiseCubicRidge:
-    """Ridge regression on products of inputs, block by block: all products of the paper's rows would take 5 GB."""
+    """Ridge regression on products of inputs, computed in blocks of rows to limit memory.
+
+    The products for all rows of the paper's data would take 5 GB.
+    """
 
     def __init__(self, alpha: float) -> None:
         self.alpha = alpha
@@ -254,7 +260,10 @@ class _BlockwiseCubicRidge:
 
 @dataclass(frozen=True)
 class _WeightedNeighbours:
-    """Nearest neighbours with row weights w, which scikit-learn lacks: its mean of w y, divided by its mean of w."""
+    """Nearest neighbours with row weights w, which scikit-learn does not support.
+
+    The prediction is scikit-learn's prediction for w y, divided by that for w.
+    """
 
     neighbours: KNeighborsRegressor
 
@@ -274,9 +283,10 @@ def blocks(rows_n: int) -> list[slice]:
 
 @dataclass(frozen=True)
 class ClassicalJob:
-    """A method on one fold, with at most `rows_max_n` training rows, which are drawn at random.
+    """Training and test of a method on one fold; `train` and `test` are row numbers.
 
-    `few_labels` are numbers of labelled rows of a new skin. Their total weight equals that of all other rows.
+    At most `rows_max_n` training rows are used, drawn at random. `few_labels` are the numbers of additional training
+    rows, from a new skin. Their total weight equals that of all other training rows.
     """
 
     name: str
@@ -300,7 +310,7 @@ class ClassicalResult:
 
 @dataclass(frozen=True)
 class _JobRows:
-    """Only the rows that one job needs, because they are sent to another process."""
+    """The rows that one job needs; only they are sent to the process that runs the job."""
 
     train: Float32[np.ndarray, "a c"]
     target: Float32[np.ndarray, "a 3"]

@@ -1,7 +1,7 @@
-"""Inputs of the models: views of the field change, and scalers between physical units and a network's scaled values.
+"""Convert field changes to the inputs of models, and targets to scaled outputs.
 
-A view is a fixed function of a row. A scaler is fitted only to training rows, so that it contains no information about
-test rows.
+A view is a fixed function of the field change of a row. A scaler converts between a view or physical units and a
+network's scaled values. It is fitted only to training rows, so that it contains no information about test rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -10,12 +10,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed lower limit of |dB|, below the noise (3 uT per channel; the norm over 15 channels is about 15 uT). Its log is
-# 0, so that all inputs are 0 for a field change of 0.
+# Assumed lower limit of |dB|, below the noise, which is 3 uT per channel, or about 15 uT in the norm of 15 channels.
+# The log of this limit is 0, so that all inputs are 0 if the field change is 0.
 DB_FLOOR_uT = 1.0
-# Lower limit of scales, for channels that are constant in training.
+# Lower limit of scales, which avoids a division by zero for channels that are constant in training.
 SCALE_FLOOR = np.float32(1e-6)
-RELEASED_INPUT_SDS = np.float32(5.0)  # the scale in the released weights is about five standard deviations
+RELEASED_INPUT_SDS = np.float32(5.0)  # the input scale of the released network is about 5 standard deviations
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 
@@ -37,7 +37,7 @@ VIEW: Mapping[str, Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "
 class Scaler:
     """Scaling of a network's inputs and outputs.
 
-    inputs = (db - input_shift) / input_scale; x_mm, y_mm and F_N = outputs * target_scale + target_shift.
+    inputs = (view - input_shift) / input_scale, and (x_mm, y_mm, F_N) = outputs * target_scale + target_shift.
     """
 
     input_shift: Float32[np.ndarray, " ch"]
@@ -79,7 +79,10 @@ def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray,
 
 
 def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """Fit the scaler of the released network: each channel / 5 sd, without removing the mean; x / 16, y / 16, F / 3."""
+    """Fit the scaling of the released network: channels / (5 standard deviations), x / 16 mm, y / 16 mm, F / 3 N.
+
+    Means are not subtracted.
+    """
     return Scaler(
         input_shift=np.zeros(db_uT.shape[1], np.float32),
         input_scale=_floored(RELEASED_INPUT_SDS * db_uT.std(axis=0, dtype=np.float64)),

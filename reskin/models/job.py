@@ -1,6 +1,6 @@
 """Training jobs: a recipe on one fold with one seed, or fine-tuning of a trained network on a new skin.
 
-`JobKeys` computes the key under which a job's result is cached: a digest of everything that the result depends on.
+`JobKeys` computes the cache key of a job: a digest of everything on which the job's result depends.
 """
 
 import hashlib
@@ -20,7 +20,8 @@ from reskin.models.inputs import Scaler
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe, Schedule
 from reskin.numerics import device, signature
 
-# A network has collapsed if its explained variance of a target on training rows is lower; usually it is above 0.9.
+# A network has collapsed if its explained variance (R2) of a target on training rows is below this limit; usually it is
+# above 0.9.
 COLLAPSED = 0.05
 # The modules on whose code the result of training depends (tests/models/test_job.py compares them with the imports).
 CODE_MODULES = (
@@ -37,8 +38,8 @@ Weights = Mapping[str, np.ndarray]
 class LossWeights:
     """Weights of the loss terms that are added to the squared error on labelled rows.
 
-    triplet: of the triplet loss on labelled rows. unlabelled: of the triplet loss on unlabelled pokes of the new skin.
-    few_labels: of the squared error on labelled pokes of the new skin.
+    triplet: weight of the triplet loss on labelled rows. unlabelled: weight of the triplet loss on unlabelled pokes of
+    the new skin. few_labels: weight of the squared error on labelled pokes of the new skin.
     """
 
     triplet: float
@@ -48,7 +49,10 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the skin of each row (triplets are within a skin)."""
+    """Rows for training and test: field changes, targets (x, y, F or x, y, Fx, Fy, Fz), and the name of the skin.
+
+    The three rows of a triplet are from the same skin.
+    """
 
     db_uT: Float32[np.ndarray, "f ch"]
     target: Float32[np.ndarray, "f t"]
@@ -60,11 +64,11 @@ class TrainingResult:
     """The result of a training run.
 
     key: name of the result in the cache. curve: mean squared error in each block of steps. predicted: x, y in mm and
-    F in N for the test rows. stopped_step: step at which the training diverged, if it did; the weights are then the
-    last ones before this. explained_min: explained variance (R2) of the worst target on training rows; None for a short
-    training run. seconds: training time of the stack, divided by its number of networks. one_reading_s: median time of
-    a prediction for one reading. reused: whether the result is from the cache. collapsed_before_n: number of earlier
-    training runs of this job, all of which collapsed.
+    F in N for the test rows. stopped_step: step at which training diverged; None if it did not. `weights` are then
+    those before the divergence. explained_min: explained variance (R2) of the worst target on training rows; None for a
+    short training run. seconds: training time of the stack, divided by its number of networks. one_reading_s: median
+    time of a prediction for one reading. reused: whether the result is from the cache. collapsed_before_n: number of
+    earlier training runs of this job, all of which collapsed.
     """
 
     key: str
@@ -87,7 +91,7 @@ class TrainingResult:
 
 @dataclass(frozen=True)
 class Pretrained:
-    """A trained network from which adaptation or fine-tuning starts, and its key."""
+    """A trained network from which adaptation or fine-tuning starts; `key` is its name in the cache."""
 
     key: str
     weights: Weights
@@ -98,7 +102,7 @@ class Pretrained:
 class Adaptation:
     """Self-supervised fine-tuning on unlabelled pokes of a new skin (paper section 5).
 
-    The only data of the new skin that are used: the field changes of the rows in `lines`, and their order.
+    Of the new skin, only the field changes of the rows in `lines` and the order of these rows are used.
     """
 
     start: Pretrained
@@ -120,8 +124,8 @@ class TrainingJob:
     """One training run.
 
     experiment: the experiment that uses the result, such as `lobo` (leave one board out). train, test: row numbers.
-    skin: the skin to adapt to. what: an additional part of the name. attempt_i: number of earlier training runs of this
-    job, all of which collapsed.
+    tuning: None for training from random weights. skin: name of the skin to adapt to. what: additional text in the name
+    of the job. attempt_i: number of earlier training runs of this job, all of which collapsed.
     """
 
     experiment: str
@@ -158,7 +162,10 @@ class TrainingJob:
 
 
 class JobKeys:
-    """Computes cache keys for jobs on the same data: digests of rows, recipe, seed, start, code and libraries."""
+    """Computes cache keys for jobs on the same data.
+
+    A key is a digest of the rows, recipe, seed and initial weights of a job, and of the code and versions of libraries.
+    """
 
     def __init__(self, data: TrainingData) -> None:
         self.data = data
@@ -184,7 +191,7 @@ class JobKeys:
         return _digest(self.data.db_uT, self.data.target, np.unique(self.data.skin, return_inverse=True)[1])
 
     def _train_digest(self, train: np.ndarray) -> str:
-        if id(train) not in self._train_digests:  # the array is kept below, so that its id is not reused
+        if id(train) not in self._train_digests:  # the array is stored below, so that its id is not reused
             skin = np.unique(self.data.skin[train], return_inverse=True)[1]
             content = _digest(self.data.db_uT[train], self.data.target[train], skin)
             self._train_digests[id(train)] = (train, content)

@@ -1,7 +1,7 @@
 """Training losses: the squared error, and the paper's triplet loss (section 5) with the sampling of triplets.
 
-A triplet consists of an anchor, a positive and a negative from the same group (a skin, or a line of pokes). The
-positive is strictly nearer to the anchor than the negative.
+A triplet consists of three points of the same group (a skin, or a line of pokes): an anchor, a positive and a negative.
+The positive is strictly nearer to the anchor than the negative.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,11 @@ from jaxtyping import Bool, Float, Int64, Shaped
 
 from reskin.errors import TrainingError
 
-MAX_DRAWS_N = 100  # if half of all draws are ties, a fraction of 1e-30 of the anchors remains after this many
-TIE_RTOL = 1e-5  # of the sum of both squared distances; float32 rounding makes equal distances differ by 1e-6 of it
-COMPARED_PLACES_N = 64  # compared per group; a place with equal distances to all of them is not used as an anchor
+MAX_DRAWS_N = 100  # if half of all draws are ties, a fraction of 1e-30 of the anchors has a tie in all these draws
+# Two squared distances are a tie if they differ by less than this fraction of their sum. Rounding to float32 causes
+# differences of 1e-6.
+TIE_RTOL = 1e-5
+COMPARED_PLACES_N = 64  # places per group; a place at the same distance from all of them is not used as an anchor
 
 Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
 
@@ -22,12 +24,12 @@ Pairs = tuple[Int64[np.ndarray, " b"], Int64[np.ndarray, " b"]]
 def squared_error(
     predicted: Float[torch.Tensor, "m b t"], truth: Float[torch.Tensor, "m b t"]
 ) -> Float[torch.Tensor, " m"]:
-    """Mean squared error over the known targets of a batch, for each of m networks.
+    """Return the mean squared error over the known targets of a batch, for each of m networks.
 
     Unknown targets (NaN) contribute neither to the loss nor to the gradient.
     """
     known = ~torch.isnan(truth)
-    # Masked before squaring: otherwise the gradient would be 0 * NaN = NaN.
+    # Differences are masked before squaring, because otherwise the gradient would be 0 * NaN = NaN.
     difference = torch.where(known, predicted - truth, 0.0)
     return (difference**2).sum((1, 2)) / known.sum((1, 2))
 
@@ -35,9 +37,10 @@ def squared_error(
 def triplet_loss(
     anchor: Float[torch.Tensor, "m b d"], positive: Float[torch.Tensor, "m b d"], negative: Float[torch.Tensor, "m b d"]
 ) -> Float[torch.Tensor, " m"]:
-    """Batch mean of max(0, |a - p|^2 - |a - n|^2), with distances between features and without a margin (section 5).
+    """Return the mean of max(0, |a - p|^2 - |a - n|^2) over a batch, for each of m networks (section 5).
 
-    Because the distances are squared, the gradient is finite (0) where points coincide.
+    a, p and n are the features of anchor, positive and negative; the loss has no margin. Distances are squared, so that
+    the gradient is 0 and not infinite where points coincide.
     """
     positive_d2 = ((anchor - positive) ** 2).sum(-1)
     negative_d2 = ((anchor - negative) ** 2).sum(-1)
@@ -46,9 +49,10 @@ def triplet_loss(
 
 @dataclass(frozen=True)
 class TripletPoints:
-    """Points sorted by group: the points of group g are `order[start[g] : start[g] + count[g]]`.
+    """Points from which triplets are drawn, with an index by group.
 
-    A point can be an anchor if the other points of its group are not all at the same distance from it.
+    The numbers of the points of group g are `order[start[g] : start[g] + count[g]]`. A point can be an anchor if the
+    other points of the group are not all at the same distance from the point.
     """
 
     place: Float[np.ndarray, "n d"]
@@ -67,7 +71,7 @@ class TripletPoints:
 
 
 def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " n"]) -> TripletPoints:
-    """Sort points by group and find the anchors.
+    """Sort points by group, and find the points that can be anchors.
 
     Raises
     ------
@@ -92,10 +96,10 @@ def triplet_points(place: Float[np.ndarray, "n d"], group: Shaped[np.ndarray, " 
 
 
 def draw_triplets(points: TripletPoints, anchor: Int64[np.ndarray, " b"], rng: np.random.Generator) -> Pairs:
-    """Draw a positive and a negative for each anchor.
+    """Draw a positive and a negative for each anchor; return their point numbers.
 
-    Both are drawn uniformly from the other points of the anchor's group, and ties are redrawn. For a point that cannot
-    be an anchor, both are the point itself, so that its loss and its gradient are 0.
+    Both are drawn uniformly from the other points of the anchor's group, and ties are redrawn. If a point in `anchor`
+    cannot be an anchor, the positive and the negative are the point itself, so that the loss and the gradient are 0.
     """
     positive, negative = anchor.copy(), anchor.copy()
     left = np.flatnonzero(points.is_anchor[anchor])
@@ -120,7 +124,10 @@ def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.G
 
 
 def _find_anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Return the mask of points whose distances to other points, at `COMPARED_PLACES_N` places, are not all equal."""
+    """Return the mask of points of one group that can be anchors.
+
+    To save time, distances are compared only for points at the first `COMPARED_PLACES_N` places.
+    """
     places, index, points_n = _unique_places(place)
     others = places[:COMPARED_PLACES_N].astype(np.float64)
     d2 = ((places[:, None].astype(np.float64) - others) ** 2).sum(axis=2)  # [places others]

@@ -1,7 +1,7 @@
 """The paper's network and the one that its authors released: architecture, initial weights, and stacks of networks.
 
-A stack of m networks has one weight tensor per layer, so that one batched product replaces m small products. For
-networks of this size, the call overhead exceeds the cost of the arithmetic.
+A stack of m networks has one weight tensor per layer, so that one batched product replaces m small products. This is
+faster, because for networks of this size the overhead of a call exceeds the time for the arithmetic.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from reskin.models.job import Weights
 from reskin.models.reproducible import affine
 
 HIDDEN_N = 200
-FEATURES_N = 40  # width of the bottleneck, to which the triplet loss is applied (paper section 4)
+FEATURES_N = 40  # width of the bottleneck layer, on whose output the triplet loss is computed (paper section 4)
 FEATURE_LAYERS_N = 3
 OUTPUTS_N = 3  # x, y, F; with shear there are five: x, y, Fx, Fy, Fz
 BLOCK_ROWS_N = 65_536  # rows per forward pass, to limit memory
@@ -33,7 +33,7 @@ class Layer:
 
 
 def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """Return the paper's layers, which it prints as follows.
+    """Return the layers of the paper's network, which the paper describes as follows.
 
     B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
     """
@@ -71,12 +71,12 @@ class Stack(nn.Module):
         self.relus = [layer.relu for layer in layers]
         self.members_n = len(members)
         numbers = range(1, len(layers) + 1)
-        # Contiguous, because autograd and AdamW would copy the gradients of a transposed view.
+        # Contiguous, because autograd and AdamW would otherwise copy the gradients of a transposed view.
         self.weights = nn.ParameterList(_stacked(members, f"layer{i}.weight").mT.contiguous() for i in numbers)
         self.biases = nn.ParameterList(_stacked(members, f"layer{i}.bias")[:, None] for i in numbers)
 
     def features(self, inputs: Float[torch.Tensor, "m b c"]) -> Float[torch.Tensor, "m b 40"]:
-        """Return the output of the first three layers, to which the triplet loss is applied."""
+        """Return the output of the first three layers, on which the triplet loss is computed."""
         return self._run(inputs, 0, FEATURE_LAYERS_N)
 
     def head(self, features: Float[torch.Tensor, "m b 40"]) -> Float[torch.Tensor, "m b t"]:
@@ -87,7 +87,7 @@ class Stack(nn.Module):
         return self.head(self.features(inputs))
 
     def weights_of(self, i: int) -> dict[str, np.ndarray]:
-        """Return copies of one network's weights: `layer1.weight` [out in], `layer1.bias` [out], ..."""
+        """Return copies of the weights of network `i`, by name: `layer1.weight` [out in], `layer1.bias` [out], ..."""
         weights = {}
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True), 1):
             weights[f"layer{k}.weight"] = weight.detach()[i].T.contiguous().cpu().numpy().copy()
@@ -105,7 +105,7 @@ class Stack(nn.Module):
 
 
 class Predictor:
-    """A trained network that maps scaled inputs to scaled outputs, block by block."""
+    """A trained network as a function from scaled inputs to scaled outputs, computed in blocks of rows."""
 
     def __init__(self, weights: Weights, architecture: str, device: str) -> None:
         inputs_n, outputs_n = weights["layer1.weight"].shape[1], len(weights[f"layer{len(weights) // 2}.bias"])

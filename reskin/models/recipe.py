@@ -1,4 +1,4 @@
-"""Recipes: the settings of training, of adaptation and of fine-tuning."""
+"""Recipes: the settings of training, adaptation and fine-tuning."""
 
 from typing import Annotated, Literal
 
@@ -8,7 +8,8 @@ from reskin.config import Strict
 
 HEADLINE = "paper"  # the recipe whose results are compared with the paper; other recipes are variants
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]  # limited, because names are parts of file names
+# restricted characters, because names are used in file names
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")]
 Weight = Annotated[float, Field(ge=0)]
 
 
@@ -27,12 +28,12 @@ class Schedule(Strict):
 
 
 class Recipe(Schedule):
-    """How a network is trained, including the choices that the paper does not specify.
+    """Settings of a training run, including those that the paper does not specify.
 
-    architecture: that of the paper's text, or that of the released network (with ReLU after layer 2 and on the output).
-    inputs: the field change itself, or its direction and the logarithm of its magnitude. scaling: standardisation of
-    each channel, or the scaling of the released network (each channel / 5 sd, without removing the mean; x / 16,
-    y / 16, F / 3). triplet_weight: weight of the triplet loss; with 0, no triplets are drawn.
+    architecture: `paper` (as in the paper's text) or `released` (as in the released network, with a ReLU after layer 2
+    and on the output). inputs: `raw` (the field change) or `shape` (its direction and the logarithm of its magnitude).
+    scaling: `standard` (mean 0 and standard deviation 1) or `released` (see `reskin.models.inputs.fit_released`).
+    triplet_weight: weight of the triplet loss; with 0, no triplets are drawn.
     """
 
     architecture: Literal["paper", "released"]
@@ -44,13 +45,13 @@ class Recipe(Schedule):
 class Augmentation(Strict):
     """Virtual copies of each training skin, as if other boards had measured it.
 
-    The settings are standard deviations of the differences between boards.
+    Except for `copies_n`, the settings are standard deviations.
     """
 
     copies_n: Annotated[int, Field(ge=1, le=100)]
-    gain_sd: Weight  # of each channel
-    lean_sd_deg: Annotated[float, Field(ge=0, le=45)]  # of each chip, about each axis
-    noise_uT: Weight  # of each channel of a reading
+    gain_sd: Weight  # relative gain of each channel of a virtual board
+    lean_sd_deg: Annotated[float, Field(ge=0, le=45)]  # tilt of each chip of a virtual board, about each axis
+    noise_uT: Weight  # additional noise of each channel of a reading
 
 
 class AugmentedRecipe(Recipe):
@@ -69,7 +70,10 @@ class AdaptationRecipe(Schedule):
 
 
 class FineTuningRecipe(Schedule):
-    """Fine-tuning to a new skin; the squared error on its few labelled pokes has weight `own_weight`."""
+    """Fine-tuning to a new skin: the recipe's loss plus the squared error on a few labelled pokes of the new skin.
+
+    own_weight: weight of this squared error.
+    """
 
     own_weight: Weight
 

@@ -2,9 +2,10 @@
 
 On a CPU, PyTorch computes matrix products, `exp`, `log`, `sqrt` and `erf` with MKL. MKL's results differ between AMD
 and Intel processors, even if MKL_CBWR is set, and training amplifies a difference in the last bit to millimetres.
-Therefore, this module computes products with NumPy's OpenBLAS and the kernels that `reskin.numerics` selects, which is
-as fast for layers of this size, and `exp` with `exp2`, which PyTorch computes without MKL. The other operations of the
-networks (sums, ReLU, sigmoid, AdamW) do not use MKL either; logarithms of inputs are computed in NumPy.
+Therefore, this module computes matrix products with NumPy's OpenBLAS, with the kernels that `reskin.numerics` selects.
+For layers of this size, OpenBLAS is as fast as MKL. `exp` is computed by `exp2`, for which PyTorch does not use MKL.
+The other operations of the networks (sums, ReLU, sigmoid, AdamW) do not use MKL, and logarithms are computed with
+NumPy.
 """
 
 import math

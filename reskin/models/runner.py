@@ -1,9 +1,9 @@
 """Run many training jobs in parallel, with a cache of completed training runs.
 
-Jobs with equal settings and seed are trained together as a stack. The position of a network in its stack affects the
-last bits of its weights. Therefore, stacks are formed from all requested jobs, whether completed or not, and the cache
-key of a result includes the keys of all jobs in its stack. If a stage is killed and run again, it trains only the
-incomplete stacks.
+Jobs with equal settings and seed are trained together as a stack. The other networks of a stack affect the last bits of
+a network's weights. Therefore, stacks are formed from all requested jobs, including those with cached results, and the
+cache key of a result depends on the keys of all jobs in the stack. If a stage is killed and run again, it trains only
+the incomplete stacks.
 """
 
 import hashlib
@@ -23,28 +23,29 @@ from reskin.models.inputs import Scaler
 from reskin.models.job import JobKeys, TrainingData, TrainingJob, TrainingResult
 from reskin.numerics import device
 
-# Training runs per job. If all of them collapse, the last network is kept and marked, and `predict` rejects it.
+# Largest number of training runs per job. If all of them collapse, the last network is kept and marked as collapsed,
+# and `reskin predict` rejects the network.
 MAX_ATTEMPTS_N = 3
 STACK_N = {"cpu": 3, "cuda": 64}  # networks per stack; on a CPU, larger stacks are not faster
-NO_ROWS = np.zeros(0, np.int64)  # replaces the row numbers of a `RemoteJob`, which are read from the shared file
+NO_ROWS = np.zeros(0, np.int64)  # row numbers of a `RemoteJob`, which are in the shared file
 
-RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers; the names of its `train` and `test` arrays
-FoldRows = Mapping[int, tuple[str, np.ndarray]]  # id of an array -> its name in the shared file, the array
+RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers; names of `train` and `test` in the shared file
+FoldRows = Mapping[int, tuple[str, np.ndarray]]  # id of an array of row numbers -> name in the shared file, the array
 
 
 def run_jobs(
     jobs: Sequence[TrainingJob], data: TrainingData, *, executor: Executor, cache: Path, log: Callable[[str], None]
 ) -> list[TrainingResult]:
-    """Train the jobs that are not in the cache, and return all results in the order of `jobs`.
+    """Train the jobs whose results are not in the cache, and return all results in the order of `jobs`.
 
-    A job whose network collapses is retrained with other random draws, up to `MAX_ATTEMPTS_N` runs in total.
+    A job whose network collapses is run again with other random draws, up to `MAX_ATTEMPTS_N` runs in total.
 
     Parameters
     ----------
-    data : rows that the jobs refer to by number
-    executor : where stacks are trained
-    cache : folder of completed training runs
-    log : receives one line per completed stack, and warnings
+    data : the rows to which the row numbers of the jobs refer
+    executor : runs the training of each stack
+    cache : folder with the results of completed training runs
+    log : called with one line per completed stack, and with warnings
     """
     results = _run_once(jobs, data, executor, cache, log)
     for attempt_i in range(1, MAX_ATTEMPTS_N):
@@ -71,10 +72,11 @@ def _run_once(
     if len(fresh) < len(unique):
         log(f"{len(unique) - len(fresh)} of {len(unique)} training runs were finished before")
     if missing:
-        shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"  # one file per process
+        # a separate file for each process that runs jobs
+        shared_file = cache / "rows" / f"{job_keys.data_digest()}-{os.getpid()}.safetensors"
         work = [([unique[key] for key in stack], files) for stack, files in missing]
-        # Arrays of row numbers are passed by name, a digest of their content. This keeps calls small, and a worker
-        # reads each array only once.
+        # Workers receive the names of arrays of row numbers, which are digests of the content, and read the arrays from
+        # the shared file. This keeps calls small, and a worker reads each array only once.
         sets = {id(rows): rows for stack, _ in work for job in stack for rows in (job.train, job.test)}
         folds = {i: (hashlib.sha256(rows.tobytes()).hexdigest()[:32], rows) for i, rows in sets.items()}
         skin = np.unique(data.skin, return_inverse=True)[1].astype(np.int64)
@@ -90,10 +92,10 @@ def _run_once(
 
 def make_stacks(jobs: Mapping[str, TrainingJob], size_n: int) -> list[list[str]]:
     """Group the keys of jobs with equal settings and seed into stacks of at most `size_n`, in the order of the jobs."""
-    alike: dict[tuple[object, ...], list[str]] = {}
+    groups: dict[tuple[object, ...], list[str]] = {}
     for key, job in jobs.items():
-        alike.setdefault((job.recipe, job.schedule, job.loss_weights, job.seed, job.seed_i), []).append(key)
-    return [group[i : i + size_n] for group in alike.values() for i in range(0, len(group), size_n)]
+        groups.setdefault((job.recipe, job.schedule, job.loss_weights, job.seed, job.seed_i), []).append(key)
+    return [group[i : i + size_n] for group in groups.values() for i in range(0, len(group), size_n)]
 
 
 def _result_files(stack: Sequence[str], cache: Path) -> list[Path]:
@@ -128,7 +130,7 @@ def _run_stacks(
 
 def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Sequence[Path]) -> None:
     """Train a stack (in a worker process), and write the result of each job to its file."""
-    from reskin.models.train import train_stack  # imported late, because it imports torch, which only workers need
+    from reskin.models.train import train_stack  # imported here, because it imports torch, which only workers need
 
     jobs = [
         replace(job, train=_read_rows(shared_file, train), test=_read_rows(shared_file, test))
@@ -137,7 +139,8 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
     try:
         results = train_stack(jobs, _read_data(shared_file))
     except RuntimeError as error:
-        if "out of memory" in str(error) or "allocate memory" in str(error):  # torch raises RuntimeError on a CPU
+        # on a CPU, torch raises RuntimeError for this
+        if "out of memory" in str(error) or "allocate memory" in str(error):
             raise MemoryError(str(error)) from None
         raise
     for job, file, result in zip(jobs, files, results, strict=True):
@@ -151,7 +154,7 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
 
 
 def _is_intact(file: Path, log: Callable[[str], None]) -> bool:
-    """Return whether a result is in the cache and intact; delete a damaged file."""
+    """Return whether a cached result exists and is intact; delete a damaged file, with a warning to `log`."""
     if not file.exists():
         return False
     try:
@@ -168,7 +171,7 @@ def _read_data(shared_file: Path) -> TrainingData:
     return TrainingData(**io.read_tensors(shared_file, ("db_uT", "target", "skin"))[0])
 
 
-@lru_cache(maxsize=16)  # the row numbers of a few folds
+@lru_cache(maxsize=16)  # a worker needs the row numbers of only a few folds at a time
 def _read_rows(shared_file: Path, name: str) -> np.ndarray:
     return io.read_tensors(shared_file, (name,))[0][name]
 

@@ -21,23 +21,25 @@ from reskin.models.recipe import Schedule
 from reskin.numerics import device
 
 BLOCK_STEPS_N = 50  # steps in a block; batches are drawn and the loss is checked once per block
-DIVERGED = 1e8  # from this mean squared error, networks hardly ever recover; predicting the mean has an error of 1
+# Mean squared error (scaled units) above which training is stopped, because networks hardly ever recover. A network
+# that predicts the mean has an error of 1.
+DIVERGED = 1e8
 CHECKED_STEPS_N = 200  # with fewer steps, a network may not have learned anything, so collapse is not checked
-CHECKED_ROWS_N = 2000  # approximate number of training rows for this check, evenly spaced
+CHECKED_ROWS_N = 2000  # approximate number of training rows for the check of collapse, evenly spaced
 
 # Defaults of torch.optim.lr_scheduler.OneCycleLR and torch.optim.AdamW.
-WARM_UP = 0.3  # fraction of the steps
-FIRST_RATE, LAST_RATE = 1 / 25, 1e-4  # fraction of the peak rate; fraction of the first rate
+WARM_UP = 0.3  # fraction of the steps in which the learning rate rises
+FIRST_RATE, LAST_RATE = 1 / 25, 1e-4  # first rate relative to the peak rate; last rate relative to the first rate
 MOMENTUM_MAX, MOMENTUM_MIN = 0.95, 0.85
 BETA2, EPS = 0.999, 1e-8
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A trained network, and the mean squared error of each block of steps (scaled units).
+    """The weights of a trained network, and the mean squared error of each block of steps (scaled units).
 
-    `stopped_step` is set if a loss or a weight was not finite, or if the loss exceeded `DIVERGED`. In this case, the
-    weights are those after the last block without such an error.
+    If a loss or a weight was not finite, or if the loss exceeded `DIVERGED`, `stopped_step` is the last step of this
+    block, and the weights are those after the block before. Otherwise, `stopped_step` is None.
     """
 
     weights: Weights
@@ -72,10 +74,10 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
 def train(
     jobs: Sequence[PreparedJob], architecture: str, schedule: Schedule, loss_weights: LossWeights, device: str
 ) -> list[Outcome]:
-    """Minimise the squared error plus the weighted loss terms.
+    """Train a stack: minimise the squared error plus the loss terms with their weights.
 
-    The paper specifies neither optimiser nor schedule. We chose AdamW with PyTorch's one-cycle learning rate and
-    momentum.
+    The paper specifies neither the optimiser nor the schedule. The choice here is AdamW with PyTorch's one-cycle
+    schedule of learning rate and momentum.
     """
     layers = LAYERS[architecture](jobs[0].labelled.inputs.shape[1], jobs[0].labelled.targets.shape[1])
     net = Stack(layers, [job.initial_weights for job in jobs]).to(device)
@@ -99,7 +101,7 @@ def train(
                 predicted = net(batch["few_labels"])
                 loss = loss + loss_weights.few_labels * squared_error(predicted, batch["few_labels_targets"])
             net.zero_grad()
-            loss.sum().backward()  # each network's gradient depends on its own term only
+            loss.sum().backward()  # each network's gradient depends only on the network's own loss
             clip_gradients(net, schedule.gradient_norm_max)  # a single large step can make all ReLUs of a layer dead
             optimizer.step(*one_cycle(step_i, schedule.steps_n, schedule.rate_max))
             total += error.detach()
@@ -114,15 +116,16 @@ def clip_gradients(net: Stack, norm_max: float) -> None:
     norm = torch.linalg.vector_norm(
         torch.stack([torch.linalg.vector_norm(gradient, dim=(1, 2)) for gradient in gradients]), dim=0
     )
-    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # inf is clamped to 1 for a gradient of 0
+    scale = (norm_max / norm).clamp(max=1.0)[:, None, None]  # for a norm of 0, the quotient inf is clamped to 1
     for gradient in gradients:
         gradient.mul_(scale)
 
 
 def one_cycle(step_i: int, steps_n: int, rate_max: float) -> tuple[float, float]:
-    """Return the learning rate and the first momentum (beta1) of a step, which vary as two half cosines.
+    """Return the learning rate and the momentum (AdamW's beta1) of a step in a one-cycle schedule of `steps_n` steps.
 
-    The rate rises to its peak and then falls to nearly zero. The momentum falls and then rises.
+    The rate rises to `rate_max` and then falls to nearly zero, each along half a cosine. The momentum falls while the
+    rate rises, and then rises.
 
     >>> [round(one_cycle(i, 10, 25.0)[0], 4) for i in (0, 2, 9)]
     [1.0, 25.0, 0.0001]
@@ -144,8 +147,8 @@ def _cosine(start: float, end: float, part: float) -> float:
 class AdamW:
     """PyTorch's fused AdamW, with learning rate and momentum passed to each step.
 
-    It uses the functional interface, because the first use of `torch.optim.AdamW` in a process imports PyTorch's
-    compiler, which takes a second of CPU time. The results are bit-identical.
+    This class calls the functional interface, because the first use of `torch.optim.AdamW` in a process imports
+    PyTorch's compiler, which takes a second of CPU time. The results are bit-identical to `torch.optim.AdamW`.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], weight_decay: float) -> None:
@@ -165,7 +168,7 @@ class AdamW:
 
 
 class Monitor:
-    """Records the loss curve of each network of a stack, and its weights before it diverged, if it did."""
+    """Records the loss curve of each network of a stack, and the weights after the last block without divergence."""
 
     def __init__(self, net: Stack) -> None:
         self.net = net
@@ -174,7 +177,7 @@ class Monitor:
         self.stopped_step: dict[int, int] = {}
 
     def check(self, error: Float[torch.Tensor, " m"], step: int) -> bool:
-        """Record the mean errors of a block; return whether any network of the stack has not diverged."""
+        """Record the mean errors of a block that ends at `step`; return False if all networks have diverged."""
         is_sound = (self.net.is_finite() & (error <= DIVERGED)).tolist()  # False for NaN
         for i in set(range(len(is_sound))) - set(self.stopped_step):
             if is_sound[i]:

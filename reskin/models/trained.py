@@ -1,4 +1,4 @@
-"""Trained networks: reading from disk, prediction, and export as ONNX."""
+"""Read trained networks from disk, predict with them, and export them as ONNX."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 class CardRecipe(Strict, extra="ignore"):
-    """The part of a model's recipe on which predictions depend."""
+    """The settings of a model's recipe on which predictions depend."""
 
     architecture: Literal["paper", "released"]
     inputs: Literal["raw", "shape"]
 
 
 class CardInput(Strict, extra="ignore"):
-    """The input of a model."""
+    """Section `input` of a model's card."""
 
     quantity: Literal["change of field"]
     unit: Literal["uT"]
@@ -45,7 +45,7 @@ class CardInput(Strict, extra="ignore"):
 
 
 class Card(Strict, extra="ignore"):
-    """The part of a model's card on which predictions depend; the rest is provenance."""
+    """The entries of a model's JSON card on which predictions depend; other entries are ignored."""
 
     format: str
     recipe: CardRecipe
@@ -56,7 +56,7 @@ class Card(Strict, extra="ignore"):
 
 @dataclass(frozen=True)
 class Network:
-    """A trained network with its card; it maps field changes in uT to x and y in mm and F in N."""
+    """A trained network, with its card and its weights."""
 
     card: Mapping[str, Any]
     tensors: Mapping[str, np.ndarray]
@@ -64,21 +64,21 @@ class Network:
     __repr__ = one_line
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "f 3"]:
-        """Predict x_mm, y_mm and F_N for each row."""
+        """Predict x_mm, y_mm and F_N for each of f field changes in uT."""
         scaler, view = Scaler.of_arrays(self.tensors), VIEW[self.card["recipe"]["inputs"]](db_uT)
         return scaler.decode(self._predictor(scaler.encode(view)))
 
     @cached_property
     def _predictor(self) -> "Predictor":
-        """The predictor; cached, because controllers predict for every frame."""
-        from reskin.models.network import Predictor  # imported late, because it imports torch
+        """The network as a PyTorch model; cached, because controllers predict for every frame."""
+        from reskin.models.network import Predictor  # imported here, because it imports torch
 
         weights = {name: values for name, values in self.tensors.items() if name.startswith("layer")}
         return Predictor(weights, self.card["recipe"]["architecture"], device())
 
 
 def read_network(model: Path) -> Network:
-    """Read a trained network, and its card from the same folder.
+    """Read a trained network (.safetensors) and its card (.json), which is in the same folder.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def read_network(model: Path) -> Network:
         raise ParamsError(f"{model}: model file not found. {_find_models(model)}")
     if model.suffix != SUFFIX:
         weights = model.with_suffix(SUFFIX)
-        remedy = f"Give {weights}." if weights.is_file() else "If it was one, copy it again."
+        remedy = f"Use {weights}." if weights.is_file() else "If it should be one, copy it again."
         raise ParamsError(f"{model}: not a trained model ({SUFFIX}) or a saved calibration. {remedy}")
     if not card_file.is_file():
         raise ParamsError(
@@ -104,42 +104,41 @@ def read_network(model: Path) -> Network:
     content = io.read_json(card_file)
     form = content.get("format") if isinstance(content, dict) else None
     if str(form).startswith(UNIVERSAL):
-        raise ParamsError(
-            f"{model}: this is the universal model. Use it without --model, or by reskin.load_universal()."
-        )
+        raise ParamsError(f"{model}: this is the universal model. Omit --model, or use reskin.load_universal().")
     if form != FORMAT:
         raise SchemaError(f"{card_file}: format {form} is not supported, only {FORMAT}. Train the model again.")
     card, tensors = parse(Card, content, str(card_file)), io.read_tensors(model)[0]
     if tuple(card.output) != TARGETS:
         outputs = ", ".join(card.output) or "nothing"
-        raise SchemaError(f"{card_file}: the model predicts {outputs}, not {', '.join(TARGETS)}. Give another model.")
+        raise SchemaError(f"{card_file}: the model predicts {outputs}, not {', '.join(TARGETS)}. Use another model.")
     if card.collapsed:
         raise SchemaError(
-            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use another seed."
+            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use a model of another "
+            "seed."
         )
     inputs_n = VIEW[card.recipe.inputs](np.zeros((1, card.input.channels_n), np.float32)).shape[1]
     weights_n = tensors["input_shift"].size if "input_shift" in tensors else 0
     if inputs_n != weights_n:
         raise SchemaError(
-            f"{card_file}: {card.input.channels_n} channels with inputs {card.recipe.inputs} give {inputs_n} inputs, "
-            f"but the weights are for {weights_n}. Is this the card of this model?"
+            f"{card_file}: the card's {card.input.channels_n} channels with inputs {card.recipe.inputs} are {inputs_n} "
+            f"inputs, but the weights are for {weights_n}. Is this the card of this model?"
         )
     require("torch", model)
     return Network(content, tensors)
 
 
 def _find_models(missing: Path) -> str:
-    """Return advice on a missing model file; stages write model files to data/models/SCENE/STAGE."""
+    """Return advice for the user on a missing model file; stages write model files to data/models/SCENE/STAGE."""
     if found := sorted(file.name for file in missing.parent.glob(f"*{SUFFIX}")):
         return f"Models in this folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
     if missing.parts[-5:-3] != ("data", "models"):
-        return "Give the path of a trained .safetensors file."
+        return "Use the path of a trained .safetensors file."
     scene = missing.parts[-3]
     return f"Scene {scene} trains it: in the checkout, run `reskin scenes use {scene}` and then `make repro`."
 
 
 def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
-    """Read the networks of stage `train_multi` that were trained with this board held out, one per seed."""
+    """Read the networks of stage `train_multi` for which the board was held out, one network per seed."""
     found = []
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -152,7 +151,7 @@ def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> li
 
 
 def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
-    """Return an experiment's networks by fold, one per seed; empty if the scene does not run the experiment."""
+    """Read the networks of an experiment, by fold, one per seed; return {} if the scene does not run the experiment."""
     found: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
@@ -164,23 +163,23 @@ def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -
 
 # --- ONNX ---
 
-OPSET, IR = 17, 8  # versions from 2022, which current runtimes support
+OPSET, IR = 17, 8  # ONNX versions from 2022, which current runtimes support
 INPUT, OUTPUT = "db_uT", "x_mm y_mm F_N"
 Node = tuple[str, tuple[str, ...], str]  # operator, inputs, output
 
 
 def write_onnx(network: Network, file: Path) -> None:
-    """Write a network as ONNX; an existing file is replaced."""
+    """Write a network as an ONNX file; replace an existing file."""
     file.write_bytes(build_onnx(network).SerializeToString())
 
 
 def build_onnx(network: Network) -> "ModelProto":
-    """Build the ONNX graph of a network: view, input scaling, layers, conversion to units."""
+    """Build the ONNX model of a network: view, input scaling, layers, and conversion of outputs to mm and N."""
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError:
         raise missing_package("onnx", "export_onnx") from None
-    from reskin.models.network import LAYERS  # imported late, because it imports torch
+    from reskin.models.network import LAYERS  # imported here, because it imports torch
 
     card, scaler = network.card, dict(network.tensors)
     channels_n = card["input"]["channels_n"]
@@ -218,7 +217,7 @@ def _raw() -> Iterator[Node]:
 
 
 def _shape() -> Iterator[Node]:
-    """Yield the nodes for direction and natural logarithm of the magnitude, as in `reskin.models.inputs.shape`."""
+    """Yield the nodes of view `shape`: direction and log of the magnitude, as in `reskin.models.inputs.shape`."""
     yield "ReduceL2", (INPUT,), "length_uT"
     yield "Max", ("length_uT", "floor_uT"), "floored_uT"
     yield "Div", (INPUT, "floored_uT"), "direction"

@@ -1,4 +1,4 @@
-"""Effects of time and contacts on a skin: relaxation, hysteresis of the field, wear and temperature."""
+"""Models of relaxation of the force, hysteresis of the field, wear, and temperature effects."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -13,13 +13,16 @@ from reskin.errors import ParamsError
 
 @dataclass(frozen=True)
 class Prony:
-    """Prony series of the relaxation function: 1 - sum_i share_i (1 - exp(-t / tau_i))."""
+    """Prony series of the relaxation function (force over time at constant depth, relative to the force at t = 0).
+
+    relaxation(t) = 1 - sum_i share_i (1 - exp(-t / tau_i))
+    """
 
     tau_s: Float[np.ndarray, " p"]
     share: Float[np.ndarray, " p"]
 
     def __post_init__(self) -> None:
-        """Raise `ParamsError` for impossible times or shares."""
+        """Raise `ParamsError` if a time is not positive, a share is negative, or the shares add up to more than 1."""
         if not (np.isfinite(self.tau_s) & (self.tau_s > 0)).all():
             raise ParamsError("prony", "every tau", "above 0 s and finite", f"{self.tau_s}", "Check its unit.")
         if not ((self.share >= 0).all() and self.share.sum() <= 1):
@@ -33,20 +36,24 @@ SKIN_RELAXATION = Prony(  # assumed values
 
 
 class Relaxation(Strict):
-    """Timing of an indentation of a fully relaxed skin: the tip approaches at constant speed, then holds its depth."""
+    """Timing of an indentation: the tip approaches at constant speed, then keeps its depth.
+
+    The skin is assumed to be fully relaxed before the indentation.
+    """
 
     approach_s: Annotated[float, Field(ge=0, le=100)]
     hold_s: Annotated[float, Field(ge=0, le=100)]  # from the end of the approach to the middle of the readings
 
 
 class Memory(Strict):
-    """Hysteresis of the field: dB creeps while an indentation is held, and decays after it.
+    """Hysteresis of the field: dB slowly grows while an indentation is held, and the added part decays after it.
 
-    The fraction of dB that remains in the next no-load reading is that of recorded boards (5 to 8 %). How it is divided
-    among the time constants is assumed.
+    The settings are chosen so that the same fraction of dB remains in the next no-load reading as on recorded boards
+    (5 to 8 %). The division of this fraction among the time constants is assumed.
     """
 
-    share: tuple[Annotated[float, Field(ge=0, le=1)], ...]  # fraction of dB that a very long indentation adds
+    # per time constant: fraction of dB that a very long indentation adds
+    share: tuple[Annotated[float, Field(ge=0, le=1)], ...]
     tau_s: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
     contact_s: Annotated[float, Field(ge=0, le=1e4)]  # from the start of an indentation to the end of its readings
     rest_s: Annotated[float, Field(ge=0, le=1e4)]  # from the end of the readings to the next no-load reading
@@ -61,23 +68,24 @@ class Memory(Strict):
 def field_memory(
     change_T: Float[np.ndarray, "n p k 3"], memory: Memory
 ) -> tuple[Float[np.ndarray, "n k 3"], Float[np.ndarray, "n p k 3"]]:
-    """Return the hysteresis of the field in T, given dB at each stop of each indentation.
+    """Return the change of the field in T due to hysteresis, given dB at p stops of n successive indentations.
 
-    For each time constant, a state q follows q' = (share dB - q) / tau during an indentation and q' = -q / tau after
-    it, starting from q = 0; the solution is exact. The times of the stops are not known. The tip is therefore assumed
-    to have been held, before each stop, for `contact_s` at the mean dB of the stops so far.
+    For each time constant, a state q starts at 0 and follows q' = (share dB - q) / tau during an indentation and
+    q' = -q / tau after it. The change of the field is the sum of all q. The times of the stops are not known.
+    Therefore, q at a stop is computed as if the indentation had lasted `contact_s` with the mean dB of the stops up to
+    this one.
 
     Returns
     -------
-    before_T : hysteresis in each no-load reading, caused by earlier indentations.
-    added_T : hysteresis at each stop, minus that in the no-load reading of the same indentation.
+    before_T : sum of q in the no-load reading before each indentation; caused by earlier indentations.
+    added_T : sum of q at each stop, minus the sum in the no-load reading of the same indentation.
     """
     running_mean_T = change_T.cumsum(axis=1) / np.arange(1, change_T.shape[1] + 1)[:, None, None]
     before_T, added_T = np.zeros_like(change_T[:, 0]), np.zeros_like(change_T)
     for share, tau_s in zip(memory.share, memory.tau_s, strict=True):
         contact_decay, rest_decay = np.exp(-memory.contact_s / tau_s), np.exp(-memory.rest_s / tau_s)
         crept_T = -np.expm1(-memory.contact_s / tau_s) * share * running_mean_T
-        # q before each indentation: q at the end of the previous one, after its decay during the rest.
+        # q before each indentation: q at the end of the previous indentation, decayed during the rest between them.
         left_T = np.zeros_like(before_T)
         for i in range(len(change_T) - 1):
             left_T[i + 1] = rest_decay * crept_T[i, -1] + contact_decay * rest_decay * left_T[i]
@@ -87,16 +95,16 @@ def field_memory(
 
 
 def relaxed_share(relaxation: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
-    """Return the force at the middle of an indentation's readings, relative to the force of an elastic skin."""
+    """Return the force when the readings of an indentation are taken, relative to that of an elastic skin."""
     elastic = np.array([0.0, 1.0, 1.0])
     return float(relax(np.cumsum([0.0, relaxation.approach_s, relaxation.hold_s]), elastic, prony)[-1])
 
 
 def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: Prony) -> Float[np.ndarray, " p"]:
-    """Integrate q' = -q / tau + share e' over `dt_s`, where e changes linearly by `change`; exact for any dt / tau.
+    """Integrate q' = -q / tau + share e' over a step of `dt_s`, in which the elastic force e changes by `change`.
 
-    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). dt = 0
-    represents a jump of e.
+    `state` is q for each term of the Prony series. The solution is exact if e changes linearly:
+    q <- exp(-x) q + share change (1 - exp(-x)) / x, x = dt / tau (Taylor, Pister & Goudreau 1970). If dt is 0, e jumps.
     """
     if not (np.isfinite(dt_s) and dt_s >= 0):
         rule = "0 s or more and finite"
@@ -106,9 +114,10 @@ def advance(state: Float[np.ndarray, " p"], change: float, dt_s: float, prony: P
 
 
 def relax(time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], prony: Prony) -> Float[np.ndarray, " t"]:
-    """Return the relaxed force at each time, for an elastic force that starts from 0 and is linear between the times.
+    """Return the force of a viscoelastic skin at each time, given the force of an elastic skin at these times.
 
-    Lee & Radok 1960: force = integral of relaxation(t - s) d elastic(s), valid while the contact does not shrink.
+    The elastic force starts from 0 and is linear between the times. Lee & Radok 1960: force = integral of
+    relaxation(t - s) d elastic(s), which is valid while the contact area does not shrink.
     """
     state = np.zeros_like(prony.tau_s)
     relaxed = np.empty_like(elastic)
@@ -120,7 +129,7 @@ def relax(time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], pro
 
 
 def _mean_decay(x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    # (1 - exp(-x)) / x. Without expm1, the error would be 11 % at x = 1e-16.
+    # Return (1 - exp(-x)) / x. Without expm1, the error would be 11 % at x = 1e-16.
     return np.where(x > 0, -np.expm1(-x) / np.where(x > 0, x, 1.0), 1.0)
 
 
@@ -129,28 +138,32 @@ REMANENCE_PER_K = -0.12e-2  # NdFeB powder: Br falls by 0.12 % per kelvin
 
 
 class Temperature(Strict):
-    """Temperature over time, and how the chips' sensitivity depends on it."""
+    """Settings of the temperature over time, and of the temperature dependence of the chips' sensitivity."""
 
     warming_K: Annotated[float, Field(ge=0, le=40)]  # temperature rise from power-on to thermal equilibrium
     warming_s: Annotated[float, Field(gt=0, le=1e5)]  # time constant of the warming
     swing_K: Annotated[float, Field(ge=0, le=20)]  # amplitude of the variation of room temperature
-    swing_s: Annotated[float, Field(gt=0, le=1e6)]  # period of that variation
-    chip_sensitivity_per_K: Annotated[float, Field(ge=0, le=0.01)]  # standard deviation between chips
+    swing_s: Annotated[float, Field(gt=0, le=1e6)]  # period of the variation of room temperature
+    # standard deviation over chips of the relative change of sensitivity
+    chip_sensitivity_per_K: Annotated[float, Field(ge=0, le=0.01)]
 
 
 def temperature_rise_K(time_s: Float[np.ndarray, "..."], temperature: Temperature) -> Float[np.ndarray, "..."]:
-    """Return the temperature rise since the start: warming (1 - exp(-t / tau)) + swing sin(2 pi t / period)."""
+    """Return the temperature rise since time 0: warming (1 - exp(-t / tau)) + swing sin(2 pi t / period)."""
     warming = -temperature.warming_K * np.expm1(-time_s / temperature.warming_s)
     return warming + temperature.swing_K * np.sin(2 * np.pi * time_s / temperature.swing_s)
 
 
 def relative_remanence(rise_K: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Return the magnetisation relative to its initial value; no-load fields and dB are proportional to it."""
+    """Return the skin's magnetisation after a temperature rise, relative to its initial value.
+
+    No-load fields and dB are proportional to the magnetisation.
+    """
     return 1 + REMANENCE_PER_K * rise_K
 
 
-SETTLING_CONTACTS = 300  # number of contacts over which the initial softening decays by a factor of e
-AGEING_CONTACTS = 1e3  # number of contacts from which softening is logarithmic
+SETTLING_CONTACTS = 300  # number of contacts after which 63 % (1 - 1/e) of the initial softening has occurred
+AGEING_CONTACTS = 1e3  # after about this number of contacts, softening is proportional to the logarithm of the number
 
 
 class Ageing(Strict):
@@ -158,12 +171,16 @@ class Ageing(Strict):
 
     settling: Annotated[float, Field(ge=0, le=0.5)]  # fraction of the force lost in the first contacts
     ageing: Annotated[float, Field(ge=0, le=0.1)]  # fraction of the force lost per decade of contacts
-    fading_per_decade: Annotated[float, Field(ge=0, le=0.1)]  # fraction of the no-load field that is lost
-    wandering_uT: Annotated[float, Field(ge=0, le=10)]  # sd of the random step per contact and channel
+    # fraction of the no-load field lost per decade of contacts
+    fading_per_decade: Annotated[float, Field(ge=0, le=0.1)]
+    wandering_uT: Annotated[float, Field(ge=0, le=10)]  # standard deviation of the random step of a channel per contact
 
 
 def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: float) -> Float[np.ndarray, " n"]:
-    """Return the force relative to that of a fresh skin: 1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000)."""
+    """Return the force after N contacts, relative to a new skin.
+
+    1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000)
+    """
     _check_counts(contacts_n)
     settled = -np.expm1(-contacts_n / SETTLING_CONTACTS)
     remaining = 1 - settling * settled - ageing * np.log10(1 + contacts_n / AGEING_CONTACTS)
@@ -174,7 +191,7 @@ def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: flo
 
 
 def fading(contacts_n: Int[np.ndarray, " n"], *, per_decade: float) -> Float[np.ndarray, " n"]:
-    """Return the relative loss of the no-load field: per_decade log10(1 + N)."""
+    """Return the fraction of the no-load field that is lost after N contacts: per_decade log10(1 + N)."""
     _check_counts(contacts_n)
     return per_decade * np.log10(1 + contacts_n)
 
@@ -182,9 +199,10 @@ def fading(contacts_n: Int[np.ndarray, " n"], *, per_decade: float) -> Float[np.
 def baseline_walk(
     contacts_n: Int[np.ndarray, " n"], channels_n: int, *, step_T: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "n ch"]:
-    """Draw each channel's no-load field in T as a random walk whose step at each contact is N(0, step_T^2).
+    """Draw the drift of each channel's no-load field in T: a random walk with a step from N(0, step_T^2) per contact.
 
-    `contacts_n` must not decrease. The walk takes one step for every contact, also for those between the given counts.
+    `contacts_n` is the number of contacts before each reading and must not decrease. If it increases by more than 1,
+    the walk takes a step for each contact.
     """
     _check_counts(contacts_n)
     new_n = np.diff(contacts_n, prepend=0)

@@ -1,7 +1,7 @@
 """Ambient fields: the earth's field and the field of an iron ball. SI units.
 
-A uniform field magnetises the ball like one dipole, and nearby dipoles magnetise it like image sources. The effect of
-the ball on the magnetisation of the nearby sources is neglected.
+A ball in a uniform field has the field of one dipole. A ball near dipoles has the field of image dipoles and poles. The
+effect of the ball on the magnetisation of nearby dipoles is neglected.
 """
 
 import numpy as np
@@ -11,15 +11,16 @@ from scipy.constants import micro, mu_0
 from reskin.physics import magnet
 from reskin.physics.magnet import MU0_4PI, Dipoles
 
-# The earth's field at a middle latitude (25-65 uT over the globe, IGRF); x is north, z is up.
+# The earth's field at a middle latitude; it varies from 25 to 65 uT over the globe (IGRF). x is north, z is up.
 EARTH_SIZE_T = 50 * micro
 EARTH_DIP_DEG = 66.0
 EARTH_T = EARTH_SIZE_T * np.array([np.cos(np.radians(EARTH_DIP_DEG)), 0.0, -np.sin(np.radians(EARTH_DIP_DEG))])
-IRON_MU_R = 1000.0  # soft iron; the moment of a ball is 0.3 % below that of a ball of infinite permeability
+# relative permeability of soft iron; the moment of a ball is 0.3 % smaller than at infinite permeability
+IRON_MU_R = 1000.0
 
 
 def random_directions(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-    """Draw unit vectors that are uniformly distributed over the sphere."""
+    """Draw n unit vectors whose directions are uniformly distributed."""
     vectors = rng.standard_normal((n, 3))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
@@ -37,7 +38,7 @@ def ball_field(
     radius_m: float,
     mu_r: float = IRON_MU_R,
 ) -> Float[np.ndarray, "o 3"]:
-    """Return the field in T that a ball in the uniform field `b_T` adds at observers outside the ball."""
+    """Return the field in T that a ball adds to the uniform field `b_T`, at points outside the ball."""
     return magnet.field(centre_m[None], ball_moment(radius_m, b_T, mu_r)[None], observers_m)
 
 
@@ -48,11 +49,11 @@ def ball_images(
     centre_m: Float[np.ndarray, "3"],
     radius_m: float,
 ) -> Float[np.ndarray, "o 3"]:
-    """Return the field in T that a ball of infinite permeability adds to the field of dipoles outside it.
+    """Return the field in T that a ball of infinite permeability adds to the field of dipoles outside the ball.
 
-    As for a conducting, uncharged sphere in electrostatics (Jackson, chapter 2): each dipole has an image dipole and a
-    magnetic pole at the inverse point, and an opposite pole at the ball's centre. Close to a skin, a single dipole at
-    the ball's centre would underestimate the field by far. `dipoles` are positions in m and moments in A m^2.
+    The solution is that of a conducting, uncharged sphere in electrostatics (Jackson, chapter 2): each dipole has an
+    image dipole and a magnetic pole at its inverse point in the ball, and an opposite pole at the ball's centre. Close
+    to a skin, a single dipole at the ball's centre would be a poor approximation, with a much smaller field.
     """
     away_m = dipoles[0] - centre_m
     distance_m = np.linalg.norm(away_m, axis=1, keepdims=True)

@@ -1,6 +1,7 @@
 """The circuit board: its design, random boards, and the spreads between boards and between skins.
 
-Each board is drawn from its own random generator, seeded by its name. Adding board 8 therefore does not change board 7.
+Each board is drawn with a random generator that is seeded by the board's name. Therefore, adding board 8 does not
+change board 7.
 """
 
 from dataclasses import dataclass
@@ -21,15 +22,15 @@ Share = Annotated[float, Field(ge=0, le=0.5)]
 
 
 class Tiles(Strict):
-    """Several boards under one skin, on a rectangular lattice around the skin's centre."""
+    """Several boards under one skin, on a rectangular grid that is centred at the skin's centre."""
 
-    columns_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along x
-    rows_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # along y
+    columns_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # number of boards along x
+    rows_n: Annotated[int, Field(ge=1, le=CHIPS_MAX_N)]  # number of boards along y
     pitch_mm: Annotated[float, Field(gt=0, le=500)]
 
     @property
     def centres_mm(self) -> list[tuple[float, float]]:
-        """Centres of the boards relative to the skin's centre, row by row."""
+        """x and y of the centre of each board, relative to the skin's centre, row by row."""
         x_mm, y_mm = (self.pitch_mm * (np.arange(n) - (n - 1) / 2) for n in (self.columns_n, self.rows_n))
         return [(float(x), float(y)) for y in y_mm for x in x_mm]
 
@@ -37,13 +38,14 @@ class Tiles(Strict):
 class BoardDesign(Strict):
     """Positions of the chips relative to the centre of the board, and the rotation of each chip about z.
 
-    The rotations in the scenes were determined from recordings (tests/recordings/test_lab_frames.py), not taken from a
-    board layout file. With `tiles`, several boards have this design, and their chips are numbered board by board.
+    The rotations in the scenes were determined from recordings (tests/recordings/test_lab_frames.py), because there is
+    no board layout file. With `tiles`, there are several boards of this design, and chips are numbered board by board.
     """
 
     chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
     chips_turn_deg: tuple[float, ...]
-    gap_mm: Annotated[float, Field(gt=0, le=10)]  # sensing plane to skin: 1.1 rigid, 0.6 flexible
+    # distance from the chips' sensing plane to the skin: 1.1 for rigid boards, 0.6 for flexible boards
+    gap_mm: Annotated[float, Field(gt=0, le=10)]
     tiles: Tiles | None = None
 
     @model_validator(mode="after")
@@ -56,32 +58,33 @@ class BoardDesign(Strict):
 
     @property
     def places_mm(self) -> list[tuple[float, float]]:
-        """Positions of all boards' chips, relative to the centre of the skin."""
+        """x and y of the chips of all boards, relative to the centre of the skin."""
         boards_mm = [(0.0, 0.0)] if self.tiles is None else self.tiles.centres_mm
         return [(x + chip_x, y + chip_y) for x, y in boards_mm for chip_x, chip_y in self.chips_xy_mm]
 
     @property
     def turns_deg(self) -> list[float]:
-        """Rotations of all boards' chips about z."""
+        """Rotation about z of each chip in `places_mm`."""
         return [*self.chips_turn_deg] * (len(self.places_mm) // len(self.chips_xy_mm))
 
 
 class Spreads(Strict):
     """Standard deviations between boards and between skins.
 
-    Gaps, gains, thicknesses and the like are multiplied by exp(sd * normal), so that they stay positive. All other
-    quantities are normally distributed around the design value.
+    Positive quantities such as gaps, gains and thicknesses are multiplied by exp(sd * normal), so that they stay
+    positive. All other quantities are normally distributed around the design value.
     """
 
     board_gap: Share  # of the gap between skin and chips
-    board_uneven: Share  # of the gap at the outermost chips: the base tilts along x and y, and bows
+    board_uneven: Share  # of the gap at the outermost chips, because the base is tilted about x and y and bowed
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
     chip_offset_uT: Annotated[float, Field(ge=0, le=5000)]
     skin_amplitude: Share  # of the magnetisation
     skin_filler: Share  # local variation of the magnetisation
-    skin_filler_length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation exp(-r^2 / 2 length^2)
+    # correlation of the local variation: exp(-r^2 / 2 length^2)
+    skin_filler_length_mm: Annotated[float, Field(gt=0, le=50)]
     skin_thickness: Share
     skin_modulus: Share
     skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # lateral offset of the skin on the board, along each axis
@@ -91,11 +94,11 @@ class Spreads(Strict):
 
 @dataclass(frozen=True)
 class Board:
-    """One board; z = 0 is the base of the skin. A chip reads sensitivity @ turn^T @ B + offset."""
+    """One board, in a frame with z = 0 at the base of the skin. A chip reads sensitivity @ turn^T @ B + offset."""
 
     name: str
     chips_m: Float[np.ndarray, "k 3"]
-    turn: Float[np.ndarray, "k 3 3"]  # columns: the chip's axes in the board's frame
+    turn: Float[np.ndarray, "k 3 3"]  # the columns are the chip's axes in the board's frame
     sensitivity: Float[np.ndarray, "k 3 3"]
     offset_T: Float[np.ndarray, "k 3"]
 
@@ -103,7 +106,10 @@ class Board:
 
 
 def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -> Board:
-    """Draw the board of this name; tiled boards share one gap, as one skin is assumed to hold them down."""
+    """Draw a board with a random generator that is seeded by `seed` and `name`.
+
+    Tiled boards have the same gap, because they are assumed to be held down by the same skin.
+    """
     rng = rng_for(seed, "board", name)
     chips_n = len(design.places_mm)
     gap_mm = design.gap_mm * np.exp(spreads.board_gap * rng.standard_normal())
@@ -123,7 +129,8 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
 
 
 def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # Tilt and bow of each board's base, scaled to the outermost chip; the skin itself is assumed to be flat.
+    # Relative height error of each chip due to tilt and bow of the board. The value of each of the three terms at the
+    # outermost chips is about a standard normal number. The skin is assumed to be flat.
     places_mm = np.array(design.chips_xy_mm)
     away_mm = np.hypot(*places_mm.T)
     share = places_mm / max(away_mm.max(), 1e-12)

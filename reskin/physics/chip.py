@@ -12,13 +12,13 @@ from reskin.config import Strict
 from reskin.physics.board import Board
 
 GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 5 / 3, 4 / 3, 1.0)  # for GAIN_SEL 0 to 7 (data sheet, table 17)
-STEP_AT_GAIN_ONE_uT = (0.150, 0.150, 0.242)  # RES 0; x, y, z
+STEP_AT_GAIN_ONE_uT = (0.150, 0.150, 0.242)  # for RES 0, on x, y and z (data sheet)
 TEMPERATURE_ZERO_DEGC, TEMPERATURE_ZERO_RAW, TEMPERATURE_STEPS_PER_DEGC = 25.0, 46244, 45.2  # data sheet
 FIELD_MAX_T = 50e-3  # saturation on any axis, at any gain (data sheet)
 
 
 class ChipDesign(Strict):
-    """Gain setting of the firmware, and the noise of one reading."""
+    """Gain setting of the firmware, and standard deviations of the noise of one reading."""
 
     gain_sel: Annotated[int, Field(ge=0, le=7)]
     noise_xy_uT: Annotated[float, Field(ge=0, le=100)]
@@ -28,21 +28,24 @@ class ChipDesign(Strict):
 
 @dataclass(frozen=True)
 class Overruns:
-    """Counts of out-of-range values: fields clipped at 50 mT, and readings that overflow int16 and wrap around."""
+    """Numbers of values out of range: fields clipped at 50 mT, and readings that overflow int16 and wrap around."""
 
     clipped_n: int
     wrapped_n: int
 
 
 def steps_uT(gain_sel: int) -> Float[np.ndarray, " 3"]:
-    """Return the field in uT that corresponds to one count, on x, y and z."""
+    """Return the field step in uT between successive raw readings, on x, y and z."""
     return np.array(STEP_AT_GAIN_ONE_uT) * GAINS[gain_sel]
 
 
 def read_field(
     b_T: Float[np.ndarray, "f k 3"], board: Board, *, design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f ch"], Overruns]:
-    """Return the chips' readings of a field, each along the chip's own axes, and counts of out-of-range values."""
+    """Return the readings of all chips along their own axes, for the field at each chip and frame.
+
+    The readings include the chips' offsets and sensitivities, noise, clipping, quantisation and int16 overflow.
+    """
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     chip_T = np.einsum("kij,fkj->fki", to_chip, b_T)
     clipped_n = int(np.count_nonzero(np.abs(chip_T) > FIELD_MAX_T))
@@ -72,7 +75,10 @@ CONVERSION_S = 1.84e-3  # MLX90393 at OSR 0, DIG_FILT 2 (data sheet)
 def last_conversions(
     frame_s: Float[np.ndarray, " f"], phase_s: Float[np.ndarray, " k"]
 ) -> tuple[Float[np.ndarray, "f k"], Int[np.ndarray, "f k"]]:
-    """Return for each frame and chip the age of its last conversion in s, and the first frame with that conversion."""
+    """Return the age in s of each chip's last conversion at each frame, and the first frame with the same conversion.
+
+    `phase_s` is the time of each chip's first conversion; further conversions follow every `CONVERSION_S`.
+    """
     conversion = np.floor((frame_s[:, None] - phase_s) / CONVERSION_S)
     age_s = frame_s[:, None] - phase_s - conversion * CONVERSION_S
     fresh = np.ones(conversion.shape, bool)
@@ -84,7 +90,7 @@ def last_conversions(
 def sample_at_conversion(
     value: Float[np.ndarray, "f k a"], age_s: Float[np.ndarray, "f k"], rate_hz: float
 ) -> Float[np.ndarray, "f k a"]:
-    """Interpolate each chip's field linearly to the time of its conversion, `age_s` before the frame."""
+    """Interpolate values linearly between frames, to the time `age_s` before each frame at which a chip converts."""
     frames_n, chips_n = age_s.shape
     place = np.maximum(np.arange(frames_n)[:, None] - age_s * rate_hz, 0.0)
     before = np.minimum(place.astype(np.intp), max(frames_n - 2, 0))

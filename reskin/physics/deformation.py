@@ -1,10 +1,10 @@
 """Finite deformation of the skin under a tip, computed in small steps and tabulated. SI units.
 
-The linear solution of `layer` is valid for small depths only. Here the tip sinks in small steps (12 to 24 for the usual
-depths). Each step solves for the pressure change that keeps the deformed surface on the spherical tip, and displaces
-the material by the linear solution for this pressure. The result is axisymmetric and, in units of the thickness,
-depends only on R/h (tip radius over thickness). A few tables for different R/h therefore cover skins of any thickness,
-and simulating an indentation only needs to interpolate between them.
+The linear solution of `layer` is valid only for small depths. Here the depth increases in small steps (12 to 24 for the
+usual depths). Each step solves for the pressure change that keeps the deformed surface on the spherical tip, and
+displaces the material by the linear solution for this pressure. The result is axisymmetric and, in units of the
+thickness, depends only on R/h (tip radius over thickness). Therefore, a few tables for different R/h suffice for skins
+of any thickness, and an indentation is simulated by interpolation between the tables.
 """
 
 from dataclasses import asdict, dataclass
@@ -24,20 +24,24 @@ from reskin.physics import layer
 from reskin.physics.layer import Displacement, IndentedLayer, Waves, contact_of_radius, displacement, waves
 from reskin.physics.magnet import Dipoles
 
-# In units of `depth_scale`: 0.05 mm in a skin of 2 mm. Halving it changes dB by 0.3 % (slipping) and 0.6 % (bonded).
+# Depth of a step in units of `depth_scale`; about 0.05 mm for a skin of 2 mm. Halving the step changes dB by 0.3 % on a
+# slipping base and by 0.6 % on a bonded base.
 STEP = 0.025
-# Depths of the steps, in units of `depth_scale`; they do not depend on the requested depths. The first step is divided
-# in three, because the contact radius grows as the square root of the depth.
+# Depths after each step, in units of `depth_scale`. They are the same for all requested depths. The first step is
+# divided in three, because the contact radius grows as the square root of the depth.
 LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
-RIM_MAX = 1.2  # largest height of the rim, in thicknesses; above the surface, the waves grow as exp(kz)
+RIM_MAX = 1.2  # largest height of the bulging rim, in thicknesses; above 1, the waves of the solution grow as exp(kz)
 MARKERS_N = 48  # number of markers on the surface; they are denser towards the axis
-PRESSURES_N = 6  # number of basis pressures; 4 or 8 change the markers by less than 0.03 mm at a depth of 1.2 mm
-DAMPING = 1e-3  # of the least squares for the pressure, relative to the largest singular value
+PRESSURES_N = 6  # number of basis pressures; 4 or 8 would move the markers by less than 0.03 mm at a depth of 1.2 mm
+DAMPING = 1e-3  # damping of the least squares for the pressure, relative to the largest singular value
 
 
 @dataclass(frozen=True)
 class Material:
-    """Current positions of material points, and the deformation gradient F; all other entries of F are zero."""
+    """Current positions (r, z) of s material points, and the deformation gradient F in cylindrical coordinates.
+
+    `f` is the part of F in the r-z plane, and `hoop` is the circumferential stretch. The other entries of F are zero.
+    """
 
     r_m: Float[np.ndarray, " s"]
     z_m: Float[np.ndarray, " s"]
@@ -48,10 +52,11 @@ class Material:
 def follow(
     r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], depths_m: Float[np.ndarray, " d"], press: IndentedLayer
 ) -> list[Material]:
-    """Follow material points from rest through increasing depths; return one `Material` per depth.
+    """Move material points from rest through increasing depths; return one `Material` per depth.
 
-    Markers on the surface are followed too, and each step solves for the pressure that moves them onto the sphere. If
-    instead the pressure fitted the surface at rest, the deformed surface would be 0.3 mm off the tip at 1.2 mm.
+    `depths_m` starts with 0. Markers on the surface are moved too, and each step solves for the pressure that moves the
+    markers onto the tip. If the pressure were computed for the surface at rest, the deformed surface would be 0.3 mm
+    off the tip at a depth of 1.2 mm.
     """
     path = [with_markers(r_m, z_m, press)]
     for depth_m in map(float, depths_m[1:]):
@@ -60,34 +65,38 @@ def follow(
 
 
 def depth_scale(size: float) -> float:
-    """Return the greatest depth in thicknesses for R/h = `size`: a smooth function below both 1 and `size`."""
+    """Return the greatest depth that can be computed, in thicknesses, for R/h = `size`.
+
+    The depth must be below the thickness and the tip radius. This is a smooth function of `size` below 1 and `size`.
+    """
     return size / (1 + size**4) ** 0.25
 
 
 def depth_steps(depths_m: tuple[float, ...], press: IndentedLayer) -> Float[np.ndarray, " d"]:
-    """List the depths of the steps: all requested depths, and those of `LADDER` below the largest requested one."""
+    """Return the depths after each step: the requested depths, and all depths of `LADDER` below the largest of them."""
     ladder_m = press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m) * LADDER
     return np.unique(np.append(ladder_m[ladder_m < max(depths_m)], depths_m))
 
 
 def undeformed(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Material:
-    """Return material at rest."""
+    """Return material points at rest, with F = I."""
     return Material(r_m, z_m, np.tile(np.eye(2), (len(r_m), 1, 1)), np.ones(len(r_m)))
 
 
 def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: IndentedLayer) -> Material:
-    """Return material at rest, preceded by surface markers, which extend to the widest possible contact."""
+    """Return material points at rest, after `MARKERS_N` markers on the surface inside the widest possible contact."""
     widest = press.contact(press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m))
     r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKERS_N) ** 2, r_m)
     return undeformed(r_m, np.append(np.full(MARKERS_N, press.thickness_m), z_m))
 
 
 def pressure_change(material: Material, depth_m: float, press: IndentedLayer) -> Waves:
-    """Solve for the pressure change that moves the markers (first in `material`) onto the tip at a greater depth.
+    """Solve for the pressure change that moves the surface markers onto the tip at a greater depth.
 
-    The pressure is a weighted sum of pressures of the same sphere with smaller contacts. The weights are the damped
-    least-squares solution that moves all markers inside the contact from their current positions to the tip. Damping is
-    needed because waves shorter than the depth do not reach the markers.
+    The first points of `material` are the markers. The pressure is a weighted sum of `PRESSURES_N` pressures, which the
+    same tip would exert with smaller contact radii. The weights are the damped least-squares solution that moves all
+    markers inside the contact from their current positions to the tip. Damping is needed, because markers that have
+    moved down are hardly affected by waves shorter than the depth.
     """
     contact = press.contact(depth_m)
     inside = np.flatnonzero(material.r_m[:MARKERS_N] < contact.radius_m)
@@ -108,9 +117,9 @@ def pressure_change(material: Material, depth_m: float, press: IndentedLayer) ->
 
 
 def displace(material: Material, change: Waves, depth_m: float, press: IndentedLayer) -> Material:
-    """Displace material by a pressure change (midpoint rule), and update F by the chain rule at the midpoint.
+    """Displace material points by a pressure change (midpoint rule), and update F by the chain rule at the midpoint.
 
-    `depth_m`, the depth after the change, is only used in an error message.
+    `depth_m` is the depth after the change; it is used only in an error message.
     """
     first = displacement(material.r_m, material.z_m, change)
     half_r_m, half_z_m = material.r_m + first.r_m / 2, material.z_m + first.z_m / 2
@@ -130,37 +139,40 @@ def _gradient(u: Displacement) -> Float[np.ndarray, "s 2 2"]:
 
 
 def rotation_angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
-    """Return the angle (from z towards r) of the rotation R in the polar decomposition F = R U."""
+    """Return the angle, positive from z towards r, of the rotation R in the polar decomposition F = R U."""
     return np.arctan2(f[:, 0, 1] - f[:, 1, 0], f[:, 0, 0] + f[:, 1, 1])
 
 
-# Radius of the tables beyond the contact, in thicknesses. Farther away, the material on a bonded base does not move
-# (with tables that end at 4 thicknesses from the axis, the error of dB is up to 17 %). On a slipping base, it moves
-# outward rigidly, apart from waves that decay as exp(-pi r / h).
+# Tables extend this far beyond the contact radius, in thicknesses. Farther away, material on a bonded base does not
+# move, and material on a slipping base moves outward rigidly, apart from waves that decay as exp(-pi r / h). With
+# tables that end at 4 thicknesses from the axis, the error of dB is up to 17 %.
 REACH = 5.0
 SIZE_STEP = 0.2  # step of ln(R/h) between tables; the interpolation error of dB is below 0.3 % (test_skin)
-STENCIL_N = 4  # number of points of the cubic interpolation, both between tables and between depths
-DET_F_ERROR_MAX = 0.1  # largest relative error of the volume
-COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which the displacement is computed, relative to the reach
-FINE_R = np.linspace(0, 1, 512)  # radii at which it is tabulated; fine enough for linear interpolation
-PACKAGE = Path(__file__).parent  # cached tables are stored in this package and depend on its source files
+STENCIL_N = 4  # number of points of the cubic interpolation between tables, and of that between depths
+DET_F_ERROR_MAX = 0.1  # largest relative error of the volume of the material, which is incompressible
+COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which displacements are computed, relative to `reach`
+FINE_R = np.linspace(0, 1, 512)  # radii at which displacements are tabulated; fine enough for linear interpolation
+PACKAGE = Path(__file__).parent  # the cache of tables is in this folder, and its keys depend on the source files here
 
 
 @dataclass(frozen=True)
 class DeformationMap:
-    """Table of the displacement of material by depth, height and radius (in equal steps of radius)."""
+    """Displacement and rotation of the material, tabulated by depth d, height l and radius i.
+
+    The radii are equally spaced from 0 to `reach_m`.
+    """
 
     thickness_m: float
     reach_m: float
     depth_m: Float[np.ndarray, " d"]  # starts with 0
-    # Displacement outward and up, in thicknesses, and tan(angle / 2) of the rotation from z towards r.
+    # Last axis: displacements outward and up, in thicknesses, and tan(angle / 2) of the rotation from z towards r.
     moved: Float[np.ndarray, "d l i 3"]
     base: layer.Base
 
 
 @dataclass(frozen=True)
 class RestingDipoles:
-    """Dipoles at rest; `height_i` is the index of a dipole's height in `heights` (in thicknesses)."""
+    """Dipoles of a skin at rest; `height_i` is the index of each dipole's height in `heights` (in thicknesses)."""
 
     nodes_m: Float[np.ndarray, "s 3"]
     moments_A_m2: Float[np.ndarray, "s 3"]
@@ -170,7 +182,7 @@ class RestingDipoles:
 
 @dataclass(frozen=True)
 class MovedDipoles:
-    """The dipoles within reach of an indentation: their indices, and their states before and after it."""
+    """The dipoles that an indentation moves: their indices `i`, and their positions and moments before and after it."""
 
     i: Int[np.ndarray, " m"]
     before: Dipoles
@@ -180,8 +192,8 @@ class MovedDipoles:
 def group_by_height(
     nodes_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], thickness_m: float
 ) -> RestingDipoles:
-    """Group a skin's nodes by height; a quadrature rule has few heights, and the map has a table for each."""
-    # Rounded, so that a quadrature rule gives the same heights for skins of any thickness.
+    """Group the dipoles of a skin by height; dipoles at quadrature nodes have few different heights."""
+    # Heights are rounded, so that a quadrature rule has the same heights in skins of any thickness.
     heights, height_i = np.unique(np.round(nodes_m[:, 2] / thickness_m, 12), return_inverse=True)
     return RestingDipoles(
         np.asfortranarray(nodes_m), np.asfortranarray(moments_A_m2), height_i, tuple(heights.tolist())
@@ -189,7 +201,7 @@ def group_by_height(
 
 
 def reach(size: float, base: layer.Base) -> float:
-    """Return the distance from the axis, in thicknesses, up to which a tip of R/h = `size` deforms the material."""
+    """Return the radius of the tables for R/h = `size`, in thicknesses; farther away, material is not deformed."""
     depth = layer.VERIFIED_DEPTH * depth_scale(size)
     return REACH + IndentedLayer(1.0, size, base).contact(depth).radius_m
 
@@ -197,10 +209,10 @@ def reach(size: float, base: layer.Base) -> float:
 def tabulate(
     thickness_m: float, tip_radius_m: float, deepest_m: float, *, heights: tuple[float, ...], base: layer.Base
 ) -> DeformationMap:
-    """Tabulate the map down to the first depth of `LADDER` that is at least `deepest_m`.
+    """Tabulate the displacement of material for depths up to `deepest_m`, or slightly beyond.
 
-    It is interpolated between tables in steps of `SIZE_STEP` of ln(R/h). The map at a given depth does not depend on
-    `deepest_m`.
+    The result is interpolated between tables for multiples of `SIZE_STEP` in ln(R/h). Its values at a given depth do
+    not depend on `deepest_m`.
 
     Parameters
     ----------
@@ -209,7 +221,7 @@ def tabulate(
     Raises
     ------
     ParamsError
-        If the layer is impossible, or the depth is beyond the greatest depth (see `depth_scale`).
+        If thickness or tip radius is invalid, or `deepest_m` is above the greatest depth (see `depth_scale`).
     """
     layer.check_layer(np.array([deepest_m]), thickness_m, tip_radius_m)
     size = tip_radius_m / thickness_m
@@ -232,19 +244,19 @@ def _tabulate(
     weights = _lagrange(tables_i.astype(float), position)
     parts = [_displaced(int(table_i), heights, rungs_n, base) for table_i in tables_i]
     coarse = sum(weight * part for weight, part in zip(weights, parts, strict=True))
-    # Contiguous, because otherwise each indentation would copy the part that it uses.
+    # Contiguous, because `at_depth` would otherwise copy the part that it needs for each indentation.
     moved = np.ascontiguousarray(CubicSpline(COARSE_R, coarse, axis=2)(FINE_R))
-    # Material on the base stays on it and, if bonded, does not move sideways; it may rotate.
+    # Material at height 0 stays on the base and, on a bonded base, does not move sideways. It may rotate.
     moved[:, np.array(heights) == 0, :, 1 if base == "slipping" else slice(2)] = 0.0
     return DeformationMap(thickness_m, thickness_m * reach(size, base), depth_m, moved, base)
 
 
 def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
-    """Interpolate the map between tabulated depths by cubic polynomials in the square root of the depth.
+    """Interpolate the table between depths, by cubic polynomials in the square root of the depth.
 
-    The square root is used because the displacement of a far point is almost proportional to its cube. Below the first
-    tabulated depth (about 10 um on a skin of 2 mm), the map is exactly proportional to the cube, like the force of a
-    light touch.
+    The variable is the square root of the depth, because the displacement of distant material is almost proportional
+    to its cube. Below the first tabulated depth (about 10 um for a skin of 2 mm), the displacement is taken to be
+    proportional to the cube, like the force of a light touch.
     """
     if not -np.inf < depth_m <= table.depth_m[-1]:
         rule = f"finite and at most {1e3 * table.depth_m[-1]:.4g} mm, the greatest tabulated depth"
@@ -260,14 +272,16 @@ def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"
 
 
 def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Float[np.ndarray, "3"]) -> MovedDipoles:
-    """Move and rotate the dipoles within reach of an indentation (x, y, depth); on a slipping base, all dipoles.
+    """Move and rotate the dipoles within `reach_m` of an indentation (x, y, depth); on a slipping base, all dipoles.
 
-    A moment m becomes R m, not F m, because the magnetisation does not depend on stretch (Danas & Reis 2024).
+    With the deformation gradient F = R U, a moment m becomes R m and not F m, because the magnetisation does not depend
+    on stretch (Danas & Reis 2024).
     """
     result = np.empty(0, np.intp), np.empty((6, 0)), np.empty((6, 0))
     moved = at_depth(table, float(indentation_m[2]))
     if indentation_m[2] > 0:
-        # Beyond the reach, r^2 grows by the same amount everywhere, because the layer conserves its volume.
+        # On a slipping base, r^2 of all material beyond `reach_m` grows by the same amount, because volume is
+        # conserved.
         edge_m = table.reach_m + table.thickness_m * moved[:, -1, 0].mean()
         grown_m2 = float(edge_m**2 - table.reach_m**2) if table.base == "slipping" else 0.0
         tip = np.append(indentation_m[:2], (table.reach_m, table.thickness_m, grown_m2))
@@ -280,7 +294,10 @@ def move_dipoles(table: DeformationMap, rest: RestingDipoles, indentation_m: Flo
 def _displaced(
     table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
 ) -> Float[np.ndarray, "d l p 3"]:
-    """Load the table (outward, up, tan(angle / 2)) of one R/h from the cache, or compute and cache it."""
+    """Load table `table_i`, for ln(R/h) = SIZE_STEP * table_i, from the cache, or compute and cache it.
+
+    The last axis is (outward, up, tan(angle / 2)), as in `DeformationMap.moved`.
+    """
     name = f"flow {table_i} {heights} {base}"
     table = io.load_cached_array(PACKAGE, name)
     if table is None or len(table) < rungs_n:
@@ -292,8 +309,7 @@ def _displaced(
 def _follow_ladder(
     table_i: int, heights: tuple[float, ...], rungs_n: int, base: layer.Base
 ) -> Float[np.ndarray, "d l p 3"]:
-    # Lengths are in thicknesses. Each step starts from the step before, so that a table for deeper indentations only
-    # has more steps.
+    # Compute the table for the first `rungs_n` depths of `LADDER`; lengths are in thicknesses.
     size = _size(table_i)
     material = rest = undeformed(*(part.ravel() for part in np.meshgrid(reach(size, base) * COARSE_R, heights)))
     parts = np.zeros((rungs_n, 3, len(rest.r_m)))
@@ -309,7 +325,7 @@ def _follow_ladder(
 
 @lru_cache(maxsize=1024)
 def _pressure_change(table_i: int, rung_i: int, base: layer.Base) -> Waves:
-    # The pressure change of one step, which is the same for material at all heights.
+    # Return the pressure change of step `rung_i`; it is cached, because it is the same for material at all heights.
     size = _size(table_i)
     depth = depth_scale(size) * float(LADDER[rung_i])
     return pressure_change(_markers(table_i, rung_i - 1, base), depth, IndentedLayer(1.0, size, base))
@@ -329,7 +345,7 @@ def _size(table_i: int) -> float:
 
 
 def _lagrange(nodes: Float[np.ndarray, " p"], at: float) -> Float[np.ndarray, " p"]:
-    """Return the weights of the nodes for Lagrange interpolation at `at`."""
+    """Return the weights of the nodes for Lagrange interpolation at position `at`."""
     positions, weights = nodes.tolist(), np.ones(len(nodes))
     for j, node in enumerate(positions):
         for i, other in enumerate(positions):

@@ -1,9 +1,9 @@
 """An incompressible elastic layer under a spherical tip: contact, force and linear displacements. SI units.
 
-The layer is bonded to a rigid base or slips on it. Displacements are Hankel integrals over waves J0(kr) of the
-pressure. kh and kz are the wave number times the thickness and times the height. Primes on functions are derivatives
-with respect to kz. For a bonded base, the vertical displacement is W = a (sinh z' - z' cosh z') + b z' sinh z' and the
-radial one U = -W'/k, with z' = kz.
+The layer is bonded to a rigid base or slips on it without friction. Displacements are Hankel integrals over waves
+J0(kr) of the pressure. In names, kh is the wave number times the thickness, and kz the wave number times the height.
+Primes on functions are derivatives with respect to kz. For a bonded base, the vertical displacement is W = a (sinh z' -
+z' cosh z') + b z' sinh z', and the radial displacement is U = -W'/k, with z' = kz.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,8 @@ from reskin.errors import ParamsError
 
 Base = Literal["bonded", "slipping"]
 
-VERIFIED_DEPTH = 0.6  # of the thickness: Long et al. 2011 verified their solution by finite elements up to this depth
+# Fraction of the thickness up to which Long et al. 2011 verified their solution by finite elements.
+VERIFIED_DEPTH = 0.6
 CURVE_N = 48  # number of contact radii on the force curve
 
 
@@ -31,14 +32,20 @@ def _gauss(top: float, points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np
     return top * (x + 1) / 2, top * w / 2
 
 
-CONTACT_X, CONTACT_W = _gauss(1.0, 48)  # in units of the contact radius
-KERNEL_KH, KERNEL_W = _gauss(24.0, 160)  # 1 - compliance falls as exp(-2 kh)
-WAVES_KH, WAVES_W = _gauss(40.0, 240)  # the shortest wavelength is 0.3 mm in a skin of 2 mm
+# Nodes and weights of Gauss quadrature: over the contact, in units of its radius; over kh up to 24 for the kernel,
+# where 1 - compliance, which falls as exp(-2 kh), is negligible; and over kh up to 40 for displacements, which is a
+# wavelength of 0.3 mm in a skin of 2 mm.
+CONTACT_X, CONTACT_W = _gauss(1.0, 48)
+KERNEL_KH, KERNEL_W = _gauss(24.0, 160)
+WAVES_KH, WAVES_W = _gauss(40.0, 240)
 
 
 @dataclass(frozen=True)
 class Contact:
-    """Contact pressure p, given by weights of its Hankel transform: p^(k) / 2G = sum_i weights_i cos(k x_i)."""
+    """A contact and its pressure p, given by the Hankel transform p^(k) / 2G = sum_i weights_i cos(k x_i).
+
+    G is the shear modulus.
+    """
 
     radius_m: float
     depth_m: float
@@ -48,7 +55,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Waves:
-    """A pressure as a sum of waves J0(k r): the wave numbers k, and the amplitude p^(k) dk / 2G of each wave."""
+    """A pressure on the layer as a sum of waves J0(k r): wave numbers k, and amplitudes p^(k) dk / 2G of the waves."""
 
     k_per_m: Float[np.ndarray, " w"]
     amplitude_m: Float[np.ndarray, " w"]
@@ -58,7 +65,11 @@ class Waves:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Displacement (outward, up) and its gradient; `r_z` is the derivative of the outward component along z."""
+    """Displacement of material points (outward `r_m`, up `z_m`) and its gradient.
+
+    `r_z` is the derivative of the outward component with respect to z, and so on. `hoop` is `r_m` divided by the
+    radius.
+    """
 
     r_m: Float[np.ndarray, " s"]
     z_m: Float[np.ndarray, " s"]
@@ -75,7 +86,7 @@ def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1), A = kh, with numerator and denominator divided by exp(2A) / 2 to avoid
     overflow.
     """
-    double = np.minimum(2 * kh, 1e3)  # above this limit, the compliance is 1; the limit keeps squares finite
+    double = np.minimum(2 * kh, 1e3)  # the compliance is 1 at this limit, which keeps the squares below finite
     fade = np.exp(-double)
     s = double**2
     series = 2 * fade * double * s / 6 * (1 + s / 20 * (1 + s / 42 * (1 + s / 72 * (1 + s / 110))))
@@ -97,10 +108,10 @@ def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
 
 
 def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
-    """Solve a Fredholm equation for pressure and depth of a contact of this radius (Lebedev & Ufliand 1958).
+    """Solve a Fredholm equation for the pressure and the depth of a contact with this radius (Lebedev & Ufliand 1958).
 
-    With p^(k) = integral of chi(x) cos(kx) dx, the pressure vanishes outside the contact. The equation
-    chi - K chi = 2/pi (depth - x artanh(x/R)) makes the surface follow the sphere. The depth is determined by
+    The pressure is expressed as p^(k) = integral of chi(x) cos(kx) dx over the contact, and therefore vanishes outside.
+    It deforms the surface to the sphere if chi - K chi = 2/pi (depth - x artanh(x/R)). The depth follows from
     chi(radius) = 0, because the pressure is finite at the edge of the contact.
     """
     x_m, weights_m = radius_m * CONTACT_X, radius_m * CONTACT_W
@@ -115,14 +126,14 @@ def contact_of_radius(radius_m: float, *, thickness_m: float, tip_radius_m: floa
 
 @lru_cache(maxsize=4096)
 def contact_of_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: Base) -> Contact:
-    """Solve for the contact at a depth above 0."""
+    """Solve for the contact at an indentation depth above 0."""
 
     def depth_error_m(radius_m: float) -> float:
         contact = contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
         return contact.depth_m - depth_m
 
-    # Bounds of the contact radius a: a^2 = R d for a thick layer, and 4 R d for a thin one, whose material can only
-    # flow sideways.
+    # Bounds of the contact radius a: a^2 = R d for a thick layer. For a thin layer, whose material can only flow
+    # sideways, a^2 = 4 R d.
     top_m = min(2.1 * np.sqrt(tip_radius_m * depth_m), 0.999 * tip_radius_m)
     radius_m = float(brentq(depth_error_m, 1e-3 * np.sqrt(tip_radius_m * depth_m), top_m, rtol=1e-12))
     return contact_of_radius(radius_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
@@ -142,7 +153,7 @@ class IndentedLayer:
 
 
 def beyond_verified(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Bool[np.ndarray, " n"]:
-    """Return which depths are beyond the range in which the published solution was verified."""
+    """Return the mask of depths beyond the range in which the published solution was verified (`VERIFIED_DEPTH`)."""
     return depth_m >= VERIFIED_DEPTH * thickness_m
 
 
@@ -154,14 +165,14 @@ def force(
     modulus_Pa: float,
     base: Base,
 ) -> Float[np.ndarray, " n"]:
-    """Return the normal force of a linear elastic layer on the tip in N; 0 without contact (depth of 0 or less).
+    """Return the normal force in N of a linear elastic layer on the tip; 0 at depths of 0 or less.
 
-    The force of a simulated skin that slides is `slide.force_at`: this force times the stiffening of the layer.
+    For simulated skins that slide on their base, use `slide.force_at`, which includes the stiffening of the layer.
 
     Raises
     ------
     ParamsError
-        If a property of layer or tip is impossible, or if a depth reaches the smaller of thickness and tip radius.
+        If a property of the layer or the tip is invalid, or a depth reaches the thickness or the tip radius.
     """
     check_layer(depth_m, thickness_m, tip_radius_m)
     if not (np.isfinite(modulus_Pa) and modulus_Pa >= 0):
@@ -171,7 +182,7 @@ def force(
 
 
 def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius_m: float) -> None:
-    """Raise `ParamsError` for an impossible layer or tip, or a depth that reaches the thickness or the tip's radius."""
+    """Raise `ParamsError` if the thickness or the tip radius is invalid, or if a depth reaches one of them."""
     for what, size_m in (("thickness", thickness_m), ("tip radius", tip_radius_m)):
         if not 0 < size_m < np.inf:
             raise ParamsError("layer", what, "above 0 m and finite", f"{size_m}", "Check its unit.")
@@ -182,14 +193,17 @@ def check_layer(depth_m: Float[np.ndarray, " n"], thickness_m: float, tip_radius
 
 
 def waves(contact: Contact, thickness_m: float, base: Base) -> Waves:
-    """Decompose the contact pressure into waves; a cos^2 window on the upper half of wave numbers avoids ringing."""
+    """Decompose a contact pressure into waves; a cos^2 window on the upper half of the wave numbers avoids ringing."""
     window = np.cos(np.pi * np.maximum(WAVES_KH / WAVES_KH[-1] - 0.5, 0)) ** 2
     pressure_m2 = np.cos(np.outer(WAVES_KH / thickness_m, contact.x_m)) @ contact.weights_m2
     return Waves(WAVES_KH / thickness_m, pressure_m2 * window * WAVES_W / thickness_m, thickness_m, base)
 
 
 def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pressure: Waves) -> Displacement:
-    """Sum the displacements due to waves of pressure: u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0."""
+    """Return the displacement of material points at (r, z) due to a pressure.
+
+    u_r = sum of amplitude g' J1, u_z = -sum of amplitude g J0, with g from `depth_profile`.
+    """
     top = float(np.max(r_m, initial=0.0) * pressure.k_per_m[-1])
     table = _bessel_table(1 << max(8, int(np.ceil(top)).bit_length()))
     rows = np.stack([pressure.k_per_m, pressure.thickness_m * pressure.k_per_m, pressure.amplitude_m])
@@ -200,9 +214,9 @@ def displacement(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], pre
 def depth_profile(
     kz: Float[np.ndarray, "s w"], kh: Float[np.ndarray, " w"], base: Base = "bonded"
 ) -> tuple[Float[np.ndarray, "s w"], Float[np.ndarray, "s w"], Float[np.ndarray, "s w"]]:
-    """Return g = k W 2G / p^ at height z and its first two derivatives with respect to kz.
+    """Return the depth profile g(kz) of each wave, and its first two derivatives with respect to kz.
 
-    g(kh) is the surface compliance.
+    g = k W 2G / p^ is the vertical displacement W at height z in dimensionless form; g(kh) is the surface compliance.
     """
     factors_of, wave = (_bonded_factors, _bonded_wave) if base == "bonded" else (_slipping_factors, _slipping_wave)
     profiles = [[wave(z, h, factors_of(h)) for z, h in zip(row, kh, strict=True)] for row in kz]
@@ -212,8 +226,8 @@ def depth_profile(
 
 @lru_cache(maxsize=64)
 def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSpline:
-    # F / (E d^1.5) is a smooth function of sqrt(d). At d = 0, where the contact is small compared with the layer, it
-    # has Hertz's value 16/9 sqrt(R).
+    # Interpolate F / (E d^1.5) as a function of sqrt(d), of which it is a smooth function. At d = 0, where the contact
+    # is small compared with the layer, its value is 16/9 sqrt(R), from Hertz contact.
     deepest_m = (1 - 1e-6) * min(thickness_m, tip_radius_m)
     widest = contact_of_depth(deepest_m, thickness_m=thickness_m, tip_radius_m=tip_radius_m, base=base)
     radii_m = widest.radius_m * np.linspace(0, 1, CURVE_N)[1:]
@@ -226,7 +240,7 @@ def _force_curve(thickness_m: float, tip_radius_m: float, base: Base) -> CubicSp
 def _kernel(
     points_m: Float[np.ndarray, " p"], x_m: Float[np.ndarray, " q"], thickness_m: float, base: Base
 ) -> Float[np.ndarray, "p q"]:
-    # 2/pi times the integral over k of (1 - compliance) cos(k point) cos(k x).
+    # K of the Fredholm equation: 2/pi times the integral over k of (1 - compliance) cos(k point) cos(k x).
     compliance = bonded_compliance if base == "bonded" else slipping_compliance
     missing = KERNEL_W / thickness_m * (1 - compliance(KERNEL_KH))
     k_per_m = KERNEL_KH / thickness_m
@@ -239,7 +253,7 @@ BESSEL_STEP = 1 / 256  # step of the argument in the table of Bessel functions
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _bonded_factors(kh):
-    """Compute the factors of `_bonded_wave` that do not depend on the height."""
+    """Return the factors in `_bonded_wave` that do not depend on the height."""
     base = exp(-2 * kh)
     size = (1 + base) ** 2 + 4 * kh * kh * base
     return (1 + base) / size, 2 * kh / size * exp(-kh), 0.0
@@ -266,7 +280,7 @@ def _bonded_wave(kz, kh, factors):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _slipping_factors(kh):
-    """Compute the factors of `_slipping_wave` that do not depend on the height."""
+    """Return the factors in `_slipping_wave` that do not depend on the height."""
     fade, second = exp(-2 * kh), -expm1(-2 * kh)
     return second * (1 + fade) + 4 * kh * fade, (1 + kh) - (1 - kh) * fade, second
 
@@ -292,7 +306,8 @@ def _slipping_wave(kz, kh, factors):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _between(table, low, share):
-    # Cubic Hermite interpolation of J0 and J1 between tabulated points, with exact slopes: error below 1e-12.
+    # Interpolate J0 and J1 between rows `low` and `low + 1` of the table, by cubic Hermite polynomials with exact
+    # slopes. The error is below 1e-12.
     j0_a, j1_a, slope_a = table[low, 0], table[low, 1], table[low, 2]
     j0_b, j1_b, slope_b = table[low + 1, 0], table[low + 1, 1], table[low + 1, 2]
     rest = 1 - share
@@ -304,7 +319,10 @@ def _between(table, low, share):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_waves(r_m, z_m, waves, slipping, table):
-    """Sum waves (rows k, kh, amplitude) at places [s]; return rows u_r, hoop, u_z, -du_z/dz, du_r/dz, du_z/dr."""
+    """Sum the displacements due to all waves at s points; return rows u_r, hoop, u_z, -du_z/dz, du_r/dz, du_z/dr.
+
+    The rows of `waves` are k, kh and the amplitude.
+    """
     sums = np.zeros((6, len(r_m)))
     for w in range(waves.shape[1]):
         k, kh, amplitude = waves[0, w], waves[1, w], waves[2, w]
@@ -322,7 +340,7 @@ def _sum_waves(r_m, z_m, waves, slipping, table):
             sums[5, s] += steep * g * j1_
     for s in range(len(r_m)):
         if r_m[s] > 0:
-            sums[1, s] = sums[0, s] / r_m[s]  # on the axis, `sums[1]` already has the limit for r = 0
+            sums[1, s] = sums[0, s] / r_m[s]  # for r = 0, `sums[1]` already has the limit
     return sums
 
 

@@ -1,4 +1,4 @@
-"""Magnetic fields: the magnetising array, the skin's magnetisation, quadrature nodes, and point dipoles. SI units."""
+"""Magnetisation of a skin by an array of magnets, quadrature nodes, and fields of point dipoles. SI units."""
 
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -15,12 +15,13 @@ from reskin.config import Strict
 from reskin.errors import ParamsError
 
 CUBE_SIDE_M = 6.35e-3  # 0.25 in cubes
-CUBES_N = (4, 4)  # along x and y, for the authors' skin of 20 x 20 mm
+CUBES_N = (4, 4)  # number of magnet cubes along x and y, for the authors' skin of 20 x 20 mm
 ARRAY_BELOW_M = 0.50e-3  # gap between the skin's base and the lower cubes, from the authors' CAD
 ARRAY_ABOVE_M = 0.25e-3  # gap between the skin's top and the upper cubes, from the authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
 
-# Not specified in the paper. With both, each upper cube attracts the lower cube that it faces.
+# Signs of adjacent cubes, which the paper does not specify. In both cases, each upper cube attracts the lower cube that
+# is opposite.
 Polarity = Literal["checkerboard", "same"]
 
 
@@ -29,8 +30,8 @@ def cuboid_field(
 ) -> Float[np.ndarray, "o 3"]:
     """Return the field in T of a cuboid that is centred at the origin and magnetised along z.
 
-    The field is that of two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus J
-    inside the cuboid. It is infinite on the lines through the edges, where no observer may be.
+    The field is that of two charged rectangles (Engel-Herbert & Hesjedal, J. Appl. Phys. 97:074504, 2005), plus the
+    polarization J inside the cuboid. The formula is singular on the lines through the edges.
     """
     half_m = np.array(sides_m) / 2
     b_T = np.zeros_like(observers_m)
@@ -45,18 +46,22 @@ def _corner(from_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
     """Return the contribution of one corner of a cuboid to its field, times 4 pi / J."""
     x, y, z = from_m.T
     xx, yy, zz = x * x, y * y, z * z
-    # asinh(y / hypot(x, z)) is log(y + r) minus a term that cancels between both ends; it is accurate also for y < 0.
+    # The published formula contains log(y + r). asinh(y / hypot(x, z)) differs by a term that cancels in the sum over
+    # corners, and is also accurate for y < 0.
     along_x, along_y = -np.arcsinh(y / np.sqrt(xx + zz)), -np.arcsinh(x / np.sqrt(yy + zz))
     return np.stack([along_x, along_y, np.arctan(x * y / (z * np.sqrt(xx + yy + zz)))], axis=1)
 
 
 def cubes_along(side_m: float) -> int:
-    """Return the number of magnet cubes that cover a side of a skin: 4 for the authors' skin (assumed for others)."""
+    """Return the smallest number of magnet cubes that cover a side of a skin: 4 for the authors' skin.
+
+    It is assumed that other skins are magnetised with the same cubes.
+    """
     return ceil(side_m / CUBE_SIDE_M - 1e-9)
 
 
 def seams_m(side_m: float) -> tuple[float, ...]:
-    """Return the positions along a side where two cubes touch; the magnetisation has kinks there."""
+    """Return the coordinates at which two cubes touch along a side; the magnetisation has kinks there."""
     n = cubes_along(side_m)
     return tuple(CUBE_SIDE_M * (i - n / 2) for i in range(1, n))
 
@@ -64,15 +69,17 @@ def seams_m(side_m: float) -> tuple[float, ...]:
 def array_field(
     nodes_m: Float[np.ndarray, "s 3"], thickness_m: float, polarity: Polarity, *, cubes_n: tuple[int, int] = CUBES_N
 ) -> Float[np.ndarray, "s 3"]:
-    """Return the magnetising array's field in T inside the skin; `cubes_n` cubes are below it, and as many above.
+    """Return the field in T of the magnetising array at nodes inside the skin.
 
-    Adjacent cubes share corners, so each corner is computed once, weighted by the sum of its cubes' signs.
+    The array has `cubes_n` cubes (along x, along y) below the skin and the same number above. Adjacent cubes have
+    common corners. The field of each corner is therefore computed once, with the sum of the signs of its cubes as the
+    weight.
     """
     if not (nodes_m[:, 2].min() >= 0 and nodes_m[:, 2].max() <= thickness_m):
         got = f"{nodes_m[:, 2].min():.3g} ... {nodes_m[:, 2].max():.3g} m"
         raise ParamsError("magnet array", "places", "inside the slab", got, "Magnetise the skin at rest.")
     signs = np.ones(cubes_n) if polarity == "same" else (-1.0) ** np.add.outer(*map(np.arange, cubes_n))
-    # Along x, y and z, the upper corner of a cube has sign + and the lower corner sign -.
+    # For each of x, y and z, the upper end of a cube has sign + and the lower end has sign -.
     weights = -np.diff(-np.diff(np.pad(signs, 1), axis=0), axis=1)
     below_m, above_m = -ARRAY_BELOW_M, thickness_m + ARRAY_ABOVE_M
     faces_m = {below_m: 1, below_m - CUBE_SIDE_M: -1, above_m + CUBE_SIDE_M: 1, above_m: -1}
@@ -85,24 +92,27 @@ def array_field(
 
 
 def magnetise(b_T: Float[np.ndarray, "s 3"], *, saturation_T: float, half_field_T: float) -> Float[np.ndarray, "s 3"]:
-    """Return the remanent magnetisation J of the powder: phi Br u^3 / (1 + u^3) along B, u = |B| / B_half."""
+    """Return the remanent polarization J in T of the powder after magnetisation in the field B.
+
+    J = `saturation_T` u^3 / (1 + u^3) in the direction of B, with u = |B| / `half_field_T`.
+    """
     u = np.linalg.norm(b_T, axis=1, keepdims=True) / half_field_T
-    # u^2 / half_field_T equals u^3 / |B|, but is finite where the field vanishes (at crossings of seams).
+    # u^2 / half_field_T equals u^3 / |B|, but is also finite where four cubes meet and the field vanishes.
     return saturation_T * b_T * u**2 / half_field_T / (1 + u**3)
 
 
 def moments(j_T: Float[np.ndarray, "s 3"], volumes_m3: Float[np.ndarray, " s"]) -> Float[np.ndarray, "s 3"]:
-    """Return the dipole moment of each cell in A m^2."""
+    """Return the dipole moment in A m^2 of each cell, from its polarization and its volume."""
     return j_T * (volumes_m3 / mu_0)[:, None]
 
 
-SKIN_SIDE_M = 20e-3  # authors' CAD
+SKIN_SIDE_M = 20e-3  # from the authors' CAD
 SKIN_SIDES_M = (SKIN_SIDE_M, SKIN_SIDE_M)
 SEAMS_M = seams_m(SKIN_SIDE_M)  # for the authors' skin, which is magnetised by 4 x 4 cubes
 
 
 class QuadratureSettings(Strict):
-    """Section `quadrature` of a board; chips closer to the skin need a finer quadrature (experiment runtime)."""
+    """Section `quadrature` of a board's settings. Chips closer to the skin need smaller cells (experiment runtime)."""
 
     cell_mm: Annotated[float, Field(gt=0, le=20)]
     layers_n: Annotated[int, Field(ge=1, le=100)]
@@ -114,7 +124,7 @@ class QuadratureSettings(Strict):
 
 @dataclass(frozen=True)
 class Quadrature:
-    """A quadrature rule: the largest width of a cell, and the number of Gauss nodes over the thickness."""
+    """A quadrature rule for a skin: the largest width of a cell, and the number of Gauss nodes over the thickness."""
 
     cell_m: float
     layers_n: int
@@ -126,7 +136,7 @@ DEFAULT_QUADRATURE = Quadrature(cell_m=0.5e-3, layers_n=6)
 
 @dataclass(frozen=True)
 class Nodes:
-    """Quadrature nodes of a skin at rest; x and y are relative to its centre, z to its base."""
+    """Quadrature nodes of a skin at rest; x and y are relative to the skin's centre, z to the skin's base."""
 
     nodes_m: Float[np.ndarray, "s 3"]
     volumes_m3: Float[np.ndarray, " s"]
@@ -135,7 +145,10 @@ class Nodes:
 def place_nodes(
     thickness_m: float, rule: Quadrature = DEFAULT_QUADRATURE, *, sides_m: tuple[float, float] = SKIN_SIDES_M
 ) -> Nodes:
-    """Place nodes: in x and y at the midpoints of cells that end at seams and edges, in z at Gauss nodes."""
+    """Place quadrature nodes: in x and y at the midpoints of cells, and in z at Gauss nodes.
+
+    No cell crosses a seam between magnet cubes.
+    """
     if not (thickness_m > 0 and rule.cell_m > 0 and rule.layers_n > 0):
         got = f"{thickness_m:.3g} m, {rule.cell_m:.3g} m and {rule.layers_n}"
         raise ParamsError("quadrature", "thickness, cell and layers", "above 0", got, "Correct the design.")
@@ -147,7 +160,7 @@ def place_nodes(
 
 
 def _cells(side_m: float, rule: Quadrature) -> tuple[Float[np.ndarray, " i"], Float[np.ndarray, " i"]]:
-    """Return centres and widths of the cells along one side."""
+    """Return the centres and widths in m of the cells along one side of a skin."""
     marks_m = (-side_m / 2, *seams_m(side_m), side_m / 2)
     spans = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in pairwise(marks_m)]
     centres_m = np.concatenate([(edges[1:] + edges[:-1]) / 2 for edges in spans])
@@ -155,13 +168,13 @@ def _cells(side_m: float, rule: Quadrature) -> tuple[Float[np.ndarray, " i"], Fl
 
 
 Dipoles = tuple[Float[np.ndarray, "s 3"], Float[np.ndarray, "s 3"]]  # positions in m, moments in A m^2
-MU0_4PI = mu_0 / (4 * np.pi)  # CODATA, T m / A; not exactly 1e-7 since 2019
+MU0_4PI = mu_0 / (4 * np.pi)  # in T m / A (CODATA); since 2019 not exactly 1e-7
 
 
 def field(
     positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
 ) -> Float[np.ndarray, "o 3"]:
-    """Return the field in T of all dipoles at each observer."""
+    """Return the total field in T of all dipoles at each observer."""
     return field_of_each(positions_m, moments_A_m2, observers_m).sum(axis=1)
 
 
@@ -169,7 +182,7 @@ def field_of_each(
     positions_m: Float[np.ndarray, "s 3"], moments_A_m2: Float[np.ndarray, "s 3"], observers_m: Float[np.ndarray, "o 3"]
 ) -> Float[np.ndarray, "o s 3"]:
     """Return the field in T of each dipole at each observer: mu0/4pi (3 (m.r) r / r^5 - m / r^3)."""
-    # The axis of x, y, z comes first, so that every product runs over long contiguous rows.
+    # The axis of the components x, y, z is first, so that every product is over long contiguous rows.
     separation = observers_m.T[:, :, None] - positions_m.T[:, None, :]
     moment = moments_A_m2.T[:, None, :]
     r2 = (separation * separation).sum(axis=0)
@@ -181,10 +194,10 @@ def field_of_each(
 
 
 def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Return the field change in T due to dipoles (positions in m, moments in A m^2) that move and rotate.
+    """Return the field change in T at each observer due to dipoles that move and rotate from `rest` to `moved`.
 
     The field changes of single dipoles are summed, because the difference of the two total fields would lose digits.
-    Arrays in Fortran order (as from `deformation.move_dipoles`) are not copied.
+    Arrays in Fortran order, as from `deformation.move_dipoles`, are not copied.
     """
     rows = [np.ascontiguousarray(part.T) for part in (*rest, *moved)]
     change_T = MU0_4PI * _sum_of_changes(*rows, np.ascontiguousarray(observers_m))
@@ -193,8 +206,8 @@ def change_of_field(rest: Dipoles, moved: Dipoles, observers_m: Float[np.ndarray
     return change_T
 
 
-# The loop over nodes accumulates nothing, so it is vectorised without fastmath. Dipoles that do not move contribute
-# exactly 0. With this error_model, a division by zero gives infinity, as in NumPy; the caller checks for that.
+# The loop over nodes has no running sum, so it can be vectorised without fastmath. Dipoles that do not move contribute
+# exactly 0. With error_model="numpy", a division by zero results in infinity, which the caller detects.
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
@@ -220,7 +233,7 @@ def _sum_of_changes(nodes, moments, moved, moved_moments, observers):
     return total
 
 
-# `reassoc` allows several partial sums in parallel and keeps infinities and NaN.
+# `reassoc` allows several partial sums in parallel. Unlike full fastmath, it preserves infinities and NaN.
 @njit(cache=True, fastmath={"reassoc"})
 @no_type_check
 def _total(parts):

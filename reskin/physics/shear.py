@@ -1,4 +1,4 @@
-"""A dragged tip: Coulomb friction along its path, and the shear of the elastic layer under it. SI units."""
+"""Friction on a tip that is dragged over the skin, and the resulting shear of the elastic layer. SI units."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,10 +24,10 @@ class Friction(Strict):
 
 @dataclass(frozen=True)
 class DragForce:
-    """Tangential force at each place of a path; `path - elastic` is the rest position of the material under the tip."""
+    """Tangential force at each of t places of a tip's path."""
 
-    force_N: Float[np.ndarray, "t 2"]  # on the skin, so it points along the tip's motion
-    elastic_m: Float[np.ndarray, "t 2"]
+    force_N: Float[np.ndarray, "t 2"]  # force on the skin, in the direction of the tip's motion
+    elastic_m: Float[np.ndarray, "t 2"]  # place of the tip minus the rest position of the material under the tip
     sliding: Bool[np.ndarray, " t"]
 
 
@@ -40,17 +40,17 @@ def drag_force(
 ) -> DragForce:
     """Return the friction force along the path of a tip that touches down at `path_m[0]`.
 
-    Return mapping (Simo & Hughes 1998): each step is first assumed to be elastic. If its force exceeds Coulomb's limit
-    |Q| <= mu F, the tip slips and the force is scaled down to the limit. The tip sticks or slides in a step only if
-    both ends of the step are in contact. Otherwise the force is zero, because the place where the tip lifted off or
-    touched down is unknown.
+    The method is return mapping (Simo & Hughes 1998): each step of the path is first assumed to be elastic. If the
+    resulting force exceeds Coulomb's limit mu F, the tip slides and the force is reduced to the limit. If the tip is
+    not in contact at both ends of a step, the force is zero, because the place where it lifted off or touched down is
+    unknown.
 
     Parameters
     ----------
     path_m : places of the tip.
     normal_N : normal force at each place; 0 means no contact.
     stiffness_N_per_m : tangential stiffness: one number, one number per place, or one symmetric matrix per place.
-    friction : coefficient mu.
+    friction : friction coefficient mu.
     """
     stiffness = np.asarray(stiffness_N_per_m, dtype=float)
     if stiffness.ndim < 3:
@@ -87,30 +87,34 @@ def _check_drag(
         raise ParamsError("drag", "friction", "0 or more and finite", f"{friction}", "Check the scene.")
 
 
-REACH = 5.0  # thicknesses beyond the contact, as in `deformation`; material farther away does not move
+REACH = 5.0  # tables extend this far beyond the contact, in thicknesses; material farther away does not move
 WIDEST = 3.0  # largest contact radius in thicknesses; `layer.WAVES_KH` is too coarse for larger contacts
 RIM_MAX = 1.2  # largest height of the rim in thicknesses, as in `deformation`; nodes above 1 move like the surface
-STEP = 0.75  # largest half curl per step; on the nominal skin with mu 0.8, one step suffices for depths to 0.6 mm
-STEEPEST = 1.5  # largest half curl for which the step size was verified (mu 0.8 at a depth of 1.2 mm)
-TABLE_R_N, TABLE_Z_N = 512, 80  # fine enough for linear interpolation
-DEPTH_STEP_M = 10e-6  # between tabulated depths; per step, the stiffness changes by 1 % and dB by 0.1 uT
+STEP = 0.75  # largest half curl per step; with mu = 0.8, one step suffices on the nominal skin for depths up to 0.6 mm
+STEEPEST = 1.5  # largest half curl for which the step size was verified (mu = 0.8 at a depth of 1.2 mm)
+TABLE_R_N, TABLE_Z_N = 512, 80  # numbers of radii and heights in a table; fine enough for linear interpolation
+DEPTH_STEP_M = 10e-6  # step between tabulated depths, over which the stiffness changes by 1 % and dB by 0.1 uT
 
 
 @dataclass(frozen=True)
 class Traction:
-    """An axisymmetric traction q, whose transform is a weighted sum of cosines: sum_i weights_i cos(k x_i), times Q."""
+    """An axisymmetric tangential traction with total force Q, given by its Hankel transform.
+
+    The transform is Q sum_i weights_i cos(k x_i).
+    """
 
     radius_m: float
     x_m: Float[np.ndarray, " q"]
-    weights: Float[np.ndarray, " q"]  # sum 1
+    weights: Float[np.ndarray, " q"]  # their sum is 1
 
 
 @dataclass(frozen=True)
 class WaveResponse:
-    """Response of the layer to a wave of tangential traction T, by kz; primes are derivatives with respect to kz.
+    """Displacement of the layer due to a wave of tangential traction T, as a function of kz.
 
-    For the component of T along the wave, the displacement in units of T / 2Gk is w' along the wave and -i w upwards.
-    For the component across the wave, the displacement in units of T / Gk is v across the wave.
+    If T is along the wave vector, the displacement in units of T / 2Gk is w' along the wave vector and -i w upwards. If
+    T is across the wave vector, the displacement in units of T / Gk is v in the direction of T. Primes are derivatives
+    with respect to kz. G is the shear modulus.
     """
 
     w: Float[np.ndarray, "z k"]
@@ -122,41 +126,43 @@ class WaveResponse:
 
 @dataclass(frozen=True)
 class ShearMap:
-    """Displacement and half curl for a force Q along x, divided by Q / G, on a grid with equal steps in r and in z.
+    """Displacement, and half of its curl, due to a force Q along x, on a grid with equal steps in r and in z.
 
-    At the angle f from x, the components along x, y and z are: displacement A + B cos 2f, B sin 2f, C cos f; half curl
-    -E sin 2f, D + E cos 2f, S sin f. `parts` are A, B, C in 1/m and D, E, S in 1/m^2.
+    Both are divided by Q / G. At the angle f from x, the components along x, y and z are A + B cos 2f, B sin 2f and
+    C cos f for the displacement, and -E sin 2f, D + E cos 2f and S sin f for the half curl. The last axis of `parts` is
+    A, B, C in 1/m and D, E, S in 1/m^2.
     """
 
     r_m: Float[np.ndarray, " i"]
     z_m: Float[np.ndarray, " j"]
     parts: Float[np.ndarray, "i j 6"]
-    stiffness_m: float  # k_t / G
-    steepest_per_m2: float  # the largest half curl
+    stiffness_m: float  # tangential stiffness divided by G
+    steepest_per_m2: float  # largest half curl in the map, divided by Q / G
 
 
 @dataclass(frozen=True)
 class ShearDisplacement:
-    """Displacement of each node, and half the curl of the displacement: the rotation vector for small rotations."""
+    """Displacement of each node, and half of the curl of the displacement, which is the vector of a small rotation."""
 
     displacement_m: Float[np.ndarray, "s 3"]
     half_curl: Float[np.ndarray, "s 3"]
 
 
 def slip_traction(contact: layer.Contact) -> Traction:
-    """Return the traction of a sliding tip: Coulomb's q = mu p, which is distributed like the pressure.
+    """Return the traction of a sliding tip, which has the distribution of the pressure (Coulomb: q = mu p).
 
-    It is used for the whole of a drag, because the tip slides except for the first one or two millimetres. Its k_t is
-    below that of `stick_traction` by 19 to 20 % on the nominal skin at 0.2 to 1.2 mm, and by 1/6 on a thick layer.
+    This traction is used for a whole drag, because the tip slides after the first one or two millimetres. The
+    tangential stiffness is lower than with `stick_traction`: by 19 to 20 % on the nominal skin at depths of 0.2 to 1.2
+    mm, and by 1/6 on a thick layer.
     """
     return Traction(contact.radius_m, contact.x_m, contact.weights_m2 / contact.weights_m2.sum())
 
 
 def stick_traction(radius_m: float, thickness_m: float) -> Traction:
-    """Return the traction of a sticking tip: axisymmetric, and moving the contact rigidly except for the B term.
+    """Return the axisymmetric traction of a sticking tip, which displaces the whole contact by the same amount.
 
-    It solves chi - K chi = 1 (see `layer.contact_of_radius`). For a thick layer, chi is constant, which gives Mindlin's
-    traction (a^2 - r^2)^(-1/2). For the B term, see `ShearMap`.
+    The term B of `ShearMap` is neglected in this condition. The traction is the solution of chi - K chi = 1 (see
+    `layer.contact_of_radius`). For a thick layer, chi is constant, which is Mindlin's traction (a^2 - r^2)^(-1/2).
     """
     x_m, weights_m = radius_m * layer.CONTACT_X, radius_m * layer.CONTACT_W
     kernel = _kernel(x_m, thickness_m) * weights_m
@@ -165,10 +171,11 @@ def stick_traction(radius_m: float, thickness_m: float) -> Traction:
 
 
 def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
-    """Return k_t / G, where k_t is the force divided by the traction-weighted mean displacement along the force.
+    """Return the tangential stiffness k_t of the layer, divided by G.
 
-    By Parseval's theorem, it is 8 pi / integral of q^2 (w' + 2v) dk at the surface. For a half-space, w' + 2v = 3; this
-    part of the integral has a closed form, and the kernel describes the effect of the base.
+    k_t is the force divided by the mean displacement along the force, weighted with the traction. By Parseval's
+    theorem, k_t / G is 8 pi / integral of q^2 (w' + 2v) dk at the surface. For a half-space, w' + 2v = 3, and the
+    integral has a closed form. The kernel describes the additional effect of the base.
     """
     chi = traction.weights / (traction.radius_m * layer.CONTACT_W)
     base_effect = _kernel(traction.x_m, thickness_m) @ traction.weights
@@ -177,9 +184,10 @@ def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
 
 @lru_cache(maxsize=32)
 def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
-    """Tabulate the shear under a tip that slides at this depth, for radii up to `deformation.reach`.
+    """Tabulate the shear of the layer under a tip that slides at this depth, for radii up to `deformation.reach`.
 
-    `base` affects only the contact. The base is always fixed sideways; otherwise no force could shear the layer.
+    `base` affects only the contact. For the shear, the base is always fixed sideways, because a layer that slips freely
+    cannot be sheared.
     """
     layer.check_layer(np.array([depth_m]), thickness_m, tip_radius_m)
     if not depth_m > 0:
@@ -190,9 +198,9 @@ def tabulate_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, b
 
 
 def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: layer.Base) -> ShearMap:
-    """Interpolate the map linearly between tabulated depths, so that it is continuous in the depth.
+    """Return the shear map at a depth, by linear interpolation between tabulated depths.
 
-    Below the first tabulated depth (`DEPTH_STEP_M`), where the force is close to zero, the map of that depth is used.
+    Below the first tabulated depth (`DEPTH_STEP_M`), where the force is almost zero, the map at that depth is used.
     """
     steps = max(depth_m / DEPTH_STEP_M, 1.0)
     first, share = int(steps), steps - int(steps)
@@ -210,7 +218,7 @@ def at_depth(depth_m: float, *, thickness_m: float, tip_radius_m: float, base: l
 
 
 def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = None) -> ShearMap:
-    """Tabulate the shear due to a traction, by default up to `REACH` thicknesses beyond the contact."""
+    """Tabulate the shear of the layer due to a traction, by default up to `REACH` thicknesses beyond the contact."""
     if not 0 < traction.radius_m <= WIDEST * thickness_m < np.inf:
         rule, got = f"above 0 m and at most {WIDEST} thicknesses", f"{traction.radius_m} m on {thickness_m} m"
         raise ParamsError("drag", "contact radius", rule, got, "Press less deep.")
@@ -219,9 +227,9 @@ def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = Non
     r_m = np.linspace(0, reach_m, TABLE_R_N)
     z_m = np.linspace(0, thickness_m, TABLE_Z_N)
     parts = evaluate_map(traction, r_m, z_m, thickness_m=thickness_m)
-    parts[:, 0, :3] = 0.0  # no displacement at the base, but its material shears and therefore rotates
+    parts[:, 0, :3] = 0.0  # the displacement at the base is zero, but the half curl is not
     d, e, s = np.moveaxis(parts[..., 3:], 2, 0)
-    # The largest half curl is at f = 0 or 90 degrees.
+    # The half curl is largest at the angle f = 0 or 90 degrees.
     steepest_per_m2 = max(np.abs(d + e).max(), np.hypot(d - e, s).max())
     return ShearMap(r_m, z_m, parts, tangential_stiffness_m(traction, thickness_m), float(steepest_per_m2))
 
@@ -229,10 +237,10 @@ def tabulate(traction: Traction, thickness_m: float, reach_m: float | None = Non
 def evaluate_map(
     traction: Traction, r_m: Float[np.ndarray, " i"], z_m: Float[np.ndarray, " j"], *, thickness_m: float
 ) -> Float[np.ndarray, "i j 6"]:
-    """Return the parts of `ShearMap` on a grid: Hankel integrals with J0, J1 and J2, computed as matrix products.
+    """Compute `ShearMap.parts` on a grid: Hankel integrals with J0, J1 and J2, as matrix products.
 
-    For a wave with direction f, a traction q along x has the components q cos f along the wave and -q sin f across it.
-    The integrals over f give Bessel functions.
+    A traction q along x has the components q cos f along the wave vector and -q sin f across it, for a wave vector at
+    the angle f. The integrals over f are Bessel functions.
     """
     k_per_m = layer.WAVES_KH / thickness_m
     window = np.cos(np.pi * np.maximum(layer.WAVES_KH / layer.WAVES_KH[-1] - 0.5, 0)) ** 2  # avoids ringing
@@ -254,11 +262,11 @@ def evaluate_map(
 
 
 def wave_response(kz: Float[np.ndarray, "z k"], kh: Float[np.ndarray, " k"]) -> WaveResponse:
-    """Return the response of the layer, fixed at its base, to a wave of tangential traction on top.
+    """Return the response of a layer that is fixed at the base to a wave of tangential traction on top.
 
-    w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z'. Here
-    w is the W of `layer` with W''' = 3 W' at the top. Numerators and denominators are divided by exp(2A) / 4, so that
-    no exponent is positive inside the layer.
+    w = [A z' cosh t - t cosh A sinh z'] / (cosh^2 A + A^2), v = sinh z' / cosh A, A = kh, z' = kz, t = A - z'. The
+    function w is the solution W of `layer` with the boundary condition W''' = 3 W' at the top. Numerators and
+    denominators are divided by exp(2A) / 4, so that no exponent is positive inside the layer.
     """
     t = kh - kz
     top, low, high = np.exp(-t), np.exp(-2 * kz), np.exp(-2 * t)
@@ -282,7 +290,10 @@ def shear_displacement(
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
 ) -> ShearDisplacement:
-    """Return the linear displacement and half curl due to a force at `centre_m`; `modulus_Pa` is Young's, 3 G."""
+    """Interpolate the linear displacement and the half curl at places, for a tangential force at `centre_m`.
+
+    `modulus_Pa` is Young's modulus, 3 G.
+    """
     lowest_m, highest_m = places_m[:, 2].min(initial=0.0), places_m[:, 2].max(initial=0.0)
     if not (0 <= lowest_m and highest_m <= RIM_MAX * shear_map.z_m[-1]):
         rule, got = f"0 to {RIM_MAX} times the thickness", f"{lowest_m:.3g} to {highest_m:.3g} m"
@@ -301,12 +312,12 @@ def shear_in_steps(
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
 ) -> ShearDisplacement:
-    """Return the finite shear of nodes that `deformation` has moved, computed in midpoint steps.
+    """Return the finite shear of nodes that `deformation` has already moved, computed in steps by the midpoint rule.
 
-    `centre_m` is the rest position of the material under the tip: the tip's place minus Q / k_t
-    (`DragForce.elastic_m`). The displacement by `deformation` must have the same centre. With mu 0.8, dB differs from
-    the result of 24 steps by up to 1.2 % for depths to 0.8 mm and by 3 % at 1.2 mm. With a single `shear_displacement`
-    of the nodes at rest, it would differ by 13 to 90 %.
+    `centre_m` is the rest position of the material under the tip: the place of the tip minus `DragForce.elastic_m`. The
+    nodes must have been moved by an indentation with the same centre. With mu = 0.8, dB differs from the result of 24
+    steps by up to 1.2 % for depths up to 0.8 mm, and by 3 % at 1.2 mm. If `shear_displacement` were applied once to the
+    nodes at rest, dB would differ by 13 to 90 %.
     """
     shear_m2 = _over_modulus(force_N, modulus_Pa)
     steepest = shear_map.steepest_per_m2 * float(np.hypot(*shear_m2))
@@ -323,12 +334,15 @@ def shear_in_steps(
         middle_m = step_centre_m + ahead_m / 2
         middle = shear_displacement(shear_map, half_m, middle_m, force_N=part_N, modulus_Pa=modulus_Pa)
         moved_m += middle.displacement_m
-        half_curl += middle.half_curl  # in simple shear, half curls add up like displacement gradients
+        half_curl += middle.half_curl  # in simple shear, half curls of successive steps add up
     return ShearDisplacement(moved_m, half_curl)
 
 
 def rotation_from_curl(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "s 3"]]:
-    """Return angle and axis of R in F = R U; the angle is the arc tangent of the half curl (exact in plane strain)."""
+    """Return the angles in rad and axes of the rotations R in the polar decomposition F = R U.
+
+    The angle is the arc tangent of the magnitude of the half curl, which is exact in plane strain.
+    """
     size = np.sqrt((half_curl**2).sum(axis=1))
     axis = half_curl / np.where(size > 0, size, 1.0)[:, None]
     axis[size == 0] = (1.0, 0.0, 0.0)  # without rotation, the axis has no effect
@@ -344,7 +358,7 @@ def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[n
 @njit(cache=True, fastmath=False)
 @no_type_check
 def _at_places(parts, steps, places, centre, force):
-    # Interpolate the parts bilinearly, then combine them for the direction of the force.
+    # Interpolate `ShearMap.parts` bilinearly at each place, then combine A to S for the direction of the force.
     r_n, z_n, _ = parts.shape
     moved, half_curl = np.zeros_like(places), np.zeros_like(places)
     values, (fx, fy) = np.empty(6), force
@@ -353,7 +367,7 @@ def _at_places(parts, steps, places, centre, force):
         r = sqrt(x * x + y * y)
         at_r, at_z = r / steps[0], min(places[i, 2] / steps[1], z_n - 1.0)
         if at_r >= r_n - 1:
-            continue  # beyond the table, nothing moves
+            continue  # material beyond the table does not move
         j, k = int(at_r), min(int(at_z), z_n - 2)
         share_r, share_z = at_r - j, at_z - k
         for p in range(6):
@@ -371,7 +385,7 @@ def _at_places(parts, steps, places, centre, force):
 
 
 def _kernel(x_m: Float[np.ndarray, " q"], thickness_m: float) -> Float[np.ndarray, "q q"]:
-    # 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk: the effect of the base. For a half-space,
+    # Effect of the base: 2/pi times the integral of (1 - (w' + 2v) / 3) cos(k x) cos(k x') dk. For a half-space,
     # w' + 2v = 3, so the kernel is 0.
     response = wave_response(layer.KERNEL_KH[None], layer.KERNEL_KH)
     missing = layer.KERNEL_W / thickness_m * (1 - (response.w_slope[0] + 2 * response.v[0]) / 3)

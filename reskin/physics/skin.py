@@ -1,7 +1,7 @@
-"""A magnetised skin: its design, random skins, and the field change and force for indentations. SI units.
+"""Magnetised skins: their design, random skins, and the field change and force due to indentations. SI units.
 
-Each skin is drawn from its own random generator, seeded by its name. Adding skin 8 therefore does not change skin 7.
-An indentation is (x, y, depth) in the board's frame: the true place of the tip, and the commanded depth.
+Each skin is drawn with a random generator that is seeded by the skin's name. Therefore, adding skin 8 does not change
+skin 7. An indentation is (x, y, depth) in the board's frame: the true place of the tip, and the commanded depth.
 """
 
 from collections.abc import Iterator
@@ -21,18 +21,18 @@ from reskin.physics.board import Board, Spreads
 from reskin.physics.magnet import DEFAULT_QUADRATURE, SKIN_SIDES_M, Dipoles, Quadrature, change_of_field, place_nodes
 from reskin.seeds import rng_for
 
-FILLER_WAVES_N = 64  # number of plane waves that make up the local variation of the filler
+FILLER_WAVES_N = 64  # number of random plane waves whose sum is the local variation of the filler
 
 
 class SkinDesign(Strict):
-    """Section `skin`: the design that all skins of a scene share, and the tip that presses them."""
+    """Section `skin` of the settings: the design of all skins of a scene, and the tip that presses them."""
 
     polarity: magnet.Polarity
-    flipped: bool  # reverse the magnetisation, as rotating a checkerboard skin by 90 degrees does
+    flipped: bool  # whether the magnetisation is reversed, which equals a rotation of a checkerboard skin by 90 degrees
     base: layer.Base
-    # For a finite skin that slides rigidly. None: an infinite layer that does not slide, with the force of `layer`.
+    # Settings of the rigid sliding of a finite skin. None: an infinite layer that does not slide, with `layer.force`.
     hold: slide.HoldDesign | None
-    saturation_T: Annotated[float, Field(ge=0, le=1)]  # phi Br: volume fraction times remanence of the powder
+    saturation_T: Annotated[float, Field(ge=0, le=1)]  # volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of saturation_T
     thickness_mm: Annotated[float, Field(gt=0, le=20)]
     modulus_kPa: Annotated[float, Field(ge=0, le=1e6)]
@@ -47,7 +47,10 @@ class SkinDesign(Strict):
 
 @dataclass(frozen=True)
 class Skin:
-    """One skin at rest on its board, in the board's frame."""
+    """One skin at rest on its board: dipoles that represent its magnetisation, and properties of the layer.
+
+    Positions are in the board's frame.
+    """
 
     name: str
     nodes_m: Float[np.ndarray, "s 3"]
@@ -73,9 +76,10 @@ def draw_skin(
     rule: Quadrature = DEFAULT_QUADRATURE,
     sides_m: tuple[float, float] = SKIN_SIDES_M,
 ) -> Skin:
-    """Draw the skin of this name on its board; the quadrature rule changes its discretisation, not the skin.
+    """Draw a skin on its board with a random generator that is seeded by `seed` and `name`.
 
-    The magnetising array has as many magnets as are needed to cover a skin with the given side lengths.
+    The quadrature rule affects only the discretisation of the skin, not the random numbers. The magnetising array has
+    as many magnets as are needed to cover a skin with the given side lengths.
     """
     rng = rng_for(seed, "skin", name)
     amplitude, thickness, modulus = np.exp(
@@ -112,7 +116,7 @@ def draw_skin(
 def changes_of_field(
     board: Board, skin: Skin, indentations_m: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "n k 3"]]:
-    """Return the no-load field at the chips in T, and the field change for each indentation (x, y, depth).
+    """Return the no-load field in T at the chips, and the field change in T for each indentation (x, y, depth).
 
     Without contact (true depth of 0 or less), the field change is exactly zero.
 
@@ -121,7 +125,7 @@ def changes_of_field(
     ParamsError
         If an indentation is outside the skin or too deep.
     """
-    # One chip at a time, to bound memory: a large skin over many chips has millions of pairs of node and chip.
+    # One chip at a time, to limit memory: a large skin on many chips has millions of pairs of a node and a chip.
     rest_T = np.concatenate([magnet.field(skin.nodes_m, skin.moments_A_m2, chip_m[None]) for chip_m in board.chips_m])
     changes_T = np.zeros((len(indentations_m), *board.chips_m.shape))
     for indentation_i, before, after in moved_dipoles(skin, indentations_m):
@@ -132,10 +136,10 @@ def changes_of_field(
 def moved_dipoles(
     skin: Skin, indentations_m: Float[np.ndarray, "n 3"], slid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[tuple[int, Dipoles, Dipoles]]:
-    """Yield for each indentation in contact its index and the dipoles that it moves, at rest and displaced.
+    """Yield, for each indentation in contact, its index, and the dipoles that it moves before and after the motion.
 
-    `slid` is the fraction of the rigid motion that takes place in each press (default: 1). The caller may displace the
-    dipoles further before it calls `change_of_field`.
+    `slid` is, for each indentation, the fraction of the skin's rigid motion that takes place (default: 1). The caller
+    may displace the dipoles further before calling `change_of_field`.
     """
     true_m = indentations_m + np.array([0.0, 0.0, skin.depth_zero_m])
     _check_on_skin(true_m, skin)
@@ -156,10 +160,9 @@ def moved_dipoles(
 
 
 def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"]) -> slide.RigidMotion:
-    """Return the rigid motion of the skin under presses (x, y, true depth), limited by the tip's friction.
+    """Return the rigid motion of the skin due to presses (x, y, true depth), limited by friction with the tip.
 
-    The displacement towards the skin's centre depends on the depth but not on the modulus. The friction limit depends
-    on the force in N.
+    The displacement without this limit depends on the depth but not on the modulus. The limit depends on the force.
     """
     places_m = true_m[:, :2] - skin.seat_m
     relative_m2 = slide.force_at(
@@ -172,7 +175,7 @@ def press_motion(skin: Skin, hold: slide.Hold, true_m: Float[np.ndarray, "n 3"])
 
 
 def count_beyond_verified(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> int:
-    """Count the commanded depths beyond the range of the published solutions."""
+    """Count the commanded depths beyond the range in which the published solution was verified."""
     return int(layer.beyond_verified(depth_m + skin.depth_zero_m, skin.thickness_m).sum())
 
 
@@ -193,7 +196,7 @@ def shear_moduli_Pa(skin: Skin, depth_m: Float[np.ndarray, " n"]) -> Float[np.nd
 
 
 def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None:
-    # The modelled layer is infinite, so a press beyond the skin's edge would give a plausible but wrong result.
+    # The modelled layer is infinite, so the result for a press beyond the skin's edge would be plausible but wrong.
     half_m = np.array(skin.sides_m) / 2
     outside = ~(np.abs(indentations_m[:, :2] - skin.seat_m) <= half_m).all(axis=1)
     if outside.any():
@@ -204,8 +207,8 @@ def _check_on_skin(indentations_m: Float[np.ndarray, "n 3"], skin: Skin) -> None
 
 
 def _filler(xy_m: Float[np.ndarray, "s 2"], spreads: Spreads, rng: np.random.Generator) -> Float[np.ndarray, " s"]:
-    # A smooth random factor: the exponential of a sum of plane waves. It does not depend on the nodes, so that a finer
-    # quadrature samples the same skin.
+    # Return the local variation of the magnetisation, a smooth random factor: the exponential of a sum of plane waves.
+    # The waves do not depend on the nodes, so that a finer quadrature samples the same skin.
     waves = rng.standard_normal((FILLER_WAVES_N, 2)) / (spreads.skin_filler_length_mm * milli)
     phases = rng.uniform(0, 2 * np.pi, FILLER_WAVES_N)
     uneven = np.sqrt(2 / FILLER_WAVES_N) * np.cos(xy_m @ waves.T + phases).sum(axis=1)

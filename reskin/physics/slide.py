@@ -1,12 +1,13 @@
-"""Rigid sliding of a finite skin on its base, and the skin's force as a function of depth. SI units.
+"""Rigid sliding of a finite skin on its base, and the normal force as a function of depth. SI units.
 
-The base holds the whole skin by evenly distributed, isotropic springs. The rigid motion of the skin, for pressing and
-for dragging, therefore follows from the displacement of the material under the tip, or from the force on it. Friction
-between tip and skin limits the slide (`limit_by_friction`), so that the slide vanishes with the normal force.
+The base is modelled as evenly distributed, isotropic springs that hold the whole skin. Therefore, the rigid motion of
+the skin follows from the displacement of the material under the tip (for a press) or from the tangential force (for a
+drag). Friction between tip and skin limits the motion (`limit_by_friction`), so that it vanishes with the normal force.
 
-The force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2), because the layer stiffens as it
-thins: for a skin of 2 mm, by a factor of 1.2 at 0.2 mm and 4.0 at 1.2 mm. This factor and the displacement due to a
-press are empirical. They were chosen on two recorded boards (scene lab), which the elastic layer alone does not fit.
+The normal force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2), because the layer stiffens as
+it thins: for a skin of 2 mm, by a factor of 1.2 at 0.2 mm and 4.0 at 1.2 mm. This factor and the displacement due to a
+press are empirical. They were fitted to two recorded boards (scene lab), whose data the elastic layer alone does not
+describe.
 """
 
 from dataclasses import dataclass
@@ -24,18 +25,18 @@ from reskin.errors import ParamsError
 from reskin.physics import layer
 from reskin.physics.magnet import Dipoles
 
-STIFFENING = 1.5  # exponent, chosen on both recorded boards; values from 1.25 to 2 fit their data equally well
-DEEPEST = 0.72  # of the thickness; a force that would press deeper is treated as the force at this depth
+STIFFENING = 1.5  # exponent, from the two recorded boards; values from 1.25 to 2 fit their data equally well
+DEEPEST = 0.72  # greatest depth of `depth_at`, as a fraction of the thickness
 CENTRE_M = np.zeros(2)
-CURVE_N = 2000  # depths of the inverse force curve; d is interpolated linearly in F^(2/3), as in Hertz contact
+CURVE_N = 2000  # number of points of the inverse force curve, in which d is interpolated linearly in F^(2/3) (Hertz)
 
 
 class HoldDesign(Strict):
-    """Section `skin.hold`: how the base holds a skin that slides on it, and how a press displaces it."""
+    """Section `skin.hold`: how the base holds a skin that slides on it, and how a press displaces the skin."""
 
-    give_um: tuple[float, float]  # compliance of the rig: displacement of arm and skin due to a press, along x and y
-    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement towards the centre, per distance from it
-    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force / Young's modulus at which that displacement vanishes
+    give_um: tuple[float, float]  # displacement of arm and skin along x and y due to a press (compliance of the rig)
+    away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement towards the centre, per distance from the centre
+    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # (force / Young's modulus) at which `away_um_mm` has no effect
     springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base: screws, clips, friction
     friction: Annotated[float, Field(gt=0, le=10)]  # coefficient between tip and skin
 
@@ -62,19 +63,19 @@ class Hold:
 
     @property
     def grip_N_per_m(self) -> float:
-        """Normal force needed per slide to hold it by friction, k / mu; infinite without friction."""
+        """Normal force per displacement that is needed to move the skin by friction: k / mu; infinite if mu is 0."""
         return self.springs_N_per_m / self.friction if self.friction > 0 else np.inf
 
 
 @dataclass(frozen=True)
 class RigidMotion:
-    """Rigid motion of a skin, one row per indentation: rotation about its centre, then translation."""
+    """Rigid motion of a skin for n indentations: a rotation about the skin's centre, then a translation."""
 
     move_m: Float[np.ndarray, "n 2"]
     spin_rad: Float[np.ndarray, " n"]
 
     def scaled(self, share: Float[np.ndarray, " n"]) -> "RigidMotion":
-        """Return the motions multiplied by the given shares."""
+        """Return each motion multiplied by a factor."""
         return RigidMotion(self.move_m * share[:, None], self.spin_rad * share)
 
 
@@ -83,24 +84,24 @@ def press_displacement_m(
 ) -> Float[np.ndarray, "n 2"]:
     """Return the displacement of the material under a tip that does not slip: give - away (1 - load) p.
 
-    p is the place relative to the skin's centre. The second term points towards the centre: the skin escapes from under
-    the tip to the opposite side. `load` is the force divided by the force at which this term vanishes. A light press
-    causes only a fraction of the displacement (see `limit_by_friction`).
+    p is the place relative to the skin's centre. The second term displaces the material towards the centre. `load` is
+    the force divided by the force at which this term vanishes. After a light press, only a fraction of this
+    displacement remains (see `limit_by_friction`).
     """
     return np.array(give_m) - away * (1 - load)[:, None] * places_m
 
 
 def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], grip_N_per_m: float) -> RigidMotion:
-    """Scale motions down to what Coulomb friction allows at these normal forces.
+    """Reduce rigid motions to those that Coulomb friction can cause at these normal forces F.
 
-    A slide u needs the lateral force k |u|, which friction limits to mu F. The motion is multiplied by
-    1 - exp(-mu F / (k |u|)). This factor keeps the lateral force below mu F and tends to 1 for a strong press.
-    `grip_N_per_m` is k / mu.
+    A displacement u of the skin needs the lateral force k |u|, but friction exerts at most mu F. The motion is
+    multiplied by 1 - exp(-mu F / (k |u|)). With this factor, the lateral force is always below mu F, and the motion
+    is complete for a strong press. `grip_N_per_m` is k / mu.
     """
-    with np.errstate(invalid="ignore"):  # inf * 0 if there is neither motion nor friction
+    with np.errstate(invalid="ignore"):  # inf * 0 is NaN, if both motion and friction are 0
         needed_N = grip_N_per_m * np.hypot(*motion.move_m.T)
     moves = needed_N > 0
-    with np.errstate(over="ignore"):  # if the slide is so small that any force suffices
+    with np.errstate(over="ignore"):  # if the motion is so small that any force suffices
         share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
     return motion.scaled(share)
 
@@ -108,7 +109,10 @@ def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], gri
 def compliance_m_per_N(
     places_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float], springs_N_per_m: float
 ) -> Float[np.ndarray, "n 2 2"]:
-    """Return the displacement at each place per force there: (I + q q^T / rho^2) / k (see `rigid_motion`)."""
+    """Return the displacement of the skin at each place per lateral force at the same place.
+
+    The compliance matrix is (I + q q^T / rho^2) / k, with q and rho as in `rigid_motion`.
+    """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     rotational = q_m[:, :, None] * q_m[:, None, :] / _rho2_m2(sides_m)
     return (np.eye(2) + rotational) / springs_N_per_m
@@ -117,11 +121,11 @@ def compliance_m_per_N(
 def rigid_motion(
     places_m: Float[np.ndarray, "n 2"], displacement_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]
 ) -> RigidMotion:
-    """Return the rigid motion with the least elastic energy of the base springs that displaces each place as given.
+    """Return, for each place, the rigid motion that displaces it as given with the least elastic energy of the base.
 
-    The motion is u(X) = f + theta z x X, with u(p) = D at the place p. Then f = (I + q q^T / rho^2)^-1 D and
-    theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is the mean of r^2 over the skin. For places
-    off the centre, the motion includes a rotation.
+    A rigid motion is u(X) = f + theta z x X, and the condition is u(p) = D at the place p. The solution is
+    f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is the mean of
+    r^2 over the skin.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     spin_rad = (q_m * displacement_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))
@@ -134,7 +138,7 @@ def apply(
     dipoles: Dipoles,
     centre_m: Float[np.ndarray, "2"] = CENTRE_M,
 ) -> Dipoles:
-    """Apply motion `i` to dipoles: rotate positions (about the skin's centre) and moments, then translate positions."""
+    """Return dipoles after motion `i`: rotate positions (about `centre_m`) and moments, then translate positions."""
     positions_m, moments_A_m2 = (part.T.copy() for part in dipoles)
     apply_in_place(motion, i, (positions_m.T, moments_A_m2.T), centre_m)
     return positions_m.T, moments_A_m2.T
@@ -146,7 +150,7 @@ def apply_in_place(
     dipoles: Dipoles,
     centre_m: Float[np.ndarray, "2"] = CENTRE_M,
 ) -> None:
-    """Apply motion `i` as `apply` does, but overwrite the arrays, to save time with thousands of dipoles."""
+    """Apply motion `i` as in `apply`, but overwrite the arrays, which is faster for thousands of dipoles."""
     positions_m, moments_A_m2 = dipoles
     cos, sin = float(np.cos(motion.spin_rad[i])), float(np.sin(motion.spin_rad[i]))
     (x_m, y_m), (centre_x_m, centre_y_m) = motion.move_m[i], centre_m
@@ -177,14 +181,14 @@ def force_at(
 
 
 def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Return the stiffening factor (1 - d/h)^(-3/2) of a thinning layer, for pressing and (assumed) also for shear."""
+    """Return the factor (1 - d/h)^(-3/2) by which a layer is stiffer at a depth; the same is assumed for shear."""
     return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
 
 
 def count_clipped(
     force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> int:
-    """Count the forces that `depth_at` clips to its greatest depth."""
+    """Count the forces that are larger than the force at the greatest depth of `depth_at`."""
     deepest_m = np.array([_deepest_m(thickness_m, tip_radius_m)])
     deepest_N = force_at(deepest_m, modulus_Pa=modulus_Pa, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return int((force_N > deepest_N).sum())
@@ -193,22 +197,22 @@ def count_clipped(
 def depth_at(
     force_N: Float[np.ndarray, " n"], *, modulus_Pa: float, thickness_m: float, tip_radius_m: float
 ) -> Float[np.ndarray, " n"]:
-    """Return the depth for each normal force, at most `DEEPEST` thicknesses (see `count_clipped`)."""
+    """Return the depth in m for each normal force, clipped to `DEEPEST` thicknesses (see `count_clipped`)."""
     if not modulus_Pa > 0:
         raise ParamsError("layer", "modulus", "above 0 Pa", f"{modulus_Pa}", "Check its unit.")
     curve_m, curve_m2 = _curve(thickness_m, tip_radius_m)
-    relative_m2 = np.maximum(force_N, 0.0) / modulus_Pa  # a pulling force is treated as no force
+    relative_m2 = np.maximum(force_N, 0.0) / modulus_Pa  # a negative force is treated as 0
     return np.interp(np.cbrt(relative_m2**2), curve_m2, curve_m)
 
 
 def _deepest_m(thickness_m: float, tip_radius_m: float) -> float:
-    """Return the greatest depth of `depth_at`: `DEEPEST` thicknesses, but less than the tip's radius."""
+    """Return the greatest depth of `depth_at`: `DEEPEST` thicknesses, or slightly less than the tip radius."""
     return min(DEEPEST * thickness_m, 0.999 * tip_radius_m)
 
 
 @lru_cache(maxsize=64)
 def _curve(thickness_m: float, tip_radius_m: float) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
-    # Depths, and (F / E)^(2/3) at these depths.
+    # Return depths in m, and (F / E)^(2/3) at these depths.
     curve_m = np.linspace(0, _deepest_m(thickness_m, tip_radius_m), CURVE_N)
     known_m2 = force_at(curve_m, modulus_Pa=1.0, thickness_m=thickness_m, tip_radius_m=tip_radius_m)
     return curve_m, np.cbrt(known_m2**2)

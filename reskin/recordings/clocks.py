@@ -18,7 +18,7 @@ TYPES = {"byte_end": pa.int64(), "t_s": pa.float64()}
 
 @dataclass(frozen=True)
 class Arrivals:
-    """For each chunk of a stream, in order (axis c): the number of bytes up to its end, and its time of arrival."""
+    """Arrival time of each chunk of a stream, and number of bytes from the start of the stream to the chunk's end."""
 
     byte_end: Int64[np.ndarray, " c"]
     t_s: Float64[np.ndarray, " c"]
@@ -56,9 +56,9 @@ def render(arrivals: Arrivals) -> str:
 def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[np.ndarray, " f"]:
     """Return the time of each frame's last byte, interpolated linearly between the ends of chunks.
 
-    A byte arrived before its chunk was read and, apart from the port's buffer, after the previous chunk was read, so
-    the error is less than the time between these reads. In the first chunk, times are extrapolated at the stream's mean
-    rate. The time of a frame after the last chunk is NaN.
+    Apart from the delay in the port's buffer, a byte arrived after the previous chunk was read and before its chunk was
+    read, so the error is less than the time between these two reads. In the first chunk, times are extrapolated at the
+    stream's mean rate. The time of a frame after the last chunk is NaN.
     """
     byte_end, t_s = arrivals.byte_end, arrivals.t_s
     s_per_byte = (t_s[-1] - t_s[0]) / (byte_end[-1] - byte_end[0])
@@ -67,41 +67,53 @@ def times_of(end_byte: Int64[np.ndarray, " f"], arrivals: Arrivals) -> Float64[n
 
 
 def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[np.ndarray, " f"]:
-    """Return the time of each frame in a stream of constant rate; 0 at the start of the stream.
+    """Return the time of each frame in s from the start of a stream with a constant frame rate.
 
-    `frame` is the position of each frame in the stream, in frames. If all frames have the same length, it is the number
-    of bytes up to the frame's end, divided by this length, so that damaged bytes also take time; otherwise it is a
-    running count. Frames that were lost before the stream was saved shift all later times.
+    `frame` is the position of each frame's end in the stream, in frames. If all frames have the same length, it is the
+    number of bytes up to the frame's end, divided by this length, so that damaged bytes also take time. Otherwise, it
+    is the number of the frame, from 1. Frames that were lost before the stream was saved make later times too early.
     """
     return frame / rate_hz
 
 
-RATE_LIMIT = 0.1  # a nominal rate may be off by some per cent; if more, a mark is in milliseconds or of another event
-STEPS_PER_DWELL_N = 16
+# Maximum deviation of a clock's fitted rate from 1. Real deviations are some per cent, if the nominal frame rate is
+# inaccurate; a larger deviation means that a mark is in milliseconds or that its two times are of different events.
+RATE_LIMIT = 0.1
+
+# To align the clocks without marks, the stream is divided into time steps. `_search` finds an offset for its first
+# SEARCH_STEPS_N steps; `_follow` then finds one offset per window of WINDOW_STEPS_N steps; a line is fitted to these.
+STEPS_PER_DWELL_N = 16  # steps in the median contact dwell (a "dwell length")
 STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
-SEARCH_STEPS_N = 2**16  # first search: 4,000 dwell lengths, over which a rate error of 50 ppm shifts by 0.2 dwells
-WINDOW_STEPS_N = 2**14  # then: one offset per window of 1,000 dwell lengths; the rate is fitted to these
-EXPLAINED_MIN = 0.5  # fraction of dwell time that must agree: 0 by chance, 1 if every dwell agrees
-# Required lead over every other offset, in indentations. If a periodic protocol is shifted by one period, it loses one
-# indentation, and one contact may be too weak to detect.
+SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths, in which a rate error of 50 ppm adds up to 0.2 dwell lengths
+WINDOW_STEPS_N = 2**14  # 1,000 dwell lengths
+# Minimum fraction of dwell time that agrees with the field. The fraction is 0 by chance, and 1 if every dwell agrees.
+EXPLAINED_MIN = 0.5
+# The best offset must match this many more indentations than every other offset. An offset that is wrong by one period
+# of a periodic protocol matches one indentation less, and one contact may be too weak to detect.
 MARGIN_MIN = 1.5
-SEEN_MIN = 0.5  # required overlap with the dwells, over the largest overlap: a few dwells can fit by chance
-PEAK_DROP = 0.05  # the offset is the peak's middle at this relative depth below its top, which can be flat
-AWAY_NOISES = 1.5  # contact threshold / median no-load distance: 2.7 sd for the 15 channels of a board
-STRETCH_PERIODS_N = 32
-START_FRAMES_N = 4
-REFERENCE_FRAMES_N = 4096
+# Minimum overlap of stream and dwells, relative to the largest overlap at any offset: the few dwells of a small overlap
+# can fit by chance.
+OVERLAP_MIN = 0.5
+# The top of a peak can be flat, so the position of the peak is the middle between its flanks at 5 % below the top.
+PEAK_DROP = 0.05
+# Contact threshold, as a multiple of the median distance from the no-load field in frames without contact: 2.7 standard
+# deviations of this distance above its median, for the 15 channels of a board.
+AWAY_NOISES = 1.5
+STRETCH_PERIODS_N = 32  # the no-load field is updated after this many periods, of one indentation each
+START_FRAMES_N = 4  # the first no-load field is the median of this many first frames
+REFERENCE_FRAMES_N = 4096  # at most this many frames of a stretch are used to estimate the no-load field
 _REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S, one event on both clocks."
 
-# Stream times [f] and fields in uT [f ch]; the axes have no letters, as f differs from block to block.
+# Stream times [f] and fields in uT [f ch]; the axes are not named, because f differs from block to block.
 Block = tuple[Float64[np.ndarray, "_"], Float32[np.ndarray, "_ _"]]
 
 
 @dataclass(frozen=True)
 class ClockMap:
-    """The line between the clocks; `residual_s` is the largest misfit of the marks (or windows) that it was fitted to.
+    """Linear map from stream time to probe time: probe_s = offset_s + rate * stream_s.
 
-    `explained` is the fraction of dwell time that agrees with the field: 0 by chance, 1 if marks were given.
+    `residual_s` is the largest misfit of the sync marks (or of the windows) to which the line was fitted. `explained`
+    is the fraction of dwell time that agrees with the field: 0 by chance; it is set to 1 if marks were given.
     """
 
     offset_s: float
@@ -115,7 +127,10 @@ class ClockMap:
 
 
 def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
-    """Fit the line to sync marks (stream time, probe time): one mark gives the offset, several also the rate."""
+    """Fit the clock map to sync marks, one row (stream time, probe time) each.
+
+    A single mark determines the offset, with a rate of 1; several marks also determine the rate.
+    """
     given = marks.tolist()
     if not given or not np.isfinite(marks).all():
         raise CaptureError(where, "clock.marks", "one or more pairs of finite times", given, "Correct them.")
@@ -125,9 +140,9 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
 
 
 def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMap:
-    """Find the line that aligns the contacts in the field with the dwells of the probe log.
+    """Find the clock map that aligns the contacts visible in the field with the dwells of the probe log.
 
-    The stream must begin with the robot lifted. Memory: 1 byte per sixteenth of a dwell.
+    The stream must begin with the robot lifted. The function needs 1 byte of memory per sixteenth of a dwell.
     """
     if not log.contact.any():
         raise CaptureError(f"{where}: the probe log has no contacts. Record the capture again.")
@@ -135,22 +150,22 @@ def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMa
     pattern = _Pattern(log)
     start_s, signal = _contact_signal(blocks, pattern, step_s, where)
     offset_s = _search(signal[:SEARCH_STEPS_N], pattern, start_s, step_s, where)
-    mid_s, offsets_s, matched, dwelt = [], [], 0.0, 0.0
+    mid_s, offsets_s, matched, overlap = [], [], 0.0, 0.0
     window_s = start_s
     for window in np.array_split(signal, -(-len(signal) // WINDOW_STEPS_N)):
-        found_s, window_matched, window_dwelt = _follow(window, pattern, window_s + offset_s, step_s)
-        matched, dwelt = matched + window_matched, dwelt + window_dwelt
-        if window_matched > EXPLAINED_MIN * window_dwelt:
-            offset_s += found_s
+        shift_s, window_matched, window_overlap = _follow(window, pattern, window_s + offset_s, step_s)
+        matched, overlap = matched + window_matched, overlap + window_overlap
+        if window_matched > EXPLAINED_MIN * window_overlap:
+            offset_s += shift_s
             mid_s.append(window_s + len(window) * step_s / 2)
             offsets_s.append(offset_s)
         window_s += len(window) * step_s
-    if matched <= EXPLAINED_MIN * dwelt:
-        agreed = matched / max(dwelt, 1e-9)
+    if matched <= EXPLAINED_MIN * overlap:
+        agreed = matched / max(overlap, 1e-9)
         raise CaptureError(
             f"{where}: the field agrees with {agreed:.0%} of the dwells; over {EXPLAINED_MIN:.0%} must agree. {_REMEDY}"
         )
-    return _line(np.array(mid_s), np.array(offsets_s), matched / dwelt, where)
+    return _line(np.array(mid_s), np.array(offsets_s), matched / overlap, where)
 
 
 class _Pattern:
@@ -159,48 +174,50 @@ class _Pattern:
     def __init__(self, log: ProbeLog) -> None:
         dwell_s = log.t_end_s - log.t_start_s
         weight = np.where(log.contact, 0.5 / dwell_s[log.contact].sum(), 0.5 / dwell_s[~log.contact].sum())
-        firsts = log.t_start_s[~log.contact]  # each indentation opens with its one no-load dwell
+        firsts = log.t_start_s[~log.contact]  # each indentation begins with its only no-load dwell
         self.start_s, self.end_s = float(log.t_start_s[0]), float(log.t_end_s[-1])
         self.period_s = float(np.median(np.diff(firsts))) if len(firsts) > 1 else self.end_s - self.start_s
+        # Fraction of the time without contact.
         self.quiet = 1 - float(dwell_s[log.contact].sum()) / (self.end_s - self.start_s)
         scaled = len(firsts) * weight * dwell_s  # so that one indentation has weight 1
         self._knots_s = np.stack([log.t_start_s, log.t_end_s], axis=1).ravel()
         self._signed = _running(np.where(log.contact, scaled, -scaled))
-        self._dwelt = _running(scaled)
+        self._unsigned = _running(scaled)
 
     def signed(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the weight of each step of a grid in probe time: contact > 0, no-load < 0, between dwells 0."""
+        """Return the weights of `steps_n` steps of probe time: contact > 0, no-load < 0, between dwells 0."""
         return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._signed))
 
-    def dwelt(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
-        """Return the same weights without signs."""
-        return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._dwelt))
+    def unsigned(self, start_s: float, steps_n: int, step_s: float) -> Float64[np.ndarray, " g"]:
+        """Return the magnitudes of the weights of `signed`."""
+        return np.diff(np.interp(start_s + step_s * np.arange(steps_n + 1), self._knots_s, self._unsigned))
 
 
 def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
+    """Return the cumulative weight at the start and at the end of each dwell."""
     total = np.cumsum(weight)
     return np.stack([total - weight, total], axis=1).ravel()
 
 
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
-    """Find the offset among all lags, by FFT; raise if another offset fits about as well."""
+    """Return the offset, probe time minus stream time in s, that fits best; raise if another one fits about as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
-    samples = signal / np.abs(signal).mean()  # scaled, because most steps may have no frame
-    weights, dwelt = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.dwelt))
-    seen = _correlate(dwelt, np.abs(samples))
-    # The match, minus what a poor fit would match. Without this term, a shift that loses a dwell could compensate for
-    # it by overlapping more of the log.
-    score = _correlate(weights, samples) - EXPLAINED_MIN * seen
-    score[seen < SEEN_MIN * seen.max()] = 0.0
+    samples = signal / np.abs(signal).mean()  # scaled to a mean magnitude of 1, because most steps may have no frame
+    weights, unsigned = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.unsigned))
+    overlap = _correlate(unsigned, np.abs(samples))
+    # The score is the match minus what a poor fit would match. Without the second term, an offset that mismatches a
+    # dwell could compensate for it by a larger overlap with the log.
+    score = _correlate(weights, samples) - EXPLAINED_MIN * overlap
+    score[overlap < OVERLAP_MIN * overlap.max()] = 0.0
     top_i = int(score.argmax())
     elsewhere = np.abs(np.arange(len(score)) - top_i) * step_s > pattern.period_s / 2
     margin = score[top_i] - score[elsewhere].max(initial=0.0)
-    # Overlapped dwell time that does not match; a wrong dwell counts twice.
-    unexplained = (1 - EXPLAINED_MIN) * seen[top_i] - score[top_i]
+    # The overlap minus the match, in indentations; a dwell with the wrong sign counts twice.
+    unexplained = (1 - EXPLAINED_MIN) * overlap[top_i] - score[top_i]
     if margin < MARGIN_MIN + unexplained / 2:
         raise CaptureError(
             f"{where}: the field fits the dwells at two times almost equally well, with matches that differ by "
-            f"{margin:.2g} of {dwelt.sum():.0f} indentations. {_REMEDY}"
+            f"{margin:.2g} of {unsigned.sum():.0f} indentations. {_REMEDY}"
         )
     return pattern.start_s + (top_i - (len(signal) - 1)) * step_s - start_s
 
@@ -208,18 +225,24 @@ def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, s
 def _follow(
     window: Int8[np.ndarray, " g"], pattern: _Pattern, probe_s: float, step_s: float
 ) -> tuple[float, float, float]:
-    """Return the deviation of a window's offset from the expected one, its match, and the dwell time it overlaps."""
+    """Find the best shift in s of a window of the contact signal, which is expected to begin at `probe_s`.
+
+    Also returns the window's match with the pattern, and its overlap with the dwells: the largest possible match.
+    """
     reach_n = int(pattern.period_s / step_s) // 2 + 1
     begin_s, steps_n = probe_s - reach_n * step_s, len(window) + 2 * reach_n
     samples = window.astype(np.float64)
     score = _correlate(pattern.signed(begin_s, steps_n, step_s), samples)[len(samples) - 1 : steps_n]
     top_i = int(score.argmax())
-    dwelt = pattern.dwelt(begin_s + top_i * step_s, len(window), step_s) @ np.abs(samples)
-    return (_middle(score, top_i) - reach_n) * step_s, float(score[top_i]), float(dwelt)
+    overlap = pattern.unsigned(begin_s + top_i * step_s, len(window), step_s) @ np.abs(samples)
+    return (_middle(score, top_i) - reach_n) * step_s, float(score[top_i]), float(overlap)
 
 
 def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " b"]) -> Float64[np.ndarray, " c"]:
-    """Correlate at every lag with an overlap, by FFT, like scipy.signal.correlate, whose import takes a second."""
+    """Correlate two signals at every lag at which they overlap, by FFT.
+
+    This replaces scipy.signal.correlate, whose import takes a second.
+    """
     from scipy.fft import irfft, next_fast_len, rfft  # imported late: only captures without clock marks need it
 
     lags_n = len(signal) + len(window) - 1
@@ -228,7 +251,7 @@ def _correlate(signal: Float64[np.ndarray, " a"], window: Float64[np.ndarray, " 
 
 
 def _middle(score: Float64[np.ndarray, " g"], top_i: int) -> float:
-    """Return the middle of a peak between its flanks, `PEAK_DROP` below its top, resolved to less than one step."""
+    """Return the position of the peak at `top_i`, interpolated between steps; see `PEAK_DROP`."""
     level = (1 - PEAK_DROP) * score[top_i]
     below_i = np.flatnonzero(score < level)
     left_i, right_i = below_i[below_i < top_i][-1:], below_i[below_i > top_i][:1]
@@ -252,8 +275,9 @@ def _contact_signal(
         if step_i[-1] > STEPS_MAX_N:
             rule = f"at most {STEPS_MAX_N * step_s:.0f} s long for dwells this short"
             raise CaptureError(where, "the stream", rule, f"{t_s[-1] - start_s:.0f} s", _REMEDY)
-        first_i, here_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
-        parts.append((first_i, np.sign(np.bincount(here_i, np.where(contact, 1, -1))).astype(np.int8)))
+        first_i, index_i = int(step_i[0]), step_i.astype(np.int64) - int(step_i[0])
+        # A step with several frames takes the sign of their majority.
+        parts.append((first_i, np.sign(np.bincount(index_i, np.where(contact, 1, -1))).astype(np.int8)))
     if start_s is None:
         raise CaptureError(f"{where}: the stream has no frames. Record the capture again.")
     signal = np.zeros(parts[-1][0] + len(parts[-1][1]), np.int8)
@@ -265,16 +289,17 @@ def _contact_signal(
 def _detect_contact(
     blocks: Iterable[Block], pattern: _Pattern
 ) -> Iterator[tuple[Float64[np.ndarray, "_"], Bool[np.ndarray, "_"]]]:
-    """Decide for each frame whether its field differs from a running no-load field by more than noise.
+    """Yield times, and for each frame whether its field differs from the current no-load field by more than noise.
 
-    The log gives the fraction of time without contact. The same fraction of the frames, those nearest to the previous
-    no-load field, is taken as no-load. The nearer half of these frames gives the next no-load field and the noise.
+    The no-load field is updated in each stretch of frames. The probe log gives the fraction of time without contact. It
+    is assumed that this fraction of the frames, those nearest to the previous no-load field, are without contact. The
+    nearer half of these frames gives the new no-load field and the noise.
     """
     noload_uT, noise_uT = None, np.inf
     for t_s, b_uT in _stretches(blocks, STRETCH_PERIODS_N * pattern.period_s):
         if noload_uT is None:
             noload_uT = np.median(b_uT[:START_FRAMES_N], axis=0)
-        # A short stretch may consist of contact only.
+        # Do not update the no-load field from a short stretch, which may consist of contact only.
         if noise_uT == np.inf or t_s[-1] - t_s[0] > STRETCH_PERIODS_N * pattern.period_s / 4:
             sample = b_uT[:: -(-len(b_uT) // REFERENCE_FRAMES_N)]
             distance_uT = np.linalg.norm(sample - noload_uT, axis=1)
@@ -284,7 +309,7 @@ def _detect_contact(
 
 
 def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
-    """Cut blocks into stretches with a nearly constant no-load field; leave out frames that are not finite."""
+    """Cut blocks into stretches of at most `stretch_s`; leave out frames whose time or field is not finite."""
     for t_s, b_uT in blocks:
         good = np.isfinite(b_uT).all(axis=1) & np.isfinite(t_s)
         t_s, b_uT = t_s[good], b_uT[good]
@@ -295,13 +320,13 @@ def _stretches(blocks: Iterable[Block], stretch_s: float) -> Iterator[Block]:
 
 
 def _line(
-    at_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
+    stream_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
 ) -> ClockMap:
-    """Fit the least-squares line to offsets at stream times; with a single offset, the rate is 1."""
-    mid_s, mean_s = at_s.mean(), offset_s.mean()  # centred, as clocks may count from 1970
-    spread_s2 = ((at_s - mid_s) ** 2).sum()
-    slope = float(((at_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(at_s) > 1 else 0.0
-    residual_s = float(np.abs(offset_s - mean_s - slope * (at_s - mid_s)).max())
+    """Fit the clock map to offsets (probe time minus stream time) by least squares; one offset gives a rate of 1."""
+    mid_s, mean_s = stream_s.mean(), offset_s.mean()  # centred for precision, as clocks may count from 1970
+    spread_s2 = ((stream_s - mid_s) ** 2).sum()
+    slope = float(((stream_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(stream_s) > 1 else 0.0
+    residual_s = float(np.abs(offset_s - mean_s - slope * (stream_s - mid_s)).max())
     if abs(slope) > RATE_LIMIT:
         raise CaptureError(
             f"{where}: clock.marks give the clock a rate of {1 + slope:.6g}, not 1 within {RATE_LIMIT}. Check that "

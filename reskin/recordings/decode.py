@@ -11,7 +11,10 @@ from reskin.recordings import clocks
 
 
 def decode_dump(data: bytes, wire: Wire, chips_n: int, where: str) -> tuple[pa.Table, dict[str, int]]:
-    """Decode a dump; raise `CaptureError` if it has no frames. Units are in the metadata of the table's fields."""
+    """Decode a serial dump to a table, and count its bytes and frames; raise `CaptureError` if it has no frames.
+
+    The unit of each column is in the metadata of its Arrow field.
+    """
     frames, account = decode_all(data, wire, chips_n, where)
     values = [*frames.b_uT.T, *frames.temperature_degC.T, frames.device_s, frames.end_byte]
     fields = [
@@ -27,8 +30,8 @@ def read_frames(
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
     """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
 
-    The time is the device's if all frames have one; otherwise it follows from the constant rate. If all frames have the
-    same length, lost bytes also take time.
+    The time is that of the board's clock if every frame has it. Otherwise, it is computed from the frame's position and
+    the constant rate `rate_hz`; in binary formats, lost bytes also take time.
     """
     chips_n = sum(name.startswith("temperature") for name in table.column_names)
     if table.column_names != list(_columns(chips_n)):
@@ -41,13 +44,13 @@ def read_frames(
     if np.isfinite(device_s).all():
         t_s = device_s.astype(np.float64)
     else:
-        frame_bytes_n = record_type("binary", chips_n).itemsize  # a line of text is longer
+        frame_bytes_n = record_type("binary", chips_n).itemsize  # a text frame is longer than a binary frame
         is_binary = (np.diff(end_byte, prepend=0) == frame_bytes_n).any()
         t_s = clocks.constant_rate(end_byte / frame_bytes_n if is_binary else 1.0 + np.arange(len(table)), rate_hz)
     return t_s, np.stack(values[: 3 * chips_n], axis=1), np.stack(values[3 * chips_n : -2], axis=1)
 
 
 def _columns(chips_n: int) -> dict[str, str]:
-    """Name the columns of a decoded dump, and the unit of each."""
+    """Return the columns of a decoded dump in order: the unit of each by its name."""
     names = {f"b{axis}{chip}_uT": "uT" for chip in range(chips_n) for axis in "xyz"}
     return names | {f"temperature{chip}_degC": "degC" for chip in range(chips_n)} | {"device_s": "s", "end_byte": "1"}

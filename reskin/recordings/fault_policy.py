@@ -1,6 +1,6 @@
-"""Policy for faulty readings, by fault: drop them, flag (keep and count) them, or refuse the recording.
+"""Policy for each kind of fault: drop the faulty readings, flag them (keep and count), or refuse the recording.
 
-`FaultLog` applies it to a stream in portions, `check_rows` to a whole table; both count the faults that they find.
+`FaultLog` applies the policy to a stream in portions, `check_rows` to a whole table; both count the faults.
 """
 
 import math
@@ -51,14 +51,15 @@ class FaultPolicy(Strict):
 
 
 REFUSE_ALL = FaultPolicy.model_validate(dict.fromkeys(FaultPolicy.model_fields, "refuse"))
-# The mildest action for each fault, to find out whether a recording can be read at all.
+# A policy that never refuses a recording, to test whether the recording can be read. The first possible action of each
+# fault is the mildest one.
 REFUSE_NONE = FaultPolicy.model_validate(
     {name: get_args(field.annotation)[0] for name, field in FaultPolicy.model_fields.items()}
 )
 
 
 def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> FaultPolicy:
-    """Change the actions of some faults by `NAME=ACTION`; `where` names the option in errors.
+    """Change the actions of some faults by texts `NAME=ACTION`; `where` names the command-line option in errors.
 
     >>> override(REFUSE_ALL, ["too-hot=drop"], "--on-fault").too_hot
     'drop'
@@ -84,7 +85,8 @@ def override(policy: FaultPolicy, overrides: Iterable[str], where: str) -> Fault
 class FaultRecord:
     """Number of times a fault occurred, its first and last position (stream time in s, or row), and the action taken.
 
-    The positions are NaN until a time is known: the last bytes before a recorder was killed may have no time.
+    The positions are NaN as long as no faulty frame has a known time: the last bytes before a recorder was killed may
+    have no time.
     """
 
     count_n: int
@@ -94,9 +96,9 @@ class FaultRecord:
 
 
 class CheckedRows(NamedTuple):
-    """Masks of the frames or rows to keep, and of those dropped, by the first reason that applies.
+    """Masks of the frames or rows to keep, and of the dropped ones by the first reason that applies.
 
-    `counts` has the count, action and span of each fault, under the keys of an account.
+    `counts` is the result of `FaultLog.account`.
     """
 
     keep: Bool[np.ndarray, " f"]
@@ -106,7 +108,7 @@ class CheckedRows(NamedTuple):
     counts: Mapping[str, int]
 
     def account(self) -> dict[str, int]:
-        """Count the dropped rows by reason, and the faults."""
+        """Return the numbers of dropped rows by reason, and `counts`."""
         out_of_range_n = int(self.out_of_range.sum())
         return {
             "dropped_failed_read_rows_n": int(self.failed.sum()),
@@ -133,16 +135,17 @@ class FaultLog:
         self,
         fault: str,
         mask: Bool[np.ndarray, " f"],
-        at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
+        position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
         count_n: int | None = None,
     ) -> Bool[np.ndarray, " f"]:
-        """Count a fault where `mask` is set, or `count_n` times; return the mask of the rows that the policy drops.
+        """Record the rows (or frames) that `mask` marks as faulty; return the mask of the rows that the policy drops.
 
-        Raises `CaptureError` if the policy refuses recordings with this fault.
+        `position` is the time in s or the number of each row. The fault is counted `count_n` times; None: once per
+        marked row. Raises `CaptureError` if the policy refuses recordings with this fault.
         """
         action: Action = getattr(self._policy, fault)
         if mask.any():
-            known = at[mask & np.isfinite(at)]
+            known = position[mask & np.isfinite(position)]
             first, last = (float(known[0]), float(known[-1])) if len(known) else (math.nan, math.nan)
             count_n = int(mask.sum()) if count_n is None else count_n
             if action == "refuse":
@@ -180,17 +183,17 @@ class FaultLog:
         return CheckedRows(~(failed | stuck | out_of_range), failed, stuck, out_of_range, {})
 
     def record_readings(
-        self, readings: ReadingFaults, at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"]
+        self, readings: ReadingFaults, position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"]
     ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-        """Record the faults of single readings.
+        """Record the faults that can be detected in each reading by itself.
 
-        Returns masks of the dropped rows: those with a failed read, and of the others those out of range.
+        Returns two masks of rows to drop: rows with a failed read, and other rows with a reading that is out of range.
         """
         failed, zeros = np.asarray(readings.failed_read.any(axis=1)), np.asarray(readings.zeros.any(axis=1))
-        dropped = self.record("failed_read", failed, at) | self.record("zeros", zeros & ~failed, at)
+        dropped = self.record("failed_read", failed, position) | self.record("zeros", zeros & ~failed, position)
         read = ~readings.failed_rows
         too_hot, saturated = readings.too_hot.any(axis=1) & read, readings.saturated.any(axis=1) & read
-        out_of_range = self.record("too_hot", too_hot, at) | self.record("saturated", saturated, at)
+        out_of_range = self.record("too_hot", too_hot, position) | self.record("saturated", saturated, position)
         return dropped, out_of_range & ~dropped
 
     def record_scale(
@@ -200,9 +203,12 @@ class FaultLog:
         expected_lsb_uT: tuple[float, float] | None,
         where: str,
         rule: str,
-        at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
+        position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"],
     ) -> None:
-        """Record frames in which the LSB of some chips is `wrong`, or refuse the recording."""
+        """Record fault `chip_reset` for all frames at `position`, if the LSB of any chip is `wrong`.
+
+        Raises `CaptureError` if the policy refuses recordings with this fault.
+        """
         if wrong.any() and self._policy.chip_reset == "refuse":
             chips = np.flatnonzero(wrong)
             xy_uT, z_uT = lsb_uT[chips[0]]
@@ -212,14 +218,14 @@ class FaultLog:
             remedy = "A chip lost its settings: reset the board, record again."
             raise CaptureError(where, f"the LSB of chip {', '.join(map(str, chips))}", rule, got, remedy)
         if wrong.any():
-            self.record("chip_reset", np.ones(len(at), bool), at)
+            self.record("chip_reset", np.ones(len(position), bool), position)
 
     def record_constant(
-        self, channels: list[str], at: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"] | None = None
+        self, channels: list[str], position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"] | None = None
     ) -> None:
-        """Record channels that never changed in a whole recording, or refuse the recording.
+        """Record channels that never changed in a whole recording; raise `CaptureError` if the policy refuses this.
 
-        `at` holds the positions of the readings; None stands for the span of the stream.
+        `position` is the position of each reading; None: the first and the last time of the stream.
         """
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
@@ -227,15 +233,15 @@ class FaultLog:
                 "chip and the columns, and record again; or accept it: faults: constant_channel: flag in params.yaml."
             )
         if channels:
-            at = np.array(self._span) if at is None else at
-            self.record("constant_channel", np.ones(len(at), bool), at)
+            position = np.array(self._span) if position is None else position
+            self.record("constant_channel", np.ones(len(position), bool), position)
 
     def account(self) -> dict[str, int]:
         """Return the count, action and (if known) span of each fault that was found."""
         account: dict[str, int] = {}
-        done = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
+        participles = {"drop": "dropped", "flag": "flagged", "refuse": "refused"}
         for fault, record in self.records.items():
-            account[f"fault_{fault}_{done[record.action]}_n"] = record.count_n
+            account[f"fault_{fault}_{participles[record.action]}_n"] = record.count_n
             if not math.isnan(record.last):
                 account[f"fault_{fault}_first_{self._unit}"] = round(record.first * self._per_unit)
                 account[f"fault_{fault}_last_{self._unit}"] = round(record.last * self._per_unit)
@@ -257,7 +263,7 @@ def check_rows(
 
     Parameters
     ----------
-    row : the rows' numbers in their file, if some rows were left out before; None: rows are counted from 1.
+    row : number of each row in its file, if some rows of the file are missing here; None: rows are counted from 1.
 
     Raises
     ------

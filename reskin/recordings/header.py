@@ -1,7 +1,7 @@
 """The header of a capture, `header.json`: names, layout, units and clock.
 
-A capture is a folder `data/raw/<scene>/<capture>/` that holds `header.json` and either the byte stream of a
-port (`stream.bin`, `arrivals.csv`, `probe.csv`) or the unchanged files of a recording in another layout.
+A capture is a folder `data/raw/<scene>/<capture>/` with `header.json` and either the byte stream of a port
+(`stream.bin`, `arrivals.csv`, `probe.csv`) or the unchanged files of a recording in another layout.
 """
 
 import json
@@ -37,8 +37,8 @@ class _Frozen(BaseModel):
 class Clock(_Frozen):
     """Source of frame times: the file arrivals.csv, a constant rate, or the recording's own files (`recording`).
 
-    `marks` are pairs (stream time, probe time) in seconds, each for one event that both clocks recorded; without marks,
-    ingest aligns the clocks by the contacts.
+    `marks` are pairs (stream time, probe time) in seconds, each for one event that both clocks recorded. Without marks,
+    ingestion aligns the clocks by the contacts.
     """
 
     kind: Literal["arrivals", "rate", "recording"]
@@ -53,7 +53,7 @@ class Clock(_Frozen):
 
 
 class Firmware(_Frozen):
-    """Scale of the magnetometer as the firmware sets it (MLX90393 data sheet, table 17)."""
+    """Gain and LSB of the magnetometers, as set by the firmware (MLX90393 data sheet, table 17)."""
 
     gain_sel: Annotated[int, Field(ge=0, le=7)]
     lsb_xy_uT: Annotated[float, Field(gt=0)]
@@ -95,7 +95,7 @@ class Header(_Frozen):
 
 
 def parse(text: str, where: str) -> Header:
-    """Read a header from JSON; raise `CaptureError` naming the first field that is wrong."""
+    """Parse a header from JSON; raise `CaptureError` naming the first field that is wrong."""
     try:
         return Header.model_validate_json(text)
     except ValidationError as error:
@@ -107,7 +107,7 @@ def parse(text: str, where: str) -> Header:
 
 
 def make_header(where: str, **fields: Any) -> Header:
-    """Make and check the header of a recording; the defaults are for recordings in another layout."""
+    """Make and check a header; the defaults of fields are for a recording in a layout other than `native`."""
     defaults: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
@@ -123,14 +123,17 @@ def render(header: Header) -> str:
 
 
 def check_same_capture(header: Header, folder: str) -> None:
-    """Raise if the name of a capture folder differs from the name in its header, because the folder was renamed."""
+    """Raise if the name of a capture folder differs from the name in its header, as after renaming the folder."""
     if header.capture != folder:
         rule = f"the folder's name {folder!r}"
         raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename it back.")
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:
-    """Write a capture's files (bytes, or copies of paths); then write the header, with their hashes."""
+    """Write the files of a capture, given as bytes or as paths to copy, and then its header with the files' hashes.
+
+    Returns the header that was written.
+    """
     with io.replacing(folder) as temporary:
         temporary.mkdir()
         for name, content in contents.items():
@@ -142,7 +145,7 @@ def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | P
 
 
 def seal(folder: Path, header: Header) -> Header:
-    """Write the header of a folder, with the hashes of its files."""
+    """Write the header of a capture folder, with the hashes of the other files, and return it."""
     names = sorted(path.name for path in folder.iterdir() if path.name != HEADER_FILE)
     complete = header.model_copy(update={"files": {name: io.sha256(folder / name) for name in names}})
     io.write_text(folder / HEADER_FILE, render(complete))

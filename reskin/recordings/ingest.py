@@ -1,6 +1,6 @@
-"""Turn a capture of any layout into readings, with an account of every lost or dropped byte and row.
+"""Convert a capture of any layout to readings, and count every lost or dropped byte, frame and row in an account.
 
-Frames are assigned to the dwells of the probe log by time, after the two clocks are aligned.
+In native captures, frames are assigned to the dwells of the probe log by time, after the two clocks were aligned.
 """
 
 from collections import Counter
@@ -49,7 +49,7 @@ COUNTS = (
     "dropped_no_noload_indentations_n",
 )
 
-OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # in the account only if there are such frames
+OUT_OF_RANGE = "dropped_out_of_range_frames_n"  # a key of the account only if there are such frames
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,7 @@ class _DwellFrames:
         return _DwellFrames(self.dwell_i[rows], self.t_s[rows], self.b_uT[rows], self.temperature_degC[rows])
 
     def then(self, later: "_DwellFrames") -> "_DwellFrames":
+        """Return these frames, followed by the later ones."""
         pairs = ((getattr(self, name), getattr(later, name)) for name in self.__dataclass_fields__)
         return _DwellFrames(*map(np.concatenate, pairs))
 
@@ -81,7 +82,10 @@ class _DwellFrames:
 def join(
     blocks: Iterable[TimedFrames], log: ProbeLog, clock: ClockMap, header: Header, account: dict[str, int]
 ) -> Iterator[Readings]:
-    """Yield the readings of finished indentations; `account` is complete once all have been yielded."""
+    """Assign the frames of a stream to dwells, and yield the readings of each indentation that has ended.
+
+    After the last readings, the counts of frames and indentations are added to `account`.
+    """
     joiner = Joiner(log, clock, header)
     for block in blocks:
         readings = joiner.feed(block)
@@ -94,7 +98,7 @@ def join(
 
 
 class Joiner:
-    """Assign frames to dwells; hold back the indentation that may still receive frames.
+    """Assign frames to dwells, and convert each indentation to readings once it has ended.
 
     A dropped frame is counted under the first reason that applies: no time, not finite, failed read, stuck chip, out of
     range, between dwells. The no-load field of an indentation is the mean over its no-load dwell. `t_s` of a reading is
@@ -103,35 +107,35 @@ class Joiner:
 
     def __init__(self, log: ProbeLog, clock: ClockMap, header: Header) -> None:
         self._log, self._clock, self._header = log, clock, header
-        opens = ~log.contact  # each indentation opens with its one no-load dwell
-        self._group_i = np.cumsum(opens) - 1
-        touched = np.zeros(int(opens.sum()), np.int64)
+        begins = ~log.contact  # each indentation begins with its only no-load dwell
+        self._group_i = np.cumsum(begins) - 1  # index of the indentation of each dwell
+        touched = np.zeros(int(begins.sum()), np.int64)
         touched[self._group_i[log.contact]] = 1
-        self._before_n = header.contacts_before_n + np.cumsum(touched) - touched
-        self._held = self._empty()
+        self._before_n = header.contacts_before_n + np.cumsum(touched) - touched  # contacts before each indentation
+        self._pending = self._empty()
         self._count: Counter[str] = Counter()
 
     def feed(self, block: TimedFrames) -> Readings:
         """Process the next frames; return the readings of all indentations that have now ended (often none)."""
         probe_s = self._clock.probe_s(block.t_s)
-        held = self._held.then(self._assign(block, probe_s))
+        pending = self._pending.then(self._assign(block, probe_s))
         known_s = probe_s[np.isfinite(probe_s)]
-        if not len(known_s) or not len(held.dwell_i):
-            self._held = held
+        if not len(known_s) or not len(pending.dwell_i):
+            self._pending = pending
             return self._readings(self._empty())
-        # Times never decrease, so an indentation has ended once a frame belongs to a later one.
+        # Times never decrease, so an indentation has ended once the time of a frame is in a later indentation.
         now_i = np.searchsorted(self._log.t_start_s, known_s[-1], "right") - 1
-        ended_n = int(np.searchsorted(self._group_i[held.dwell_i], self._group_i[now_i], "left"))
-        self._held = held.where(slice(ended_n, None))
-        return self._readings(held.where(slice(0, ended_n)))
+        ended_n = int(np.searchsorted(self._group_i[pending.dwell_i], self._group_i[now_i], "left"))
+        self._pending = pending.where(slice(ended_n, None))
+        return self._readings(pending.where(slice(0, ended_n)))
 
     def close(self) -> Readings:
         """Return the readings of the last indentation, as far as it was recorded."""
-        held, self._held = self._held, self._empty()
-        return self._readings(held)
+        pending, self._pending = self._pending, self._empty()
+        return self._readings(pending)
 
     def account(self) -> dict[str, int]:
-        """Count the frames and indentations so far, used and dropped by reason; each total is the sum of its parts."""
+        """Return the counts of frames and indentations so far: in total, used, and dropped by reason."""
         counted = {name: self._count[name] for name in COUNTS}
         counted |= {OUT_OF_RANGE: self._count[OUT_OF_RANGE]} if self._count[OUT_OF_RANGE] else {}
         logged_n = int((~self._log.contact).sum())
@@ -158,13 +162,16 @@ class Joiner:
             keep &= ~mask
         return _DwellFrames(dwell_i[keep], block.t_s[keep], frames.b_uT[keep], frames.temperature_degC[keep])
 
-    def _readings(self, held: _DwellFrames) -> Readings:
-        """Convert the frames of whole indentations to readings; count those without a no-load dwell or a contact."""
-        group_i, contact = self._group_i[held.dwell_i], self._log.contact[held.dwell_i]
+    def _readings(self, pending: _DwellFrames) -> Readings:
+        """Convert the frames of whole indentations to readings.
+
+        Indentations without a frame in the no-load dwell, or without a frame in contact, are dropped and counted.
+        """
+        group_i, contact = self._group_i[pending.dwell_i], self._log.contact[pending.dwell_i]
         with_noload, with_contact = group_i[~contact], group_i[contact]
         paired_noload, paired = np.isin(with_noload, with_contact), np.isin(with_contact, with_noload)
-        rows, group_i = held.where(contact).where(paired), with_contact[paired]
-        noload = held.where(~contact).where(paired_noload)
+        rows, group_i = pending.where(contact).where(paired), with_contact[paired]
+        noload = pending.where(~contact).where(paired_noload)
         noload_uT, row_group_i = _means(noload.b_uT, with_noload[paired_noload], group_i)
         self._count.update(
             frames_noload_n=int(paired_noload.sum()),
@@ -197,7 +204,10 @@ class Joiner:
 def _means(
     b_uT: Float32[np.ndarray, "f ch"], group_i: Int64[np.ndarray, " f"], wanted_i: Int64[np.ndarray, " g"]
 ) -> tuple[Float32[np.ndarray, "i ch"], Int64[np.ndarray, " g"]]:
-    """Return the mean field of each run of equal `group_i`, and the index of the run for each of `wanted_i`."""
+    """Return the mean field of each group of rows, and the index of the mean for each group number in `wanted_i`.
+
+    `group_i` is the group number of each row, in increasing order.
+    """
     runs_i, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
     if not len(runs_i):
         return b_uT, wanted_i
@@ -206,13 +216,13 @@ def _means(
 
 
 def _rank(group_i: Int64[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
-    """Number the rows of each run of equal `group_i` from 0."""
+    """Number the rows within each run of equal `group_i`, from 0."""
     _, first_i, run_n = np.unique(group_i, return_index=True, return_counts=True)
     return (np.arange(len(group_i)) - np.repeat(first_i, run_n)).astype(np.int32)
 
 
 BLOCK_BYTES_N = 2**22
-SPREAD_MAX_degC = 10.0  # between the chips of one board, in one block
+SPREAD_MAX_degC = 10.0  # maximum spread of the temperatures in a block, over time and the chips of a board
 # Key of a total, and prefix and suffix of the keys that count its losses.
 LOSSES = (
     ("bytes_n", "skipped_", "_bytes_n"),
@@ -220,8 +230,9 @@ LOSSES = (
     ("rows_read_n", "dropped_", "_rows_n"),
     ("logged_indentations_n", "dropped_", "_indentations_n"),
 )
-# Not losses: frames between dwells, frames of an indentation without a no-load dwell or without a contact, and rows of
-# zeros, which a recorder writes when it polls faster than the chips measure (the reader limits their number).
+# These do not count as losses: frames between dwells, frames of an indentation without a no-load dwell or without a
+# contact, and rows of zeros, which a recorder writes when it polls faster than the chips measure (layout `eflash7`
+# limits their number).
 NO_LOSS = (
     "dropped_between_dwells_frames_n",
     "dropped_no_noload_frames_n",
@@ -233,7 +244,7 @@ Timer = Callable[[Frames, int], Float64[np.ndarray, "_"]]  # frames, number of e
 
 
 class OpenedCapture(NamedTuple):
-    """A capture being read; `account` is complete when `blocks` is exhausted."""
+    """A capture that is being read; `account` is complete once all `blocks` have been read."""
 
     header: Header
     blocks: Iterable[Readings]
@@ -281,9 +292,9 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
 
 
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
-    """Begin to read a capture; the account is complete when the readings are exhausted.
+    """Return an iterator of the readings of a native capture, and the account, which is complete after the last ones.
 
-    Without sync marks the stream is read twice, the first time to align the clocks.
+    Without sync marks, the stream is read twice, the first time to align the clocks.
     """
     stream = folder / STREAM_FILE
     if not stream.is_file():
@@ -301,6 +312,7 @@ def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iter
 
 
 def _clock(folder: Path, header: Header, log: ProbeLog, blocks: Iterator[TimedFrames]) -> ClockMap:
+    """Return the clock map from the header's sync marks; without marks, from the contacts in the frames."""
     if header.clock.marks:
         return from_marks(np.array(header.clock.marks), str(folder))
     pairs = ((block.t_s[block.checked.keep], block.frames.b_uT[block.checked.keep]) for block in blocks)
@@ -335,9 +347,9 @@ def _timed_frames(
 
 
 def _check_units(frames: Frames, wire: Wire, where: str) -> bool:
-    """Check the first good frames for wrong units and, in text formats, for the other column order.
+    """Raise if the fault-free frames have wrong units or, in text formats, the columns of the other text format.
 
-    Returns False if there is no such frame yet.
+    Returns False if there are no fault-free frames, so nothing was checked.
     """
     read = np.isfinite(frames.b_uT).all(axis=1) & np.isfinite(frames.temperature_degC).all(axis=1)
     read &= ~find_reading_faults(frames.b_uT, frames.temperature_degC).failed_rows
@@ -378,7 +390,7 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the arrivals; raise if the stream has fewer bytes, because it was cut after recording."""
+    """Read the arrivals; raise if they list more bytes than the stream has, as when it was cut after recording."""
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:

@@ -1,4 +1,4 @@
-"""Sources of labels for a recording: a person who presses places, a robot's program or CSV, a force gauge."""
+"""Sources of labels for a recording: a person who presses by hand, a robot's program or CSV file, or a force gauge."""
 
 import math
 import os
@@ -31,32 +31,36 @@ from reskin.recordings.labels import (
 
 @dataclass
 class LabelContext:
-    """What a source of labels works with: writer, clock in unix seconds, stop event and function for clock marks."""
+    """The objects that a source of labels uses during a recording.
+
+    These are the writer of the probe log, the host's clock in unix seconds, the event that stops the recording, and a
+    function that sets the clock mark in the capture's header.
+    """
 
     writer: ProbeLogWriter
     unix_s: Callable[[], float]
     stop: threading.Event
-    mark: Callable[[float, float], object]  # takes an event's unix time and its time on the source's own clock
+    mark: Callable[[float, float], object]  # takes an event's unix time and its time on the clock of the source
 
     def hold(self, label: Label, dwell_s: float) -> Dwell:
-        """Wait `dwell_s`, or until the recording stops; return the dwell."""
+        """Wait for `dwell_s`, or until the recording stops; return a dwell that spans this time."""
         start_s = self.unix_s()
         self.stop.wait(dwell_s)
         return Dwell(label, start_s, self.unix_s())
 
 
 class LabelSource(NamedTuple):
-    """A source of labels: its name in the header, the order of places, and a function that runs until labels end."""
+    """A source of labels."""
 
-    name: str
-    scan: str | None
-    run: Callable[[LabelContext], str]  # returns a summary for the user
+    name: str  # for the header
+    scan: str | None  # order of the places
+    run: Callable[[LabelContext], str]  # writes labels until they end or the recording stops; returns a summary
 
 
 def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: float) -> LabelSource:
     """Take labels from a generator, or from a function that is called until it returns None.
 
-    The program moves the robot before it returns a label; the next label is requested after the dwell.
+    The generator or function moves the robot before it returns a label. The next label is requested after the dwell.
     """
     label_iterator = iter(labels, None) if callable(labels) else iter(labels)
 
@@ -76,7 +80,7 @@ def from_program(labels: Iterable[Label] | Callable[[], Label | None], dwell_s: 
 
 
 class LabelThread:
-    """Run a source of labels in a thread; `problem` says why it ended early."""
+    """Run a source of labels in a thread; if it fails, `failed` is the exception and `problem` describes it."""
 
     def __init__(self, source: LabelSource, context: LabelContext) -> None:
         self.summary, self.problem = "", ""
@@ -86,7 +90,10 @@ class LabelThread:
         self._thread.start()
 
     def end(self, wait_s: float = 1.0) -> str:
-        """Stop, and return a summary. If the source hangs, wait at most `wait_s`; the labels so far are kept."""
+        """Stop the source and the recording; return a summary.
+
+        Wait at most `wait_s` for a source that does not stop. The labels that were written are kept.
+        """
         self._label_context.stop.set()
         self._thread.join(wait_s)
         writer = self._label_context.writer
@@ -110,14 +117,14 @@ RANDOM, SNAKE = "random", "snake"
 
 @dataclass(frozen=True)
 class Places:
-    """Numbered places in mm, [(x, y), ...], row by row; a snake goes through every other row backwards."""
+    """Numbered places, (x, y) in mm, row by row; `row_n` is the number of places in a row."""
 
     name: str
     xy_mm: Sequence[tuple[float, float]]
     row_n: int
 
     def order(self, scan: str, rng: np.random.Generator) -> list[int]:
-        """Order the places for one pass: at random, or row by row with every other row backwards."""
+        """Return the numbers of all places in the order of a pass: random, or row by row, every other row backwards."""
         if scan == RANDOM:
             return [int(i) for i in rng.permutation(len(self.xy_mm))]
         rows = [list(range(first, first + self.row_n)) for first in range(0, len(self.xy_mm), self.row_n)]
@@ -143,11 +150,11 @@ def parse_places(text: str) -> Places | None:
 
 
 TABLE_POLL_s = 0.02
-BETTER_s = 0.005  # a clock mark is replaced if a new one has a delay that is shorter by this much
+BETTER_s = 0.005  # a clock mark is replaced if the delay of the new mark is shorter by more than this
 
 
 def from_table(file: Path) -> LabelSource:
-    """Follow a CSV that a robot's program appends to; rows from before the recording are skipped."""
+    """Take labels from a CSV file to which a robot's program appends rows; skip rows older than the recording."""
 
     def run(context: LabelContext) -> str:
         table, dwells, least_delay_s = SampleTable(str(file)), DwellBuilder(), math.inf
@@ -157,7 +164,7 @@ def from_table(file: Path) -> LabelSource:
                 if not samples or not is_new:
                     continue
                 delay_s = arrival_s - samples[-1].t_s if table.clock == "t_s" else least_delay_s
-                # Rows arrive late, so the mark with the least delay is the most accurate.
+                # Rows are read with a delay, so the mark with the shortest delay is the most accurate.
                 if delay_s < least_delay_s - BETTER_s:
                     least_delay_s = delay_s
                     context.mark(arrival_s, samples[-1].t_s)
@@ -174,7 +181,10 @@ def _bad_lines(where: str, lines: SampleTable | GaugeLines) -> str:
 
 
 def _follow(file: Path, stop: threading.Event) -> Iterator[tuple[bytes, bool]]:
-    """Yield a file's content, then what is appended, each with whether it is new; wait for a missing file."""
+    """Yield the content of a file, then all data that is appended to it, until `stop` is set.
+
+    Each chunk comes with a flag: whether it was written after the call. If the file does not exist, wait for it.
+    """
     is_new = not file.exists()
     while not stop.is_set() and not file.exists():
         stop.wait(TABLE_POLL_s)
@@ -206,11 +216,11 @@ def _check_grows(file: Path, stream: BinaryIO) -> None:
         )
 
 
-KEPT_N = 10_000  # samples; a touch has a few hundred
+KEPT_N = 10_000  # number of latest samples that a gauge stores; a touch has a few hundred
 
 
 class ForceGauge:
-    """A force gauge at a port, read in a thread; it keeps the latest samples."""
+    """A force gauge at a port; it can be read in a thread, which stores the latest samples."""
 
     def __init__(self, port: str, baud: int) -> None:
         self.port, self._baud, self._gauge = port, baud, GaugeLines()
@@ -219,20 +229,23 @@ class ForceGauge:
         self._without_force_n = 0
 
     def during(self, start_s: float, end_s: float) -> Label:
-        """Return the mean force between two times; if there is no sample, return NaN and count the contact."""
+        """Return a label with the mean force between two times.
+
+        Without a sample in this time, the force is NaN, and the contact is counted as one without a force.
+        """
         labels = [sample.label for sample in list(self._kept) if sample.label and start_s <= sample.t_s <= end_s]
         self._without_force_n += not labels
         return mean_label(labels) if labels else Label(True)
 
     def summary(self) -> str:
-        """Say how many lines could not be read, and how many contacts have no force."""
+        """Describe how many lines could not be read, and how many contacts have no force; empty if none."""
         bad = _bad_lines(f"the gauge at {self.port}", self._gauge)
         without = f"{self._without_force_n} touches without a force: the gauge at {self.port} sent none during them"
         return "; ".join(filter(None, (bad, self._problem, without if self._without_force_n else "")))
 
     @contextmanager
     def listening(self, context: LabelContext) -> Iterator[None]:
-        """Read in a thread within the `with` block; raise `CaptureError` if the port does not open."""
+        """Read the gauge in a thread during the `with` block; raise `CaptureError` if the port cannot be opened."""
         with open_port(self.port, self._baud) as device:
             thread = threading.Thread(target=self._listen, args=[device, context], daemon=True)
             thread.start()
@@ -249,7 +262,7 @@ class ForceGauge:
             self._problem = f"{error} Later forces are missing"
 
     def read(self, device: Device, context: LabelContext, use: Callable[[list[Sample]], object]) -> None:
-        """Read until the recording stops; raise `CaptureError` if the gauge is unplugged before that."""
+        """Pass samples to `use` until the recording stops; raise `CaptureError` if the gauge is unplugged earlier."""
         while not context.stop.is_set():
             try:
                 chunk = read_waiting(device)
@@ -262,7 +275,7 @@ class ForceGauge:
 
 
 def from_gauge(port: str, baud: int) -> LabelSource:
-    """Take labels without places from a force gauge: when the skin is touched, and with which force."""
+    """Take labels from a force gauge: the times and forces of contacts, without places."""
 
     def run(context: LabelContext) -> str:
         forces, dwells = ForceGauge(port, baud), DwellBuilder()
@@ -285,12 +298,12 @@ Say = Callable[[str], object]
 
 @dataclass(frozen=True)
 class Prompts:
-    """Prompt a person to press places one after the other, and to press Enter when the tip does not move."""
+    """Prompt a person to press one place after another, and to press the Enter key when the tip does not move."""
 
     places: Places
     dwell_s: float
     say: Say
-    lines: Callable[[], Iterable[str]]  # the lines that are typed
+    lines: Callable[[], Iterable[str]]  # returns the lines that the person types
     forces: ForceGauge | None
     rng: np.random.Generator
     scan: str = RANDOM
@@ -327,7 +340,7 @@ class Prompts:
         return f"place {place_i} (x {x_mm:g}, y {y_mm:g} mm)"
 
     def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
-        """Read the label of a press; None at the end, a label without contact for a skipped place."""
+        """Return the label that a person typed for a press; None at the end, without contact for a skipped place."""
         for line in typed:
             match = REPLY.fullmatch(line)
             if line in ENDS:
@@ -349,7 +362,7 @@ class Prompts:
 
 
 def typed_until(lines: Callable[[], Iterable[str]], stop: threading.Event) -> Iterator[str]:
-    """Yield lines as they are typed, until they end or the recording stops."""
+    """Yield typed lines, stripped, until they end or `stop` is set; a thread waits for the input."""
     typed: queue.SimpleQueue[str | None] = queue.SimpleQueue()
 
     def read() -> None:

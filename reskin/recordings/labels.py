@@ -1,4 +1,4 @@
-"""Labels during a recording: samples of a table or a force gauge -> dwells -> rows of `probe.csv`.
+"""Labels during a recording: join samples of a table or a force gauge to dwells, and write these to `probe.csv`.
 
 The sources of labels are in `label_sources`.
 """
@@ -21,15 +21,15 @@ from reskin.recordings.units import SAME_PLACE_mm
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 TIME_STEP_s = 1e-6  # resolution of the written times
-TIME_MAX_s = 1e11  # unix time stays below this for 3,000 years, but not in milliseconds
-CLOCKS = ("unix_s", "t_s")  # this machine's clock, or the source's own
+TIME_MAX_s = 1e11  # unix time in seconds is below this for 3,000 years; in milliseconds, it is above
+CLOCKS = ("unix_s", "t_s")  # time on this machine's clock, or on the clock of the source
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
 CONTACT_N = 0.05  # assumed: above the noise of a gauge
-NOLOAD_N = 0.025  # from this to CONTACT_N, a contact may be beginning or ending
+NOLOAD_N = 0.025  # below this, there is no contact; from this to CONTACT_N, a contact may be beginning or ending
 DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer contact is split into several dwells, each with its own force
-DWELL_SAMPLES_MAX_N = 10_000  # limit if the clock stands still
+DWELL_SAMPLES_MAX_N = 10_000  # limits the memory if the clock of the source has stopped
 LINE_BYTES_MAX_N = 4096
-GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # by the number of values in a line, in N
+GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # number of values in a gauge's line -> their names
 
 
 class Label(NamedTuple):
@@ -49,7 +49,7 @@ class Label(NamedTuple):
 
 
 class Dwell(NamedTuple):
-    """A label with its start and end, on the clock of its source."""
+    """A label with the start and end of the time for which it holds, on the clock of its source."""
 
     label: Label
     t_start_s: float
@@ -59,8 +59,8 @@ class Dwell(NamedTuple):
 class ProbeLogWriter:
     """Write the probe log of a recording as labels arrive, each contact together with the no-load dwell before it.
 
-    Thus even a killed recorder leaves a log that `probe.parse` accepts. Contacts that `probe.parse` would refuse are
-    counted but not written.
+    Therefore, even a killed recorder leaves a log that `probe.parse` accepts. Contacts that `probe.parse` would refuse
+    are not written, but counted.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -68,7 +68,7 @@ class ProbeLogWriter:
         self._indentation = -1
         self._end_s = -math.inf
         self._noload: Dwell | None = None
-        self._touch: Label | None = None  # the first label of a touch that may continue
+        self._touch: Label | None = None  # first label of the latest touch, which may continue
         self._lock = threading.Lock()
         self._file = (folder / PROBE_FILE).open("xb", buffering=0)
         io.append(self._file, (",".join(TYPES) + "\n").encode())
@@ -80,14 +80,14 @@ class ProbeLogWriter:
 
     @contextmanager
     def locked(self) -> Iterator[bool]:
-        """Hold the lock during the block; yield whether labels are still accepted."""
+        """Lock the writer during the `with` block; yield whether it still accepts labels."""
         with self._lock:
             yield not self._file.closed
 
     def write(self, dwell: Dwell) -> None:
-        """Write a contact; keep a no-load dwell for the contact that follows it.
+        """Write a dwell with contact; store a dwell without contact until the next contact.
 
-        A contact may continue over several dwells at one place. At another place, it needs its own no-load dwell.
+        A contact may continue over several dwells at one place. A contact at another place must follow a no-load dwell.
         """
         _check(dwell)
         with self.locked() as is_open:
@@ -107,14 +107,14 @@ class ProbeLogWriter:
             self.write(dwell)
 
     def _append(self, touch: Dwell) -> None:
-        opens = self._noload is not None
-        self._touch = touch.label if opens else self._touch
-        indentation = self._indentation + opens
+        is_new = self._noload is not None  # otherwise, the dwell continues a touch
+        self._touch = touch.label if is_new else self._touch
+        indentation = self._indentation + is_new
         pass_i = touch.label.pass_i
         rows = [_row(dwell, indentation, pass_i) for dwell in (self._noload, touch) if dwell is not None]
         io.append(self._file, "".join(rows).encode())
         self._indentation, self._end_s, self._noload = indentation, touch.t_end_s, None
-        self.touches_n += opens
+        self.touches_n += is_new
 
 
 def same_place(a: Label, b: Label) -> bool:
@@ -148,14 +148,14 @@ def _check(dwell: Dwell) -> None:
 
 
 class Sample(NamedTuple):
-    """A label at one time; None while the rig moves."""
+    """A label at one time; the label is None while the rig moves."""
 
     t_s: float
     label: Label | None
 
 
 class LineBuffer:
-    """Split bytes into lines of text; a line longer than `LINE_BYTES_MAX_N` is cut."""
+    """Split bytes that arrive in portions into lines of text; a line longer than `LINE_BYTES_MAX_N` is cut in two."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -168,7 +168,7 @@ class LineBuffer:
 
 
 class SampleTable:
-    """Read samples from a CSV that arrives in portions; `bad_n` counts unreadable lines."""
+    """Parse samples from CSV text that arrives in portions; `bad_n` counts unreadable lines."""
 
     def __init__(self, where: str) -> None:
         self._where = where
@@ -217,7 +217,7 @@ class SampleTable:
 
 
 class GaugeLines:
-    """Read lines of a force gauge: one number (Fz) or three (Fx Fy Fz), in N and with the signs of `Label`."""
+    """Parse lines of a force gauge: one number (Fz) or three (Fx Fy Fz), in N and with the signs of `Label`."""
 
     def __init__(self) -> None:
         self._lines = LineBuffer()
@@ -239,15 +239,15 @@ class GaugeLines:
 
 
 class DwellBuilder:
-    """Join samples of a contact at one place, or of a period without contact, into dwells with mean forces and depths.
+    """Join the samples of a contact at one place, or of a period without contact, to a dwell with mean force and depth.
 
-    A contact longer than `DWELL_MAX_s` is cut into several dwells, so that a killed recorder leaves labels for it.
-    `short_n` counts contacts that are too short for a dwell.
+    A contact longer than `DWELL_MAX_s` is cut into several dwells, so that some of its labels are already written if
+    the recorder is killed. `short_n` counts contacts that are too short for a dwell.
     """
 
     def __init__(self) -> None:
         self._run: list[Sample] = []
-        self._cut: Sample | None = None  # where a contact that continues was cut
+        self._cut: Sample | None = None  # last sample before a contact was cut, if the contact may continue
         self.short_n = 0
 
     def feed(self, samples: Iterable[Sample]) -> Iterator[Dwell]:
@@ -265,17 +265,20 @@ class DwellBuilder:
                     self._cut = sample
 
     def close(self) -> Iterator[Dwell]:
-        """Yield the dwell of the last samples, if they last long enough."""
+        """Yield the dwell of the samples since the last dwell, if they span at least `DWELL_MIN_s`."""
         lasts_s, run, self._run = self._lasts_s(), self._run, []
-        rest = bool(run) and self._cut is not None and _continues(self._cut, self._cut, run[0])
+        is_remainder = bool(run) and self._cut is not None and _continues(self._cut, self._cut, run[0])
         self._cut = None
         if lasts_s >= DWELL_MIN_s:
             yield Dwell(mean_label([sample.label for sample in run if sample.label]), run[0].t_s, run[-1].t_s)
-        elif run and run[0].label and run[0].label.contact and not rest:
+        elif run and run[0].label and run[0].label.contact and not is_remainder:
             self.short_n += 1
 
     def summary(self) -> str:
-        """Say how many contacts were too short; in a table with rows only at changes of state, all are."""
+        """Describe how many contacts were too short for a dwell; empty if none.
+
+        In a table with rows only at the start and end of contacts, all contacts are too short.
+        """
         if not self.short_n:
             return ""
         least = f"{DWELL_MIN_s:g} s from first to last line"
@@ -286,12 +289,13 @@ class DwellBuilder:
 
 
 def mean_label(labels: list[Label]) -> Label:
-    """Return the first label with the mean of each number; NaN if a label lacks it."""
+    """Return the first label, with each number replaced by its mean over all labels; NaN if it is unknown in one."""
     means: dict[str, Any] = {name: math.fsum(getattr(label, name) for label in labels) / len(labels) for name in LABELS}
     return labels[0]._replace(**means)
 
 
 def _continues(first: Sample, last: Sample, sample: Sample) -> bool:
+    """Return whether `sample` belongs to the dwell that consists of the samples from `first` to `last`."""
     a, b = first.label, sample.label
     if a is None or b is None or a.contact != b.contact or a.pass_i != b.pass_i or sample.t_s < last.t_s:
         return False
@@ -299,7 +303,7 @@ def _continues(first: Sample, last: Sample, sample: Sample) -> bool:
 
 
 def _is_contact(force_N: float) -> bool | None:
-    """Return whether a force is a contact; None between the thresholds, or for NaN."""
+    """Return whether a force indicates contact; None between the two thresholds, or for NaN."""
     if abs(force_N) >= CONTACT_N:
         return True
     return False if abs(force_N) < NOLOAD_N else None

@@ -16,7 +16,7 @@ from reskin.schema import Readings
 
 PRESSES_MIN_N = 20  # with fewer presses, no orientation is reported
 EXPLAINED_MIN = 0.5  # fraction of the looked-up places' variance that another orientation must explain
-GAIN_MIN = 0.5  # difference by which it must explain more than the unchanged labels do
+GAIN_MIN = 0.5  # by how much this fraction must exceed the fraction that the unchanged labels explain
 ORIENTATIONS = {
     "as they are": [[1, 0], [0, 1]],
     "with x and y swapped": [[0, 1], [1, 0]],
@@ -31,14 +31,14 @@ ORIENTATIONS = {
 
 @dataclass(frozen=True)
 class Presses:
-    """Places in mm, relative to their middle, and unit vectors along the field change, one per press."""
+    """The place and the direction of the field change of each press."""
 
-    place_mm: Float[np.ndarray, "n 2"]
-    direction: Float[np.ndarray, "n ch"]
+    place_mm: Float[np.ndarray, "n 2"]  # relative to the middle of all places
+    direction: Float[np.ndarray, "n ch"]  # unit vector along the mean field change
 
 
 def presses_of(blocks: Iterable[Readings]) -> Presses:
-    """Average the readings of each press whose place is known, over all blocks of a capture."""
+    """Average the readings of each press of a capture whose place is known."""
     place_mm, change_uT = [], []
     for block in blocks:
         known = np.isfinite(block.x_mm) & np.isfinite(block.y_mm)
@@ -56,11 +56,11 @@ def presses_of(blocks: Iterable[Readings]) -> Presses:
 
 
 def other_orientation(own: Presses, others: Presses) -> str | None:
-    """Return how the labels must be changed to agree with those of other captures; None if no change is needed.
+    """Return how the labels of `own` must be changed to agree with those of `others`; None if no change is needed.
 
-    Each press gets the mean place of the three presses of `others` with the nearest directions. A change of the labels
-    is reported if it explains at least `EXPLAINED_MIN` of the variance of these places, and `GAIN_MIN` more than the
-    labels as they are.
+    For each press of `own`, the mean place of the three presses of `others` with the nearest directions is looked up. A
+    change of the labels is reported if it explains at least `EXPLAINED_MIN` of the variance of the looked-up places,
+    and `GAIN_MIN` more than the unchanged labels.
     """
     comparable = own.direction.shape[1:] == others.direction.shape[1:]
     if not comparable or min(len(own.place_mm), len(others.place_mm)) < PRESSES_MIN_N:

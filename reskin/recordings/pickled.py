@@ -1,7 +1,7 @@
-"""Convert archives of pickled samples (.npz, written by the rig of layout `lab`) to one CSV file of that layout.
+"""Convert an .npz archive of pickled samples, written by the rig of layout `lab`, to a CSV file of this layout.
 
-No pickle is loaded: its opcodes are interpreted as data, so nothing in it is imported or executed. Anything but
-plain values and NumPy numbers is refused.
+Pickles are not loaded with `pickle`: their opcodes are interpreted as data, so nothing is imported or executed. Pickles
+with anything but plain values and NumPy numbers are refused.
 """
 
 import pickletools
@@ -16,7 +16,7 @@ import numpy as np
 from reskin.errors import CaptureError
 
 CHIPS_N = 5
-COLUMNS = [f"{what}{chip}" for chip in range(CHIPS_N) for what in ("T", "Bx", "By", "Bz")]
+COLUMNS = [f"{quantity}{chip}" for chip in range(CHIPS_N) for quantity in ("T", "Bx", "By", "Bz")]
 HEAD = ",".join(["indent", "phase", "x_mm", "y_mm", *COLUMNS, "Fx", "Fy", "Fz"])
 PHASES = {"noload": "bl_arr", "contact": "cont_arr"}  # phase -> name of its samples in the archive
 REMEDY = "Is it the recording of one port and depth, copied whole?"
@@ -25,7 +25,7 @@ MARK = object()
 
 
 def to_lab_csv(archive: bytes, where: str) -> bytes:
-    """Write an archive's samples as CSV, sorted by indentation, with the no-load samples of each first.
+    """Return the samples of an archive as CSV, sorted by indentation; an indentation begins with its no-load samples.
 
     Values are rounded to 1e-4 degC, 1e-4 uT and 1e-6 N. Lines end in CR LF, as in RFC 4180.
     """
@@ -51,26 +51,27 @@ def to_lab_csv(archive: bytes, where: str) -> bytes:
 def _row(sample: Mapping[str, Any]) -> str:
     place, fields, forces = (sample[key] for key in ("Location", "ReSkin Data", "Force Data"))
     if (len(place), len(fields), len(forces)) != (2, len(COLUMNS), 3):
-        raise ValueError(f"a sample of {len(place)} places, {len(fields)} fields and {len(forces)} forces")
+        raise ValueError(f"a sample has {len(place)} coordinates, {len(fields)} readings and {len(forces)} forces")
     cells = [f"{mm:g}" for mm in place] + [f"{value:.4f}" for value in fields] + [f"{force:.6f}" for force in forces]
     return ",".join(cells)
 
 
 def decode_array(npy: bytes, where: str) -> Any:
-    """Return the objects in an .npy file with an array of objects."""
+    """Return the plain values of the array of objects in an .npy file."""
     stream = BytesIO(npy)
     version = np.lib.format.read_magic(stream)
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = read_header(stream)
     if not dtype.hasobject:
-        raise CaptureError(f"{where}: the array holds {dtype}, not objects. {REMEDY}")
+        raise CaptureError(f"{where}: the array contains {dtype}, not objects. {REMEDY}")
     return decode(stream.read(), where)
 
 
 def decode(pickled: bytes, where: str) -> Any:
-    """Return the plain values of a pickle: lists, tuples, dicts, numbers, text, bytes, NumPy numbers and arrays.
+    """Return the content of a pickle as lists, tuples, dicts, numbers, text and bytes.
 
-    Supports protocols 3 and 4, in which NumPy writes arrays of objects.
+    NumPy numbers and arrays become numbers and lists. Supports protocols 3 and 4, in which NumPy writes arrays of
+    objects.
     """
     stack = _Stack([], {})
     try:
@@ -90,7 +91,7 @@ def decode(pickled: bytes, where: str) -> Any:
 
 @dataclass
 class Call:
-    """A call that a pickle contains: the function's name, which is never looked up, and the arguments."""
+    """A function call in a pickle: the function's name, which is never looked up, and the arguments."""
 
     name: str
     args: Any
@@ -166,33 +167,35 @@ STEPS: Mapping[str, Step] = {
     "MEMOIZE": lambda stack, _: stack.remember(len(stack.memo)),
     **dict.fromkeys(("BINPUT", "LONG_BINPUT"), lambda stack, i: stack.remember(i)),
     **dict.fromkeys(("BINGET", "LONG_BINGET"), lambda stack, i: stack.push(stack.memo[i])),
-}  # by opcode of pickletools; any other is refused
+}  # keys are opcodes of pickletools; any other opcode is refused
 
 
-def plain(value: Any, known: dict[int, Any] | None = None) -> Any:
-    """Convert calls of NumPy functions to lists and numbers; raise `ValueError` for any other call.
+def plain(value: Any, converted: dict[int, Any] | None = None) -> Any:
+    """Convert calls of NumPy functions in a value to lists and numbers; raise `ValueError` for any other call.
 
-    A value that a pickle uses several times is converted once; otherwise nested references could take forever.
+    A value that a pickle uses several times is converted only once; `converted` maps its `id` to the result. Otherwise,
+    nested references could take exponential time.
     """
-    known = {} if known is None else known
+    converted = {} if converted is None else converted
     if not isinstance(value, NESTED):
         return value
-    if id(value) not in known:
-        known[id(value)] = _plain(value, known)
-    return known[id(value)]
+    if id(value) not in converted:
+        converted[id(value)] = _plain(value, converted)
+    return converted[id(value)]
 
 
-def _plain(value: Any, known: dict[int, Any]) -> Any:
+def _plain(value: Any, converted: dict[int, Any]) -> Any:
     match value:
-        case list() | tuple():  # may have a million numbers, which need no conversion
-            return type(value)(plain(item, known) if isinstance(item, NESTED) else item for item in value)
+        case list() | tuple():  # for speed, do not call `plain` for numbers: a list may have a million
+            return type(value)(plain(item, converted) if isinstance(item, NESTED) else item for item in value)
         case dict():
-            return {plain(key, known): plain(item, known) for key, item in value.items()}
+            return {plain(key, converted): plain(item, converted) for key, item in value.items()}
     return _numbers(value)
 
 
 def _numbers(call: Call) -> Any:
-    match call.name.replace("numpy._core", "numpy.core"):  # NumPy 2's name
+    """Convert the call that creates a NumPy number or array to a number or nested lists."""
+    match call.name.replace("numpy._core", "numpy.core"):  # NumPy 2 renamed the module to numpy._core
         case "numpy.core.multiarray scalar":
             return np.frombuffer(plain(call.args[1]), _dtype(call.args[0]))[0].item()
         case "numpy.core.multiarray _reconstruct":

@@ -1,6 +1,6 @@
 """Prepare a recording of any layout for `reskin add`: make the header of its capture and collect its files.
 
-Nothing is written here; see `header.write_capture`.
+This module writes no capture; see `header.write_capture`.
 """
 
 import re
@@ -31,7 +31,10 @@ Prepared = tuple[Header, Mapping[str, bytes | Path]]
 
 @dataclass(frozen=True)
 class CaptureNames:
-    """The names of a board, a skin and a capture; if the last is None, it is made from the others and the file name."""
+    """The names of a board, a skin and a capture.
+
+    If the capture's name is None, it is made from the names of the board, the skin and the file.
+    """
 
     board: str
     skin: str
@@ -40,7 +43,7 @@ class CaptureNames:
 
 @dataclass(frozen=True)
 class Dump:
-    """Facts that a bare serial dump lacks: wire format, number of chips, rate, the rig's probe log and clock marks."""
+    """What a serial dump does not contain: wire format, number of chips, frame rate, probe log and clock marks."""
 
     wire: Wire
     chips_n: int
@@ -50,7 +53,7 @@ class Dump:
 
 
 def parse_marks(texts: list[str]) -> Marks:
-    """Read `STREAM_S,PROBE_S` pairs.
+    """Parse clock marks, each written as `STREAM_S,PROBE_S`.
 
     >>> parse_marks(["0,12.5"])
     ((0.0, 12.5),)
@@ -66,9 +69,10 @@ def parse_marks(texts: list[str]) -> Marks:
 
 @contextmanager
 def suggesting_layout(recording: Path, layout: str) -> Iterator[None]:
-    """Add to errors about a recording the layouts in which it can be read, unless `layout` is one of them.
+    """Extend the errors of a `with` block by the layouts in which the recording can be read.
 
-    A `ParamsError` is about names or options, and is passed on as it is.
+    An error is unchanged if the recording can be read in `layout`, or if the error is a `ParamsError`, which is about
+    names or options.
     """
     try:
         yield
@@ -88,7 +92,8 @@ def layouts_of(recording: Path) -> list[str]:
     if (recording / headers.HEADER_FILE).is_file():
         return ["capture"]
     if layouts := [layout for layout in get_args(ReaderLayout) if _is_readable(recording, layout)]:
-        # Read as a plain table, a recording of another layout may lose labels.
+        # If a recording of another layout is read as a table, labels may be lost, so suggest `table` only if it is the
+        # only one.
         return [layout for layout in layouts if layout != "table"] or layouts
     formats = stream.matching_formats(io.read_bytes(recording)) if recording.is_file() else []
     return sorted({"serial-text" if wire in TEXT_WIRES else "serial-binary" for wire, _ in formats})
@@ -107,21 +112,21 @@ def _is_readable(recording: Path, layout: ReaderLayout) -> bool:
 
 
 def foreign(recording: Path, layout: ReaderLayout, names: CaptureNames, options: Mapping[str, str]) -> Prepared:
-    """Prepare a recording of a layout with a reader: its own files, unchanged, and a header."""
-    _need(recording, folder=True)
+    """Prepare a recording in a layout that has a reader: make a header, and collect the recording's files unchanged."""
+    _check_exists(recording, folder=True)
     files = READERS[layout].collect(recording)
     chips_n = READERS[layout].count_chips(files)
     return _header(names, recording, layout=layout, chips_n=chips_n, options=dict(options)), files
 
 
 def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
-    """Prepare a bare dump of a port with its probe log; frames get their time from a constant rate."""
+    """Prepare a serial dump and its probe log; the times of frames are computed from a constant rate."""
     if what.probe is None:
         raise CaptureError(
             f"{recording}: a serial dump needs its probe log. Add --probe PROBE.csv (columns in data/README.md)."
         )
-    _need(recording)
-    _need(what.probe)
+    _check_exists(recording)
+    _check_exists(what.probe)
     if not 0 < what.rate_hz <= headers.RATE_MAX_HZ:
         rule = f"above 0, at most {headers.RATE_MAX_HZ:g}"
         raise CaptureError("--rate-hz", "the rate", rule, what.rate_hz, "Count the frames per second.")
@@ -131,25 +136,26 @@ def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
 
 
 def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Marks) -> Prepared:
-    """Prepare a capture folder that `reskin record` wrote; `probe` is a probe log to add to it."""
-    _need(recording, folder=True)
+    """Prepare a capture folder that `reskin record` wrote; `probe` is a probe log that is added or replaces its log."""
+    _check_exists(recording, folder=True)
     header = read_header(recording)
     for option, given, in_header in (("--board", names.board, header.board), ("--skin", names.skin, header.skin)):
         if in_header not in (given, UNNAMED):
             raise CaptureError(
                 f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct one of them."
             )
-    # A recorder that was killed has not hashed its files into the header.
+    # If the recorder was killed, the header does not list the files.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in header.files}
     marks_before = header.clock.marks
     if probe is not None:
-        _need(probe)
-        marks_before = () if headers.PROBE_FILE in files else marks_before  # they belong to the replaced log
+        _check_exists(probe)
+        # The marks in the header are for the folder's probe log, which `probe` replaces.
+        marks_before = () if headers.PROBE_FILE in files else marks_before
         files[headers.PROBE_FILE] = probe
     if headers.PROBE_FILE not in files:
         raise CaptureError(f"{recording}: the capture has no labels. Add --probe PROBE.csv, or record with --labels.")
     for name, file in files.items():
-        _need(file)
+        _check_exists(file)
         if file.parent == recording and header.files.get(name, io.sha256(file)) != io.sha256(file):
             raise CaptureError(f"{file}: the file has changed since it was recorded (another hash). Record it again.")
     _check_names(names)
@@ -174,7 +180,7 @@ def _header(names: CaptureNames, recording: Path, *, layout: headers.Layout, chi
     )  # fmt: skip
 
 
-def _need(path: Path, *, folder: bool = False) -> None:
+def _check_exists(path: Path, *, folder: bool = False) -> None:
     """Raise `CaptureError` if a path does not exist, or is a folder where a file is needed."""
     if not path.exists():
         raise CaptureError(f"{path}: file not found. Check the path.")

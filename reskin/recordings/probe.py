@@ -1,7 +1,7 @@
 """The probe log `probe.csv`: places, depths and forces of the rig, one row per dwell, on the rig's own clock.
 
-Rows are in chronological order. An indentation is one no-load dwell (robot lifted), followed by its contact dwells
-(one, unless the robot drags).
+Rows are in chronological order. An indentation is one no-load dwell (robot lifted), followed by its contact dwells:
+one dwell, or several if the robot drags the indenter.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class ProbeLog:
 
 
 def parse(source: str | Path, where: str) -> ProbeLog:
-    """Read a probe log from CSV text, or from the file at a path; raise `CaptureError` naming the first bad row."""
+    """Parse a probe log from CSV text or from the file at a path; raise `CaptureError` naming the first bad row."""
     table = tables.parse_csv(source, TYPES, where)
     if not len(table):
         raise CaptureError(f"{where}: the probe log has no rows. Record the capture again.")
@@ -60,8 +60,8 @@ def parse(source: str | Path, where: str) -> ProbeLog:
         unknown = np.asarray(table.column(name).is_null())
         refuse_row(unknown, where, name, "known", "an empty field", "Only labels may be empty.")
     phases = table.column("phase")
-    foreign = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
-    refuse_row(foreign, where, "phase", f"{NOLOAD} or {CONTACT}", phases, "Write one of the two words.")
+    is_other = np.asarray(pc.invert(pc.is_in(phases, pa.array([NOLOAD, CONTACT]))))
+    refuse_row(is_other, where, "phase", f"{NOLOAD} or {CONTACT}", phases, f"Write {NOLOAD} or {CONTACT}.")
     numbers = {name: np.asarray(table.column(name)) for name in TYPES if name != "phase"}
     log = ProbeLog(contact=np.asarray(pc.equal(phases, CONTACT)), **numbers)
     _check_numbers(log, where)
@@ -70,7 +70,7 @@ def parse(source: str | Path, where: str) -> ProbeLog:
 
 
 def render(log: ProbeLog) -> str:
-    """Write a probe log as CSV; `parse` returns the same log."""
+    """Return a probe log as CSV text, from which `parse` returns the same log."""
     arrays = {name: getattr(log, name) for name in TYPES if name != "phase"}
     arrays["phase"] = np.where(log.contact, CONTACT, NOLOAD)
     # from_pandas: NaN becomes null, which CSV writes as an empty field
@@ -99,7 +99,7 @@ def _check_order(log: ProbeLog, where: str) -> None:
     )
     falls = np.diff(number, prepend=number[0]) < 0
     refuse_row(falls, where, "indentation", "rising with time", number, "Continue the numbering from pass to pass.")
-    opens = np.diff(number, prepend=-1) != 0
+    begins = np.diff(number, prepend=-1) != 0
     remedy = "For every indentation, log one no-load dwell and then the contact dwells."
-    refuse_row(opens & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
-    refuse_row(~opens & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)
+    refuse_row(begins & log.contact, where, "an indentation's first dwell", NOLOAD, CONTACT, remedy)
+    refuse_row(~begins & ~log.contact, where, "an indentation's later dwells", CONTACT, NOLOAD, remedy)

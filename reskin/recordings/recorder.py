@@ -1,6 +1,6 @@
-"""Record a board as a capture folder for `reskin add`, with labels if a source provides them during the recording.
+"""Record a board to a capture folder for `reskin add`, with labels if a source provides them during the recording.
 
-The capture is written into `<folder>.part`, its header first, and renamed when the recording has ended. A killed
+The capture is written to `<folder>.part`, beginning with the header, and renamed when the recording has ended. A killed
 recorder leaves a `.part` folder that can still be added, with the labels received until then.
 """
 
@@ -28,20 +28,20 @@ CAPTURES = Path("captures")
 
 @dataclass(frozen=True)
 class CaptureInfo:
-    """Names for a capture's header, the order of the rig's places (random, snake or text), and the source of labels."""
+    """Names for the header of a capture, and the source of its labels."""
 
     board: str
     skin: str
-    scan: str
+    scan: str  # order of the places: random, snake or other text
     labels: LabelSource | None = None
 
 
 class CaptureResult(NamedTuple):
-    """A finished recording, a summary of its labels, and the error that ended the labels, if any."""
+    """A finished recording and its labels."""
 
     stream: Recording
-    labels: str
-    failed: Exception | None
+    labels: str  # a summary of the labels for the user
+    failed: Exception | None  # the error that ended the labels
 
 
 NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
@@ -50,7 +50,10 @@ NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
 def record_capture(
     port: str, folder: Path, *, info: CaptureInfo, settings: PortSettings, report: Report, watch: Watch
 ) -> CaptureResult:
-    """Record a port as a native capture, with labels if `info` has a source of labels; stop when either ends."""
+    """Record a port as a native capture, with labels if `info` has a source of labels.
+
+    The recording stops when the port's stream or the labels end.
+    """
     part, header = begin_capture(folder, info, wire=settings.wire, chips_n=settings.chips_n, by="reskin record")
     stop, headers, label_thread = threading.Event(), [header], None
     try:
@@ -61,7 +64,7 @@ def record_capture(
         if label_thread is not None:
             label_thread.end()
         io.remove(part)  # no frame arrived, so there is nothing to keep
-        if label_thread is not None and label_thread.failed is not None:  # this ended the recording
+        if label_thread is not None and label_thread.failed is not None:  # the failed labels ended the recording
             raise label_thread.failed from error
         raise
     summary = label_thread.end() if label_thread is not None else ""
@@ -74,8 +77,12 @@ def record_capture(
 
 
 def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
-    """Make the context of a source of labels; labels are on the clock of the arrivals until `mark` is called."""
-    offset_s = time.time() - time.monotonic()  # the system's clock may be adjusted during the recording
+    """Make the context of a source of labels.
+
+    Until the source calls `mark`, the clock mark says that labels and arrivals are on the same clock.
+    """
+    # Determined once, because the system's clock may be adjusted during the recording.
+    offset_s = time.time() - time.monotonic()
     writer = ProbeLogWriter(part)
 
     def unix_s() -> float:
@@ -83,7 +90,7 @@ def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> 
 
     def mark(stream_s: float, source_s: float) -> None:
         with writer.locked() as is_open:
-            if is_open:  # otherwise the header is final
+            if is_open:  # if the writer is closed, the header must not change any more
                 clock = headers[-1].clock.model_copy(update={"marks": ((stream_s, source_s),)})
                 headers[-1] = headers[-1].model_copy(update={"clock": clock})
                 io.write_text(part / HEADER_FILE, render(headers[-1]))
@@ -94,7 +101,10 @@ def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> 
 
 
 def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, by: str) -> tuple[Path, Header]:
-    """Make `<folder>.part` with its header, to write the stream into."""
+    """Create `<folder>.part` and its header; return its path, to write the stream to, and the header.
+
+    `by` is the name of the recording program, for the header's note.
+    """
     part = _part_of(folder)
     for path in (folder, part):
         if path.exists():
@@ -113,7 +123,7 @@ def begin_capture(folder: Path, info: CaptureInfo, *, wire: Wire, chips_n: int, 
 
 
 def end_capture(folder: Path, header: Header) -> None:
-    """Hash the files of `<folder>.part` into its header and rename it to `folder`."""
+    """Write the header of `<folder>.part` with the hashes of its files, and rename it to `folder`."""
     seal(_part_of(folder), header)
     _part_of(folder).rename(folder)
 
@@ -128,7 +138,7 @@ def new_folder() -> Path:
 
 
 def print_progress(alarms: Callable[[], Sequence[str]]) -> Report:
-    """Return a report that prints rate, losses and alarms once a second, if stderr is a terminal."""
+    """Return a `Report` function that prints rate, losses and alarms once a second, if stderr is a terminal."""
     start_s = last_s = time.monotonic()
     last_n = 0
 

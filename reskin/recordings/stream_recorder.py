@@ -19,34 +19,34 @@ from reskin.board.wire import TEXT_WIRES, Frames, Wire
 from reskin.errors import CaptureError
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 
-HEAD_BYTES_N = 16384  # this many first bytes are kept, to suggest a wire format if no frame arrives
+HEAD_BYTES_N = 16384  # this many first bytes are stored, to suggest a wire format if no frame arrives
 
-Report = Callable[[Mapping[str, int]], None]  # called with the account many times a second
+Report = Callable[[Mapping[str, int]], None]  # called many times a second with the counts of `FrameStream.account`
 Watch = Callable[[Frames], object]  # called with frames as they arrive
 Ended = Literal["duration", "bytes", "stopped", "unplugged", "silent", "no frame", "not written"]
 
 
 @dataclass(frozen=True)
 class PortSettings:
-    """How to read a port, and for how long: with `math.inf` seconds and no `bytes_max_n`, until stopped."""
+    """Settings of the port, and limits of the recording."""
 
     baud: int
     wire: Wire
     chips_n: int
-    duration_s: float
-    bytes_max_n: int | None
+    duration_s: float  # math.inf: no limit
+    bytes_max_n: int | None  # None: no limit
     silence_s: float  # the recording ends if the port sends nothing for this long
     no_frame_s: float  # the recording ends if no frame arrives within this time of the first byte
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What was recorded and how it ended; `account` counts the frames and losses that a `FrameStream` saw."""
+    """Summary of a finished recording."""
 
     ended: Ended
     duration_s: float
-    partial_line_bytes_n: int  # bytes before the first whole line, not written
-    account: dict[str, int]
+    partial_line_bytes_n: int  # bytes before the first whole line, which are not written
+    account: dict[str, int]  # counts of bytes and frames, see `FrameStream.account`
 
 
 def record(
@@ -58,10 +58,11 @@ def record(
     report: Report = lambda account: None,
     watch: Watch = lambda frames: None,
 ) -> Recording:
-    """Write what a port sends until `stop` is set, Ctrl-C, SIGTERM, unplugging, or a limit in the settings.
+    """Write the bytes that a port sends to a capture folder.
 
-    Raises `CaptureError` if the port cannot be opened or no frame arrives. The recording also ends if the port falls
-    silent after its first frame; the data received until then are kept.
+    The recording ends when `stop` is set, at Ctrl-C or SIGTERM, when the board is unplugged, when the port is silent,
+    or at a limit in the settings. The data received until then are kept. Raises `CaptureError` if the port cannot be
+    opened or no frame arrives.
     """
     with (
         open_port(port, settings.baud) as device,
@@ -74,7 +75,7 @@ def record(
 
 
 class CaptureWriter:
-    """Write the two files of a recording as it proceeds: each chunk of bytes first, then its time of arrival.
+    """Write the files `stream.bin` and `arrivals.csv` of a recording: each chunk of bytes, then its time of arrival.
 
     In this order, no arrival refers to bytes that are missing. If the disk is full, a partly written chunk is removed.
     """
@@ -82,7 +83,7 @@ class CaptureWriter:
     def __init__(self, folder: Path, wire: Wire) -> None:
         self.bytes_n = self.partial_line_bytes_n = 0
         self._in_partial_line = wire in TEXT_WIRES
-        # Unbuffered: what a killed process has written is kept, and closing cannot fail.
+        # Unbuffered, so that no written data is lost if the process is killed, and closing the file cannot fail.
         self._stream = (folder / STREAM_FILE).open("xb", buffering=0)
         self._arrivals = (folder / ARRIVALS_FILE).open("xb", buffering=0)
         self._arrivals.write(b"byte_end,t_s\n")
@@ -99,7 +100,10 @@ class CaptureWriter:
         self._arrivals.close()
 
     def write(self, chunk: bytes, unix_s: float) -> bytes:
-        """Write a chunk and return what was written: all but a first line of text, which may start inside a number."""
+        """Write a chunk; return the bytes that were written.
+
+        In text formats, the first line is left out, because the recording may have begun inside a number.
+        """
         if self._in_partial_line:
             partial, newline, rest = chunk.partition(b"\n")
             self.partial_line_bytes_n += len(partial + newline)
@@ -123,11 +127,12 @@ class _Recorder:
         self._head = b""
         self._start_s = self._last_byte_s = time.monotonic()
         self._first_byte_s = math.inf
-        # The system's clock may be adjusted during the recording, but arrival times must not go backwards.
-        self._unix_s = time.time() - self._start_s
+        # Unix time minus monotonic time. It is determined once, because the system's clock may be adjusted during the
+        # recording, but arrival times must not go backwards.
+        self._unix_offset_s = time.time() - self._start_s
 
     def listen(self, device: Device, stop: threading.Event, report: Report) -> Ended:
-        """Read until there is a reason to end; return the reason."""
+        """Read and write chunks until there is a reason to end; return the reason."""
         while not (ended := self._reason_to_end(stop)):
             report(self._frames.account())
             try:
@@ -135,7 +140,7 @@ class _Recorder:
             except OSError:  # pyserial's errors are OSErrors too
                 return "unplugged"
             try:
-                self._keep(chunk)
+                self._write(chunk)
             except OSError:
                 return "not written"
         return ended
@@ -168,19 +173,19 @@ class _Recorder:
         bytes_max_n = self._settings.bytes_max_n
         return sys.maxsize if bytes_max_n is None else bytes_max_n - self._writer.bytes_n
 
-    def _keep(self, chunk: bytes) -> None:
+    def _write(self, chunk: bytes) -> None:
         if not chunk:
             return
         self._last_byte_s = time.monotonic()
         self._first_byte_s = min(self._first_byte_s, self._last_byte_s)
         self._head = (self._head + chunk)[:HEAD_BYTES_N]
-        if written := self._writer.write(chunk, self._unix_s + self._last_byte_s):
+        if written := self._writer.write(chunk, self._unix_offset_s + self._last_byte_s):
             self._watch(self._frames.feed(written))
 
 
 @contextmanager
 def _stopping_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM set `stop`, in the main thread."""
+    """Set `stop` at Ctrl-C and SIGTERM during the `with` block; outside the main thread, change nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,6 +1,6 @@
 """Read tables from text and CSV files, with errors that name the line and column.
 
-`parse_csv` reads this project's own files, whose columns and types are known; `read_cells` and `to_numbers` read files
+`parse_csv` reads files that this project wrote, with known columns and types; `read_cells` and `to_numbers` read files
 that other recorders wrote.
 """
 
@@ -19,7 +19,7 @@ from reskin.errors import CaptureError
 from reskin.recordings.header import Header
 from reskin.schema import UNITS, Readings
 
-FIRST_ROW = 2  # row 1 of the file is the header
+FIRST_ROW = 2  # the first row with values; row 1 of the file has the column names
 # Arrow's messages about a cell that is not a number, and about a row with too few or too many cells
 CONVERSION = re.compile(r"column #(\d+): Row #(\d+): CSV conversion error to (\w+): invalid value '(.*)'")
 COLUMNS_N = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
@@ -28,7 +28,7 @@ COLUMNS_N = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) -> pa.Table:
     """Read CSV text, or the file at a path, that has exactly the columns of `types`, in any order.
 
-    Row numbers in errors count lines of the file: the header is row 1.
+    Row numbers in errors are line numbers in the file; the column names are in row 1.
     """
     try:
         table = pacsv.read_csv(
@@ -40,14 +40,14 @@ def parse_csv(source: str | Path, types: Mapping[str, pa.DataType], where: str) 
         )
     except (pa.ArrowInvalid, UnicodeDecodeError) as error:
         got = ascii(" ".join(str(error).split()))[1:-1][:200]  # the error may quote a long row of binary data
-        if found := CONVERSION.search(got):
-            name, rule = _column_names(source)[int(found[1])], "a whole number" if "int" in found[3] else "a number"
+        if match := CONVERSION.search(got):
+            name, rule = _column_names(source)[int(match[1])], "a whole number" if "int" in match[3] else "a number"
             raise CaptureError(
-                f"{where} row {found[2]}", name, rule, f"'{found[4][:20]}'", "Correct or remove that row."
+                f"{where} row {match[2]}", name, rule, f"'{match[4][:20]}'", "Correct or remove that row."
             ) from None
-        if found := COLUMNS_N.search(got):
-            what = f"{found[3]} columns, but row 1 has {found[2]}"
-            raise CaptureError(f"{where} row {found[1]}: {what}. Was the file cut or edited?") from None
+        if match := COLUMNS_N.search(got):
+            what = f"{match[3]} columns, but row 1 has {match[2]}"
+            raise CaptureError(f"{where} row {match[1]}: {what}. Was the file cut or edited?") from None
         raise CaptureError(f"{where}: not a CSV with columns {_list(types)}: {got}. Correct that row.") from None
     except FileNotFoundError:
         raise CaptureError(f"{where}: file not found. Copy the whole capture folder.") from None
@@ -64,14 +64,21 @@ def _column_names(source: str | Path) -> list[str]:
 
 
 def render_csv(table: pa.Table) -> str:
-    """Write a table as CSV text, with the shortest digits that read back as the same number; null is an empty field."""
+    """Return a table as CSV text; null is an empty field.
+
+    A number is written with the fewest digits from which the same number is read.
+    """
     sink = pa.BufferOutputStream()
     pacsv.write_csv(table, sink, pacsv.WriteOptions(include_header=False, quoting_style="none"))
     return ",".join(table.column_names) + "\n" + sink.getvalue().to_pybytes().decode()
 
 
 def refuse_row(bad: Bool[np.ndarray, " rows"], where: str, what: str, rule: str, values: Any, remedy: str) -> None:
-    """Raise for the first row that `bad` marks, if any; `values` are those of all rows, or one text for all."""
+    """Raise `CaptureError` for the first row that `bad` marks, if any.
+
+    `what` is the name of the wrong value, `rule` the rule that it violates, and `values` the values of all rows, or a
+    text that describes the wrong value.
+    """
     if bad.any():
         row_i = int(bad.argmax())
         got = values if isinstance(values, str) else values[row_i]
@@ -90,12 +97,12 @@ def _list(names: Mapping[str, pa.DataType] | list[str]) -> str:
     return ",".join(names) or "none"
 
 
-# All readings, places and unix times are far below this, and float32 can represent it.
+# Limit for numbers in files: all readings, places and unix times are far below, and float32 can represent it.
 MAGNITUDE_MAX = 1e10
 
 
 def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[str]]:
-    """Split a text file into cells, one list per line, all of the same length; `None` splits at any white space."""
+    """Split a text file into cells: one list per line, all of the same length; separator None is any white space."""
     text = _read_text(path, where)
     if separator == "," and ";" in text.partition("\n")[0]:
         raise CaptureError(
@@ -112,7 +119,7 @@ def read_cells(path: Path, where: str, *, separator: str | None) -> list[list[st
 def to_numbers(
     cells: list[list[str]], where: str, *, names: Sequence[str], first_line_n: int = 1
 ) -> Float64[np.ndarray, "f c"]:
-    """Parse cells as finite numbers; `names` are the column names, `first_line_n` is the line of `cells[0]`."""
+    """Parse cells as finite numbers; errors name the column, and the line if `cells[0]` is line `first_line_n`."""
     if cells and len(cells[0]) != len(names):
         problem = f"{len(cells[0])} columns instead of {len(names)} ({names[0]} ... {names[-1]})"
         raise CaptureError(f"{where}: {problem}. Are the layout and the number of chips right?")
@@ -130,7 +137,7 @@ def to_numbers(
 def make_readings(
     header: Header, keep: Bool[np.ndarray, " rows"], **columns: Shaped[np.ndarray, "rows ..."]
 ) -> Readings:
-    """Make readings of the rows to keep; a missing column becomes NaN (unknown), but `reading_i` becomes 0."""
+    """Make readings from the rows that `keep` marks; a missing column becomes NaN (unknown), or 0 for `reading_i`."""
     unknown_degC = np.full((len(keep), header.chips_n), np.nan)
     columns = {"reading_i": np.zeros(len(keep)), "temperature_degC": unknown_degC, **columns}
     unknown = np.full(len(keep), np.nan)
@@ -173,6 +180,7 @@ def _read_text(path: Path, where: str) -> str:
 
 
 def _first_fault(cells: list[list[str]], where: str, names: Sequence[str], first_line_n: int) -> CaptureError:
+    """Return the error for the first cell that is not a number, or that is too large."""
     for row_i, row in enumerate(cells):
         for name, cell in zip(names, row, strict=True):
             if not is_number(cell):
@@ -195,13 +203,13 @@ PHASES = ("noload", "contact")
 
 
 def count_chips_of(names: list[str]) -> int:
-    """Count the chips from column names `T<i>`, `Bx<i>`, `By<i>`, `Bz<i>`."""
+    """Return 1 plus the largest chip number i in column names `T<i>`, `Bx<i>`, `By<i>`, `Bz<i>`."""
     numbers = [int(match[1]) for name in names if (match := re.fullmatch(r"(?:T|Bx|By|Bz)(\d{1,3})", name))]
     return max(numbers, default=0) + 1
 
 
 def check_columns(names: list[str], wanted: list[str], where: str, *, layout: str) -> None:
-    """Raise for missing and for duplicate columns."""
+    """Raise if one of the wanted columns is missing, or if two columns have the same name."""
     missing = [name for name in wanted if name not in names]
     if missing:
         raise CaptureError(
@@ -214,7 +222,7 @@ def check_columns(names: list[str], wanted: list[str], where: str, *, layout: st
 
 
 def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.ndarray, " f"]:
-    """Mark the rows in contact; raise for other words than `noload` and `contact`, and for a table without contact."""
+    """Mark the rows of phase `contact`; raise for other phases than `noload` and `contact`, or if none is `contact`."""
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {first_line_n + row_i}"

@@ -8,32 +8,38 @@ from reskin.errors import CaptureError
 from reskin.recordings.probe import ProbeLog
 from reskin.recordings.tables import FIRST_ROW
 
-# MLX90393 data sheet, table 17: 16 bits of the coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3).
+# Full scale of an MLX90393 at its coarsest step, 9.680 uT (z, GAIN_SEL 0, RES 3): 2^15 steps (data sheet, table 17).
 FULL_SCALE_uT = 32768 * 9.680
-# The earth's field alone is 25-65 uT; a chip under a skin reads 200 to 9000 uT. In mT or T, the number is below this.
+# If the median field is below this number, it is not in uT: the earth's field alone is 25 to 65 uT, and a chip under a
+# skin reads 200 to 9000 uT. In mT or T, these fields are smaller numbers.
 WEAKEST_uT = 20.0
-# The strongest known skin, 13000 uT, would be 130 G. Values below this limit, in steps finer than any step of the chip,
-# are in gauss.
+# The field of the strongest known skin, 13000 uT, is 130 G. If the median field is below this number, and the steps
+# between values are finer than those of any chip in uT, the values are in gauss.
 GAUSS_MAX = 200.0
-NANO_STEP_MIN = 100.0  # the finest step is 150 nT, the coarsest 9.68 uT
-# Skins are a few mm thick and bear smaller forces; 1 N in grams would be 102.
+# If the steps between values are larger than this number, they are in nT: the chip has steps of 0.150 uT = 150 nT to
+# 9.68 uT.
+NANO_STEP_MIN = 100.0
+# Skins are a few mm thick, and forces on them are smaller than this. A force of 1 N in grams would be 102.
 FORCE_MAX_N = 100.0
-FORCE_MIN_N = 0.05  # every recording has a stronger touch; 0.4 N in kg is a smaller number
+FORCE_MIN_N = 0.05  # every recording has a touch with a larger force; 0.4 N in kg would be 0.04
 SAME_PLACE_mm = 0.002  # the logged place of a robot at rest varies by a few um
 EXTENT_MIN_mm, EXTENT_MAX_mm = 1.0, 200.0
-FAR_SHARE_MAX = 0.1  # fraction of places far from the others; if there are more, all places are in another unit
+# If at most this fraction of the places is far from the others, these places are wrong; otherwise, the unit is.
+FAR_SHARE_MAX = 0.1
 DEPTH_MIN_mm, DEPTH_MAX_mm = 0.05, 100.0
 
 
 def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if fields exceed the chip's full scale, are weaker than the earth's, or have steps that no chip has in uT.
+    """Raise if raw fields are probably not in uT.
 
-    The steps are visible only if values were neither averaged nor rounded to decimals.
+    Fields are in another unit if they exceed the chip's full scale, if they are weaker than the earth's field, or if
+    the steps between their values are not those of any chip in uT. The steps are visible only if the values were
+    neither averaged nor rounded to decimals.
     """
     _check_full_scale(b_uT, where, first_line_n)
     usual_uT = float(np.median(np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3).astype(np.float64), axis=2)))
     if usual_uT < WEAKEST_uT:
-        rule = f"{WEAKEST_uT:g} uT or more at most chips, as the earth's field is"
+        rule = f"{WEAKEST_uT:g} uT or more on most chips, like the earth's field"
         raise CaptureError(where, "field", rule, f"{usual_uT:.4g}", "Convert mT or G to uT.")
     step_uT = _find_step(b_uT)
     if step_uT > NANO_STEP_MIN or (usual_uT < GAUSS_MAX and step_uT < faults.STEP_MIN_uT):
@@ -43,7 +49,10 @@ def check_fields(b_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: i
 
 
 def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n: int) -> None:
-    """Raise if field changes exceed the chip's full scale or have steps that no chip has; weak changes are allowed."""
+    """Raise if field changes are probably not in uT: they exceed the chip's full scale, or have steps that no chip has.
+
+    Unlike raw fields, field changes may be weak.
+    """
     _check_full_scale(db_uT, where, first_line_n)
     step_uT = _find_step(db_uT)
     if step_uT > NANO_STEP_MIN or step_uT < faults.STEP_MIN_uT:
@@ -52,7 +61,7 @@ def check_changes(db_uT: Float[np.ndarray, "f ch"], where: str, *, first_line_n:
 
 
 def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: int) -> None:
-    """Raise if a force is more than these skins bear, as forces in grams would be; NaN (unknown) is allowed."""
+    """Raise if a force exceeds `FORCE_MAX_N`, as forces in grams do; NaN (unknown) is allowed."""
     too_strong = np.flatnonzero(np.abs(force_N) > FORCE_MAX_N)
     if len(too_strong):
         got = f"{force_N[too_strong[0]]:.6g} in line {first_line_n + int(too_strong[0])}"
@@ -60,7 +69,7 @@ def check_forces(force_N: Float[np.ndarray, " f"], where: str, *, first_line_n: 
 
 
 def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
-    """Raise if forces are known but all too weak for a gauge to detect, as forces in kg or kN would be."""
+    """Raise if all known forces are below `FORCE_MIN_N`, as forces in kg or kN are; all 0 or all unknown is allowed."""
     strongest_N = np.abs(force_N[np.isfinite(force_N)]).max(initial=0.0)
     if 0 < strongest_N < FORCE_MIN_N:
         got = f"{strongest_N:.3g} at most"
@@ -69,12 +78,15 @@ def check_touch(force_N: Float[np.ndarray, "*f"], where: str) -> None:
 
 
 def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_line_n: int = 1) -> None:
-    """Raise if different places are closer together or farther apart than on a skin; NaN (unknown) is allowed."""
+    """Raise if places are closer together or farther apart than on a skin, as places in m or um are.
+
+    A single place and NaN (unknown) are allowed.
+    """
     known = np.isfinite(place_mm).all(axis=1)
     known_mm = place_mm[known]
     extent_mm = float(np.ptp(known_mm, axis=0).max()) if len(known_mm) else 0.0
     if extent_mm > SAME_PLACE_mm and not EXTENT_MIN_mm <= extent_mm <= EXTENT_MAX_mm:
-        rule = f"one, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
+        rule = f"equal, or spread over {EXTENT_MIN_mm:g} to {EXTENT_MAX_mm:g} mm"
         got, remedy = f"{extent_mm:.4g}", "Convert m or um to mm."
         is_far = (np.abs(known_mm - np.median(known_mm, axis=0)) > EXTENT_MAX_mm).any(axis=1)
         if 0 < is_far.sum() <= FAR_SHARE_MAX * len(is_far):
@@ -89,7 +101,10 @@ def check_places(place_mm: Float[np.ndarray, "f axes"], where: str, *, first_lin
 
 
 def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
-    """Raise if the greatest depth is too small for a press or deeper than a skin; 0 and NaN (unknown) are allowed."""
+    """Raise if the greatest depth is too small or too large for a skin, as depths in m or um are.
+
+    All 0 and NaN (unknown) are allowed.
+    """
     deepest_mm = np.abs(depth_mm[np.isfinite(depth_mm)]).max(initial=0.0)
     if deepest_mm and not DEPTH_MIN_mm <= deepest_mm <= DEPTH_MAX_mm:
         rule = f"{DEPTH_MIN_mm:g} to {DEPTH_MAX_mm:g} mm where it is greatest"
@@ -97,7 +112,7 @@ def check_depths(depth_mm: Float[np.ndarray, " f"], where: str) -> None:
 
 
 def check_log(log: ProbeLog, where: str) -> None:
-    """Raise if places, depths or forces of the contacts are not in mm and N, or if compression is negative."""
+    """Raise if places, depths or forces of a probe log are probably not in mm and N, or if compression is negative."""
     contact = log.contact
     force_N = np.stack([log.Fx_N, log.Fy_N, log.Fz_N], axis=1)
     for axis_N in force_N.T:
@@ -122,7 +137,7 @@ def _check_full_scale(b_uT: Float[np.ndarray, "f ch"], where: str, first_line_n:
 
 
 def _find_step(b_uT: Float[np.ndarray, "f ch"]) -> float:
-    """Return the usual step of the chips along x and y; NaN if no step is visible, or if it comes from rounding."""
+    """Return the median step of the chips along x and y; NaN if no step is visible, or if rounding caused it."""
     steps_uT = faults.find_lsb(b_uT, step_min_uT=0.0, steps_min_n=faults.SURE_STEPS_MIN_N)[:, 0]
     steps_uT = steps_uT[np.isfinite(steps_uT)]
     if not len(steps_uT):

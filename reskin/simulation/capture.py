@@ -1,6 +1,6 @@
-"""Simulated captures: a protocol presses a skin, and the result is encoded in the formats of a recorded capture.
+"""Simulate captures: the presses of a protocol on a skin, encoded in the file formats of recorded captures.
 
-Only `source: simulated` in the header distinguishes such a capture from a recorded one.
+The files of a simulated capture differ from those of a recorded one only by `source: simulated` in the header.
 """
 
 from dataclasses import dataclass
@@ -37,30 +37,33 @@ from reskin.simulation.rig import (
 from reskin.simulation.settings import MAIN, SimulationSettings
 
 WIRE: Wire = "binary"
-# Each part has its own random generator, so that an additional term does not change the other parts.
+# Each part of a simulation has its own random generator, so that random numbers of one part do not change the others.
 PARTS = ("plan", "robot", "drift", "chips", "noise", "warmth", "port", "probe")
 
 
 @dataclass(frozen=True)
 class SimulatedCapture:
-    """A capture before it is encoded: frames in order of time, their arrivals, probe log and clock marks."""
+    """A simulated capture before encoding: frames in order of time, arrival times, probe log and clock marks."""
 
     name: str
     board: str
     skin: str
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
-    arrived_frames_n: Int64[np.ndarray, " c"]  # cumulative number of frames; starts with 0
-    arrived_s: Float64[np.ndarray, " c"]  # on the stream's clock
+    arrived_frames_n: Int64[np.ndarray, " c"]  # cumulative number of frames after each chunk; starts with 0
+    arrived_s: Float64[np.ndarray, " c"]  # arrival time of each chunk, on the stream's clock
     probe: ProbeLog
-    marks: tuple[tuple[float, float], ...]  # times of the same events on both clocks: (stream_s, probe_s)
-    protocol: str  # description
-    overruns: dict[str, int]  # counts of values out of range, by kind
-    card_rate_hz: float | None  # frame rate on an SD card; None if frames come through a port
+    marks: tuple[tuple[float, float], ...]  # times of the same events on the clocks of stream and probe
+    protocol: str  # description of the protocol, for the header
+    overruns: dict[str, int]  # kind of value out of range -> number of such values
+    card_rate_hz: float | None  # frame rate of a log on an SD card; None for frames from a port
 
 
 def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str, str]]:
-    """List (board, skin) of each of a protocol's captures; adding boards or skins does not change earlier names."""
+    """Return the names (board, skin) of all captures of a protocol.
+
+    If boards or skins are added to the settings, existing names do not change.
+    """
     kind, skins_n = settings.boards[settings.protocols[protocol].boards], settings.protocols[protocol].skins_n
     boards = [f"{kind.letter}{board_i}" for board_i in range(kind.boards_n)]
     skins = [(board, f"{board}_s{skin_i}") for skin_i in range(kind.skins_per_board_n) for board in boards]
@@ -70,7 +73,7 @@ def list_captures(settings: SimulationSettings, protocol: str) -> list[tuple[str
 def simulate_capture(
     settings: SimulationSettings, protocol: str, *, board: str, skin: str, seed: int
 ) -> SimulatedCapture:
-    """Draw the board and the skin of these names, and simulate the protocol's capture of them."""
+    """Draw the board and the skin with these names, and simulate the capture of a protocol with them."""
     presses, chip, spreads = settings.protocols[protocol], settings.chip, settings.spreads
     rig, terms = rig_for(settings.rig, presses), settings.terms.only(presses.terms)
     kind = settings.boards[presses.boards]
@@ -112,7 +115,10 @@ def simulate_capture(
 
 
 def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[Header, dict[str, bytes]]:
-    """Encode a capture as the files of a native or SD-card capture; the header does not have the files' hashes yet."""
+    """Return the header and the files (name -> content) of a native or SD-card capture.
+
+    The header does not contain the hashes of the files yet.
+    """
     on_card = capture.card_rate_hz is not None
     frames_n, chips_n = capture.temperature_degC.shape
     xy_uT, _, z_uT = steps_uT(settings.chip.gain_sel).tolist()
@@ -140,7 +146,10 @@ def to_files(capture: SimulatedCapture, settings: SimulationSettings) -> tuple[H
 
 
 def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the tip's positions in m in the board's frame; the depth of a commanded load depends on the skin."""
+    """Return the true positions of the tip in m in the board's frame.
+
+    If the plan has loads instead of depths, the depths are computed from the skin's stiffness.
+    """
     tip_m = (actual_positions(plan, rig, rng) - (*plan.centre_mm, 0)) * milli
     if plan.weight_N is not None:
         tip_m[:, :, 2] = depths_under_load(skin, plan.weight_N)
@@ -148,7 +157,10 @@ def _tip(plan: Plan, rig: Rig, skin: Skin, rng: np.random.Generator) -> Float64[
 
 
 def _force_readings(response: Response, rig: Rig, rng: np.random.Generator) -> tuple[Float32[np.ndarray, "n d 3"], int]:
-    """Return force readings in N, with each indentation's no-load dwell before its stops, and how many were clipped."""
+    """Return force readings in N at each dwell, and the number of clipped values.
+
+    The first dwell of each indentation is without contact; the others are at its stops.
+    """
     force_N = np.concatenate([np.zeros((len(response.force_N), 1, 3)), response.force_N], axis=1)
     read_N, past_range_n = read_force(force_N.reshape(-1, 3), noise_N=rig.force_noise_N, rng=rng)
     return read_N.reshape(force_N.shape), past_range_n

@@ -1,6 +1,7 @@
-"""Response of a skin to a tip: fields at the chips and forces at every stop of a protocol.
+"""Simulate the response of a skin to a tip: fields at the chips, and forces, at every stop of a protocol.
 
-Terms of physics that a protocol does not name are neglected; experiment neglected_effects reports the resulting error.
+Optional effects (friction, ageing, ...) are simulated only if the protocol's settings list them under `terms`.
+Experiment neglected_effects reports the error due to effects that are not listed.
 """
 
 from collections.abc import Collection
@@ -40,7 +41,7 @@ from reskin.physics.skin import (
 
 
 class Terms(Strict):
-    """Section `terms`: terms of physics that only some protocols need."""
+    """Section `terms` of the settings: parameters of physical effects that only some protocols simulate."""
 
     ageing: Ageing | None = None
     friction: Friction | None = None
@@ -49,18 +50,19 @@ class Terms(Strict):
     temperature: Temperature | None = None
 
     def named(self) -> set[str]:
-        """Return the names of the terms that have settings."""
+        """Return the names of the effects that are not None."""
         return {name for name in type(self).model_fields if getattr(self, name) is not None}
 
     def only(self, names: Collection[str]) -> "Terms":
-        """Return a copy with only the named terms."""
+        """Return a copy in which all effects except the named ones are None."""
         return Terms(**{name: getattr(self, name) for name in names})
 
 
 class TangentialResponse(NamedTuple):
     """Response to a dragged or tilted tip at each stop.
 
-    force_N: tangential force. change_T: dB due to pressing and dragging together. slide_m: translation of the skin.
+    force_N: tangential force on the skin. change_T: field change due to both pressing and dragging. slide_m:
+    translation of the skin on its base.
     """
 
     force_N: Float[np.ndarray, "n p 2"]
@@ -70,7 +72,7 @@ class TangentialResponse(NamedTuple):
 
 @dataclass(frozen=True)
 class Response:
-    """Fields at the chips and forces on the skin; the axes are n indentations, p stops and k chips."""
+    """Fields at the chips, and forces on the skin, for n indentations with p stops each, and k chips."""
 
     rest_T: Float[np.ndarray, "n k 3"]  # no-load field before each indentation
     change_T: Float[np.ndarray, "n p k 3"]
@@ -87,10 +89,10 @@ def simulate_response(
     terms: Terms,
     rng: np.random.Generator,
 ) -> Response:
-    """Simulate the response of a new skin at each stop (x, y, depth in the board's frame).
+    """Simulate the response of a new skin at each stop of the tip (x, y, depth in the board's frame).
 
-    `tilt` is the slope of the stylus, dx/dz and dy/dz. Without the term friction, there is no tangential force: a
-    dragged or tilted tip has the effect of a press.
+    `tilt` is the slope of the stylus, dx/dz and dy/dz, for each indentation. If `terms.friction` is None, there is no
+    tangential force, and a dragged or tilted tip has the same effect as a press.
     """
     n, stops_n, _ = tip_m.shape
     flat_m = tip_m.reshape(-1, 3)
@@ -123,12 +125,13 @@ def simulate_response(
 def drag_tip(
     board: Board, skin: Skin, tip_m: Float[np.ndarray, "n p 3"], *, tilt: Float[np.ndarray, "n 2"], friction: Friction
 ) -> TangentialResponse:
-    """Move a dragged or tilted tip through the stops of each indentation, with Coulomb friction.
+    """Simulate a dragged or tilted tip at the stops of each indentation, with Coulomb friction.
 
-    The tangential force shears the layer under the tip. It also slides the whole skin if springs hold its base
-    (`Skin.hold`); otherwise the base is assumed to be fixed sideways. One friction limit applies to pressing and
-    dragging together. The drag is assumed to use as much of it as it needs, and the displacement due to the press is
-    scaled by what remains. Under a slipping tip, nothing remains, and the skin loses its displacement due to the press.
+    The tangential force shears the layer under the tip. If the base is held by springs (`Skin.hold`), the force also
+    moves the whole skin; otherwise the base is assumed to be fixed sideways. The friction limit applies to the sum of
+    the forces due to pressing and dragging. It is assumed that the drag takes its full force, and that the displacement
+    due to the press is scaled by the remaining fraction of the limit. If the tip slips, this fraction is zero, and so
+    is the displacement due to the press.
     """
     if skin.hold is not None:
         skin = replace(skin, hold=replace(skin.hold, friction=friction.coefficient))
@@ -149,7 +152,7 @@ def _drag_once(
         tip_m[:, :2], normal_N, stiffness_N_per_m=_in_series(layer_N_per_m, slides_m_per_N), friction=coefficient
     )
     force_N = _clip(dragged.force_N + normal_N[:, None] * tilt, coefficient * normal_N)
-    # Displacements due to pressing and dragging are centred at the rest position of the material under the tip.
+    # The deformations due to pressing and dragging are centred at the rest position of the material under the tip.
     drag_slide_m = (slides_m_per_N @ force_N[:, :, None])[:, :, 0]
     elastic_m = force_N / np.where(layer_N_per_m > 0, layer_N_per_m, 1.0)[:, None] + drag_slide_m
     centre_m = np.column_stack([tip_m[:, :2] - elastic_m, tip_m[:, 2]])
@@ -179,7 +182,7 @@ def _base_compliance(skin: Skin, places_m: Float[np.ndarray, "p 2"]) -> Float[np
 def _in_series(
     layer_N_per_m: Float[np.ndarray, " p"], slides_m_per_N: Float[np.ndarray, "p 2 2"]
 ) -> Float[np.ndarray, "p 2 2"]:
-    # A layer without stiffness transmits no force to the springs.
+    # Return the stiffness of the layer in series with the springs of the base; 0 where the layer has no stiffness.
     stiff = layer_N_per_m > 0
     layers_m_per_N = np.eye(2) / np.where(stiff, layer_N_per_m, 1.0)[:, None, None]
     return np.where(stiff[:, None, None], np.linalg.inv(layers_m_per_N + slides_m_per_N), 0.0)
@@ -192,7 +195,7 @@ def _shear_map(skin: Skin, depth_m: float) -> shear.ShearMap:
 
 def _clip(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
     size_N = np.hypot(*force_N.T)
-    with np.errstate(over="ignore"):  # if the force is far below its limit
+    with np.errstate(over="ignore"):  # if the force is far below the limit
         return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
 
 

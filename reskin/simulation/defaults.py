@@ -1,4 +1,4 @@
-"""Settings of the nominal skin, rig, chips and boards, from `nominal.yaml` in this folder."""
+"""Read the nominal settings of skin, rig, chips, boards and protocols from `nominal.yaml` in this folder."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,9 +7,9 @@ from typing import Any
 from reskin.config import read_yaml
 
 NOMINAL = Path(__file__).with_name("nominal.yaml")
-SHARED = ("skin", "rig", "chip", "spreads", "terms")  # sections that all simulations take from `nominal.yaml`
+SHARED = ("skin", "rig", "chip", "spreads", "terms")  # sections of `nominal.yaml` that all simulations use
 
 
 def nominal(section: str, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return a section of the nominal settings, with some settings replaced by `changes`."""
+    """Return a section of the nominal settings; `changes` replaces or adds settings."""
     return {**read_yaml(NOMINAL)[section], **(changes or {})}

@@ -1,4 +1,4 @@
-"""Protocols of simulated captures: places and depths of the tip in order of time."""
+"""Protocols of simulated captures, which plan the places and depths of the tip in order of time."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -13,14 +13,14 @@ from reskin.data.grid import CENTRE_MM, PITCH_MM, SIDE_POINTS_N, points_mm, prot
 from reskin.errors import ParamsError
 from reskin.physics.skin import Skin, forces
 
-LIFTED_MM = -1.0  # depth of a stop above the skin, without contact; such stops are not in the robot's log
-DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load; it is 1e-8 N on a skin of 10 N/mm
-DEEPEST_SHARE = 0.999  # of the smaller of thickness and tip radius, which is the limit of the force model
+LIFTED_MM = -1.0  # depth of a tip above the skin, without contact; such stops are not in the robot's log
+DEPTH_STEP_M = 1e-12  # tolerance of the depth under a load; equals 1e-8 N for a skin with a stiffness of 10 N/mm
+DEEPEST_SHARE = 0.999  # largest depth under a load, relative to the smaller of thickness and tip radius
 
 
 @dataclass(frozen=True)
 class Stops:
-    """Positions of the tip at each stop in mm; the axes are n indentations and p stops."""
+    """Positions of the tip in mm, for n indentations with p stops each."""
 
     x_mm: Float64[np.ndarray, "n p"]
     y_mm: Float64[np.ndarray, "n p"]
@@ -37,10 +37,10 @@ Sides_mm = tuple[float, float]
 
 @dataclass(frozen=True)
 class Plan:
-    """Stops in order of time: places and depths at which readings are taken. Each of n indentations has p stops.
+    """The stops of the tip at which readings are taken, in order of time: n indentations with p stops each.
 
-    A negative depth means a stop above the skin; depths are NaN if a load is commanded. `tilt` is the slope of the
-    stylus, dx/dz and dy/dz. `centre_mm` is the place of the skin's centre, in the coordinates of the labels.
+    A negative depth is a stop above the skin. Depths are NaN if `weight_N` commands loads instead. `tilt` is the slope
+    of the stylus, dx/dz and dy/dz. `centre_mm` is the skin's centre in the coordinate system of the labels.
     """
 
     pass_i: Int32[np.ndarray, " n"]
@@ -49,7 +49,7 @@ class Plan:
     depth_mm: Float64[np.ndarray, "n p"]
     tilt: Float64[np.ndarray, "n 2"]
     description: str
-    labelled: bool = True  # whether places, depths and forces are recorded
+    labelled: bool = True  # whether places, depths and forces are in the probe log
     weight_N: Float64[np.ndarray, "n p"] | None = None  # commanded loads
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM)
 
@@ -58,18 +58,19 @@ class Plan:
 
 
 class ProtocolSettings(Strict):
-    """Settings common to all protocols."""
+    """Settings that all protocols have."""
 
-    boards: str  # kind of board, a key of section `boards` of the scene
-    skins_n: Count  # skins are taken in this order: the first skin of each board, then the second of each board, ...
+    boards: str  # kind of board: a key of the scene's section `boards`
+    # number of skins; the first skin of each board is used first, then the second skin of each board, ...
+    skins_n: Count
     terms: tuple[
         Literal["ageing", "friction", "memory", "relaxation", "temperature"], ...
-    ]  # terms of physics that are simulated
-    rate_hz: Rate_hz | None = None  # default: the rate of the rig; boards with more chips need a lower rate
+    ]  # physical effects to simulate
+    rate_hz: Rate_hz | None = None  # frame rate; default: the rate of the rig; lower for boards with more chips
 
 
 class _RandomDepth(ProtocolSettings):
-    depth_mm: tuple[Depth_mm, Depth_mm]  # uniform between these limits
+    depth_mm: tuple[Depth_mm, Depth_mm]  # depths are uniformly distributed between these limits
 
     @model_validator(mode="after")
     def _check_depths(self) -> "_RandomDepth":
@@ -79,8 +80,8 @@ class _RandomDepth(ProtocolSettings):
 
 
 class _OnlyTemperature(ProtocolSettings):
-    # Other terms are not possible: ageing and relaxation would change the force between stops, which is not modelled,
-    # and the tip does not move sideways.
+    # The other effects are not allowed: ageing and relaxation would change the force between stops, which is not
+    # modelled, and the tip does not move sideways, so friction has no effect.
     terms: tuple[Literal["temperature"], ...]
 
     @model_validator(mode="after")
@@ -92,14 +93,14 @@ class _OnlyTemperature(ProtocolSettings):
 
 
 class Grid(ProtocolSettings):
-    """The paper's grid of 65 places: all places at one depth, then at the next, in several passes (section 3)."""
+    """The paper's grid of 65 places, pressed at several depths in several passes (section 3)."""
 
     kind: Literal["grid"]
     passes_n: Count
     depths_mm: Depths_mm
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Press each place at each depth in each pass."""
+        """Plan one indentation per place, depth and pass; all places are pressed at one depth before the next depth."""
         pokes = protocol(self.depths_mm, self.passes_n)
         stops = Stops(pokes.x_mm[:, None], pokes.y_mm[:, None], pokes.depth_mm[:, None])
         return _upright_plan(
@@ -108,15 +109,15 @@ class Grid(ProtocolSettings):
 
 
 class Drag(ProtocolSettings):
-    """Lines along x and along y, 2 mm apart, dragged over the whole grid (section 4, shear)."""
+    """A tip that is dragged along lines in x and in y, 2 mm apart, over the whole grid (section 4, shear)."""
 
     kind: Literal["drag"]
     passes_n: Count
     depths_mm: Depths_mm
-    step_mm: Annotated[float, Field(gt=0, le=4)]  # between stops
+    step_mm: Annotated[float, Field(gt=0, le=4)]  # distance between stops
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Drag along each row, then along each column; the direction alternates from line to line."""
+        """Plan one indentation per line, depth and pass; the direction alternates from line to line."""
         stops_n = round(2 * CENTRE_MM / self.step_mm) + 1
         along_mm = np.linspace(0, 2 * CENTRE_MM, stops_n)
         alternating_mm = np.where((np.arange(SIDE_POINTS_N) % 2 == 0)[:, None], along_mm, along_mm[::-1])
@@ -124,7 +125,8 @@ class Drag(ProtocolSettings):
         lines_n, depths_n = 2 * SIDE_POINTS_N, len(self.depths_mm)
         x_mm = np.tile(np.concatenate([alternating_mm, across_mm]), (depths_n, 1))
         y_mm = np.tile(np.concatenate([across_mm, alternating_mm]), (depths_n, 1))
-        # Every second pass is reversed, so that the place of the tip does not determine the direction of the force.
+        # In every second pass, all lines are reversed, so that the direction of the force does not follow from the
+        # place.
         directions = [slice(None, None, -1 if pass_i % 2 else 1) for pass_i in range(self.passes_n)]
         depth_mm = np.tile(np.repeat(np.array(self.depths_mm), lines_n), self.passes_n)
         stops = Stops(
@@ -139,16 +141,16 @@ class Drag(ProtocolSettings):
 
 
 class Hand(_RandomDepth):
-    """Manual indentations along lines; only their order is known, not their places, depths or forces (section 5.2)."""
+    """Manual indentations along lines, without labels: only their order along the lines is known (section 5.2)."""
 
     kind: Literal["hand"]
     lines_n: Count
     pokes_per_line_n: Annotated[int, Field(ge=2, le=1000)]
-    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # across the line and along it
-    tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # of the stylus, about each axis
+    place_sd_mm: Annotated[float, Field(ge=0, le=2)]  # standard deviation of the place, across the line and along it
+    tilt_sd_deg: Annotated[float, Field(ge=0, le=20)]  # standard deviation of the stylus's tilt about x and about y
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Press along parallel lines over the grid; each line is a pass."""
+        """Plan indentations along parallel lines over the grid; each line is one pass."""
         across_mm = np.linspace(0, 2 * CENTRE_MM, self.lines_n) if self.lines_n > 1 else np.array([CENTRE_MM])
         along_mm = np.linspace(0, 2 * CENTRE_MM, self.pokes_per_line_n)
         pokes_n = self.lines_n * self.pokes_per_line_n
@@ -166,14 +168,17 @@ class Hand(_RandomDepth):
 
 
 class Scatter(_RandomDepth):
-    """Indentations uniformly distributed over the skin (section 6, arm sleeve); labels are in mm from its corner."""
+    """Indentations at random places, uniformly distributed over a skin (section 6, arm sleeve).
+
+    The origin of the labels is a corner of the skin.
+    """
 
     kind: Literal["scatter"]
     pokes_n: Count
-    margin_mm: Annotated[float, Field(ge=0)]  # least distance to the edges
+    margin_mm: Annotated[float, Field(ge=0)]  # smallest distance of a place from the edges of the skin
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw uniformly distributed places and depths; places keep the margin to the edges."""
+        """Draw places and depths from uniform distributions."""
         if not 2 * self.margin_mm < min(skin_mm):
             rule = f"less than half of the skin's shorter side, {min(skin_mm) / 2:g} mm"
             raise ParamsError("protocol scatter", "margin_mm", rule, self.margin_mm, "Lower it.")
@@ -187,10 +192,10 @@ class Scatter(_RandomDepth):
 
 
 class Load(_OnlyTemperature):
-    """A glass at the skin's centre that is filled step by step (section 6); its foot is modelled as the rig's tip."""
+    """A glass on the skin's centre that is filled in steps (section 6), modelled as a load on the rig's tip."""
 
     kind: Literal["load"]
-    # Number of fillings; a direction is fitted to half of them and tested on the other half.
+    # Number of fillings; at least 2, because an experiment fits to half of the fillings and tests on the other half.
     passes_n: Annotated[int, Field(ge=2, le=100_000)]
     force_max_N: Annotated[float, Field(gt=0, le=100)]
     step_N: Annotated[float, Field(gt=0, le=100)]
@@ -203,7 +208,7 @@ class Load(_OnlyTemperature):
         return self
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Fill the glass once per pass; the depths will be computed from the skin."""
+        """Plan one filling per pass. The depths are NaN: they will be computed from the loads and the skin."""
         weight_N = np.tile(load_steps_N(self.force_max_N, self.step_N), (self.passes_n, 1))
         centre_mm = np.full(weight_N.shape, CENTRE_MM)
         stops = Stops(centre_mm, centre_mm, np.full(weight_N.shape, np.nan))
@@ -212,16 +217,16 @@ class Load(_OnlyTemperature):
 
 
 class Press(_OnlyTemperature):
-    """Half-sine presses at grid places, read continuously: each frame is a stop (section 7, dynamic data)."""
+    """Presses whose depth is half a sine over time, at grid places; each frame is a stop (section 7, dynamic data)."""
 
     kind: Literal["press"]
     presses_n: Count
-    duration_s: tuple[Duration_s, Duration_s]  # log-uniform between these limits
+    duration_s: tuple[Duration_s, Duration_s]  # durations are log-uniform between these limits
     depth_mm: tuple[Depth_mm, Depth_mm]
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw places, durations (log-uniform) and depths; the tip stays lifted until the longest press would end."""
+        """Draw places, durations and depths. After shorter presses, the tip is lifted until the longest press ends."""
         least_s, most_s = self.duration_s
         long_s = np.exp(rng.uniform(np.log(least_s), np.log(most_s), size=self.presses_n))
         long_n = np.maximum(np.round(long_s * self.rate_hz).astype(np.int64), 1)
@@ -235,18 +240,18 @@ class Press(_OnlyTemperature):
 
 
 class Walk(_OnlyTemperature):
-    """Footfalls of a shoe or touches of a glove, recorded as one walk (section 6: dog shoe, glove)."""
+    """Footfalls of a shoe, or touches of a glove, in one continuous recording (section 6: dog shoe, glove)."""
 
     kind: Literal["walk"]
     steps_n: Count
     stance_s: tuple[Duration_s, Duration_s]
     swing_s: tuple[Duration_s, Duration_s]
-    quiet_s: Duration_s  # before the first step
+    quiet_s: Duration_s  # time without contact before the first step
     depth_mm: tuple[Depth_mm, Depth_mm]
     rate_hz: Rate_hz
 
     def plan(self, rng: np.random.Generator, skin_mm: Sides_mm) -> Plan:
-        """Draw a walk as one indentation of many stops, in which footfalls alternate with swings above the skin."""
+        """Plan a walk as one indentation with one stop per frame; footfalls alternate with swings above the skin."""
         stance_n, swing_n = (
             np.maximum(np.round(rng.uniform(*range_s, size=self.steps_n) * self.rate_hz).astype(np.int64), 1)
             for range_s in (self.stance_s, self.swing_s)
@@ -273,7 +278,7 @@ def _upright_plan(
     weight_N: Float64[np.ndarray, "n p"] | None = None,
     centre_mm: tuple[float, float] = (CENTRE_MM, CENTRE_MM),
 ) -> Plan:
-    """Create a plan with an upright tip; without `pass_i`, it is a single pass."""
+    """Create a plan with an upright tip; without `pass_i`, all indentations are in one pass."""
     n = len(stops.depth_mm)
     passes = np.zeros(n, np.int32) if pass_i is None else pass_i
     return Plan(
@@ -283,12 +288,12 @@ def _upright_plan(
 
 
 def load_steps_N(force_max_N: float, step_N: float) -> Float64[np.ndarray, " p"]:
-    """List the loads of one filling, from 0 to the maximum in equal steps."""
+    """Return the loads of one filling, from 0 to the maximum in equal steps."""
     return step_N * np.arange(round(force_max_N / step_N) + 1)
 
 
 def depths_under_load(skin: Skin, load_N: Float[np.ndarray, "n p"]) -> Float64[np.ndarray, "n p"]:
-    """Solve for the commanded depth in m under each load; at a load of 0, the tip just touches the skin.
+    """Solve for the commanded depth in m at which the force equals each load; at load 0, the tip just touches the skin.
 
     Raises
     ------
@@ -314,7 +319,7 @@ def _depth_under_load(skin: Skin, load_N: float) -> float:
 
 
 def half_sine(frames_n: int, peak_mm: float) -> Float64[np.ndarray, " p"]:
-    """Return the depth of a half-sine press at the middle of each frame."""
+    """Return the depth in mm at the middle of each frame of a press whose depth is half a sine over time."""
     return peak_mm * np.sin(np.pi * (np.arange(frames_n) + 0.5) / frames_n)
 
 

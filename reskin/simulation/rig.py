@@ -1,4 +1,4 @@
-"""The simulated rig: robot, force sensor, chips, port and clocks, which turn fields into frames and a probe log."""
+"""The simulated rig (robot, force sensor, chips, port and clocks), which produces frames and a probe log."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -21,26 +21,29 @@ Spread = Annotated[float, Field(ge=0, le=1)]
 
 
 class Rig(Strict):
-    """Section `rig`: numbers of frames, repeatability of the robot, noise of the force sensor, port and clocks."""
+    """Section `rig` of the settings: frames per dwell, errors of robot and force sensor, timing of port and clocks."""
 
     noload_frames_n: FrameCount
-    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # on the way down, and the same number on the way up
-    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # with the tip at rest, before each dwell
+    moving_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames while the tip moves down, and while it moves up
+    settling_frames_n: Annotated[int, Field(ge=0, le=1000)]  # frames before each dwell while the tip is at rest
     readings_n: FrameCount
     rate_hz: Rate_hz
-    robot_place_sd_mm: Spread  # along each axis
+    robot_place_sd_mm: Spread  # standard deviation of the robot's position along x and along y
     robot_depth_sd_mm: Annotated[float, Field(ge=0, le=0.2)]
-    place_offset_sd_mm: Spread  # true place minus label, the same for all skins of a board
+    place_offset_sd_mm: Spread  # sd of (true place - label), a constant offset for all skins of a board
     force_noise_N: Annotated[float, Field(ge=0, le=10)]
     chunk_frames_max_n: FrameCount
     arrival_jitter_s: Annotated[float, Field(ge=0, le=1)]  # mean of the exponentially distributed delay of a chunk
-    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]  # sd of (probe's clock - stream's clock)
-    probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd
+    probe_clock_offset_s: Annotated[float, Field(ge=0, le=1e6)]  # sd of (probe clock - stream clock)
+    probe_clock_rate_error: Annotated[float, Field(ge=0, le=0.01)]  # sd of the relative rate error
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Frames of one indentation, axis t: the stop of each frame, and the fraction of its field change in the frame."""
+    """The t frames of one indentation.
+
+    `stop_i` is the stop to which a frame belongs, and `share` is the fraction of the stop's field change at the frame.
+    """
 
     stop_i: Int64[np.ndarray, " t"]
     share: Float64[np.ndarray, " t"]
@@ -52,9 +55,10 @@ class Timeline:
 
 
 def rig_for(rig: Rig, protocol: Protocol) -> Rig:
-    """Adapt the rig to a protocol.
+    """Return the rig's settings for a protocol.
 
-    A protocol may have its own rate. Presses and walks have one frame per stop; walks have no robot and a single clock.
+    The frame rate is that of the protocol, if it has one. Protocols `press` and `walk` have one frame per stop.
+    Protocol `walk` has no robot, no force noise, and a single clock.
     """
     changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
     if isinstance(protocol, Press | Walk):
@@ -73,7 +77,10 @@ def rig_for(rig: Rig, protocol: Protocol) -> Rig:
 
 
 def timeline(rig: Rig, stops_n: int) -> Timeline:
-    """Arrange the frames of an indentation: settle, no-load dwell, down, settle and dwell at each stop, up."""
+    """Create the timeline of an indentation.
+
+    The tip settles, dwells without contact, moves down, settles and dwells at each stop, and moves up.
+    """
     ramp = np.arange(1, rig.moving_frames_n + 1) / (rig.moving_frames_n + 1)
     lifted_n, dwell_n = rig.settling_frames_n + rig.noload_frames_n, rig.settling_frames_n + rig.readings_n
     share = np.concatenate([np.zeros(lifted_n), ramp, np.ones(stops_n * dwell_n), ramp[::-1]])
@@ -84,9 +91,10 @@ def timeline(rig: Rig, stops_n: int) -> Timeline:
 
 
 def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[np.ndarray, "n p 3"]:
-    """Return the true positions of the tip (x, y, depth in mm); all stops of an indentation have the same error.
+    """Return the true positions of the tip (x, y, depth in mm): planned positions plus the robot's error.
 
-    Without a robot, there are no commanded positions: the plan consists of true positions.
+    The error is the same for all stops of an indentation. Plans without labels are not executed by a robot, so their
+    positions are the true ones.
     """
     planned_mm = np.stack([plan.x_mm, plan.y_mm, plan.depth_mm], axis=2)
     if not plan.labelled:
@@ -98,7 +106,7 @@ def actual_positions(plan: Plan, rig: Rig, rng: np.random.Generator) -> Float64[
 def draw_arrivals(
     frame_s: Float64[np.ndarray, " f"], rig: Rig, rng: np.random.Generator
 ) -> tuple[Int64[np.ndarray, " c"], Float64[np.ndarray, " c"]]:
-    """Draw when chunks of frames arrive at the port: cumulative numbers of frames, and times in s."""
+    """Draw chunks of frames; return the cumulative number of frames after each chunk, and its arrival time in s."""
     frames_n = len(frame_s)
     sizes = rng.integers(1, rig.chunk_frames_max_n + 1, size=frames_n)
     ends = np.cumsum(sizes)
@@ -108,16 +116,16 @@ def draw_arrivals(
 
 
 def draw_clock(rig: Rig, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw the offset in s and the rate of the probe's clock relative to the stream's clock."""
+    """Draw the offset in s and the relative rate of the probe clock with respect to the stream clock."""
     offset_s, error = rng.standard_normal(2) * (rig.probe_clock_offset_s, rig.probe_clock_rate_error)
     return float(offset_s), float(1 + error)
 
 
 def probe_log(plan: Plan, read_N: Float[np.ndarray, "n d 3"], rig: Rig, clock: tuple[float, float]) -> ProbeLog:
-    """Build the log of robot and force sensor: for each indentation, the no-load dwell, then its p stops (d = 1 + p).
+    """Create the log of robot and force sensor, with d = 1 + p dwells per indentation: without contact, then p stops.
 
-    A dwell lasts from half a frame before its first frame to half a frame after its last. Stops above the skin are not
-    logged.
+    A dwell lasts from half a frame before its first frame to half a frame after its last frame. Stops above the skin
+    are not logged.
     """
     stops_n = plan.x_mm.shape[1]
     frames = timeline(rig, stops_n)
@@ -149,18 +157,18 @@ FORCE_RANGE_N = (25.0, 25.0, 35.0)  # +- on x, y and z: ATI Nano17, calibration 
 def read_force(
     force_N: Float[np.ndarray, "n 3"], *, noise_N: float, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "n 3"], int]:
-    """Return force readings with noise of sd `noise_N`, and how many values were clipped to the sensor's range."""
+    """Return force readings with noise, and the number of values that were clipped to the sensor's range."""
     noisy_N = force_N + noise_N * rng.standard_normal(force_N.shape)
     read_N = noisy_N.clip(-np.array(FORCE_RANGE_N), FORCE_RANGE_N)
     return read_N.astype(np.float32), int(np.count_nonzero(read_N != noisy_N))
 
 
-BLOCK_INDENTATIONS_N = 1000
+BLOCK_INDENTATIONS_N = 1000  # indentations per block, to limit memory
 
 
 @dataclass(frozen=True)
 class SimulatedFrames:
-    """Readings in order of time, and how many values were outside the chips' range."""
+    """Readings of all chips in order of time, and the numbers of values outside the chips' range (`chip.Overruns`)."""
 
     b_uT: Float32[np.ndarray, "f ch"]
     temperature_degC: Float32[np.ndarray, "f k"]
@@ -170,7 +178,7 @@ class SimulatedFrames:
 
 @dataclass(frozen=True)
 class Readout:
-    """How a board is read in one capture; each chip has its own conversion phase and temperature sensitivity."""
+    """Properties of the readout of a board in one capture, such as the conversion phase of each chip."""
 
     board: Board
     design: ChipDesign
@@ -183,7 +191,7 @@ class Readout:
 def start_readout(
     board: Board, design: ChipDesign, *, rate_hz: float, temperature: Temperature | None, rng: np.random.Generator
 ) -> Readout:
-    """Draw each chip's conversion phase and temperature sensitivity for one capture."""
+    """Draw the conversion phase and the temperature dependence of the sensitivity of each chip for one capture."""
     chips_n = len(board.chips_m)
     phase_s = chip.CONVERSION_S * rng.random(chips_n)
     sd = 0.0 if temperature is None else temperature.chip_sensitivity_per_K
@@ -198,7 +206,10 @@ def read_frames(
     noise: np.random.Generator,
     warmth_noise: np.random.Generator,
 ) -> SimulatedFrames:
-    """Read all frames of all indentations, in blocks; the result does not depend on the block size."""
+    """Simulate the chips' readings at all frames of all indentations.
+
+    Frames are computed in blocks of indentations; the result does not depend on the block size.
+    """
     frame_s = (1 + np.arange(len(response.rest_T) * len(timeline))) / readout.rate_hz
     age_s, source_i = chip.last_conversions(frame_s, readout.phase_s)
     b_uT, temperature_degC, overruns = [], [], []
@@ -208,7 +219,7 @@ def read_frames(
         b_uT.append(block_uT)
         overruns.append(overrun)
         temperature_degC.append(read_temperature(chip_degC, readout.design, warmth_noise))
-    # Frames that contain the same conversion have the same reading, including its noise.
+    # Frames that contain the same conversion of a chip have the same reading, including the noise.
     chip_i = np.arange(len(readout.phase_s))
     repeated_uT = np.concatenate(b_uT).reshape(len(frame_s), -1, 3)[source_i, chip_i].reshape(len(frame_s), -1)
     return SimulatedFrames(
@@ -222,7 +233,8 @@ def read_frames(
 def _field_at(
     response: Response, timeline: Timeline, readout: Readout, age_s: Float[np.ndarray, "f k"], first_i: int
 ) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
-    # The first frames of a block may contain conversions from the previous indentation.
+    # Return the field in T and the temperature in degC at the conversion of each chip, for one block of indentations.
+    # Frames at the start of the block may contain conversions during the previous indentation, so it is included first.
     lead_n = len(timeline) if first_i else 0
     block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
     b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]

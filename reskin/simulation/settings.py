@@ -1,4 +1,4 @@
-"""Settings of a simulation: boards, skins, protocols and the rig that records them."""
+"""Settings of a simulation: boards, skins, protocols and the rig."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -16,13 +16,13 @@ from reskin.simulation.defaults import SHARED
 from reskin.simulation.protocols import Drag, Grid, Hand, Protocol
 from reskin.simulation.rig import Rig
 
-MAIN = "grid"  # the protocol whose captures have the names of their skins
+MAIN = "grid"  # name of the main protocol; a capture of this protocol has the same name as its skin
 Count = Annotated[int, Field(ge=1, le=1000)]
 Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class BoardKind(Strict):
-    """Boards of one kind, each with its own skins; names of boards and skins start with the letter."""
+    """A kind of board, and the numbers of boards and skins; names of boards and skins start with the letter."""
 
     letter: Annotated[str, Field(pattern="^[a-z]$")]
     boards_n: Count
@@ -37,7 +37,7 @@ class BoardKind(Strict):
 
 
 class SimulationSettings(Strict):
-    """Section `simulate` of a scene, together with the sections that all simulations share."""
+    """A scene's section `simulate`, together with the nominal sections that all simulations share."""
 
     boards: Annotated[dict[str, BoardKind], Field(min_length=1)]
     protocols: Annotated[dict[str, Protocol], Field(min_length=1)]
@@ -52,7 +52,7 @@ class SimulationSettings(Strict):
         used = {term for protocol in self.protocols.values() for term in protocol.terms}
         if used != self.terms.named():
             raise ValueError(
-                f"terms must be exactly those of the protocols, {sorted(used)}, not {sorted(self.terms.named())}"
+                f"terms must be those that the protocols list, {sorted(used)}, not {sorted(self.terms.named())}"
             )
         for name, protocol in self.protocols.items():
             if protocol.boards not in self.boards:
@@ -69,7 +69,7 @@ class SimulationSettings(Strict):
                     f"protocol {name}: skins_n {skins_n} is more than the {have_n} skins of {protocol.boards} boards"
                 )
         if len({kind.letter for kind in self.boards.values()}) < len(self.boards):
-            raise ValueError("each kind of board must have its own letter")
+            raise ValueError("kinds of boards must have different letters")
         return self
 
     @model_validator(mode="after")
@@ -80,7 +80,7 @@ class SimulationSettings(Strict):
 
     @property
     def main(self) -> Grid:
-        """The protocol whose captures are split into folds."""
+        """The main protocol, whose captures are split into folds for training and testing."""
         main = self.protocols[MAIN]
         assert isinstance(main, Grid), "checked above"
         return main
@@ -91,7 +91,7 @@ class SimulationSettings(Strict):
 
 
 def parse_simulation(section: Mapping[str, Any], shared: Mapping[str, Any], where: str) -> SimulationSettings:
-    """Parse section `simulate` of a scene, with the shared sections, of which `terms` is reduced to those in use."""
+    """Parse a scene's section `simulate` together with the shared sections; drop `terms` that no protocol lists."""
     protocols = section.get("protocols")
     named = {
         term

@@ -1,6 +1,6 @@
-"""Benchmarks. `make bench` runs them at full size; the test suite runs each at a tiny size, so that it keeps working.
+"""Benchmarks. `make bench` runs them at full size; the test suite runs each one at a tiny size.
 
-Sizes are written `size(FULL, TINY)`. Times and learnt results are asserted at full size only.
+Sizes are written `size(FULL, TINY)`. Assertions about times and training results apply at full size only.
 """
 
 import os
@@ -10,5 +10,5 @@ FULL = os.environ.get("RESKIN_BENCHMARKS") == "full"
 
 
 def size(full: Any, tiny: Any) -> Any:
-    """Return the first value if RESKIN_BENCHMARKS is `full`, else the second."""
+    """Return `full` if the environment variable RESKIN_BENCHMARKS is "full", else `tiny`."""
     return full if FULL else tiny

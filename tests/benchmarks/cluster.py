@@ -1,8 +1,8 @@
-"""Run one sweep of training runs on this machine and on a Dask cluster in network namespaces, including failures.
+"""Run one sweep of training runs on this machine and on a Dask cluster, also while parts of the cluster fail.
 
-Run `make cluster-test` or `python -m tests.benchmarks.cluster` as root, which network namespaces need. The programs
-are those that deploy/ starts on SLURM and Kubernetes (deploy/dask.sh). Writes docs/measured/cluster.md, scaling.md and
-scaling.svg.
+Run `make cluster-test` or `python -m tests.benchmarks.cluster` as root: each machine of the cluster is a network
+namespace, which only root can create. deploy/dask.sh starts the programs, as on SLURM and Kubernetes. Writes
+docs/measured/cluster.md, scaling.md and scaling.svg.
 """
 
 import argparse
@@ -28,12 +28,12 @@ from tests.benchmarks.steps import ROOT, Steps, end_on_signals, require
 WORKERS = ("w1", "w2", "w3")
 PORT = 8786
 STARTED_MAX_s, SWEEP_MAX_s = 240.0, 900.0
-DUTY_s = (1.5, 0.5)  # a slow machine is stopped, then runs
+DUTY_s = (1.5, 0.5)  # seconds for which a slow worker is stopped and then runs, repeatedly
 SWEEP = [sys.executable, "-W", "ignore", "-m", "tests.benchmarks.cluster_sweep"]
 
 
 class Sweep:
-    """A running or finished sweep and the files in its folder."""
+    """A running or finished sweep: reads the task log and the results in the sweep's folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -53,13 +53,13 @@ class Sweep:
         return Counter(line[2] for line in self.lines("ended"))
 
     def task_s(self) -> list[float]:
-        """Return the CPU seconds of each task except the first, which loads the libraries."""
-        begun = {(name, by): float(at) for _, name, by, at in self.lines("begun")}
-        return [float(at) - begun[name, by] for _, name, by, at in self.lines("ended")][1:]
+        """Return the CPU seconds of each task. The first task is omitted because it loads the libraries."""
+        begun = {(name, by): float(cpu_s) for _, name, by, cpu_s in self.lines("begun")}
+        return [float(cpu_s) - begun[name, by] for _, name, by, cpu_s in self.lines("ended")][1:]
 
 
 class Cluster:
-    """A scheduler, workers and a user, each with its own address, started by deploy/dask.sh."""
+    """A Dask cluster: a scheduler, three workers and a client machine, each with a network address of its own."""
 
     def __init__(self, nodes: Mapping[str, Node], folder: Path) -> None:
         self._nodes, self._folder = nodes, folder
@@ -77,7 +77,7 @@ class Cluster:
         self.wait_for(len(WORKERS))
 
     def wait_for(self, workers_n: int) -> None:
-        """Wait until the user can reach this many workers."""
+        """Wait until a client on the node `user` can reach this many workers."""
         words = (
             f"from distributed import Client as C; C({self.address!r}, timeout=60).wait_for_workers({workers_n}, 120)"
         )
@@ -100,14 +100,14 @@ class Cluster:
 
 
 def sweep_here(folder: Path, place: str) -> Sweep:
-    """Run the sweep on this machine."""
+    """Run the sweep on this machine with the executor `place` (`here` or `processes:N`)."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "RESKIN_EXECUTOR": place}
     subprocess.run([*SWEEP, str(folder)], cwd=ROOT, env=environment, check=True, timeout=SWEEP_MAX_s)
     return Sweep(folder).read()
 
 
 def wait_for_sweep(process: subprocess.Popen[bytes], folder: Path) -> Sweep:
-    """Wait for a sweep on the cluster, which must succeed."""
+    """Wait for a sweep on the cluster; fail unless it succeeds."""
     process.wait(SWEEP_MAX_s)
     require(process.returncode == 0, (folder / "said.txt").read_text()[-600:])
     return Sweep(folder).read()
@@ -134,17 +134,17 @@ def sweep_locally(steps: Steps, folder: Path) -> dict[str, Sweep]:
 def sweep_on_three_workers(
     steps: Steps, cluster: Cluster, nodes: Mapping[str, Node], folder: Path, expected: str
 ) -> Sweep:
-    """Run the sweep on three workers: equal bytes, and the bytes that each worker received."""
+    """Run the sweep on three workers; require the local results, and note the bytes that each worker received."""
     with steps.step("three workers") as note:
         before = {name: nodes[name].received_bytes() for name in WORKERS}
         sweep = wait_for_sweep(cluster.sweep(folder / "whole", "--empty"), folder / "whole")
         require(sweep.found["sha256"] == expected, "bytes differ")
-        came = {name: nodes[name].received_bytes() - before[name] for name in WORKERS}
+        received = {name: nodes[name].received_bytes() - before[name] for name in WORKERS}
         ran = sweep.tasks_per_worker()
-        sweep.found["received_bytes"] = sum(came.values())
+        sweep.found["received_bytes"] = sum(received.values())
         require(len(sweep.lines("begun")) == TASKS_N, f"begun {len(sweep.lines('begun'))}")
         note(f"{TASKS_N} tasks, by worker {sorted(ran.values())}; received kB by worker "
-            f"{sorted(round(n / 1e3) for n in came.values())}; equal bytes")  # fmt: skip
+            f"{sorted(round(n / 1e3) for n in received.values())}; equal bytes")  # fmt: skip
         reads = Counter(line[1] for line in sweep.lines("read"))
         require(set(reads.values()) <= {1}, f"rows read {reads}")
         note(f"rows ({sweep.found['rows_bytes'] / 1e6:.1f} MB) read once by each of {len(reads)} workers")
@@ -153,10 +153,10 @@ def sweep_on_three_workers(
 
 def kill_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> Sweep:
     with steps.step("a worker is killed during the sweep (SIGKILL)") as note:
-        process, at = cluster.sweep(folder / "killed"), Sweep(folder / "killed")
-        wait_until(lambda: len(at.lines("ended")) >= 3, SWEEP_MAX_s, "three tasks")
+        process, running = cluster.sweep(folder / "killed"), Sweep(folder / "killed")
+        wait_until(lambda: len(running.lines("ended")) >= 3, SWEEP_MAX_s, "three tasks")
         cluster.end("w1")
-        ended_n = len(at.lines("ended"))
+        ended_n = len(running.lines("ended"))
         sweep = wait_for_sweep(process, folder / "killed")
         begun_n = len(sweep.lines("begun"))
         require(sweep.found["sha256"] == expected, "bytes differ")
@@ -170,18 +170,18 @@ def kill_worker(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> 
 def restart_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: str) -> None:
     place = folder / "restarted"
     with steps.step("the scheduler is killed during the sweep") as note:
-        process, at = cluster.sweep(place), Sweep(place)
-        wait_until(lambda: len(at.lines("ended")) >= 4, SWEEP_MAX_s, "four tasks")
+        process, running = cluster.sweep(place), Sweep(place)
+        wait_until(lambda: len(running.lines("ended")) >= 4, SWEEP_MAX_s, "four tasks")
         cluster.end("scheduler")
         start_s = time.monotonic()
         process.wait(120)
-        said = (place / "said.txt").read_text().splitlines()[-1]
-        require(process.returncode == 1 and "Finished trainings are cached" in said, said)
-        note(f"after {time.monotonic() - start_s:.1f} s: `{said}`")
+        last_line = (place / "said.txt").read_text().splitlines()[-1]
+        require(process.returncode == 1 and "Finished trainings are cached" in last_line, last_line)
+        note(f"after {time.monotonic() - start_s:.1f} s: `{last_line}`")
         cluster.end_all()
     with steps.step("restart scheduler and workers, repeat the command") as note:
-        finished = {line[1] for line in at.lines("ended")}
-        before_n = len(at.lines("begun"))
+        finished = {line[1] for line in running.lines("ended")}
+        before_n = len(running.lines("begun"))
         cluster.start_all()
         sweep = wait_for_sweep(cluster.sweep(place), place)
         again = [line[1] for line in sweep.lines("begun")[before_n:]]
@@ -192,7 +192,7 @@ def restart_scheduler(steps: Steps, cluster: Cluster, folder: Path, expected: st
 
 @contextmanager
 def slow_down(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """Let a worker run for a quarter of the time only."""
+    """Suspend and resume a worker repeatedly within the block, so that it runs for a quarter of the time."""
     done = threading.Event()
 
     def stop_and_go() -> None:
@@ -239,8 +239,8 @@ def run_slurm_script(steps: Steps, folder: Path, expected: str) -> None:
     environment = {**os.environ, **job, "PATH": f"{srun.parent}:{os.environ['PATH']}"}
     with steps.step("`deploy/slurm/reskin.sbatch` with a substitute for `srun`, two workers") as note:
         words = ["bash", str(ROOT / "deploy/slurm/reskin.sbatch"), *SWEEP, str(place)]
-        with (folder / "slurm.log").open("wb") as said:
-            process = subprocess.Popen(words, env=environment, stdout=said, stderr=said, start_new_session=True)
+        with (folder / "slurm.log").open("wb") as log:
+            process = subprocess.Popen(words, env=environment, stdout=log, stderr=log, start_new_session=True)
             try:
                 code = process.wait(SWEEP_MAX_s)
             finally:

@@ -1,7 +1,7 @@
 """Run one sweep of training runs on RESKIN_EXECUTOR and log every task: `python -m ... FOLDER`.
 
-cluster.py runs it on this machine and in network namespaces. Writes the results to FOLDER/found.json and the log of
-tasks to FOLDER/ran.txt.
+cluster.py runs it on this machine and in network namespaces. The results are written to FOLDER/found.json, the task log
+to FOLDER/ran.txt.
 """
 
 import hashlib
@@ -24,12 +24,12 @@ from reskin.models.runner import _read_rows, run_jobs
 from reskin.seeds import rng_for
 
 BOARDS_N, SEEDS_N, ROWS_N, STEPS_N = 6, 6, 20_000, 200
-TASKS_N = SEEDS_N * BOARDS_N // 3  # stacks of three
+TASKS_N = SEEDS_N * BOARDS_N // 3  # one task trains a stack of three networks
 EMPTY_N = 300
 
 
 class LoggingExecutor(Executor):
-    """Executor that forwards calls to another one; each call is logged where it runs."""
+    """Executor that forwards calls to `inner`; the process that runs a call logs its begin and end."""
 
     def __init__(self, inner: Executor, log: Path) -> None:
         self._inner, self._log = inner, log
@@ -42,7 +42,7 @@ class LoggingExecutor(Executor):
 
 
 def call_and_log(log: Path, fn: Callable[..., Any], *args: Any) -> Any:
-    """Call a function and log its begin and end, each with the process id and the CPU seconds of that process."""
+    """Call a function; log its begin and end with the id and the CPU seconds of the process that runs it."""
     name = hashlib.sha256(repr(args[-1]).encode()).hexdigest()[:8]
     _note(log, "begun", name)
     before_n = _read_rows.cache_info().misses
@@ -54,7 +54,7 @@ def call_and_log(log: Path, fn: Callable[..., Any], *args: Any) -> Any:
 
 
 def _note(log: Path, word: str, name: str) -> None:
-    with log.open("a") as stream:  # a line this short is appended atomically while other processes write
+    with log.open("a") as stream:  # appending a short line is atomic, although several processes write to this file
         stream.write(f"{word} {name} {os.getpid()} {time.process_time():.4f}\n")
 
 
@@ -90,7 +90,7 @@ def main() -> None:
     found: dict[str, object] = {}
     with make_executor(imports="reskin.models.train") as executor:
         connect_end_s = time.monotonic()
-        executor.submit(empty_task).result()  # local workers have imported their modules
+        executor.submit(empty_task).result()  # afterwards, local workers have imported all modules
         ready_s = time.monotonic()
         logged = LoggingExecutor(executor, folder / "ran.txt")
         done = run_jobs(make_jobs(rows), rows, executor=logged, cache=folder / "cells", log=lambda line: None)
@@ -108,7 +108,7 @@ def main() -> None:
     end_workers()
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     found |= {"sha256": digest.hexdigest(), "children_cpu_s": used.ru_utime + used.ru_stime}
-    numbers_n = BOARDS_N * ROWS_N  # each fold uses each row for training or for testing
+    numbers_n = BOARDS_N * ROWS_N  # each of the BOARDS_N folds uses every row, for training or for testing
     found["rows_bytes"] = sum(part.nbytes for part in (rows.db_uT, rows.target, rows.skin)) + 8 * numbers_n
     (folder / "found.json").write_text(json.dumps(found))
 

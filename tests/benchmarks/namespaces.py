@@ -1,7 +1,7 @@
 """A small network on one machine: network namespaces, each with its own address, on one bridge.
 
-Each namespace runs programs as if it were a machine. Needs root and the command `ip`; the context manager removes
-all namespaces on exit.
+Programs in a namespace run as if on a machine of their own. Needs root and the command `ip`; the context manager
+`network` removes all namespaces on exit.
 """
 
 import os
@@ -25,16 +25,16 @@ def unsupported_reason() -> str | None:
 
 
 class Node:
-    """A machine of the network."""
+    """A machine of the network: a network namespace with an address."""
 
     def __init__(self, namespace: str, address: str) -> None:
         self.namespace, self.address = namespace, address
 
     def popen(self, words: Sequence[str], log: Path, folder: Path) -> subprocess.Popen[bytes]:
         """Start a program on this node, in its own process group."""
-        with log.open("ab") as said:
+        with log.open("ab") as output:
             command = ["ip", "netns", "exec", self.namespace, *words]
-            return subprocess.Popen(command, stdout=said, stderr=said, cwd=folder, start_new_session=True)
+            return subprocess.Popen(command, stdout=output, stderr=output, cwd=folder, start_new_session=True)
 
     def received_bytes(self) -> int:
         """Return the number of bytes that this node has received."""
@@ -44,7 +44,7 @@ class Node:
 
 @contextmanager
 def network(names: Sequence[str]) -> Iterator[dict[str, Node]]:
-    """Make machines that reach only each other."""
+    """Create a network namespace per name, connected by a bridge and to nothing else; yield the nodes by name."""
     tag = f"reskin-{uuid.uuid4().hex[:6]}"
     with ExitStack() as down:
 
@@ -73,7 +73,7 @@ def network(names: Sequence[str]) -> Iterator[dict[str, Node]]:
 
 
 def kill(process: subprocess.Popen[bytes], word: signal.Signals = signal.SIGKILL) -> None:
-    """End a program and its children, as if its machine were switched off."""
+    """Kill a program and its child processes, as if its machine were switched off."""
     try:
         os.killpg(process.pid, word)
     except ProcessLookupError:

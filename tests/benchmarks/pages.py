@@ -1,4 +1,4 @@
-"""Write results of benchmarks into generated blocks of pages in docs."""
+"""Write benchmark results into the generated blocks of pages in docs/."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,13 +15,13 @@ MEASURED = ROOT / "docs/measured"  # one file per benchmark; pages are generated
 
 
 def write_block(page: str, name: str, parts: Sequence[str]) -> None:
-    """Write paragraphs and tables between the marks of a block."""
+    """Replace the content between the markers of a block by paragraphs and tables."""
     file = ROOT / "docs" / page
     io.write_text(file, fill({page: file.read_text(encoding="utf-8")}, {name: "\n\n".join(parts)})[page])
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return rows as a Markdown table; a missing value is a dash."""
+    """Format rows as a Markdown table; missing values become dashes."""
     frame = pd.DataFrame(rows).fillna("–").astype(str)
     return to_markdown(frame)
 

@@ -1,8 +1,9 @@
-"""Simulate 1 to 256 workers from measured times and sizes: where more workers stop helping, and why.
+"""Estimate the speed-up of training by 1 to 256 workers, and what limits it, by simulating the cluster.
 
-Reads the measurements of cluster.py and the times of each stage's training runs (reports/<scene>/provenance.json);
-writes a table and a figure. In this discrete-event simulation one client sends tasks one after another over one
-network, each worker reads the rows once, and a task takes the time of a task of its stage, with the measured spread.
+Uses the times and sizes measured by cluster.py and the training times of each stage in reports/<scene>/provenance.json;
+writes a table and a figure. The discrete-event simulation makes three assumptions. One client sends tasks one after
+another over a shared network. Each worker loads the training rows once. The time of a task is the mean for its stage,
+multiplied by a ratio drawn from the measured task times.
 """
 
 import heapq
@@ -23,19 +24,19 @@ from tests.benchmarks.steps import ROOT
 
 WORKERS_N = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 NETWORK_bytes_s = 1.25e8  # assumed: 1 Gbit/s, shared by all workers
-WIDE_N = 10_000  # tasks of a sweep that keeps any of these numbers of workers busy
+WIDE_N = 10_000  # tasks in a hypothetical sweep that is large enough to occupy 256 workers
 
 
 @dataclass(frozen=True)
 class Measurements:
     """Times and sizes that the cluster test measured."""
 
-    task_s: tuple[float, ...]  # CPU time of single tasks
-    processes_s: tuple[float, float]  # the sweep on one and on two processes
-    call_s: float  # an empty task, one after another
-    connect_s: float  # connecting a stage to a cluster whose workers have loaded their libraries
-    rows_bytes: float  # read once by each worker
-    task_bytes: float  # received by a worker per task, everything included
+    task_s: tuple[float, ...]  # CPU time of each task
+    processes_s: tuple[float, float]  # the whole sweep, in one process and in two
+    call_s: float  # per empty task, when empty tasks are sent one after another
+    connect_s: float  # to connect a stage to a cluster whose workers have already loaded the libraries
+    rows_bytes: float  # of the training rows, which each worker loads once
+    task_bytes: float  # received by a worker per task, in total
 
 
 @dataclass(frozen=True)
@@ -46,17 +47,17 @@ class Sweep:
     task_s: float
 
 
-def simulate(sweep: Sweep, workers_n: int, of: Measurements, spread: Sequence[float]) -> float:
-    """Return the seconds of a sweep on this number of workers."""
+def simulate(sweep: Sweep, workers_n: int, measured: Measurements, spread: Sequence[float]) -> float:
+    """Simulate a sweep on this number of workers; return its duration in seconds."""
     rng = rng_for(0, "scaling", str(sweep.tasks_n))
     tasks_s = sweep.task_s * rng.choice(np.asarray(spread), sweep.tasks_n)
-    free_s, has_rows = [(of.connect_s, i) for i in range(workers_n)], set[int]()
-    sent_s = arrived_s = of.connect_s
+    free_s, has_rows = [(measured.connect_s, i) for i in range(workers_n)], set[int]()
+    sent_s = arrived_s = measured.connect_s
     end_s = 0.0
     for task_s in tasks_s:
         at_s, worker = heapq.heappop(free_s)
-        sent_s = max(sent_s, at_s) + of.call_s
-        load_bytes = of.task_bytes + (0.0 if worker in has_rows else of.rows_bytes)
+        sent_s = max(sent_s, at_s) + measured.call_s
+        load_bytes = measured.task_bytes + (0.0 if worker in has_rows else measured.rows_bytes)
         has_rows.add(worker)
         arrived_s = max(arrived_s, sent_s) + load_bytes / NETWORK_bytes_s
         done_s = arrived_s + task_s
@@ -66,7 +67,7 @@ def simulate(sweep: Sweep, workers_n: int, of: Measurements, spread: Sequence[fl
 
 
 def read_sweeps(scene: str) -> tuple[list[Sweep], float]:
-    """Return the sweeps of the stages that train, and the total seconds of all other stages."""
+    """Return a scene's sweeps, one per training stage, and the total seconds of all other stages."""
     stages = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["runtime"]["stages"].values()
     sweeps, rest_s = [], 0.0
     for stage in stages:
@@ -78,9 +79,9 @@ def read_sweeps(scene: str) -> tuple[list[Sweep], float]:
     return sweeps, rest_s
 
 
-def write_scaling(of: Measurements, folder: Path) -> None:
-    """Write the table, the measurements that it is based on, and the figure."""
-    spread = np.asarray(of.task_s) / np.mean(of.task_s)
+def write_scaling(measured: Measurements, folder: Path) -> None:
+    """Write scaling.md (the table of speed-ups and the measurements behind it) and the figure scaling.svg."""
+    spread = np.asarray(measured.task_s) / np.mean(measured.task_s)
     paper, rest_s = read_sweeps("paper")
     largest = max(paper, key=lambda sweep: sweep.tasks_n)
     wide = Sweep(WIDE_N, largest.task_s)
@@ -93,16 +94,17 @@ def write_scaling(of: Measurements, folder: Path) -> None:
         "`quick` in full": (quick, quick_rest_s),
     }
 
-    def total_s(sweeps: Sequence[Sweep], rest_s: float, workers_n: int, at: Measurements) -> float:
-        return rest_s + sum(simulate(sweep, workers_n, at, spread) for sweep in sweeps)
+    def total_s(sweeps: Sequence[Sweep], rest_s: float, workers_n: int, assumed: Measurements) -> float:
+        return rest_s + sum(simulate(sweep, workers_n, assumed, spread) for sweep in sweeps)
 
-    alone = {name: total_s(*case, 1, replace(of, connect_s=0.0)) for name, case in cases.items()}
+    alone = {name: total_s(*case, 1, replace(measured, connect_s=0.0)) for name, case in cases.items()}
     faster = {
-        name: [alone[name] / total_s(*case, workers_n, of) for workers_n in WORKERS_N] for name, case in cases.items()
+        name: [alone[name] / total_s(*case, workers_n, measured) for workers_n in WORKERS_N]
+        for name, case in cases.items()
     }
-    free = replace(of, call_s=0.0, connect_s=0.0, task_bytes=0.0, rows_bytes=0.0)
+    free = replace(measured, call_s=0.0, connect_s=0.0, task_bytes=0.0, rows_bytes=0.0)
     cost = {
-        name: 100 * (1 - total_s(*case, WORKERS_N[-1], free) / total_s(*case, WORKERS_N[-1], of))
+        name: 100 * (1 - total_s(*case, WORKERS_N[-1], free) / total_s(*case, WORKERS_N[-1], measured))
         for name, case in cases.items()
     }
     rows = [
@@ -111,32 +113,34 @@ def write_scaling(of: Measurements, folder: Path) -> None:
     text = [
         "Speed-up over one worker, simulated from times and sizes measured by `make cluster-test`.", "",
         "| workers | " + " | ".join(cases) + " |", "|---" * (len(cases) + 1) + "|", *rows, "",
-        *explain(of, paper, rest_s, largest, cost), "", "![Speed-up against workers](scaling.svg)", "",
+        *explain(measured, paper, rest_s, largest, cost), "", "![Speed-up against workers](scaling.svg)", "",
     ]  # fmt: skip
     (folder / "scaling.md").write_text("\n".join(text))
     draw(faster, folder / "scaling.svg")
 
 
 def explain(
-    of: Measurements, paper: Sequence[Sweep], rest_s: float, largest: Sweep, cost: dict[str, float]
+    measured: Measurements, paper: Sequence[Sweep], rest_s: float, largest: Sweep, cost: dict[str, float]
 ) -> list[str]:
-    """Describe the measurements and the limits of the speed-up."""
-    one_s, two_s = of.processes_s
+    """Return Markdown list items: the measurements, and what limits the speed-up."""
+    one_s, two_s = measured.processes_s
     work_s = sum(sweep.tasks_n * sweep.task_s for sweep in paper)
     counts = ", ".join(str(sweep.tasks_n) for sweep in sorted(paper, key=lambda sweep: -sweep.tasks_n))
-    mean_s, sd_s = np.mean(of.task_s), np.std(of.task_s)
+    mean_s, sd_s = np.mean(measured.task_s), np.std(measured.task_s)
     lines = [
-        f"Measured: a sweep of {len(of.task_s) + 1} tasks takes {one_s:.1f} s in one process and {two_s:.1f} s in two "
-        f"({one_s / two_s:.2f} times as fast), at a load of {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores; "
+        f"Measured: a sweep of {len(measured.task_s) + 1} tasks takes {one_s:.1f} s in one process and "
+        f"{two_s:.1f} s in two ({one_s / two_s:.2f} times as fast), at a load of "
+        f"{os.getloadavg()[0]:.0f} on {os.cpu_count()} cores; "
         f"a task takes {mean_s:.2f} s of CPU (sd {100 * sd_s / mean_s:.0f} %).",
-        f"Measured for Dask: {1e3 * of.call_s:.1f} ms per task, {of.connect_s:.1f} s to connect a stage, "
-        f"{of.task_bytes / 1e3:.1f} kB per task and {of.rows_bytes / 1e6:.1f} MB of rows per worker. Assumed: "
-        "a network of 1 Gbit/s, shared by all workers.",
+        f"Measured for Dask: {1e3 * measured.call_s:.1f} ms per task, {measured.connect_s:.1f} s to connect a stage, "
+        f"{measured.task_bytes / 1e3:.1f} kB per task and {measured.rows_bytes / 1e6:.1f} MB of rows per worker. "
+        "Assumed: a network of 1 Gbit/s, shared by all workers.",
         f"The number of tasks limits the speed-up: stages of `paper` have {counts} tasks and run one after another.",
         f"The remaining work is counted as one process: {rest_s:.0f} s of {rest_s + work_s:.0f} s, which limits the "
         f"speed-up of `paper` to {(rest_s + work_s) / rest_s:.0f}.",
         f"Dask is no limit: with 256 workers it costs {cost['`paper` in full']:.1f} % of the time of `paper`. One "
-        f"scheduler can serve about {largest.task_s / of.call_s:,.0f} workers with tasks of {largest.task_s:.0f} s.",
+        f"scheduler can serve about {largest.task_s / measured.call_s:,.0f} workers with tasks of "
+        f"{largest.task_s:.0f} s.",
     ]
     return [f"- {line}" for line in lines]
 

@@ -1,7 +1,7 @@
-"""Write docs/growth.md and its figure from the measurements of time_growth in docs/measured/growth.json.
+"""Write docs/growth.md and its figure from docs/measured/growth.json, which time_growth.py measures.
 
-Run `python -m tests.benchmarks.show_growth`. The page has two exponents: the slope in the log-log figure, which
-includes fixed costs, and the exponent of the growing part alone.
+Run `python -m tests.benchmarks.show_growth`. The page reports two exponents of cost against size: the slope in the
+log-log figure, which includes fixed costs, and the exponent of the growing part alone.
 """
 
 import json
@@ -20,8 +20,8 @@ from tests.benchmarks.pages import MEASURED, ROOT, short, table, write_block
 
 FIGURE = "docs/img/growth.svg"
 MANY_N = 100_000
-GROWTH_MIN = 1.25  # growth from one count to the next that exceeds the noise of a busy machine
-# The reason for each exponent; a stage that is missing here raises a KeyError.
+GROWTH_MIN = 1.25  # cost ratio of two successive counts above which growth is distinguished from timing noise
+# Why the cost of each stage has its exponent. A stage that is missing here raises a KeyError.
 CAUSES = {
     "ingest_simulated": "one capture after another, independently: bytes to Parquet",
     "describe": "one skin after another; medians over skins sort them",
@@ -41,7 +41,7 @@ Points = list[tuple[int, float]]
 
 
 def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: str) -> dict[str, Points]:
-    """Collect one quantity of each stage by count."""
+    """Return the points (row[count], quantity `what`) of each stage in `row[part]`."""
     found: dict[str, Points] = {}
     for row in rows:
         for name, values in row[part].items():
@@ -51,19 +51,22 @@ def points_of(rows: Sequence[Mapping[str, Any]], count: str, part: str, what: st
 
 
 def memory_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Points]:
-    """Collect the peak memory of stages; that of a program started here would include memory of this process."""
+    """Return the points (number of skins, peak MB) of each stage.
+
+    DVC commands are omitted: their measured peak memory includes memory of the measuring process.
+    """
     found = points_of(rows, "skins_n", "stages", "peak_MB")
     return {name: points for name, points in found.items() if not name.startswith("dvc") and name != "whole"}
 
 
 def slopes(points: Points) -> list[float]:
-    """Return the slope in the figure from each count to the next."""
+    """Return the slope of the log-log curve between each pair of successive points."""
     steps = pairwise(points)
     return [log(after / before) / log(n / m) for (m, before), (n, after) in steps if before > 0 and after > 0]
 
 
 def exponent(points: Points) -> float | None:
-    """Solve the last three points for p in a + b n^p; None if fixed and growing costs cannot be separated."""
+    """Return the p with which a + b n^p passes through the last three points; None if the cost hardly grows."""
     if len(points) < 3:
         return None
     (k, first), (m, second), (n, third) = points[-3:]
@@ -74,13 +77,13 @@ def exponent(points: Points) -> float | None:
 
 
 def rows_of(points: Mapping[str, Points]) -> Iterable[dict[str, str]]:
-    for name, own in points.items():
-        (m, before), (n, last) = own[-2:]
-        power, per_item = exponent(own), max(last - before, 0.0) / (n - m)
+    for name, stage_points in points.items():
+        (m, before), (n, last) = stage_points[-2:]
+        power, per_item = exponent(stage_points), max(last - before, 0.0) / (n - m)
         yield {
             "what": name,
-            **{f"{count:,}": short(value) for count, value in own},
-            "slope, last step": f"{slopes(own)[-1]:.2f}",
+            **{f"{count:,}": short(value) for count, value in stage_points},
+            "slope, last step": f"{slopes(stage_points)[-1]:.2f}",
             "exponent beyond the fixed start": "–" if power is None else f"{power:.2f}",
             f"at {MANY_N:,}": short(last + per_item * (MANY_N - n)),
             "why": CAUSES[name],
@@ -88,14 +91,14 @@ def rows_of(points: Mapping[str, Points]) -> Iterable[dict[str, str]]:
 
 
 def draw(panels: Mapping[str, tuple[str, Mapping[str, Points]]]) -> str:
-    """Plot quantities against counts, log-log: one panel per quantity, one colour and marker per stage."""
+    """Return a log-log figure (SVG) of cost against count: a panel per quantity, a colour and marker per stage."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(9.6, 3.1 * len(panels)), layout="constrained")
         for axes, (title, (count, points)) in zip(
             figure.subplots(len(panels), 1, squeeze=False).flat, panels.items(), strict=True
         ):
-            for i, (name, own) in enumerate(points.items()):
-                ns, values = zip(*own, strict=True)
+            for i, (name, stage_points) in enumerate(points.items()):
+                ns, values = zip(*stage_points, strict=True)
                 style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % len(MARKERS)]}
                 axes.plot(ns, values, label=name, linewidth=1, markersize=4, **style)
             axes.set(xscale="log", yscale="log", xlabel=count)
@@ -107,19 +110,19 @@ def draw(panels: Mapping[str, tuple[str, Mapping[str, Points]]]) -> str:
 
 def main() -> None:
     found = json.loads((MEASURED / "growth.json").read_text())
-    of = {
+    panels = {
         "CPU seconds, simulated skins": ("simulated skins", points_of(found["skins"], "skins_n", "stages", "cpu_s")),
         "peak memory of a process, MB": ("simulated skins", memory_of(found["skins"])),
         "CPU seconds, recorded captures": (
             "recorded captures", points_of(found["captures"], "captures_n", "steps", "cpu_s"),
         ),
     }  # fmt: skip
-    io.write_text(ROOT / FIGURE, draw(of))
+    io.write_text(ROOT / FIGURE, draw(panels))
     parts = [
         f"Code {found['git']}, {found['machine']}.",
         f"![Cost against size, log-log]({FIGURE.removeprefix('docs/')})",
     ]
-    for title, (_, points) in of.items():
+    for title, (_, points) in panels.items():
         parts += [f"**{title}**", table(list(rows_of(points)))]
     before = points_of(found["stage_each"], "captures_n", "steps", "cpu_s")
     parts += ["**CPU seconds, recorded captures, one stage per capture**", table(list(rows_of(before)))]

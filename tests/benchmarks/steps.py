@@ -1,4 +1,4 @@
-"""Time a run step by step and print a Markdown table of seconds and results, row by row."""
+"""Time the steps of a long run and print a Markdown table, one row per step as soon as it ends."""
 
 import os
 import platform
@@ -15,7 +15,7 @@ HEAD = "| step | seconds | result |\n|---|---|---|\n"
 
 
 class Steps:
-    """Table of steps: what was done, the time it took and the result."""
+    """Table of steps: description, seconds and result of each step."""
 
     def __init__(self) -> None:
         self.rows: list[str] = []
@@ -24,7 +24,7 @@ class Steps:
 
     @contextmanager
     def step(self, what: str) -> Iterator[Callable[[str], None]]:
-        """Time a block and add its row, also if it fails; the block calls the yielded function with its results."""
+        """Time a block and add a row, even if the block fails. The block passes its results to the yielded function."""
         results, start_s = [], time.monotonic()
         try:
             yield results.append
@@ -36,7 +36,7 @@ class Steps:
             print(self.rows[-1], flush=True)
 
     def write(self, file: Path, title: str) -> None:
-        """Write the table below a line with its title, the commit and the machine."""
+        """Write a line with the title, the commit and the machine, followed by the table."""
         machine = f"{platform.machine()}, {os.cpu_count()} shared cores, Python {platform.python_version()}"
         file.parent.mkdir(parents=True, exist_ok=True)
         words = f"{title} Commit {self._commit}, {machine}, load {os.getloadavg()[0]:.1f} at the end.\n\n"
@@ -44,11 +44,11 @@ class Steps:
 
 
 def end_on_signals() -> None:
-    """Let SIGTERM end this process as Ctrl-C does, so that its child processes are stopped too."""
+    """Make SIGTERM end this process as Ctrl-C does, so that the code that stops its child processes runs."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
 
 
 def require(condition: bool, what: str) -> None:
-    """Fail a step, also under `python -O`, which removes `assert`."""
+    """Raise an AssertionError unless the condition is true. Unlike `assert`, this also works under `python -O`."""
     if not condition:
         raise AssertionError(what)

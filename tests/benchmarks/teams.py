@@ -1,7 +1,8 @@
-"""Run the workflow of a team on loopback: PostgreSQL, MLflow, DVC remotes, recordings of two people merged.
+"""Run a team's workflow on this machine: PostgreSQL, MLflow, DVC remotes, merging the recordings of two people.
 
-Run `make teams` or `python -m tests.benchmarks.teams`. Starts its own servers and stops them, also after a failure; all
-files are in one temporary folder. Writes a table of the steps with their seconds to docs/measured/teams.md.
+Run `make teams` or `python -m tests.benchmarks.teams`. The program starts servers on the loopback address and always
+stops them, even after a failure; all files are in one temporary folder. A table of the steps and their seconds is
+written to docs/measured/teams.md.
 """
 
 import argparse
@@ -42,7 +43,7 @@ RAN, KEPT = re.compile(r"^Running stage '(.*?)(?:@.*)?'", re.M), re.compile(r"di
 
 
 class Clone:
-    """One person's clone of the team's repository, with the virtual environment of this process."""
+    """One person's clone of the team's repository; its commands use the virtual environment of this process."""
 
     def __init__(self, folder: Path, origin: Path, variables: Mapping[str, str]) -> None:
         self.folder = folder
@@ -60,14 +61,14 @@ class Clone:
         return run([sys.executable, "-m", "pipeline", *words], self.folder, self._variables)
 
     def add(self, skin_i: int) -> None:
-        """Add a simulated skin on its own board, as a plain table of readings."""
+        """Add the recording of a simulated skin on a board of its own, in layout `table`."""
         file = self.folder.parent / f"skin{skin_i}.csv"
         recording(skin_i).to_csv(file, index=False)
         labels = ["--board", f"board{skin_i}", "--skin", f"skin{skin_i}", "--scene", SCENE]
         self.reskin("add", str(file), "--layout", "table", *labels)
 
     def repro(self) -> Counter[str]:
-        """Run `dvc repro`; return how often each stage ran."""
+        """Run `dvc repro`; return how many times each stage ran."""
         return Counter(RAN.findall(self.dvc("repro")))
 
     def commit(self, sentence: str) -> None:
@@ -83,7 +84,7 @@ def run(words: list[str], folder: Path, variables: Mapping[str, str], *, check: 
 
 
 def recording(skin_i: int) -> pd.DataFrame:
-    """Simulate presses at 81 places and two depths, each after a no-load row."""
+    """Return a simulated recording as CSV: presses at 81 places and two depths, each preceded by a no-load row."""
     grid = np.stack(np.meshgrid(np.arange(0, 18, 2.0), np.arange(0, 18, 2.0), [0.6, 1.2]), -1).reshape(-1, 3)
     skin = reskin.draw_skin(f"b{skin_i}_s0", seed=skin_i)
     noload_uT, b_uT, force_N = reskin.simulate_pokes(skin, grid, board=reskin.draw_board(f"b{skin_i}", seed=skin_i))
@@ -96,7 +97,7 @@ def recording(skin_i: int) -> pd.DataFrame:
 
 
 def make_origin(folder: Path, address: str) -> Path:
-    """Make the team's bare repository with this commit, one small scene and both remotes."""
+    """Create the team's bare repository: the code of this commit, one small scene and two DVC remotes."""
     seed = Clone(folder / "seed", ROOT, {})
     seed.git("checkout", "--quiet", "-B", "main")
     with (seed.folder / f"pipeline/scenes/{SCENE}.yaml").open("w") as stream:
@@ -112,9 +113,9 @@ def make_origin(folder: Path, address: str) -> Path:
     return origin
 
 
-def transfer_summary(said: str) -> str:
-    """Return the summary of a push or pull from DVC's output."""
-    found = re.search(r"(\d+ files? (?:pushed|fetched)[^\n]*)|Everything is up to date", said)
+def transfer_summary(output: str) -> str:
+    """Return the summary line in the output of `dvc push` or `dvc pull`."""
+    found = re.search(r"(\d+ files? (?:pushed|fetched)[^\n]*)|Everything is up to date", output)
     return found[0] if found else "no message from DVC"
 
 
@@ -123,10 +124,10 @@ def list_stages(ran: Counter[str]) -> str:
 
 
 def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) -> tuple[Clone, Clone]:
-    """Push, clone and pull from the S3-compatible server and from the folder; then no stage needs to run."""
-    at = {"MLFLOW_TRACKING_URI": tracking}
+    """Push the data to both DVC remotes and pull them into new clones; check that no stage needs to run there."""
+    variables = {"MLFLOW_TRACKING_URI": tracking}
     with steps.step("Ana: clone, `reskin add` two skins, `dvc repro`") as note:
-        ana = Clone(folder / "ana", origin, at)
+        ana = Clone(folder / "ana", origin, variables)
         for skin_i in (1, 2):
             ana.add(skin_i)
         ran = ana.repro()
@@ -140,7 +141,7 @@ def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) ->
     fresh = []
     for remote in (REMOTE, "folder"):
         with steps.step(f"fresh clone, `dvc pull -r {remote}`") as note:
-            fresh.append(Clone(folder / f"fresh-{remote}", origin, at))
+            fresh.append(Clone(folder / f"fresh-{remote}", origin, variables))
             note(transfer_summary(fresh[-1].dvc("pull", "-r", remote)))
         with steps.step("`dvc repro` in this clone") as note:
             before = fresh[-1].git("status", "--porcelain")
@@ -152,7 +153,7 @@ def share_by_remotes(steps: Steps, folder: Path, origin: Path, tracking: str) ->
 
 
 def merge_two(steps: Steps, ana: Clone, ben: Clone) -> None:
-    """Two people each add a skin, run and push; the second merges, and the first pulls the merge."""
+    """Let two people each add a skin, run the pipeline and push; the second merges, and the first pulls the merge."""
     for name, clone, skin_i in (("Ana", ana, 3), ("Ben", ben, 4)):
         with steps.step(f"{name}: `reskin add` skin {skin_i}, `dvc repro`, commit, `dvc push`") as note:
             clone.add(skin_i)
@@ -182,7 +183,7 @@ def merge_two(steps: Steps, ana: Clone, ben: Clone) -> None:
 
 
 def pull_merge(steps: Steps, ana: Clone) -> None:
-    """Pull what somebody else merged and ran; no stage needs to run."""
+    """Pull a merge that somebody else made and ran; check that no stage needs to run."""
     with steps.step("Ana: `git pull`, `dvc pull`, `dvc repro`") as note:
         ana.git("pull", "--quiet", "origin", "main")
         ana.dvc("pull")
@@ -197,7 +198,7 @@ def search_runs(tracking: str) -> pd.DataFrame:
 
 
 def share_by_mlflow(steps: Steps, ana: Clone, ben: Clone, tracking: str, database: str) -> int:
-    """Check that PostgreSQL has each run once and that the server returns a model; return the number of runs."""
+    """Check that PostgreSQL has each MLflow run once and that the server returns a model; return the run count."""
     with steps.step("publish again from both clones at once") as note:
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(lambda clone: clone.reskin("publish"), (ana, ben)))
@@ -231,18 +232,18 @@ def count_rows(database: str) -> int:
 
 
 def run_steps(steps: Steps, folder: Path) -> None:
-    """Run all steps in a folder; the context managers stop the servers."""
+    """Run all steps of the workflow in a folder."""
     os.environ.update(KEYS, MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR="false")
-    at, ports = [], [servers.free_port() for _ in range(3)]
+    addresses, ports = [], [servers.free_port() for _ in range(3)]
     try:
         with ExitStack() as up:
             with steps.step("start PostgreSQL (new database), MLflow and an S3-compatible server"):
                 database = up.enter_context(servers.postgres(folder / "postgres", ports[0]))
-                at.append(database)
+                addresses.append(database)
                 down = up.enter_context(ExitStack())
                 tracking = down.enter_context(servers.mlflow(folder / "mlflow", database, ports[1]))
                 store = up.enter_context(servers.s3(folder / "s3", ports[2]))
-                at += [tracking, store]
+                addresses += [tracking, store]
                 boto3.client("s3", endpoint_url=store).create_bucket(Bucket=BUCKET)
             ana, ben = share_by_remotes(steps, folder, make_origin(folder, store), tracking)
             merge_two(steps, ana, ben)
@@ -254,9 +255,9 @@ def run_steps(steps: Steps, folder: Path) -> None:
                 note(f"{rows_n} runs, as before")
     finally:
         with steps.step("stop all servers") as note:
-            left = [address.split("@")[-1] for address in at if servers.listens(address)]
+            left = [address.split("@")[-1] for address in addresses if servers.listens(address)]
             require(not left, f"still listening: {left}")
-            note(f"{len(at)} ports are closed")
+            note(f"{len(addresses)} ports are closed")
 
 
 def main() -> None:
@@ -268,7 +269,7 @@ def main() -> None:
     steps = Steps()
     with ExitStack() as kept:
         folder = arguments.keep or Path(kept.enter_context(tempfile.TemporaryDirectory()))
-        folder.chmod(0o755)  # for PostgreSQL's user
+        folder.chmod(0o755)  # PostgreSQL runs as another user
         run_steps(steps, folder.resolve())
     steps.write(arguments.out, "`make teams`: two people share runs and simulated recordings, on one machine.")
 

@@ -1,7 +1,8 @@
-"""How much faster whole blocks decode than one frame at a time, for the same bytes in the same run.
+"""Compare the time to decode whole blocks of bytes with that of loops over single frames, on the same bytes.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_decode_benchmark.py`. The loops run over a tenth of the
-frames, and their times are scaled by ten; every time is the best of three. Only the equality of the values is asserted.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_decode_benchmark.py`. The loops decode a tenth of the
+frames, and their times are multiplied by ten. Each time is the smallest of three. The test asserts only that the
+decoded values are equal.
 """
 
 import io
@@ -30,12 +31,12 @@ Sample = namedtuple("Sample", "time_s, delay_s, values, device")
 
 
 def bare_loop(data: bytes) -> list[tuple[float, ...]]:
-    """Unpack frames at their known positions, without checks and without arrays."""
+    """Unpack frames at known positions with `struct`, without checking them and without building arrays."""
     return [struct.unpack_from("<20f", data, first) for first in range(0, len(data), FRAME_BYTES_N)]
 
 
 def loop_to_arrays(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Unpack frame after frame into the arrays that a model needs, and check the end of each frame."""
+    """Unpack frames one by one into the arrays that a model needs; check the terminator of each frame."""
     b_uT, temperature_degC = [], []
     for first in range(0, len(data), FRAME_BYTES_N):
         frame = data[first : first + FRAME_BYTES_N]
@@ -47,13 +48,13 @@ def loop_to_arrays(data: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reader_loop(data: bytes) -> list[Sample]:
-    """Read each frame as the sensor's public reader does, from memory instead of its port."""
+    """Read each frame with the code of the sensor's public Python reader, from memory instead of a serial port."""
     port, samples = io.BytesIO(data), []
     for _ in range(len(data) // FRAME_BYTES_N):
         start_s = time.time()
         frame = port.read(FRAME_BYTES_N)
         if frame[-2:] == b"\r\n":
-            values = struct.unpack("@{}fcc".format(4 * CHIPS_N), frame)[: 4 * CHIPS_N]  # noqa: UP032 - as the reader does
+            values = struct.unpack("@{}fcc".format(4 * CHIPS_N), frame)[: 4 * CHIPS_N]  # noqa: UP032
             samples.append(Sample(start_s, time.time() - start_s, values, -1))
     return samples
 
@@ -76,7 +77,7 @@ def peak_MB(call: Callable[[], Any]) -> float:
 
 
 def bare_copy(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Move every value to where decoding puts it and do nothing else: the cost of memory access alone."""
+    """Copy every value to its position in the decoded arrays, without any check: the cost of memory access alone."""
     frames = np.frombuffer(data, np.dtype([("chips", "<f4", (CHIPS_N, 4)), ("end", "V2")]))["chips"]
     return frames[:, :, 1:].reshape(len(frames), -1).copy(), frames[:, :, 0].copy()
 
@@ -89,7 +90,7 @@ def feed_in_portions(data: bytes, wire: str) -> None:
 
 
 @pytest.mark.parametrize("crlf_share", [0.0, 0.01])
-def test_binary(crlf_share):
+def test_decoding_time_of_binary_frames(crlf_share):
     frames = make_frames(FRAMES_N, CHIPS_N, 0, crlf_share=crlf_share)
     data = encode(frames, "binary")
     decoded, _ = decode_all(data, "binary", CHIPS_N, "benchmark")
@@ -101,20 +102,20 @@ def test_binary(crlf_share):
     print(f"peak {peak_MB(lambda: decode_all(data, 'binary', CHIPS_N, 'benchmark')):.0f} MB in addition to the bytes")
     print(f"  blocks, fed {PORTION_BYTES_N} bytes at a time: {best_s(lambda: feed_in_portions(data, 'binary')):.3f} s")
     print(f"  moving the values alone: {copy_s:.3f} s; copying the bytes unchanged: {flat_s:.3f} s")
-    some = data[: LOOP_FRAMES_N * FRAME_BYTES_N]
+    loop_data = data[: LOOP_FRAMES_N * FRAME_BYTES_N]
     for loop in (bare_loop, reader_loop, loop_to_arrays):
-        loop_s = best_s(lambda loop=loop: loop(some)) * FRAMES_N / LOOP_FRAMES_N
+        loop_s = best_s(lambda loop=loop: loop(loop_data)) * FRAMES_N / LOOP_FRAMES_N
         print(f"  {loop.__name__}: {loop_s:.3f} s, ratio {loop_s / ours_s:.0f}")
 
 
 @pytest.mark.parametrize("wire", ["text-xyzt", "text-txyz"])
-def test_text(wire):
+def test_decoding_time_of_text_frames(wire):
     frames = make_frames(LOOP_FRAMES_N, CHIPS_N, 0)
     data = encode(frames, wire)
     decoded, _ = decode_all(data, wire, CHIPS_N, "benchmark")
     np.testing.assert_array_equal(decoded.b_uT, frames.b_uT.astype(float).round(2).astype(np.float32))
     ours_s = best_s(lambda: decode_all(data, wire, CHIPS_N, "benchmark"))
     print(f"\n{LOOP_FRAMES_N} frames of {wire}: {ours_s:.3f} s, {LOOP_FRAMES_N / ours_s:.3g} frames/s")
-    if wire == "text-xyzt":  # the other format is not separated by white space
+    if wire == "text-xyzt":  # values of the other format are not separated by white space
         loop_s = best_s(lambda: [[float(word) for word in line.split()] for line in data.decode().splitlines()])
         print(f"  a loop over lines and words: {loop_s:.3f} s, ratio {loop_s / ours_s:.1f}")

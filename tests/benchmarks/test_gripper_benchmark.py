@@ -1,4 +1,4 @@
-"""How well a simulated gripper holds a force with our estimate as feedback.
+"""Force error of a simulated gripper whose controller uses the model's force estimate as feedback.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_gripper_benchmark.py`, which prints the numbers. Nothing is
 asserted.
@@ -20,7 +20,7 @@ POKES_N, SECONDS = size(600, 20), size(PERIOD_S, SETTLED_S + 0.1)
 @pytest.mark.parametrize(
     ("feedback", "aim_N"), [("network of this skin", AIM_N), ("map of simulated skins", 2 * AIM_N)]
 )
-def test_errors_of_the_held_force(feedback, aim_N):
+def test_error_of_the_held_force(feedback, aim_N):
     errors, within = [], []
     for seed in range(SKINS_N):
         models = [fit(seed, POKES_N)] if feedback.startswith("network") else load_universal()

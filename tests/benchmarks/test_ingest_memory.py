@@ -1,7 +1,7 @@
-"""A million indentations, and a capture larger than the allowed memory, are ingested in bounded memory.
+"""Peak memory of ingesting a million indentations, and of ingesting a capture larger than the memory limit.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_ingest_memory.py`, which prints frames per second and the
-peak memory and writes 2 GB below pytest's folder.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_ingest_memory.py`, which prints frames per second and peak
+memory and writes 2 GB to pytest's temporary folder.
 """
 
 import resource
@@ -24,17 +24,17 @@ from tests.benchmarks import FULL, size
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 INDENTATIONS_N = size(1_000_000, 800)
-TILE_N = size(4_000, 400)  # indentations whose bytes are written repeatedly
-QUIET_N = 400  # frames before the first and after the last
-SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # of the field change of an indentation, frame by frame
-TRAVEL_N = 8  # random number of frames until the next indentation, at most; aligns the clocks without marks
+TILE_N = size(4_000, 400)  # indentations in the block of bytes that is written repeatedly
+QUIET_N = 400  # no-load frames before the first indentation and after the last
+SHARE = np.array([0, 0, 0, 0, 0.5, 1, 1, 1, 1, 0.5])  # fraction of the indentation's full field change, frame by frame
+TRAVEL_N = 8  # maximum of the random number of frames between indentations (irregular gaps align the clocks)
 RATE_HZ = 400.0
 ALLOWED_MB, LARGE_N, LARGE_TRAVEL_N = (
     size(800, 2000),
     size(240_000, 800),
     80,
-)  # a stream of about 1 GB, in less memory than that
-PEAK_MAX_MB = 1500  # the log of 2e6 dwells takes 0.1 GB, its text 0.15 GB, and parsing the rest
+)  # the stream has about 1 GB; the memory limit is lower
+PEAK_MAX_MB = 1500  # 0.1 GB for the probe log of 2e6 dwells, 0.15 GB for its text, the rest for parsing
 
 
 def write_capture(folder: Path, indentations_n: int = INDENTATIONS_N, travel_n: int = TRAVEL_N) -> None:
@@ -124,7 +124,7 @@ def test_a_capture_larger_than_memory_is_read(tmp_path: Path) -> None:
     write_capture(tmp_path, LARGE_N, LARGE_TRAVEL_N)
     stream_MB = (tmp_path / STREAM_FILE).stat().st_size / 1e6
     command = [sys.executable, "-c", READ, str(tmp_path)]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-    print(f"\n{stream_MB:.0f} MB, {said[0]} frames under RLIMIT_AS of {ALLOWED_MB} MB: peak {said[2]} MB resident")
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+    print(f"\n{stream_MB:.0f} MB, {output[0]} frames under RLIMIT_AS of {ALLOWED_MB} MB: peak {output[2]} MB resident")
     assert not FULL or stream_MB > ALLOWED_MB
-    assert int(said[1]) == LARGE_N
+    assert int(output[1]) == LARGE_N

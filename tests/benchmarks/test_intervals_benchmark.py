@@ -1,10 +1,12 @@
-"""Coverage of the nominal variant's 90 % intervals on simulated skins whose law errors are unlike those in training.
+"""Coverage of the universal model's 90 % intervals on simulated skins with law errors unlike those in training.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_intervals_benchmark.py`, three minutes of processor time.
-The network has the settings of scene lab and is trained on simulated skins alone. For each law error the benchmark
-prints the misfit of the unlabelled presses. For each number of labels it prints, for the map | for map and network, the
-coverage at the assumed power and at the calibrated power, the half width at the latter in brackets, and the accuracy.
-The test asserts that larger errors widen the intervals.
+The law error is the difference between a skin's fields and the fields of the simulated law. The network (variant
+`nominal`, settings of scene lab) is trained on simulated skins alone. For each kind of law error, the benchmark prints
+the misfit of the unlabelled presses. For each number of labels, it prints four numbers for the map, then for map and
+network combined: the coverage at the assumed likelihood power, the coverage at the calibrated power, in brackets the
+half width of the interval at the calibrated power, and the accuracy. The test asserts that larger law errors widen the
+intervals.
 """
 
 import numpy as np
@@ -34,12 +36,12 @@ from reskin.universal.training import SkinPrior, TrainingSettings, add_error, tr
 from tests.benchmarks import FULL, size
 from tests.universal.skins import SETUP
 
-SEED, SETTINGS = 2021, TrainingSettings(skins_n=size(500, 4), steps_n=size(1200, 3), seeds_n=1)  # as scene lab
+SEED, SETTINGS = 2021, TrainingSettings(skins_n=size(500, 4), steps_n=size(1200, 3), seeds_n=1)  # settings of scene lab
 SKINS_N, LABELS_N = size(12, 1), size((0, 5, 10, 20, 40), (0,))
 
 
 def law_error(part: float, over_mm: tuple[float, float] = training.ERROR_MM) -> LawError:
-    """Return the law error of training with another size and length scale."""
+    """Return a law error like that of training, with another size and another length scale."""
 
     def add(skins: Population, rng: np.random.Generator) -> np.ndarray:
         with pytest.MonkeyPatch.context() as patch:
@@ -50,19 +52,19 @@ def law_error(part: float, over_mm: tuple[float, float] = training.ERROR_MM) -> 
 
 
 def mix_chips(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """Change the gain matrix of every chip by random entries with a standard deviation of 0.25."""
+    """Add to each chip's gain matrix random entries with a standard deviation of 0.25; apply it to the fields."""
     gain = np.eye(3) + 0.25 * rng.standard_normal((len(skins), 5, 3, 3))
     return np.einsum("skij,snkj->snki", gain, skins.db_uT.reshape(*skins.db_uT.shape[:2], 5, 3))
 
 
 def add_memory(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """Subtract from each press 15 % of the field change of a random press of the skin."""
+    """Subtract from each press 15 % of the field change of another press on the same skin, chosen at random."""
     order = [rng.permutation(skins.db_uT.shape[1]) for _ in range(len(skins))]
     return np.stack([db_uT - 0.15 * db_uT[one] for db_uT, one in zip(skins.db_uT, order, strict=True)])
 
 
 def add_independent_errors(skins: Population, rng: np.random.Generator) -> np.ndarray:
-    """Add to each press an independent, heavy-tailed error of 0.3 of |dB|."""
+    """Add to each press an independent, heavy-tailed error whose size is 30 % of the field change |dB|."""
     length_uT = np.linalg.norm(skins.db_uT, axis=2, keepdims=True) / np.sqrt(skins.db_uT.shape[2])
     return skins.db_uT + 0.3 * length_uT * rng.standard_t(3, skins.db_uT.shape)
 
@@ -76,7 +78,7 @@ FAMILIES: dict[str, LawError] = {
 
 
 @pytest.mark.timeout(3600)
-def test_intervals_under_other_errors_of_the_law(monkeypatch):
+def test_interval_coverage_by_kind_of_law_error(monkeypatch):
     if not FULL:
         monkeypatch.setattr(universal, "CALIBRATION_SKINS_N", 1)
     prior = SkinPrior("nominal", NOMINAL, NOMINAL_SPREADS, SETUP)
@@ -103,6 +105,7 @@ def test_intervals_under_other_errors_of_the_law(monkeypatch):
 
 
 def _scores(calibration, tested, labels_n, powers):
+    """Return coverage at the assumed and at the calibrated power, half width and accuracy: map, map with network."""
     lowered = lower_by_labels(calibration, labels_n, [calibration.nominal_powers(powers)])
     assumed = Powers(ASSUMED_POWER, ASSUMED_POWER)
     before, found = estimate(calibration.with_labels(labels_n), tested.db_uT, [assumed, *lowered])

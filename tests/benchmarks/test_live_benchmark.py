@@ -1,7 +1,7 @@
-"""Latency from a byte to its estimate while a page is open, and memory for a day of frames.
+"""Latency from the last byte of a frame to its estimate and to the screen, and memory use over a day of frames.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_live_benchmark.py`. Each board is a process of its own on a
-pseudo-terminal, and another process reads the page. The tests assert only that frames arrived.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_live_benchmark.py`. Each board is emulated by a separate
+process on a pseudo-terminal; another process opens the page. The tests assert only that frames arrive.
 """
 
 import asyncio
@@ -87,7 +87,7 @@ def test_latency_from_last_byte_to_screen(tmp_path, boards):
 
 @contextmanager
 def running_boards(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tuple[list[Session], str]]:
-    """Start each board in its own process and serve their page; yield when all boards have been zeroed."""
+    """Start a process per board and serve their page; yield as soon as every board has a no-load reading."""
     sessions, players = [], []
     try:
         for i, (chips_n, rate_hz) in enumerate(boards):
@@ -111,7 +111,7 @@ def running_boards(folder: Path, boards: list[tuple[int, float]]) -> Iterator[tu
 
 @contextmanager
 def print_latency(sessions: list[Session], boards: list[tuple[int, float]]) -> Iterator[None]:
-    """Print the latency of the frames that arrive within this block, for all boards together."""
+    """Print the latency of the frames that arrive during the block, pooled over all boards."""
     for session in sessions:
         session.traces.to_estimate_s.clear()
         session.traces.to_screen_s.clear()
@@ -138,7 +138,7 @@ def count_frames(sessions: list[Session]) -> int:
 
 
 def serve_in_thread(sessions: list[Session]) -> str:
-    """Serve the page in a thread; return its address."""
+    """Serve the page from a thread; return the address of the page."""
     ready, address = threading.Event(), []
 
     async def run() -> None:
@@ -171,7 +171,7 @@ def test_memory_of_a_day_of_frames():
 
 
 class Accelerated:
-    """Reader without a port or a clock: each call returns a quarter of a second of frames."""
+    """Reader for tests, without a port or a clock: each call returns the frames of a quarter of a second at once."""
 
     plugged_in, problem, missed_bytes_n = True, "", 0
 

@@ -1,7 +1,7 @@
-"""Processor time of the universal model: one reading, many readings, calibration by pokes and by labels.
+"""Processor time of the universal model: estimates of one and of many readings, calibration by pokes and by labels.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_map_benchmark.py`. Times are of one thread. The test asserts
-only that the predictions are finite.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_map_benchmark.py`. All times are for one thread. The test
+asserts only that the predictions are finite.
 """
 
 import os
@@ -22,10 +22,10 @@ POKES_N = 65
 def test_time_of_estimates_and_calibration():
     skin, rng = load_universal(), rng_for(0, "map")
     tables = skin.tables
-    at = rng.integers(len(tables.axis_mm), size=(2, POKES_N))
+    lattice_i = rng.integers(len(tables.axis_mm), size=(2, POKES_N))
     force_i = rng.integers(len(tables.force_N), size=POKES_N)
-    db_uT, force_N = tables.mean_uT[*at, force_i], tables.force_N[force_i]
-    # Not converted to the chips' axes, which does not matter for the time
+    db_uT, force_N = tables.mean_uT[*lattice_i, force_i], tables.force_N[force_i]
+    # The fields are not converted to the chips' axes: the time does not depend on that.
     b_uT = db_uT + tables.rest_uT + rng.normal(0, 4, (POKES_N, CHANNELS_N))
     rest_uT = b_uT[:1] - db_uT[:1]
     print(f"\nload of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
@@ -44,7 +44,7 @@ def test_time_of_estimates_and_calibration():
         f"calibration to {POKES_N} pokes", 1e3, "ms", calibrate, 30, lambda: skin.zero(rest_uT).estimate(b_uT[:1])
     )
     print_time("calibration to one more poke", 1e3, "ms", calibrate_to_one, 50)
-    place_mm = tables.axis_mm[at].T + CENTRE_MM
+    place_mm = tables.axis_mm[lattice_i].T + CENTRE_MM
     for n in (5, 40):
 
         def label(i: int, n: int = n) -> None:
@@ -61,7 +61,7 @@ def print_time(
     what: str, times: float, unit: str, call: Callable[[int], object], calls_n: int,
     before: Callable[[], object] = lambda: None,
 ) -> None:  # fmt: skip
-    """Print the minimum, the median and the 99th percentile of the times of these calls."""
+    """Call `call` `calls_n` times; print the minimum, median and 99th percentile of the times."""
     took = []
     for i in range(size(calls_n, 2)):
         before()

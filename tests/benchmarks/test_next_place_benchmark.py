@@ -1,8 +1,8 @@
-"""Errors after labels at places chosen by the map's uncertainty, compared with fixed and random places.
+"""Place error after labelling presses at places chosen by the map's uncertainty, at fixed places, or at random.
 
 Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_next_place_benchmark.py`, one minute. The skins are
-simulated about the nominal one, with law errors as in training; the shipped model was not trained on them. For each
-skin, 65 presses on the grid are candidates for labels, and 65 others are test presses.
+simulated, with parameters around those of the nominal skin and law errors as in training; the shipped model was not
+trained on them. On each skin, 65 presses on the grid are candidates for labels, and another 65 are test presses.
 """
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def test_errors_by_choice_of_labelled_places():
 
 
 def ways(pool_mm: np.ndarray, rng: np.random.Generator) -> dict[str, Choose]:
-    """Return the ways to choose the next press; `fixed` takes those nearest to the places that `reskin live` shows."""
+    """Return functions that choose the next press to label; `fixed` follows the places that `reskin live` shows."""
     live_mm = np.stack(np.meshgrid(GUIDED_MM, GUIDED_MM), axis=-1).reshape(-1, 2) - CENTRE_MM
     fixed = [int(np.linalg.norm(pool_mm - one, axis=1).argmin()) for one in rng.permutation(live_mm)]
     anywhere = rng.permutation(len(pool_mm)).tolist()

@@ -1,7 +1,7 @@
-"""Time of a simulated indentation on one core, and of magpylib's dipoles in the same run.
+"""Time to simulate an indentation on one core, and time of magpylib's dipole sum in the same run.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_physics_benchmark.py`. Only the equality of results is
-asserted.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_physics_benchmark.py`. The test asserts only that both
+fields are equal.
 """
 
 import resource
@@ -42,7 +42,7 @@ def one_pass_m() -> np.ndarray:
 
 def forget_tables() -> None:
     if not FULL:
-        return  # tests that run in parallel use these tables
+        return  # keep the cached tables, which other tests in this process use
     for cached in (
         deformation._tabulate,
         deformation._displaced,
@@ -68,12 +68,12 @@ def move_everything(one: Skin) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.
     moments = Rotation.from_rotvec([0.06, 0.08, 0.0]).apply(one.moments_A_m2)
     moved = one.nodes_m + 1e-4 * np.cos(1e3 * one.nodes_m), moments
     rest = one.nodes_m, one.moments_A_m2
-    # In the memory order of `deformation.move_dipoles`
+    # in the memory order of `deformation.move_dipoles`
     return tuple(map(np.asfortranarray, rest)), tuple(map(np.asfortranarray, moved))
 
 
 def core_field(dipoles: tuple[np.ndarray, np.ndarray], board: Board) -> np.ndarray:
-    """Sum magpylib.core's dipoles, by one call for all pairs of node and chip."""
+    """Sum the dipole fields of magpylib.core, computed by one call for all pairs of node and chip."""
     from magpylib.core import dipole_Hfield
 
     positions_m, moments = dipoles
@@ -105,14 +105,14 @@ def test_field_of_all_nodes_equals_magpylib() -> None:
     print(f"\nfield before and after, {len(rest[0])} nodes that all move x {len(BOARD.chips_m)} chips")
     for name, (call, _) in calls.items():
         print(f"  {name:16} {times_ms[name]:8.2f} ms {times_ms[name] / times_ms['compiled']:8.1f} x")
-        # The others lose digits in the difference of two sums, and magpylib's mu_0 is from another CODATA year.
+        # The reference fields lose digits in the difference of two sums, and magpylib uses mu_0 of another CODATA year.
         np.testing.assert_allclose(call(), truth_T, atol=1e-7 * np.abs(truth_T).max())
 
 
 @pytest.mark.timeout(600)
 def test_time_of_pokes_with_and_without_table() -> None:
     pokes_m, one = one_pass_m(), skin("s0")
-    changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # compiles
+    changes_of_field(BOARD, skin("s1"), pokes_m[:1])  # the first call compiles the kernel
     forget_tables()
     start_s = time.perf_counter()
     _, first_T = changes_of_field(BOARD, one, pokes_m)

@@ -1,7 +1,7 @@
 """Time to simulate the paper's 18 skins x 10,140 indentations as raw captures, by the stage in two processes.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_simulate_benchmark.py`. Only the number of captures is
-asserted.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_simulate_benchmark.py`. The test asserts only the number of
+captures.
 """
 
 import json
@@ -29,7 +29,7 @@ def test_time_to_simulate_the_papers_captures(tmp_path: Path) -> None:
     grid = scene["simulate"]["protocols"]["grid"]
     grid |= {"passes_n": PASSES_N, "skins_n": SKINS_N, "depths_mm": list(DEPTHS_MM)}
     (tmp_path / SCENES).mkdir(parents=True)
-    (tmp_path / SCENES / "quick.yaml").write_text(json.dumps(scene))  # JSON is YAML
+    (tmp_path / SCENES / "quick.yaml").write_text(json.dumps(scene))  # JSON is valid YAML
     for name in (PARAMS, PLAN, "dvc.yaml"):
         shutil.copy(ROOT / name, tmp_path / name)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "RESKIN_EXECUTOR": size("processes:2", "here")}

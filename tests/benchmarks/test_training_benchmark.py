@@ -1,8 +1,8 @@
-"""Time to train the fold grid: this engine, a plain DataLoader loop, and a loop over index tensors, in one run.
+"""Time to train networks for many folds: stacks of this project, a plain DataLoader loop, a loop over index tensors.
 
-Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_training_benchmark.py`. Only convergence of the training is
-asserted. Ratios are formed within a repeat, whose parts run under about the same load. On a machine that is busy with
-other work two threads wait for each other, and only the ratios of CPU seconds are meaningful.
+Run `RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_training_benchmark.py`. The test asserts only that the
+training converges. Time ratios are computed within a repeat, during which the load of the machine is about constant. If
+other programs keep the machine busy, use the ratios of CPU seconds: wall times of two threads then include waiting.
 """
 
 import os
@@ -36,7 +36,8 @@ from tests.benchmarks import FULL, size
 BOARDS_N, SKINS_PER_BOARD_N, SEEDS_N = 6, 3, 3
 ROWS_N, CHANNELS_N = size(100_000, 3_600), 15
 STEPS_N, BATCH_N = size(400, 2), 128
-PLAIN_N = 2  # networks that the plain loops train, one after another; their time is scaled to the grid
+# networks that a plain loop trains, one after another; the time is scaled up to all networks of the grid
+PLAIN_N = 2
 REPEATS_N = size(3, 1)
 LAYERS = paper_layers(CHANNELS_N)
 
@@ -68,11 +69,11 @@ def fold_grid(rows: TrainingData, triplet_weight: float) -> list[TrainingJob]:
 
 
 def flop(triplet_weight: float) -> float:
-    """Count the operations of the matrix products in one step of one network; a multiply-add is two operations.
+    """Count the floating-point operations of the matrix products in one training step of one network.
 
-    The forward pass, the gradients of the weights and those of the inputs, except for the first layer's inputs, take
-    2 b (3 sum(in out) - in1 out1); triplets add two passes through the first three layers. Bias, ReLU, loss and
-    optimiser are not counted.
+    A multiply-add counts as two operations. The forward pass, the weight gradients and the input gradients (not
+    computed for the first layer) take 2 b (3 sum(in out) - in1 out1) operations for a batch of b rows. Triplets add two
+    passes through the first three layers. Bias, ReLU, loss and optimiser are not counted.
     """
 
     def passes(layers: Sequence) -> float:
@@ -99,7 +100,7 @@ def train_one(job: TrainingJob, rows: TrainingData) -> int:
 
 
 def start_workers(executor: Executor, workers_n: int = 2) -> None:
-    """Start the workers with one training step each: the first step of a process loads most of PyTorch."""
+    """Let each worker train for one step, because the first step in a process loads most of PyTorch."""
     few = TrainingData(*(values[:BATCH_N] for values in (make_rows().db_uT, make_rows().target, make_rows().skin)))
     job = replace(fold_grid(few, 0.0)[0], recipe=recipe(0.0, 1), train=np.arange(64), test=np.arange(64, BATCH_N))
     running = [executor.submit(train_one, job, few) for _ in range(workers_n)]
@@ -107,7 +108,7 @@ def start_workers(executor: Executor, workers_n: int = 2) -> None:
 
 
 def run_grid(jobs: list[TrainingJob], rows: TrainingData, executor: Executor, cache: Path) -> tuple[float, float]:
-    """Train the grid; return its wall seconds, and the sum of the seconds that networks took in their processes."""
+    """Train all jobs; return the wall seconds, and the seconds per network summed over all networks."""
     start_s = time.perf_counter()
     trained = run_jobs(jobs, rows, executor=executor, cache=cache, log=lambda line: None)
     took_s = time.perf_counter() - start_s
@@ -134,7 +135,7 @@ def plain_loop(batches: Iterable[Sequence[torch.Tensor]]) -> None:
 def plain_grid(
     rows: TrainingData, threads_n: int, batches_of: Callable[[TensorDataset], Iterable]
 ) -> tuple[float, float]:
-    """Train a part of the grid one network at a time; return wall and CPU seconds scaled to the whole grid."""
+    """Train PLAIN_N networks one after another; return wall and CPU seconds scaled up to the whole grid."""
     torch.set_num_threads(threads_n)
     jobs = fold_grid(rows, 0.0)
     start_s, start_cpu_s = time.perf_counter(), time.process_time()
@@ -148,7 +149,7 @@ def plain_grid(
 
 
 def engine_cpu_s(rows: TrainingData) -> float:
-    """Train one stack in this process; return its CPU time, scaled to the whole grid.
+    """Train one stack of networks in this process; return its CPU seconds, scaled up to the whole grid.
 
     CPU time hardly depends on the machine's load.
     """
@@ -170,7 +171,7 @@ def by_index(data: TensorDataset) -> Iterable:
 
 @contextmanager
 def record_cpu_s(parts: dict[str, list[tuple[object, str]]]):
-    """Sum the CPU seconds spent in named functions, none of which calls another."""
+    """Yield the CPU seconds spent in each of the named functions during the block; none of them calls another."""
     spent_s: dict[str, float] = defaultdict(float)
 
     def timed(call: Callable, part: str) -> Callable:
@@ -210,7 +211,8 @@ def _unset_variables(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.timeout(1800)
 def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
     rows = make_rows()
-    plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))  # imports
+    # the first call imports PyTorch
+    plain_loop(islice(by_index(TensorDataset(torch.rand(BATCH_N, CHANNELS_N), torch.rand(BATCH_N, 3))), 3))
     train_stack([replace(fold_grid(rows, 0.0)[0], recipe=recipe(0.0, 1))], rows)
     columns: dict[str, list[float]] = defaultdict(list)
     for i in range(REPEATS_N):
@@ -220,7 +222,7 @@ def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
             start_s = seconds(lambda: start_workers(executor))
             beside = [
                 executor.submit(sgemm_flop_per_s, size(100, 2)) for _ in range(2)
-            ]  # each takes a quarter of a second
+            ]  # each product takes a quarter of a second
             both = harmonic_mean(list(chain.from_iterable(one.result() for one in beside)))
             columns["sgemm, in both processes at once, GFLOP/s"].append(1e-9 * both)
             for what, weight in (("grid", 0.0), ("grid with triplets", 0.1)):
@@ -256,10 +258,10 @@ def test_time_of_fold_grid_plain_loops_and_sgemm(tmp_path: Path) -> None:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("triplet_weight", [0.0, 0.1])
-def test_a_step_is_taken_apart(triplet_weight: float) -> None:
+def test_cpu_time_of_the_parts_of_a_training_step(triplet_weight: float) -> None:
     rows = make_rows()
     jobs = [replace(one, test=one.test[:1]) for one in fold_grid(rows, triplet_weight)[: STACK_N["cpu"]]]
-    train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # imports
+    train_stack([replace(jobs[0], recipe=recipe(triplet_weight, 1))], rows)  # the first call imports PyTorch
     sgemm, best_s, best = max(sgemm_flop_per_s()), np.inf, {}
     for _ in range(REPEATS_N):
         with record_cpu_s({"all": [(train_module, "train")]}) as whole, record_cpu_s(STEP) as spent_s:

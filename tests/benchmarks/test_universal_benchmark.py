@@ -1,8 +1,8 @@
-"""Error of the universal model against its cost: lattice pitch, forces, training skins and steps.
+"""Error of the universal model against its cost, for different lattices, numbers of training skins and steps.
 
-`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints the table of docs/learning.md. No
-network was trained on the tested skins, which have law errors as in training and 65 presses each. Times are processor
-time of one thread.
+`RESKIN_BENCHMARKS=full pytest -s tests/benchmarks/test_universal_benchmark.py` prints the table of docs/learning.md.
+The test skins were not used in training; they have law errors as in training and 65 presses each. All times are
+processor time of one thread.
 """
 
 import os
@@ -36,7 +36,7 @@ TESTED_N, SEED = size(24, 2), 2021
 
 @dataclass(frozen=True)
 class Row:
-    """One setting with its errors and costs."""
+    """Errors and costs of one setting."""
 
     setting: str
     accuracy_pct: float
@@ -82,7 +82,7 @@ def test_error_against_time_of_map_and_network(monkeypatch):
 
 
 def make_lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> tuple[Tables, float]:
-    """Tabulate a lattice of this pitch and number of forces; return it with the seconds it took."""
+    """Tabulate the fields on a lattice of this pitch and number of forces; return the tables and the seconds taken."""
     monkeypatch.setattr(map, "PITCH_MM", pitch_mm)
     monkeypatch.setattr(map, "STEPS_N", 2 * round(SIDE_MM / pitch_mm / 2))
     forces_N = np.geomspace(map.FORCES_N[0], map.FORCES_N[-1], forces_n)
@@ -91,13 +91,13 @@ def make_lattice(monkeypatch, pitch_mm: float, forces_n: int, setup: Setup) -> t
 
 
 def evaluate(setting: str, tables: Tables, networks: Sequence[Weights], prior: SkinPrior, build_s: float) -> Row:
-    """Score a model on new skins, calibrated to 65 presses of each."""
+    """Calibrate a model to 65 presses of each test skin and score it there."""
     model = Universal(tables, networks, NO_POWERS)
     skins = draw_prior_skins(prior, TESTED_N, SEED, AS_TRAINED, LAW_ERRORS[AS_TRAINED])
     off_mm, off_log, took_s, read_n = [], [], 0.0, 0
     for i in range(len(skins)):
         b_uT, place_mm = calibrate(model, skins, i, (FULL_SET_N, 0), even=True, seed=SEED)
-        model.estimate(b_uT[:1])  # prepares the map
+        model.estimate(b_uT[:1])  # prepares the map, so that the timed calls do not
         start_s = time.process_time()
         found = model.estimate(b_uT)
         took_s, read_n = took_s + time.process_time() - start_s, read_n + len(b_uT)

@@ -1,8 +1,9 @@
-"""Write docs/costs.md: the cost of each stage of a scene, with lower limits for the three most expensive stages.
+"""Write docs/costs.md: the cost of each stage of a scene, and lower bounds for the three most expensive stages.
 
-Run `python -m tests.benchmarks.time_costs [quick paper]`. Costs of stages are those of their last runs, from
-reports/<scene>/provenance.json and dvc.lock. The limits use rates of this machine that are measured now: matrix
-products per CPU second (with the instructions that training uses), memory and disk. Keep the machine quiet meanwhile.
+Run `python -m tests.benchmarks.time_costs [quick paper]`. The costs are those of each stage's last run, from
+reports/<scene>/provenance.json and dvc.lock. The lower bounds follow from rates of this machine, which the program
+measures: matrix products per CPU second (with the instructions that training uses), and bytes per second of memory and
+disk. Run nothing else on the machine meanwhile.
 """
 
 import argparse
@@ -25,20 +26,22 @@ HEAVIEST_N, BEST_OF_N = 3, 5
 LAYERS = paper_layers(15)
 WEIGHTS_N = sum(layer.in_n * layer.out_n + layer.out_n for layer in LAYERS)
 WIDTHS_N = sum(layer.out_n for layer in LAYERS)
-MOVES_N = 8  # per weight and step: read weight, gradient and both moments; write the gradient, then weight and moments
-ACTIVATION_MOVES_N = 4  # written and read in the forward pass, and again in the backward pass
-# Passes of a batch through the first layers in addition to the labelled one: triplets, unlabelled lines.
+# memory accesses per weight and step: read weight, gradient, two moments; write gradient, weight, two moments
+MOVES_N = 8
+# memory accesses per activation: a write and a read in the forward pass, and again in the backward pass
+ACTIVATION_MOVES_N = 4
+# Batches through the first layers in each step, in addition to the labelled batch: triplets, unlabelled lines.
 EXTRA_PASSES_N = {"train_multi": 0, "train_single": 0, "train_triplet": 2, "adapt": 5}
 GROUP = {
     "train_multi": 1,
     "train_triplet": 1,
     "adapt": 3,
-}  # networks of sweep_sensors for each board and number of skins
+}  # networks that sweep_sensors trains per board and number of skins
 MIXED: dict[str, Mapping[str, int]] = {"sweep_sensors": GROUP, "sweep_pokes": {"adapt": 1}}
 
 
 def products_flop(kind: str, batch_n: int) -> float:
-    """Count the products of one step of one network (as test_training_benchmark does)."""
+    """Count the floating-point operations of one step of one network (see `flop` in test_training_benchmark.py)."""
 
     def passes(layers: Any) -> float:
         return 2.0 * batch_n * (3 * sum(one.in_n * one.out_n for one in layers) - layers[0].in_n * layers[0].out_n)
@@ -47,7 +50,7 @@ def products_flop(kind: str, batch_n: int) -> float:
 
 
 def moved_bytes(kind: str, batch_n: int) -> float:
-    """Count the bytes that one step of one network moves if no cache keeps any."""
+    """Count the bytes that one step of one network reads and writes if the processor's cache is never hit."""
     activations_n = batch_n * (WIDTHS_N + EXTRA_PASSES_N[kind] * sum(one.out_n for one in LAYERS[:FEATURE_LAYERS_N]))
     return 4.0 * (MOVES_N * WEIGHTS_N + ACTIVATION_MOVES_N * activations_n)
 
@@ -63,7 +66,7 @@ def best(call: Callable[[], object], clock: Callable[[], float]) -> float:
 
 
 def measure_rates() -> dict[str, float]:
-    """Measure matrix products and memory per CPU second of one thread, and the disk per wall second."""
+    """Measure products and copied bytes per CPU second of one thread, and bytes written to disk per second."""
     torch.set_num_threads(1)
     one, other = torch.rand(2, 1024, 1024)
     many, block = np.ones(2**26, np.float32), os.urandom(2**26)
@@ -84,7 +87,7 @@ def measure_rates() -> dict[str, float]:
 
 
 def stages_of(scene: str) -> list[dict[str, Any]]:
-    """Return the cost of each stage, and the size of its outputs if dvc.lock has it."""
+    """Return each stage's cost and, if dvc.lock has it, the size of its outputs; most expensive stage first."""
     costs = json.loads((ROOT / f"reports/{scene}/provenance.json").read_text())["runtime"]["stages"]
     lock = read_yaml(ROOT / "dvc.lock")["stages"]
     rows = []
@@ -97,7 +100,7 @@ def stages_of(scene: str) -> list[dict[str, Any]]:
 
 
 def limits_of(scene: str, row: Mapping[str, Any], rates: Mapping[str, float]) -> dict[str, float] | None:
-    """Return the seconds that products, memory and disk alone would need; None for stages that do not train."""
+    """Return a stage's lower bounds in s, from products, memory and disk alone; None for stages that do not train."""
     settings, stage = read_yaml(ROOT / f"pipeline/scenes/{scene}.yaml"), str(row["stage"])
     shared = read_yaml(ROOT / "params.yaml")
     group = MIXED.get(stage, {stage: 1} if stage in EXTRA_PASSES_N else None)
@@ -127,7 +130,7 @@ def format_row(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def compare_heaviest(scene: str, rows: list[dict[str, Any]], rates: Mapping[str, float]) -> list[dict[str, str]]:
-    """Compare the three most expensive stages with their limits."""
+    """Return one row per stage for the three most expensive stages: the cost and the lower bounds."""
     found = []
     for row in rows[:HEAVIEST_N]:
         limits, took_s = limits_of(scene, row, rates), row.get("computed_s", row["seconds"])

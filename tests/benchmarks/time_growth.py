@@ -1,11 +1,11 @@
-"""Measure CPU seconds and memory of each stage and of DVC against the number of skins or of recorded captures.
+"""Measure CPU seconds and memory of each stage and of DVC for growing numbers of skins or recorded captures.
 
-`python -m tests.benchmarks.time_growth skins 18 60 180 600 1800` processes scenes with these numbers of simulated
-skins, from bytes to the page, with 65 pokes per skin. Only 18 skins are simulated; further skins are copies under other
-labels, which cost the same in all later stages. `python -m tests.benchmarks.time_growth captures 10 30 100` times, for
-these numbers of recorded captures, `reskin add` of one more capture, the first `dvc repro` of all, and a `dvc repro`
-that has nothing to do. Adds to docs/measured/growth.json, from which show_growth writes the page. Costs are CPU seconds
-because other work on the machine changes them least.
+`python -m tests.benchmarks.time_growth skins 18 60 180 600 1800` runs the whole pipeline on scenes with these numbers
+of simulated skins and 65 pokes per skin. Only 18 skins are simulated; the others are copies under other labels, which
+cost the same in all later stages. `python -m tests.benchmarks.time_growth captures 10 30 100` creates these numbers of
+recorded captures and times three commands: `reskin add` of one more capture, the first `dvc repro`, and a `dvc repro`
+that has nothing to do. The results are added to docs/measured/growth.json, from which show_growth.py writes
+docs/growth.md. Costs are CPU seconds because other work on the machine changes them least.
 """
 
 import argparse
@@ -32,16 +32,16 @@ from tests.benchmarks.pages import MEASURED
 from tests.stages.checkout import ROOT, copy_checkout, variables
 
 SCENE, BOARDS_N, SIMULATED_N = "grow", 6, 18
-STEPS_N = 100  # per training run: more rows change the cost of reading and scoring, not that of a step
-READINGS_N = 40  # per recorded capture: few, so that the overhead per capture dominates
+STEPS_N = 100  # per training run; the cost of a step does not depend on the number of rows
+READINGS_N = 40  # readings per recorded capture; few, so that the overhead per capture dominates
 
 
 def time_command(folder: Path, *words: str) -> dict[str, float]:
-    """Run a program of the environment; return CPU and wall seconds with its children, and the largest peak memory."""
+    """Run a program; return CPU and wall seconds, including child processes, and the largest peak memory."""
     command, start_s = [str(folder / ".venv/bin" / words[0]), *words[1:]], time.monotonic()
     log = folder / "said.txt"
-    with log.open("w") as said:
-        started = subprocess.Popen(command, cwd=folder, env=variables(folder), stdout=said, stderr=subprocess.STDOUT)
+    with log.open("w") as output:
+        started = subprocess.Popen(command, cwd=folder, env=variables(folder), stdout=output, stderr=subprocess.STDOUT)
         _, status, usage = os.wait4(started.pid, 0)
     if status:
         raise AssertionError(f"{' '.join(words)} failed:\n{log.read_text()[-3000:]}")
@@ -51,15 +51,15 @@ def time_command(folder: Path, *words: str) -> dict[str, float]:
 
 @contextmanager
 def checkout(scene: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield a copy of this checkout with one scene."""
+    """Yield a temporary copy of this checkout that has only the given scene."""
     with tempfile.TemporaryDirectory() as temporary:
         root = copy_checkout(Path(temporary))
-        (root / SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is YAML
+        (root / SCENES / f"{SCENE}.yaml").write_text(json.dumps(scene))  # JSON is valid YAML
         yield root
 
 
 def skins_scene(skins_n: int) -> dict[str, Any]:
-    """Return a scene with the boards of scene quick and one light press at each place."""
+    """Return a scene with the boards of scene quick and one light press per place."""
     quick = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
     rigid = quick["simulate"]["boards"]["rigid"] | {"boards_n": BOARDS_N, "skins_per_board_n": skins_n // BOARDS_N}
     grid = quick["simulate"]["protocols"]["grid"] | {"skins_n": skins_n, "passes_n": 1, "depths_mm": [0.8]}
@@ -71,7 +71,7 @@ def skins_scene(skins_n: int) -> dict[str, Any]:
 
 
 def copy_captures(raw: Path, skins_n: int) -> None:
-    """Add copies of the simulated captures under other names until there are `skins_n` captures."""
+    """Copy the simulated captures under new names until there are `skins_n` captures."""
     sources = sorted(child for child in raw.iterdir() if child.is_dir())
     for i in range(len(sources), skins_n):
         source, name = sources[i % len(sources)], f"b{i % BOARDS_N}_s{i // BOARDS_N}"
@@ -84,28 +84,29 @@ def copy_captures(raw: Path, skins_n: int) -> None:
         io.write_json(target / HEADER_FILE, header | {"capture": name, "board": name.split("_")[0], "skin": name})
 
 
-def stages_of(root: Path, before: Mapping[str, float]) -> dict[str, Any]:
-    """Return the cost of each stage of the scene; the rest of the whole run is the cost of DVC."""
+def stages_of(root: Path, whole_run: Mapping[str, float]) -> dict[str, Any]:
+    """Return the cost of each stage; the cost of DVC is that of the whole run minus the sum over stages."""
     files = sorted((root / ".reskin/costs" / SCENE).glob("*.json"))
-    costs = {file.stem: io.read_json(file) for file in files if file.stem != "simulate"}  # which ran before
+    # Stage simulate is excluded: it ran before `whole_run`.
+    costs = {file.stem: io.read_json(file) for file in files if file.stem != "simulate"}
     found = {
         stage: {"cpu_s": cost["cpu_s"], "peak_MB": round(cost["peak_process_memory_MB"])}
         for stage, cost in costs.items()
     }
-    return found | {"dvc": {"cpu_s": round(before["cpu_s"] - sum(cost["cpu_s"] for cost in found.values()), 2)}}
+    return found | {"dvc": {"cpu_s": round(whole_run["cpu_s"] - sum(cost["cpu_s"] for cost in found.values()), 2)}}
 
 
-def grow_skins(skins_n: int, bytes_of: Path) -> dict[str, Any]:
-    """Process this number of skins from bytes to a page, stage by stage, as `dvc repro` does."""
+def grow_skins(skins_n: int, simulated_raw: Path) -> dict[str, Any]:
+    """Run the pipeline on this number of skins, from raw captures to the report page; return the cost of each stage."""
     with checkout(skins_scene(skins_n)) as root:
         time_command(root, "reskin", "scenes", "use", SCENE)
         raw = root / "data/raw" / SCENE
-        if not bytes_of.exists():
+        if not simulated_raw.exists():
             simulated = time_command(root, "dvc", "repro", "--quiet", f"simulate@{SCENE}")
-            shutil.copytree(raw, bytes_of)
-            io.write_json(bytes_of.with_suffix(".json"), simulated)
+            shutil.copytree(raw, simulated_raw)
+            io.write_json(simulated_raw.with_suffix(".json"), simulated)
         if not raw.exists():
-            shutil.copytree(bytes_of, raw)
+            shutil.copytree(simulated_raw, raw)
         copy_captures(raw, skins_n)
         time_command(root, "dvc", "repro", "--quiet", "code")
         committed = time_command(root, "dvc", "commit", "--quiet", "--force", f"simulate@{SCENE}")
@@ -120,7 +121,7 @@ def grow_skins(skins_n: int, bytes_of: Path) -> dict[str, Any]:
 
 
 def recording(rng: np.random.Generator) -> bytes:
-    """Return a recording of layout `table`; no two recordings have a reading in common."""
+    """Return a random recording in layout `table`."""
     fields = [f"B{axis}{chip}" for chip in range(5) for axis in "xyz"]
     lines = [",".join(["phase", "x_mm", "y_mm", "Fz_N", *fields])]
     for i in range(READINGS_N):
@@ -131,7 +132,7 @@ def recording(rng: np.random.Generator) -> bytes:
 
 
 def create_captures(root: Path, captures_n: int, rng: np.random.Generator) -> None:
-    """Create captures as `reskin add` would, all at once: folders, .dvc files, the registry and the plan."""
+    """Create captures as repeated calls of `reskin add` would: folders, .dvc files, the registry and the plan."""
     from dvc.repo import Repo
 
     entries, targets = {}, []
@@ -149,7 +150,7 @@ def create_captures(root: Path, captures_n: int, rng: np.random.Generator) -> No
 
 
 def grow_captures(captures_n: int) -> dict[str, Any]:
-    """Time commands on this number of recorded captures: add one, ingest and split all, find nothing to do."""
+    """Time four commands on this number of recorded captures; return the times and the size of dvc.lock."""
     rng = np.random.default_rng(captures_n)
     training = {"recipe": "paper", "steps_n": 1, "seeds_n": 1, "variants": {}}
     scene = {
@@ -171,12 +172,12 @@ def grow_captures(captures_n: int) -> dict[str, Any]:
 
 
 def keep(out: Path, part: str, point: Mapping[str, Any], count: str) -> None:
-    """Add a point to the measurements; it replaces one of the same count."""
+    """Write a measurement to the file `out`, replacing an earlier measurement of the same count."""
     before: dict[str, Any] = json.loads(out.read_text()) if out.exists() else {}
     others = [row for row in before.get(part, []) if row[count] != point[count]]
-    of = {"git": code_version(), "machine": machine()}
+    stamp = {"git": code_version(), "machine": machine()}
     out.write_text(
-        json.dumps(before | of | {part: sorted([*others, point], key=lambda row: row[count])}, indent=1) + "\n"
+        json.dumps(before | stamp | {part: sorted([*others, point], key=lambda row: row[count])}, indent=1) + "\n"
     )
 
 

@@ -1,9 +1,9 @@
-"""Time the installation for a new user who has only Python: an empty environment, the wheel, a page.
+"""Time the installation for a new user who has only Python, from an empty environment to the first live page.
 
-Run `python3 tests/benchmarks/time_install.py [--python FILE] [--constraint FILE]`. Builds the wheel, makes an empty
-environment, installs the wheel without extras, and runs `reskin live --emulate nominal` in an empty folder until its
-page loads. It does so twice, because Numba compiles in the first run. Prints seconds and MB as JSON. Needs packages
-from pip's index or cache.
+Run `python3 tests/benchmarks/time_install.py [--python FILE] [--constraint FILE]`. The program builds the wheel,
+creates an empty environment, installs the wheel without extras, and runs `reskin live --emulate nominal` in an empty
+folder until the page loads. The last step is timed twice, because Numba compiles in the first run. Seconds and MB are
+printed as JSON. Packages come from pip's index or cache.
 """
 
 import argparse
@@ -18,10 +18,10 @@ import time
 import urllib.request
 from pathlib import Path
 
-from time_repro import run, size_MB  # beside this file
+from time_repro import run, size_MB  # a module in the folder of this script
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE_S = 600.0  # limit until the page loads
+PAGE_S = 600.0  # time limit for loading the page
 PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check")
 
 
@@ -57,12 +57,12 @@ def seconds_to_page(reskin: Path, folder: Path) -> float:
 
 
 def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, object]:
-    """Build, install and run in an empty folder."""
+    """Build the wheel, install it and open the page, all in an empty folder; return seconds and MB."""
     bytecode = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "reskin", folder / "source/reskin", ignore=bytecode)
     for name in ("pyproject.toml", "README.md", "LICENSE", "MANIFEST.in", "CHANGELOG.md", "CITATION.cff"):
         shutil.copy(ROOT / name, folder / "source")
-    made = run([python, "-m", "venv", str(folder / "venv")], folder)
+    environment = run([python, "-m", "venv", str(folder / "venv")], folder)
     new_python = str(folder / "venv/bin/python")
     built = run([new_python, *PIP, "wheel", "--no-deps", "--wheel-dir", "dist", "./source"], folder)
     wheel = next((folder / "dist").glob("*.whl"))
@@ -72,7 +72,7 @@ def measure(folder: Path, python: str, constraint: Path | None) -> dict[str, obj
     (folder / "empty").mkdir()
     return {
         "python": subprocess.check_output([new_python, "-V"], text=True).split()[1],
-        "venv": made, "wheel": built, "install": installed,
+        "venv": environment, "wheel": built, "install": installed,
         "wheel_MB": round(wheel.stat().st_size / 1e6, 1), "environment_MB": size_MB(folder / "venv"),
         "packages_n": len(packages), "load_1min": round(os.getloadavg()[0], 1),
         "page_s": [seconds_to_page(folder / "venv/bin/reskin", folder / "empty") for _ in range(2)],

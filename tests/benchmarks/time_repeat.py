@@ -1,9 +1,9 @@
 """Compare the results of a scene under different numbers of threads, processor instructions and Python versions.
 
-Run `python -m tests.benchmarks.time_repeat [--python .../python3.12 ...]`. A part of scene quick (one skin per board,
-all passes and steps; experiments single_random, lobo and triplet) runs from nothing in a clean copy of the last commit
-under each setting, and its numbers are compared with those of the first run. Adds to docs/measured/repeat.json and
-writes docs/repeat.md.
+Run `python -m tests.benchmarks.time_repeat [--python .../python3.12 ...]`. Under each setting, a reduced scene quick
+(one skin per board, all passes and steps, experiments single_random, lobo and triplet) runs in a new clone of the last
+commit, without cached results. Its numbers are compared with those under the first setting. The program adds to
+docs/measured/repeat.json and writes docs/repeat.md.
 """
 
 import argparse
@@ -25,11 +25,11 @@ from reskin.config import read_yaml
 from tests.benchmarks.pages import MEASURED, ROOT, table, write_block
 
 SCENE = "repeat"
-SKINS_N = 6  # one per board
+SKINS_N = 6  # one skin on each board
 EXPERIMENTS = ("single_random", "lobo", "triplet")
 TRAINED = ("train_single", "train_multi", "train_triplet")
 AGAIN = f"from pathlib import Path; from pipeline.manage.verify import rerun; rerun(Path(), ['{SCENE}'])"
-# Let libraries choose by the processor: undo all that reskin/numerics.py pins.
+# Variables that undo the settings of reskin/numerics.py, so that libraries choose instructions by the processor.
 UNPINNED = {
     "MKL_CBWR": "AUTO", "ATEN_CPU_CAPABILITY": "avx512", "ONEDNN_MAX_CPU_ISA": "DEFAULT",
     "OPENBLAS_CORETYPE": "SkylakeX", "OPENBLAS_NUM_THREADS": "2",
@@ -47,7 +47,7 @@ FIRST = "two processes"
 
 
 def scene_settings() -> dict[str, Any]:
-    """Return the part of scene quick that these experiments need."""
+    """Return the settings of scene quick that the three experiments need, with SKINS_N skins."""
     quick = read_yaml(ROOT / "pipeline/scenes/quick.yaml")
     kept = {key: quick[key] for key in ("source", "seed", "selection", *TRAINED)}
     split = {key: quick["split"][key] for key in ("random_test_fraction", "random_repeats_n")}
@@ -61,14 +61,14 @@ def scene_settings() -> dict[str, Any]:
 def make_checkout(folder: Path) -> None:
     """Clone the last commit and commit the scene to the clone."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
-    (folder / f"pipeline/scenes/{SCENE}.yaml").write_text(json.dumps(scene_settings(), indent=1))  # JSON is YAML
+    (folder / f"pipeline/scenes/{SCENE}.yaml").write_text(json.dumps(scene_settings(), indent=1))  # JSON is valid YAML
     author = ("-c", "user.name=a", "-c", "user.email=a@b")
     for words in (["add", "."], [*author, "commit", "--quiet", "--message", SCENE]):
         subprocess.run(["git", *words], cwd=folder, check=True)
 
 
 def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any]:
-    """Run the scene from nothing and return its numbers."""
+    """Run the scene without cached results; return the numbers of its report."""
     environment = {**os.environ, **setting, "PYTHONPATH": str(folder)}
     subprocess.run([str(python), "-c", AGAIN], cwd=folder, env=environment, check=True, stderr=subprocess.DEVNULL)
     numbers: dict[str, Any] = io.read_json(folder / f".reskin/verified/{SCENE}/numbers.json")
@@ -76,7 +76,7 @@ def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any
 
 
 def differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Count equal and differing values; return the largest relative difference and its name."""
+    """Return the counts of equal and differing values, and the largest relative difference with its name."""
     done = compare(first, other)
     found = {
         "equal_n": done.equal.total(),
@@ -121,13 +121,13 @@ def main() -> None:
             first = first or numbers
             found[name] = {"settings": setting, **differences(first, numbers)}
             print(f"{name}: {json.dumps(found[name])}", flush=True)
-            of = {"git": code_version(), "machine": machine(), "experiments": EXPERIMENTS, "runs": found}
-            arguments.out.write_text(json.dumps(of, indent=1) + "\n")
+            measurements = {"git": code_version(), "machine": machine(), "experiments": EXPERIMENTS, "runs": found}
+            arguments.out.write_text(json.dumps(measurements, indent=1) + "\n")
     show(json.loads(arguments.out.read_text()))
 
 
 def show(found: Mapping[str, Any]) -> None:
-    """Write the measurements into docs/repeat.md, one row per setting."""
+    """Write the table of docs/repeat.md: one row per setting."""
     rows = [
         {
             "setting": name,
@@ -144,8 +144,8 @@ def show(found: Mapping[str, Any]) -> None:
 
 def python_version(python: Path) -> str:
     words = "import platform; print(platform.python_version())"
-    said = subprocess.run([str(python), "-c", words], capture_output=True, text=True, check=True)
-    return f"Python {said.stdout.strip()}" if said.stdout.strip() != platform.python_version() else "the same Python"
+    done = subprocess.run([str(python), "-c", words], capture_output=True, text=True, check=True)
+    return f"Python {done.stdout.strip()}" if done.stdout.strip() != platform.python_version() else "the same Python"
 
 
 if __name__ == "__main__":

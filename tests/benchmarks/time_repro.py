@@ -1,8 +1,9 @@
-"""Time `make repro` for a new user: a clone in an empty folder, first the environment, then all stages.
+"""Time `make repro` for a new user: clone into an empty folder, create the environment, run all stages.
 
-Run `python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json`. It clones the last commit and uses no
-cache except pip's own. The environment is made once, and the stages run `--times` times from nothing: between two runs
-all untracked files except the environment are removed. Needs only Python and git. Keep the machine quiet meanwhile.
+Run `python3 tests/benchmarks/time_repro.py --times 3 --out reports/time.json`. The program clones the last commit and
+uses no cache except that of pip. It creates the environment once and runs the stages `--times` times without cached
+results: before each run, all untracked files except the environment are removed. It needs only Python and git. Run
+nothing else on the machine meanwhile.
 """
 
 import argparse
@@ -21,9 +22,9 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(command: list[str], folder: Path) -> dict[str, float]:
-    """Run a command; return wall and CPU seconds, including all processes that it started."""
+    """Run a command; return its wall and CPU seconds, including all of its child processes."""
     before, start_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    # DVC waits for every stage and make waits for DVC, so RUSAGE_CHILDREN includes all of them.
+    # DVC waits for every stage, and make waits for DVC, so RUSAGE_CHILDREN includes make, DVC and all stages.
     subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -31,12 +32,12 @@ def run(command: list[str], folder: Path) -> dict[str, float]:
 
 
 def size_MB(folder: Path) -> float:
-    """Return the disk space of the files in a folder."""
+    """Return the disk space that the files in a folder use."""
     return round(sum(file.lstat().st_blocks * 512 for file in folder.rglob("*")) / 1e6)
 
 
 def measure(folder: Path, times: int) -> Iterator[dict[str, object]]:
-    """Time making the environment in a new clone, and the stages in each run."""
+    """Clone the last commit; return the seconds to create the environment and to run all stages, repeatedly."""
     subprocess.run(["git", "clone", "--quiet", str(ROOT), str(folder)], check=True)
     environment = run(["make", ".venv/.installed"], folder)
     environment_MB = size_MB(folder / ".venv")

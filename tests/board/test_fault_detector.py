@@ -22,7 +22,7 @@ RESET_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_u
 
 
 def board(frames_n: int, *, steps_uT: tuple[float, float, float] = (0.15, 0.15, 0.242), seed: int = 0) -> Frames:
-    """Return readings of chips with 5 uT of noise about a constant field, rounded to their LSB."""
+    """Return frames of a constant field with 5 uT of noise, rounded to multiples of the LSB (`steps_uT`)."""
     rng = seeds.rng_for(seed, "watch")
     rest_uT = seeds.rng_for(0, "rest").uniform(-1500, 1500, 3 * CHIPS_N)
     b_uT = rest_uT + 5 * rng.standard_normal((frames_n, 3 * CHIPS_N))
@@ -37,7 +37,7 @@ def with_chip_values(frames: Frames, rows: slice, chip_i: int, values_uT: np.nda
 
 
 def detect(frames: Frames, *ends: int, expected_lsb_uT: tuple[float, float] | None = None) -> np.ndarray:
-    """Feed chunks that end at `ends`, with the default policy; return the mask of frames with a stuck chip."""
+    """Feed the frames in chunks that end at `ends`; return the mask of frames in which a chip is stuck."""
     detector = FaultDetector(CHIPS_N, expected_lsb_uT=expected_lsb_uT)
     log = FaultLog(DEFAULT_POLICY, "stream.bin", "ms")
     masks = []
@@ -65,7 +65,7 @@ def test_chip_reset_is_refused(chips: tuple[int, ...], expected_lsb_uT: tuple[fl
         detect(frames, 500, 1300, expected_lsb_uT=expected_lsb_uT)
 
 
-def test_common_change_of_lsb_is_refused() -> None:
+def test_change_of_lsb_on_all_chips_is_refused() -> None:
     frames, other = board(1600), board(1600, steps_uT=(0.6, 0.6, 0.968))
     for chip_i in range(CHIPS_N):
         frames = with_chip_values(frames, slice(800, None), chip_i, other.b_uT[800:, 3 * chip_i : 3 * chip_i + 3])
@@ -77,19 +77,19 @@ def test_frozen_chip_is_stuck() -> None:
     frames = board(1500)
     frozen = with_chip_values(frames, slice(500, None), 1, frames.b_uT[500, 3:6])
     stuck = detect(frozen)
-    # Detection needs 20 equal readings.
+    # A chip counts as stuck from its 20th equal reading on.
     assert np.flatnonzero(stuck).tolist() == list(range(500 + faults.STUCK_FRAMES_MIN_N - 1, 1500))
 
 
 @settings(max_examples=20, deadline=None)
 @given(ends=st.lists(st.integers(0, 3 * SCALE_FRAMES_N), max_size=6))
-def test_chunks_do_not_matter(ends: list[int]) -> None:
+def test_result_does_not_depend_on_chunks(ends: list[int]) -> None:
     frames = board(3 * SCALE_FRAMES_N)
     frozen = with_chip_values(frames, slice(100, 300), 1, frames.b_uT[100, 3:6])
     np.testing.assert_array_equal(detect(frozen, *ends), detect(frozen))
 
 
-def test_failed_reads_are_not_stuck() -> None:
+def test_chip_with_failed_reads_is_not_stuck() -> None:
     failed = with_chip_values(board(100), slice(10, 60), 0, np.array(faults.FAILED_B_uT))
     failed.temperature_degC[10:60, 0] = faults.FAILED_TEMPERATURE_degC
     assert not detect(failed).any()

@@ -9,14 +9,14 @@ from reskin import seeds
 from reskin.board import faults
 from tests.board.signals import frames_of
 
-NOISE_uT = 5.0  # 3.0 to 5.0 uT on real boards
+NOISE_uT = 5.0  # upper end of the noise of real boards (3.0 to 5.0 uT)
 GRIDS_uT = {"ini": (0.15, 0.242), "lab": (0.2, 0.3227), "eflesh": (2.4, 3.872), "eflesh shear": (0.6, 0.968)}
 
 
 def readings_on_grid(
     lsb_uT: list[tuple[float, float]], frames_n: int, seed: int, *, noise_uT: float = 5.0
 ) -> np.ndarray:
-    """Make noisy readings of chips with the given LSB (xy, z), rounded to two decimals like text."""
+    """Return noisy fields of chips with the given LSB (xy, z), rounded to two decimals as the text firmware does."""
     rng = seeds.rng_for(seed, "faults")
     step_uT = np.array([[xy, xy, z] for xy, z in lsb_uT]).reshape(-1)
     field_uT = rng.uniform(-3000, 3000, len(step_uT)) + NOISE_uT * rng.standard_normal((frames_n, len(step_uT)))
@@ -29,13 +29,13 @@ def load_ini(shared_data, name: str, rows: slice = slice(None)) -> tuple[np.ndar
 
 
 class TestFailedReads:
-    def test_all_four_values_must_match_a_failure(self):
+    def test_failed_read_needs_its_temperature_and_all_three_fields(self):
         b_uT = np.tile([8028.16, 5194.00, 12943.36], 3)[None]
         temperature_degC = np.array([[-880.49, -880.49, 25.0]])
         b_uT[0, 4] = 5194.2
         assert faults.failed_reads(b_uT, temperature_degC).tolist() == [[True, False, False]]
 
-    def test_without_temperature_the_field_decides(self):
+    def test_without_temperature_the_fields_decide(self):
         b_uT = np.array([[8028.16, 5194.00, 12943.36, 1.0, 2.0, 3.0]])
         assert faults.failed_reads(b_uT, np.full((1, 2), np.nan)).tolist() == [[True, False]]
 
@@ -43,7 +43,7 @@ class TestFailedReads:
         sent = frames_of(np.tile([8028.16, 5194.00, 12943.36], 5)[None], np.full((1, 5), -880.49))
         assert faults.failed_reads(sent.b_uT, sent.temperature_degC).all()
 
-    def test_real_failed_recording(self, shared_data):
+    def test_real_recording_of_failed_reads_is_recognised(self, shared_data):
         assert faults.failed_reads(*load_ini(shared_data, "faults/b20_artillery_AFG_flex_50.head400.txt")).all()
 
     def test_real_working_board(self, shared_data):
@@ -51,14 +51,14 @@ class TestFailedReads:
 
 
 class TestZeroReads:
-    def test_only_three_zeros_are_a_zero_read(self):
+    def test_zero_read_needs_three_zero_fields(self):
         b_uT = np.array([[0.0, 0.0, 0.0, 0.0, 5.0, 0.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]])
         assert faults.zero_reads(b_uT).tolist() == [[True, False], [False, True]]
 
     @pytest.mark.parametrize(
         ("name", "zeros_n"), [("position_1_20251028_003401", 18), ("multi_touch_1_2_20251109_230349", 61)]
     )
-    def test_zero_rows_of_real_recordings(self, shared_data, name, zeros_n):
+    def test_zero_reads_of_real_recordings_are_counted(self, shared_data, name, zeros_n):
         table = np.genfromtxt(shared_data / f"eflash7/{name}.csv", delimiter=",", skip_header=1)
         zeros = faults.zero_reads(table[:, -15:])
         assert zeros.all(axis=1).sum() == zeros.any(axis=1).sum() == zeros_n
@@ -74,7 +74,8 @@ class TestZeroReads:
 class TestScale:
     @given(st.sampled_from(sorted(GRIDS_uT)), st.integers(0, 1000))
     def test_lsb_is_found(self, name, seed):
-        # Within 2 %: two decimals shift a step of 0.15 uT by as much, and the mean of many steps by less.
+        # Tolerance 2 %: rounding to two decimals changes a step of 0.15 uT by 2 % at most, and the mean of many steps
+        # by less.
         lsb_uT = faults.find_lsb(readings_on_grid([GRIDS_uT[name]], 400, seed))
         np.testing.assert_allclose(lsb_uT, [GRIDS_uT[name]], rtol=0.02)
 
@@ -93,13 +94,13 @@ class TestScale:
         assert faults.reset_chips(b_uT, None).tolist() == expected
         assert faults.reset_chips(b_uT, GRIDS_uT[name]).tolist() == expected
 
-    def test_expected_lsb_may_equal_that_of_a_reset(self):
+    def test_expected_lsb_may_equal_the_reset_lsb(self):
         grid_uT = (faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT)
         b_uT = readings_on_grid([grid_uT] * 5, 400, 0)
         assert faults.reset_chips(b_uT, None).all()
         assert not faults.reset_chips(b_uT, grid_uT).any()
 
-    def test_real_resets(self, shared_data):
+    def test_reset_chips_of_real_recordings_are_found(self, shared_data):
         one_chip, _ = load_ini(shared_data, "faults/b20_artillery_AFG_test_new_board15.head400.txt")
         all_chips, _ = load_ini(shared_data, "faults/b20_artillery_piezo.head400.txt")
         assert faults.reset_chips(one_chip, None).tolist() == [False, False, False, True, False]
@@ -118,7 +119,7 @@ class TestScale:
 
 class TestStuck:
     def stuck_naively(self, b_uT: np.ndarray) -> np.ndarray:
-        """Reference: walk back over each run of equal readings and count the frames in which other chips moved."""
+        """Reference: for each reading, walk back over equal readings and count frames in which another chip changed."""
         frames_n, chips_n = len(b_uT), b_uT.shape[1] // 3
         rows = b_uT.reshape(frames_n, chips_n, 3)
         stuck = np.zeros((frames_n, chips_n), bool)
@@ -136,28 +137,28 @@ class TestStuck:
 
     @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 45)), max_size=6), st.integers(1, 2))
     def test_stuck_chips_equal_naive_loop(self, stretches, chips_n):
-        """Bit 0 of a stretch moves chip 0, bit 1 moves the last chip; the other chips stay still."""
+        """In each stretch of frames, bit 0 changes chip 0, bit 1 changes the last chip; other chips stay constant."""
         moves = np.array([[which & 1, which >> 1] for which, frames_n in stretches for _ in range(frames_n)])
         places = moves.reshape(-1, 2)[:, :chips_n].cumsum(axis=0)
         b_uT = np.repeat(places, 3, axis=1).astype(np.float32)
         np.testing.assert_array_equal(faults.stuck_chips(b_uT), self.stuck_naively(b_uT))
 
     @given(st.lists(st.integers(0, 200), max_size=4))
-    def test_chunks_do_not_matter(self, ends):
+    def test_result_does_not_depend_on_chunks(self, ends):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 2, 200, 0)
         b_uT[60:150, 3:6] = b_uT[60, 3:6]
         detector = faults.StuckChips(2)
         parts = [detector.feed(part) for part in np.split(b_uT, sorted(ends))]
         np.testing.assert_array_equal(np.concatenate(parts), faults.stuck_chips(b_uT))
 
-    def test_stuck_from_20th_equal_reading(self):
+    def test_chip_is_stuck_from_its_20th_equal_reading_on(self):
         b_uT = readings_on_grid([GRIDS_uT["ini"]] * 3, 200, 0)
         b_uT[120:, 3:6] = b_uT[120, 3:6]
         expected = np.zeros((200, 3), bool)
         expected[120 + faults.STUCK_FRAMES_MIN_N - 1 :, 1] = True
         np.testing.assert_array_equal(faults.stuck_chips(b_uT), expected)
 
-    def test_still_board_is_not_stuck(self):
+    def test_board_without_changes_is_not_stuck(self):
         assert not faults.stuck_chips(np.ones((100, 15))).any()
 
     def test_real_working_board(self, shared_data):

@@ -1,4 +1,4 @@
-"""Tests that decoding does not depend on how a stream is split into chunks, and accounts for every byte."""
+"""Tests of the stream decoder: results do not depend on chunks, and every byte is in a frame or counted as skipped."""
 
 import struct
 from itertools import pairwise
@@ -44,7 +44,7 @@ def split_bytes(data: bytes, sizes: list[int]) -> list[bytes]:
     return [data[first:last] for first, last in pairwise([0, *np.cumsum(sizes).tolist(), None])]
 
 
-# Round trips ----------------------------------------------------------------------------------------------------
+# Undamaged streams ----------------------------------------------------------------------------------------------
 
 
 @given(frames_strategy(), EVERY_WIRE, st.lists(st.integers(0, 200), max_size=8))
@@ -68,7 +68,7 @@ def test_any_finite_floats_round_trip(chips_n, payload):
 
 
 @pytest.mark.parametrize("wire", WIRES)
-def test_byte_by_byte_equals_whole(wire):
+def test_stream_fed_byte_by_byte_decodes_like_the_whole(wire):
     data = b"\x07rubbish" + encode(make_frames(6, 5, 1, crlf_share=0.3), wire)[5:-3]
     data = data[:200] + data[205:]
     whole, account = decode_portions([data], wire, 5)
@@ -109,7 +109,7 @@ def test_terminators_decode_equally_in_any_chunks(data, chips_n, sizes):
     check_account(account, data)
 
 
-# Damage: `decode_damaged` counts lost frames, false frames and every byte ----------------------------------------
+# Damaged streams: `decode_damaged` checks the lost frames, the false frames and the account of bytes -------------
 
 
 @settings(max_examples=150)
@@ -118,7 +118,8 @@ def test_missing_bytes_cost_at_most_two_frames(frames, wire, where, missing_shar
     data = encode(frames, wire)
     missing_n = 1 + int(missing_share * (record_type(wire, chips_of(frames)).itemsize - 2))
     first = int(where * (len(data) - missing_n))
-    # The remains of two frames look like one frame only if a payload contains CR LF at the distance of one frame.
+    # What remains of two damaged frames is taken for a frame only if a payload has CR LF one frame length before the
+    # end.
     false_n = int(data.count(b"\r\n") > len(frames))
     check_damage(frames, wire, [data[:first], data[first + missing_n :]], lost_n=2, false_n=false_n)
 
@@ -141,13 +142,13 @@ def test_missing_text_bytes_cost_only_touched_lines(frames, wire, where, missing
 
 
 @given(frames_strategy(min_frames_n=4), st.sampled_from(BINARY_WIRES), st.floats(0, 1))
-def test_joining_mid_frame_loses_one_frame(frames, wire, where):
+def test_stream_that_starts_within_a_frame_loses_one_frame(frames, wire, where):
     length_n = record_type(wire, chips_of(frames)).itemsize
-    joined_n = 1 + int(where * (length_n - 3))  # not between CR and LF: that costs the next frame too
+    joined_n = 1 + int(where * (length_n - 3))  # the cut is not between CR and LF, which would lose the next frame too
     assert decode_damaged(join_mid_frame(frames, wire, (joined_n + 0.5) / length_n), frames, wire).holds
 
 
-def test_terminator_in_steady_temperature():
+def test_terminator_bytes_in_a_constant_temperature():
     frames = make_frames(50, 5, 3)
     frames.temperature_degC[:] = CRLF_TEMPERATURE_degC
     assert not broken(
@@ -159,13 +160,13 @@ def test_remains_of_two_frames_are_not_a_frame():
     frames = make_frames(6, 1, 3)
     frames.temperature_degC[2], frames.b_uT[2, 0] = CRLF_TEMPERATURE_degC, 100.0
     data = encode(frames, "binary")
-    # 8 bytes of frame 2 and 13 of frame 3 remain. After the CR LF in the temperature, they are as long as one frame.
+    # 8 bytes of frame 2 and 13 of frame 3 remain: after the CR LF in the temperature, exactly as many as in a frame.
     kept, _ = decode_portions([data[: 2 * 18 + 8] + data[3 * 18 + 5 :]], "binary", 1)
     assert records(kept) == [record for i, record in enumerate(records(frames)) if i not in (2, 3)]
 
 
 @pytest.mark.parametrize("wire", BINARY_WIRES)
-def test_failed_reads_are_still_frames(wire):
+def test_frames_with_failed_reads_are_decoded(wire):
     frames = make_frames(20, 5, 4)
     frames.b_uT[:], frames.temperature_degC[:] = np.tile([8028.16, 5194.00, 12943.36], 5), -880.49
     kept, account = decode_portions([encode(frames, wire)[30:]], wire, 5)
@@ -217,14 +218,14 @@ def test_rest_of_endless_line_is_not_a_frame():
     assert kept.end_byte.tolist() == [len(line), account["bytes_n"]]
 
 
-def test_text_end_bytes_over_several_blocks(monkeypatch):
+def test_end_bytes_of_text_over_several_blocks(monkeypatch):
     data = encode(make_frames(10, 2, 8), "text-xyzt")
     monkeypatch.setattr(stream, "BLOCK_LINES_N", 3)
     kept, _ = decode_portions([data[:20], data[20:]], "text-xyzt", 2)
     assert kept.end_byte.tolist() == np.cumsum([len(line) for line in data.splitlines(keepends=True)]).tolist()
 
 
-def test_long_stream_with_many_breaks():
+def test_long_stream_with_many_damaged_frames_is_decoded():
     frames = make_frames(3 * stream.BLOCK_FRAMES_N, 5, 9, crlf_share=0.01)
     data = encode(frames, "binary")
     data = b"".join(data[i + 7 : i + 82 * 100] for i in range(0, len(data), 82 * 100))
@@ -236,7 +237,7 @@ def test_long_stream_with_many_breaks():
 # Errors ---------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)  # each error searches for a wire format that fits
+@settings(max_examples=25, deadline=None)  # an error is slow, because it tries all wire formats
 @given(st.binary(max_size=2000), EVERY_WIRE, st.integers(1, 6))
 def test_random_bytes_decode_or_raise_capture_error(data, wire, chips_n):
     try:
@@ -258,12 +259,12 @@ def test_error_suggests_matching_wire():
         decode_all(data, "binary", 5, "a.bin")
 
 
-def test_error_without_suggestion():
+def test_error_has_no_suggestion_if_no_wire_format_fits():
     with pytest.raises(CaptureError, match="in 1 bytes, .* Wrong baud rate, chip count or wire format\\?$"):
         decode_all(b"\0", "binary", 5, "a.bin")
 
 
-def test_dump_becomes_a_table_with_units():
+def test_dumped_stream_becomes_a_table_with_units():
     frames = make_frames(4, 2, seed=0)
     table, account = decode_dump(encode(frames, "binary"), "binary", 2, "dump.bin")
     assert account["frames_n"] == len(table) == 4
@@ -273,6 +274,6 @@ def test_dump_becomes_a_table_with_units():
     assert table["end_byte"].to_pylist() == [34, 68, 102, 136]
 
 
-def test_dump_without_frames_is_refused():
+def test_dumped_stream_without_frames_is_refused():
     with pytest.raises(CaptureError, match="no frame found in 3 bytes"):
         decode_dump(b"abc", "binary", 2, "dump.bin")

@@ -1,4 +1,4 @@
-"""Tests that frames have the byte layout of the firmware and survive a round trip."""
+"""Tests that encoded frames have the firmware's byte layout, and that decoding returns the encoded values."""
 
 import re
 import struct
@@ -20,7 +20,7 @@ def lines_of(text: bytes, wire: str, chips_n: int):
 
 
 def one_frame(chips_n: int):
-    """Return a frame: chip 0 reads X 1.25, Y -2.5, Z 56.78, T 25; each further chip reads 3 more in every value."""
+    """Return a frame: chip 0 reads 1.25, -2.5, 56.78 uT and 25 degC; each next chip reads 3 more in every value."""
     b_uT = np.array([[1.25, -2.5, 56.78]]) + 3 * np.arange(chips_n)[:, None]
     return frames_of(b_uT.reshape(1, -1), 25.0 + 3 * np.arange(chips_n)[None])
 
@@ -43,22 +43,22 @@ def test_clock_frame_starts_with_seconds():
     assert data[86 + 4 : 2 * 86] == encode(frames, "binary")[82 : 2 * 82]
 
 
-def test_reskin_text_layout():
+def test_text_layout_of_reskin():
     assert encode(one_frame(2), "text-xyzt") == b"1.25\t-2.50\t56.78\t25.00\t4.25\t0.50\t59.78\t28.00\t\r\n"
 
 
-def test_anyskin_text_has_no_tab_between_chips():
+def test_text_of_anyskin_has_no_tab_between_chips():
     assert encode(one_frame(2), "text-txyz") == b"25.00\t1.25\t-2.50\t56.7828.00\t4.25\t0.50\t59.78\r\n"
 
 
-def test_missing_tab_splits_after_two_decimals():
+def test_values_without_tab_are_split_after_two_decimals():
     frames, is_frame = lines_of(b"24.00\t1.00\t2.00\t-56.7825.00\t-3.00-4.000.05\n", "text-txyz", 2)
     assert is_frame.tolist() == [True]
     assert frames.temperature_degC.tolist() == [[24.0, 25.0]]
     assert frames.b_uT[0].tolist() == [1.0, 2.0, np.float32(-56.78), -3.0, -4.0, np.float32(0.05)]
 
 
-def test_fixture_values_contain_the_terminator():
+def test_signals_contain_the_terminator():
     for value in (signals.CRLF_TEMPERATURE_degC, *signals.CRLF_B_uT):
         assert b"\r\n" in struct.pack("<f", value)
 

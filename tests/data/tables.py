@@ -10,7 +10,7 @@ from reskin.seeds import rng_for
 
 
 def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 6, **changes: object) -> Readings:
-    """Return a capture of one chip: two passes, one place per reading, force 1 N, b - noload = row number."""
+    """Return readings of a chip: two passes, every reading at another place, 1 N, field change = row number."""
     ones = np.ones(f, np.float32)
     values = {
         "capture": capture, "board": board, "skin": skin, "source": "recorded",
@@ -25,7 +25,7 @@ def readings(capture: str = "c0", board: str = "b0", skin: str = "s0", f: int = 
 
 
 def rows(boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> Rows:
-    """Return rows with these labels and random fields; each row is one indentation."""
+    """Return rows with these labels and random fields; every row is an indentation of its own."""
     rng = rng_for(0, "rows")
     f = len(boards)
     return Rows(

@@ -16,16 +16,16 @@ def test_change_equals_nested_loops():
 
 @given(st.floats(-3000, 3000, width=32))
 def test_constant_field_cancels(ambient_uT):
-    # each number is in the thousands, where float32 rounds to about 1e-4
+    # the fields are a few thousand uT, which float32 rounds to about 1e-4
     shifted = subtract(B_uT + np.float32(ambient_uT), NOLOAD_uT + np.float32(ambient_uT))
     np.testing.assert_allclose(shifted, subtract(B_uT, NOLOAD_uT), atol=2e-3)
 
 
-runs_n = st.lists(st.integers(1, 4), min_size=1, max_size=12)  # readings per indentation
+runs_n = st.lists(st.integers(1, 4), min_size=1, max_size=12)  # number of readings of each indentation
 
 
 def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return no-load fields that equal the number of their indentation, and these numbers, which have gaps."""
+    """Return no-load fields and indentation numbers; a field equals the number, and the numbers have gaps."""
     indentation = np.repeat(7 + 3 * np.arange(len(runs_n), dtype=np.int32), runs_n)
     return np.repeat(indentation[:, None], 3, axis=1).astype(np.float32), indentation
 
@@ -34,19 +34,19 @@ def capture(runs_n: list[int]) -> tuple[np.ndarray, np.ndarray]:
 def test_policies_equal_loop_over_readings(runs_n, regular_n):
     noload_uT, indentation = capture(runs_n)
     seen, first, last = [], None, None
-    for i, own in enumerate(indentation.tolist()):
-        if own not in seen:
+    for i, number in enumerate(indentation.tolist()):
+        if number not in seen:
             if len(seen) % regular_n == 0:
                 last = noload_uT[i, 0]
-            seen.append(own)
+            seen.append(number)
         first = noload_uT[0, 0] if first is None else first
         assert initial(noload_uT, indentation)[i].tolist() == [first] * 3
         assert regular(noload_uT, indentation, regular_n=regular_n)[i].tolist() == [last] * 3
-        assert each(noload_uT, indentation)[i].tolist() == [own] * 3
+        assert each(noload_uT, indentation)[i].tolist() == [number] * 3
 
 
 @given(runs_n, st.integers(1, 5))
-def test_policies_agree_at_first_indentation(runs_n, regular_n):
+def test_policies_agree_at_the_first_indentation(runs_n, regular_n):
     noload_uT, indentation = capture(runs_n)
     first = slice(0, runs_n[0])
     for policy in (initial(noload_uT, indentation), regular(noload_uT, indentation, regular_n=regular_n)):
@@ -55,13 +55,13 @@ def test_policies_agree_at_first_indentation(runs_n, regular_n):
     assert (regular(noload_uT, indentation, regular_n=len(runs_n)) == initial(noload_uT, indentation)).all()
 
 
-def test_ranks_follow_time():
+def test_ranks_follow_the_order_in_time():
     assert rank(np.array([5, 5, 2, 9, 9])).tolist() == [0, 0, 1, 2, 2]
     assert rank(np.zeros(0, np.int32)).tolist() == []
 
 
 def make_touches(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return b, no-load and indentation of touches of `rows_n` rows, on a skin whose field at rest drifts randomly."""
+    """Return field, randomly drifting no-load field and touch number of each row; a touch has `rows_n` rows."""
     rng = rng_for(0, "touched")
     rest_uT = np.cumsum(walk_uT * rng.standard_normal((touches_n, 15)), axis=0)
     touch_uT = 60 * rng.standard_normal((touches_n, 15))
@@ -71,12 +71,13 @@ def make_touches(rows_n: int, touches_n: int = 200, walk_uT: float = 1.0) -> tup
 
 
 @pytest.mark.parametrize("rows_n", [1, 4, 50])
-def test_contact_free_policy_follows_drift(rows_n):
+def test_contact_free_policy_follows_the_no_load_drift(rows_n):
     b_uT, noload_uT, indentation = make_touches(rows_n)
     within_uT = alike_within_uT(noload_uT[: 20 * rows_n], indentation[: 20 * rows_n])
     assert within_uT == pytest.approx(2.0, rel=0.2)
     off_uT = free(b_uT, noload_uT, indentation, within_uT=within_uT) - noload_uT
-    assert np.sqrt((off_uT**2).mean()) < 0.7  # the policy lags by part of a touch, occasionally by one or two touches
+    # the estimated no-load field lags by less than a touch, occasionally by one or two touches
+    assert np.sqrt((off_uT**2).mean()) < 0.7
     assert np.sqrt(((initial(noload_uT, indentation) - noload_uT) ** 2).mean()) > 5
 
 
@@ -89,7 +90,7 @@ def test_long_slide_keeps_the_old_no_load_reading():
     np.testing.assert_array_equal(zeros[-1], sent[-2])
 
 
-def test_contact_free_policy_is_causal():
+def test_contact_free_policy_uses_no_later_reading():
     b_uT, noload_uT, indentation = make_touches(2)
     whole, part = (free(b_uT[:n], noload_uT[:n], indentation[:n], within_uT=2.0) for n in (400, 123))
     np.testing.assert_array_equal(whole[:123], part)

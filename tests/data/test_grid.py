@@ -19,15 +19,16 @@ def test_grid_has_65_points():
     assert points == full - missing
 
 
-def test_snake_order():
+def test_places_are_visited_in_snake_order():
     steps_mm = np.abs(np.diff(points_mm(), axis=0))
     assert (steps_mm[:, 1] <= 2).all()
     along = steps_mm[:, 1] == 0
     assert (steps_mm[along, 0] == 2).all()
-    assert (steps_mm[~along, 0] <= 4).all()  # neighbouring rows differ by at most two points in length
+    # between rows: successive rows of the grid differ by at most two places in length
+    assert (steps_mm[~along, 0] <= 4).all()
 
 
-def test_order_equals_lab_recordings(shared_data):
+def test_order_of_places_equals_that_of_lab_recordings(shared_data):
     with (shared_data / "lab" / "board1_depth1.csv").open() as file:
         rows = {int(row["indent"]): (float(row["x_mm"]), float(row["y_mm"])) for row in csv.DictReader(file)}
     np.testing.assert_array_equal(points_mm(), [rows[i] for i in sorted(rows)])
@@ -49,7 +50,7 @@ def test_every_pass_covers_every_point_and_depth(depths, passes_n):
 
 
 @given(depths_mm)
-def test_another_pass_keeps_earlier_passes(depths):
+def test_additional_pass_leaves_earlier_passes_unchanged(depths):
     short, long = protocol(depths, 1), protocol(depths, 2)
     for name in ("indentation", "pass_i", "x_mm", "y_mm", "depth_mm"):
         assert np.array_equal(getattr(short, name), getattr(long, name)[: len(short)])

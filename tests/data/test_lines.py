@@ -15,11 +15,11 @@ from reskin.simulation.protocols import Hand
 from tests.data.tables import readings
 from tests.data.tables import rows as make_rows
 
-READINGS_N = 2  # per indentation
+READINGS_N = 2  # readings of each indentation
 
 
 def rows_at(place_mm, skins=None, indentation=None) -> Rows:
-    """Return rows at places (x, y); by default, each row is one indentation."""
+    """Return rows at these places (x, y in mm); by default, every row is an indentation of its own."""
     f = len(place_mm)
     skins = ["s0"] * f if skins is None else skins
     table = make_rows([f"b_{skin}" for skin in skins], skins)
@@ -39,7 +39,7 @@ def all_rows(table: Rows) -> np.ndarray:
 
 
 def as_set(lines: Lines, names=None) -> set:
-    """Return each line as a set of (row, index), regardless of the numbers of the lines."""
+    """Return the set of lines, each as a set of (row, index); line numbers are ignored."""
     names = np.arange(lines.row.max() + 1) if names is None else np.asarray(names)
     pairs_of = {line: [] for line in lines.line_i.tolist()}
     for row, line, order in zip(lines.row, lines.line_i, lines.order_i, strict=True):
@@ -48,7 +48,7 @@ def as_set(lines: Lines, names=None) -> set:
 
 
 def grid_lines_naively(table: Rows, chosen) -> set:
-    """Reference by loops: rows of one skin with the same y (then the same x), indexed by the other coordinate."""
+    """Reference: table rows of a skin with equal y (then equal x) form a line, indexed by the other coordinate."""
     found = set()
     place = {int(i): (str(table.skin[i]), *(round(float(v) * 10) for v in table.target[i, :2])) for i in chosen}
     for i in place:
@@ -77,16 +77,16 @@ def test_grid_lines_equal_nested_loops(labels, data):
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
 
 
-def test_65_points_are_9_rows_and_9_columns():
+def test_65_places_form_9_rows_and_9_columns():
     lines = grid_lines(grid(depths_n=2), all_rows(grid(depths_n=2)))
     lengths = [len(set(lines.order_i[lines.line_i == line_i])) for line_i in range(18)]
-    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # rows of the grid, then columns
+    assert lengths == [5, 5, 9, 9, 9, 9, 9, 5, 5] * 2  # lines along rows of the grid, then along columns
     assert lines.line_i.max() == 17
-    # Each table row is once in a row and once in a column of the grid.
+    # Each table row belongs to one row and to one column of the grid.
     assert Counter(lines.row.tolist()) == dict.fromkeys(range(65 * 2 * READINGS_N), 2)
 
 
-def test_repeated_visits_share_line_and_index():
+def test_visits_to_one_place_share_line_and_index():
     table = grid(depths_n=2, passes_n=3)
     lines = grid_lines(table, all_rows(table))
     of_row = {row: set() for row in range(len(table))}
@@ -97,11 +97,11 @@ def test_repeated_visits_share_line_and_index():
         by_place.setdefault((x_mm, y_mm), set()).add(frozenset(of_row[row]))
     assert len(by_place) == 65
     assert all(len(seen) == 1 for seen in by_place.values())
-    assert len(set.union(*by_place.values())) == 65  # no two places share both lines
+    assert len(set.union(*by_place.values())) == 65  # every place has another pair of lines
 
 
 @given(places, st.data())
-def test_row_order_does_not_matter(labels, data):
+def test_lines_do_not_depend_on_row_order(labels, data):
     order = data.draw(st.permutations(range(len(labels))))
     original = rows_at([(x, y) for _, x, y in labels], [skin for skin, _, _ in labels])
     reordered = [labels[i] for i in order]
@@ -114,7 +114,7 @@ def test_row_order_does_not_matter(labels, data):
 
 
 @given(places, st.lists(st.floats(0.3, 5), min_size=10, max_size=10), st.floats(-20, 20))
-def test_only_the_order_of_places_matters(labels, gaps_mm, origin_mm):
+def test_distances_between_places_do_not_matter(labels, gaps_mm, origin_mm):
     skins = [skin for skin, _, _ in labels]
     along_mm = origin_mm + np.cumsum(gaps_mm)
     plain = rows_at([(x, y) for _, x, y in labels], skins)
@@ -127,18 +127,18 @@ def test_only_the_order_of_places_matters(labels, gaps_mm, origin_mm):
         assert (getattr(one, field.name) == getattr(other, field.name)).all()
 
 
-def test_rounding_differences_are_one_place():
+def test_places_that_differ_by_rounding_are_one_place():
     lines = grid_lines(rows_at([(0, 0), (2.00001, 0), (1.99999, 0.02), (4, 0)]), np.arange(4))
     assert as_set(lines) == {frozenset({(0, 0), (1, 1), (2, 1), (3, 2)})}
 
 
-def test_missing_place_leaves_a_gap():
+def test_missing_place_leaves_a_gap_in_the_indices():
     lines = grid_lines(rows_at([(0, 0), (4, 0), (0, 2), (2, 2)]), np.arange(4))
     assert frozenset({(0, 0), (1, 2)}) in as_set(lines)
     assert frozenset({(2, 0), (3, 1)}) in as_set(lines)
 
 
-def test_empty_pool_and_single_place_have_no_lines():
+def test_no_rows_or_a_single_place_form_no_line():
     assert len(grid_lines(rows_at([(1, 1)] * 3), np.arange(3))) == 0
     assert len(grid_lines(rows_at([(1, 1)]), np.zeros(0, np.int64))) == 0
 
@@ -149,19 +149,19 @@ def test_lines_expose_no_place_force_or_field(lines):
     assert set(vars(lines)) == {"row", "line_i", "order_i"}
     for array in vars(lines).values():
         assert array.dtype.kind == "i"
-        assert array.base is None  # not a view of a table
+        assert array.base is None  # a copy: a view would give access to the whole table
 
 
 @given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 5)), min_size=1, max_size=30))
 def test_hand_lines_equal_nested_loops(pokes):
     pass_i, poke_i = (np.array(column, np.int32) for column in zip(*pokes, strict=True))
-    indentation = (10 * pass_i + poke_i).astype(np.int32)  # numbers go on from pass to pass
+    indentation = (10 * pass_i + poke_i).astype(np.int32)  # numbering continues from pass to pass
     naive = set()
     for one in set(pass_i.tolist()):
-        own = [i for i in range(len(pokes)) if pass_i[i] == one]
-        first = min(indentation[i] for i in own)
-        if len({indentation[i] for i in own}) > 1:
-            naive.add(frozenset((i, int(indentation[i] - first)) for i in own))
+        pokes_of_pass = [i for i in range(len(pokes)) if pass_i[i] == one]
+        first = min(indentation[i] for i in pokes_of_pass)
+        if len({indentation[i] for i in pokes_of_pass}) > 1:
+            naive.add(frozenset((i, int(indentation[i] - first)) for i in pokes_of_pass))
     lines = hand_lines(pass_i, indentation)
     assert as_set(lines, range(len(pokes))) == naive
     assert sorted(set(lines.line_i.tolist())) == list(range(len(naive)))
@@ -181,7 +181,7 @@ def test_simulated_hand_pokes_are_indexed_from_0():
 
 
 @given(st.integers(0, 6 * 65), st.integers(0, 2**32))
-def test_places_are_poked_equally_often(indentations_n, seed):
+def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
     table = grid(depths_n=3, passes_n=2)
     chosen = take_pokes(table, all_rows(table), indentations_n, rng_for(seed, "pokes"))
     taken = set(table.indentation[chosen].tolist())
@@ -206,22 +206,24 @@ def test_choice_does_not_depend_on_row_order(seed):
     table = grid(depths_n=2)
     order = rng_for(seed, "order").permutation(len(table))
     shuffled = replace(table, target=table.target[order], indentation=table.indentation[order])
-    one, other = (take_pokes(each, all_rows(each), 80, rng_for(seed, "pokes")) for each in (table, shuffled))
+    one, other = (take_pokes(rows, all_rows(rows), 80, rng_for(seed, "pokes")) for rows in (table, shuffled))
     assert set(table.indentation[one].tolist()) == set(shuffled.indentation[other].tolist())
 
 
-def test_only_rows_of_the_pool_are_taken():
+def test_pokes_are_chosen_from_the_pool_only():
     table = grid(depths_n=2, passes_n=2)
-    pool = np.flatnonzero(table.indentation >= 130)  # the second pass
+    pool = np.flatnonzero(table.indentation >= 130)  # the rows of the second pass
     assert take_pokes(table, pool, 130, rng_for(0, "pokes")).tolist() == pool.tolist()
     assert set(take_pokes(table, pool, 20, rng_for(0, "pokes")).tolist()) < set(pool.tolist())
 
 
-def test_remainder_and_depths_are_drawn_fairly():
-    # Place 0 has 8 visits, place 1 has one. The poke is equally likely at both places, and at each of the 8 visits.
+def test_places_and_visits_are_equally_likely():
+    # Place 0 has 8 visits, place 1 has one. A poke is at either place with equal probability; at place 0, all visits
+    # are equally likely.
     table = rows_at([(0, 0)] * 8 + [(2, 0)])
     taken = Counter(int(take_pokes(table, all_rows(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
-    assert abs(taken[8] - 800) < 4 * np.sqrt(1600 / 4)  # four standard deviations of a fair coin
+    # four standard deviations of a binomial distribution with p = 1/2
+    assert abs(taken[8] - 800) < 4 * np.sqrt(1600 / 4)
     assert all(abs(taken[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
 
 
@@ -247,7 +249,7 @@ def hand_readings(skin: str = "s0", **changes: object):
 
 
 @given(st.integers(2, 12), st.integers(2, 12))
-def test_stacked_rows_are_kept_and_indentations_are_distinct(above_n, below_n):
+def test_stacking_keeps_rows_and_renumbers_indentations(above_n, below_n):
     above, below = gather([readings("c0", f=above_n)], EVERY), gather([readings("c1", skin="s1", f=below_n)], EVERY)
     both = stack(above, below)
     assert len(both) == above_n + below_n
@@ -267,7 +269,7 @@ def test_hand_pokes_have_fields_but_no_labels():
     assert len({*rows.indentation}) == 6
 
 
-def test_lines_of_each_skin_refer_to_its_own_rows():
+def test_lines_of_a_skin_contain_only_its_rows():
     captures = [hand_readings("s0"), hand_readings("s1")]
     rows, lines = hand_rows(captures)
     for one in captures:
@@ -279,7 +281,7 @@ def test_lines_of_each_skin_refer_to_its_own_rows():
     assert set(stack(above, rows).skin[below.row]) == {"s1"}
 
 
-def test_other_channels_and_repeated_skin_are_refused():
+def test_stacking_other_channels_or_the_same_skin_is_refused():
     wide = {name: np.zeros((6, 6), np.float32) for name in ("b_uT", "noload_uT")}
     other = gather([readings("c1", skin="s1", temperature_degC=np.zeros((6, 2), np.float32), **wide)], EVERY)
     with pytest.raises(ParamsError, match="6 channels, but c0 has 3"):

@@ -1,4 +1,4 @@
-"""Tests of the rows that models receive: field change, passes, indentation numbers and order of captures."""
+"""Tests of the rows on which models are trained: field change, passes, indentation numbers, order of captures."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def test_rows_without_place_or_force_are_counted():
     y_mm = np.array([0, 1, 2, 3, np.nan, 5], np.float32)
     Fz_N = np.array([1, 1, 0.05, np.nan, 1, 1], np.float32)
     rows = gather([readings(x_mm=x_mm, y_mm=y_mm, Fz_N=Fz_N)], Selection(force_min_N=0.1))
-    assert rows.target[:, 0].tolist() == [0, 3, 5]  # unknown force is kept
+    assert rows.target[:, 0].tolist() == [0, 3, 5]  # the row at x = 3 mm is kept: the selection ignores unknown forces
     assert rows.dropped == {"no_contact_rows_n": 2, "low_force_rows_n": 1}
 
 
@@ -30,21 +30,22 @@ def test_passes_continue_across_captures_of_a_skin():
 
 
 def test_indentation_numbers_are_unique_in_the_scene():
-    press = np.array([7, 7, 2, 2, 9, 9], np.int32)  # both captures use the same numbers, which do not start at 0
+    # both captures use these indentation numbers, which do not start at 0
+    press = np.array([7, 7, 2, 2, 9, 9], np.int32)
     lost = np.array([0, 0, np.nan, np.nan, 4, 4], np.float32)
     rows = gather([readings("c1", indentation=press, x_mm=lost), readings("c0", indentation=press)], ALL)
     naive, seen = [], []
-    for capture, own in zip(rows.capture, [*press, *press[~np.isnan(lost)]], strict=True):
-        if (capture, own) not in seen:
-            seen.append((capture, own))
-        naive.append((capture, own))
+    for capture, number in zip(rows.capture, [*press, *press[~np.isnan(lost)]], strict=True):
+        if (capture, number) not in seen:
+            seen.append((capture, number))
+        naive.append((capture, number))
     same = np.array([[one == other for one in naive] for other in naive])
     assert ((rows.indentation[:, None] == rows.indentation) == same).all()
     assert sorted(set(rows.indentation.tolist())) == list(range(len(seen)))
     assert rows.indentation[rows.capture == "c0"].max() < rows.indentation[rows.capture == "c1"].min()
 
 
-def test_capture_order_does_not_matter():
+def test_rows_do_not_depend_on_the_order_of_captures():
     one, other = readings("c0"), readings("c1", board="b1", skin="s1", Fz_N=np.full(6, 2, np.float32))
     expected, actual = gather([one, other], ALL), gather([other, one], ALL)
     assert (expected.board == actual.board).all()

@@ -1,4 +1,4 @@
-"""Tests of splits within one skin: indentations and passes stay together, except in the paper's split."""
+"""Tests of splits within a skin: only the paper's split separates readings of one indentation or pass."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ splits = st.builds(
 
 
 def make_passes(passes_n: int, pokes_n: int, readings_n: int = 2, skins_n: int = 2):
-    """Return rows of `skins_n` skins on one board, in passes; each indentation has `readings_n` rows."""
+    """Return rows of `skins_n` skins on one board: `passes_n` passes of `pokes_n` indentations of `readings_n` rows."""
     labels = [(skin, p) for skin in range(skins_n) for p in range(passes_n) for _ in range(pokes_n * readings_n)]
     table = rows(["b0"] * len(labels), [f"b0_s{skin}" for skin, _ in labels], [p for _, p in labels])
     return replace(table, indentation=np.arange(len(labels)) // readings_n)
@@ -43,7 +43,7 @@ def test_indentations_and_passes_are_not_split(experiment, passes_n, pokes_n, sp
 
 @pytest.mark.parametrize("experiment", TOGETHER)
 @given(order=st.permutations(range(24)))
-def test_row_order_does_not_matter(experiment, order):
+def test_split_does_not_depend_on_row_order(experiment, order):
     table = make_passes(3, 4, skins_n=1)
     order = np.array(order)
     shuffled = replace(table, **{name: getattr(table, name)[order] for name in ("indentation", "pass_i", "skin")})
@@ -61,7 +61,7 @@ def test_paper_split_separates_readings_of_one_indentation():
 
 
 @given(st.integers(2, 200), st.floats(0.01, 0.9), st.integers(0, 2**32 - 1))
-def test_groups_of_one_row_equal_scikit_learn(rows_n, fraction, state):
+def test_split_of_single_readings_equals_scikit_learn(rows_n, fraction, state):
     test_n = max(1, round(fraction * rows_n))
     if test_n == rows_n:
         return
@@ -76,7 +76,7 @@ def test_at_least_one_pass_is_tested():
     table = make_passes(4, 5)
     folds = draw_folds(table, ["single_pass"], Split(random_test_fraction=0.1, random_repeats_n=20), 0)
     assert {len({*table.pass_i[fold.test]}) for fold in folds} == {1}
-    # Probability that one pass is never tested, for an arbitrary seed: 4 (3/4)^20 = 1 %.
+    # The probability that one of four passes is never tested is 4 (3/4)^20 = 1 % for an arbitrary seed.
     assert {int(table.pass_i[fold.test[0]]) for fold in folds} == {0, 1, 2, 3}
 
 

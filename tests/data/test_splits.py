@@ -1,4 +1,4 @@
-"""Tests of splits into training, test and pool rows, and of their JSON form."""
+"""Tests of folds: rows for training, for test and for the pool (pokes for adaptation), and the JSON format of folds."""
 
 import doctest
 import json
@@ -50,7 +50,7 @@ def test_six_boards_give_six_folds():
 
 
 @given(st.permutations(range(18)))
-def test_row_order_does_not_matter(order):
+def test_folds_do_not_depend_on_row_order(order):
     pairs = [(board, skin) for board in range(6) for skin in range(3)]
     original, shuffled = rows_of_pairs(pairs), rows_of_pairs([pairs[i] for i in order])
     for experiment, split in (("lobo", Split()), ("transfer", TRANSFER)):
@@ -83,14 +83,14 @@ def test_random_readings_stay_within_one_skin():
 
 
 @given(st.integers(3, 30))
-def test_last_passes_are_tested(passes_n):
+def test_last_passes_are_test_rows(passes_n):
     table = rows(["b0"] * 2 * passes_n, ["s0"] * 2 * passes_n, [i // 2 for i in range(2 * passes_n)])
     (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
     assert table.pass_i[fold.train].max() < table.pass_i[fold.test].min()
     assert len(fold.train) + len(fold.test) == len(table)
 
 
-def test_fifty_passes_split_forty_to_ten():
+def test_of_fifty_passes_the_last_ten_are_tested():
     table = rows(["b0"] * 50, ["s0"] * 50, list(range(50)))
     (fold,) = draw_folds(table, ["single_temporal"], TEMPORAL, 0)
     assert (len(fold.train), len(fold.test)) == (40, 10)
@@ -123,7 +123,7 @@ def test_pool_is_the_first_passes_of_held_out_skins(experiment, split):
 @given(order=st.permutations(range(12)))
 def test_pool_and_skins_do_not_depend_on_row_order(experiment, order):
     labels = [(f"b{board}", f"b{board}_s{skin}", p) for board in range(3) for skin in range(2) for p in (3, 5)]
-    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # pass 4 has no rows
+    split = Split(sensors_skins_n=(1, 3), sensors_draws_n=2, pool_passes_n=1)  # passes have the numbers 3 and 5
     original, shuffled = (
         rows(*(list(column) for column in zip(*(labels[i] for i in numbers), strict=True)))
         for numbers in (range(12), order)
@@ -135,7 +135,7 @@ def test_pool_and_skins_do_not_depend_on_row_order(experiment, order):
             assert {*getattr(one, side).tolist()} == {order[i] for i in getattr(other, side).tolist()}
 
 
-def test_without_pool_all_held_out_rows_are_tested():
+def test_without_pool_all_held_out_rows_are_test_rows():
     table = six_by_three_in_passes(2)
     for experiment in ("lobo", "sensors"):
         for fold in draw_folds(table, [experiment], Split(sensors_skins_n=(2,), sensors_draws_n=1), 0):
@@ -144,7 +144,7 @@ def test_without_pool_all_held_out_rows_are_tested():
 
 
 @pytest.mark.parametrize(("experiment", "split"), [("single_random", RANDOM), ("single_temporal", TEMPORAL)])
-def test_experiments_without_adaptation_have_no_pool(experiment, split):
+def test_folds_without_adaptation_have_no_pool(experiment, split):
     table = six_by_three_in_passes(5)
     pooled = draw_folds(table, [experiment], split.model_copy(update={"pool_passes_n": 1}), 0)
     for fold, plain in zip(pooled, draw_folds(table, [experiment], split, 0), strict=True):
@@ -153,7 +153,7 @@ def test_experiments_without_adaptation_have_no_pool(experiment, split):
 
 
 @given(st.integers(0, 2**32))
-def test_fewer_sensors_are_nested_within_a_draw(seed):
+def test_smaller_sensor_sets_are_subsets_within_a_draw(seed):
     table = six_by_three_in_passes(3, readings_n=1)
     folds = {fold.name: fold for fold in draw_folds(table, ["sensors"], SENSORS, seed)}
     boards = [f"b{i}" for i in range(6)]
@@ -171,7 +171,7 @@ def test_fewer_sensors_are_nested_within_a_draw(seed):
         assert board not in {skin[:2] for skin in all_of_them}
 
 
-def test_all_sensors_equal_the_lobo_fold():
+def test_fold_of_all_sensors_equals_the_lobo_fold():
     table = six_by_three_in_passes(3)
     split = Split(sensors_skins_n=(15,), sensors_draws_n=2, pool_passes_n=1)
     for fold, whole in zip(
@@ -199,7 +199,7 @@ def test_boards_draw_their_skins_independently():
         tuple(np.flatnonzero(np.isin(np.unique(np.delete(table.skin, fold.test)), table.skin[fold.train])))
         for fold in folds
     }
-    assert len(ranks) > 1  # not all boards draw the same three skins
+    assert len(ranks) > 1  # the three drawn skins are not the same on all boards
 
 
 def test_repeated_number_of_sensors_is_refused():
@@ -209,12 +209,12 @@ def test_repeated_number_of_sensors_is_refused():
 
 LABELS = Split(labels_pool_n=5, labels_draws_n=3)
 PLACES_N = 4
-# The places of ten indentations. As in recordings, places occur unequally often.
+# Place numbers of ten indentations. As in recordings, some places are pressed more often than others.
 PLACE = np.array([0, 0, 0, 1, 1, 1, 2, 2, 3, 3])
 
 
 def poked_rows(boards_n: int = 3, readings_n: int = 2):
-    """Return rows of two skins per board; each skin has ten indentations at four places in two passes."""
+    """Return rows of two skins per board; each skin has ten indentations at the places `PLACES`, in two passes."""
     labels = [
         (f"b{board}", f"b{board}_s{skin}", place, i, i // 5)
         for board in range(boards_n) for skin in range(2) for i, place in enumerate(PLACE) for _ in range(readings_n)
@@ -226,13 +226,13 @@ def poked_rows(boards_n: int = 3, readings_n: int = 2):
 
 
 @given(st.integers(0, 2**32), st.integers(1, 9), st.integers(1, 3))
-def test_boards_are_held_out_with_a_pool_of_each_skin(seed, pool_n, draws_n):
+def test_held_out_board_has_a_pool_on_each_skin(seed, pool_n, draws_n):
     table = poked_rows()
     folds = draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=draws_n), seed)
     assert [fold.name for fold in folds] == [f"b{board}-draw{draw}" for board in range(3) for draw in range(draws_n)]
     for fold in folds:
         held = np.flatnonzero(table.board == fold.name[:2])
-        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # disjoint and complete
+        assert sorted([*fold.pool, *fold.test]) == held.tolist()  # every held-out row is in the pool or in the test set
         assert sorted([*fold.train, *held]) == list(range(len(table)))
         assert not {*table.indentation[fold.pool]} & {*table.indentation[fold.test]}
         for skin in np.unique(table.skin[held]):
@@ -240,17 +240,17 @@ def test_boards_are_held_out_with_a_pool_of_each_skin(seed, pool_n, draws_n):
 
 
 @given(st.integers(0, 2**32), st.integers(1, 8))
-def test_label_pool_takes_places_equally_often(seed, pool_n):
+def test_label_pool_is_spread_evenly_over_places(seed, pool_n):
     table = poked_rows()
     for fold in draw_folds(table, ["labels"], Split(labels_pool_n=pool_n, labels_draws_n=2), seed):
         for skin in np.unique(table.skin[fold.pool]):
-            own = fold.pool[table.skin[fold.pool] == skin]
-            first = own[np.unique(table.indentation[own], return_index=True)[1]]
+            pool_of_skin = fold.pool[table.skin[fold.pool] == skin]
+            first = pool_of_skin[np.unique(table.indentation[pool_of_skin], return_index=True)[1]]
             visits = np.bincount((table.target[first, 0] / 2).astype(int), minlength=PLACES_N)
             assert visits.max() <= -(-pool_n // PLACES_N)
 
 
-def test_label_pools_depend_only_on_seed_and_draw():
+def test_label_pool_depends_only_on_seed_and_draw():
     table = poked_rows()
     first, again, other = (draw_folds(table, ["labels"], LABELS, seed) for seed in (1, 1, 2))
     fewer = draw_folds(table, ["labels"], Split(labels_pool_n=5, labels_draws_n=1), 1)
@@ -328,7 +328,7 @@ TABLE = rows(["b0", "b0", "b1", "b2"], ["s0", "s0", "s1", "s2"])
 
 
 @given(st.sets(st.integers(0, 200)))
-def test_ranges_round_trip(numbers):
+def test_row_numbers_round_trip_as_ranges(numbers):
     sorted_numbers = np.array(sorted(numbers), np.int64)
     assert from_ranges(to_ranges(sorted_numbers)).tolist() == sorted_numbers.tolist()
 
@@ -341,12 +341,12 @@ def test_folds_round_trip(table, split):
     def listed(folds):
         return [[one.name, one.train.tolist(), one.test.tolist(), one.pool.tolist()] for one in folds]
 
-    drawn = draw_folds(table, ["lobo"], split, 0)
-    document = json.loads(json.dumps(render_folds(["c0"], table, drawn)))
-    assert listed(parse_folds(document, table, "folds.json")) == listed(drawn)
+    folds = draw_folds(table, ["lobo"], split, 0)
+    document = json.loads(json.dumps(render_folds(["c0"], table, folds)))
+    assert listed(parse_folds(document, table, "folds.json")) == listed(folds)
 
 
-def test_folds_list_boards_and_skins():
+def test_saved_folds_list_boards_and_skins():
     document = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
     assert document["folds"][0]["test_boards"] == ["b0"]
     assert document["folds"][0]["train_skins"] == ["s1", "s2"]
@@ -358,9 +358,9 @@ def test_folds_list_boards_and_skins():
     ]
 
 
-def test_folds_of_other_rows_are_refused():
+def test_saved_folds_of_other_rows_are_refused():
     document = render_folds(["c0"], TABLE, draw_folds(TABLE, ["lobo"], Split(), 0))
-    with pytest.raises(SchemaError, match="but its captures have 2"):
+    with pytest.raises(SchemaError, match="but the captures have 2 rows"):
         parse_folds(document, rows(["b0", "b1"], ["s0", "s1"]), "folds.json")
 
 

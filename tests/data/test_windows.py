@@ -37,7 +37,7 @@ def test_windows_equal_naive_loop(sizes):
 
 
 @given(sizes)
-def test_units_are_tested_once_and_never_trained_on(sizes):
+def test_test_units_are_tested_once_and_never_trained_on(sizes):
     units_n, test_n, more_n, less_n = sizes
     every_n = test_n + more_n
     windows = make_windows(
@@ -47,13 +47,14 @@ def test_units_are_tested_once_and_never_trained_on(sizes):
     assert len(used) == len(set(used))
 
 
-def test_skins_share_the_shortest_range():
+def test_windows_end_with_the_shortest_capture():
     windows = make_windows([12, 24], train_n=5, test_n=2, every_n=5)
     assert windows.tests == ((5, 7), (10, 12))
-    assert windows.left_out_units_n == 24 - 15  # all units from the first window that the shorter capture lacks
+    # all units from the first window on that the shorter capture does not reach
+    assert windows.left_out_units_n == 24 - 15
 
 
-def test_parts_are_whole_rows():
+def test_part_contains_whole_rows():
     taken = take(readings(), np.array([0, 1, 0, 0, 1, 0], bool))
     assert taken.x_mm.tolist() == [1, 4] == taken.indentation.tolist()
     assert taken.b_uT[:, 0].tolist() == [101, 104]
@@ -66,19 +67,19 @@ def test_two_captures_of_one_skin_are_refused():
     check_one_per_skin([readings("c0"), readings("c1", skin="s1")])
 
 
-def test_documented_windows():
+def test_docstring_examples():
     outcome = doctest.testmod(documented)
     assert (outcome.attempted, outcome.failed) == (2, 0)
 
 
 POLICIES = {
-    name: lambda of, choose=choose: choose(of.noload_uT, of.indentation)
+    name: lambda captured, choose=choose: choose(captured.noload_uT, captured.indentation)
     for name, choose in (("initial", initial), ("each", each))
 }
 
 
 def capture(skin: str, f: int = 24):
-    """Return one reading per indentation, whose number is the no-load field; every fifth is too weak to be selected."""
+    """Return `f` indentations of one reading: no-load field = indentation number; every fifth force is too low."""
     noload_uT = np.tile(np.arange(f, dtype=np.float32)[:, None], (1, 3))
     weak = np.where(np.arange(f) % 5 == 0, 0.01, 1).astype(np.float32)
     return readings(skin, skin=skin, f=f, noload_uT=noload_uT, b_uT=np.full((f, 3), 100, np.float32), Fz_N=weak)
@@ -102,10 +103,11 @@ def test_every_window_has_the_change_of_each_policy():
 
 def test_first_no_load_reading_may_be_unselected():
     first = next(part for part in example_parts("s0") if (part.policy, part.window_i) == ("initial", TRAIN))
-    assert (first.rows.db_uT == 100).all()  # relative to reading 0, whose contact is too weak
+    # relative to the no-load field of reading 0, which is not selected because its force is too low
+    assert (first.rows.db_uT == 100).all()
 
 
-def test_parts_index_their_rows():
+def test_parts_have_the_numbers_of_their_rows():
     parts = example_parts("s0", "s1")
     rows = stack(parts)
     assert np.concatenate([part.row_i for part in parts]).tolist() == list(range(len(rows)))
@@ -120,7 +122,7 @@ def test_unselected_rows_are_counted_once():
 
 
 @given(st.integers(1, 5), st.integers(1, 4), st.integers(0, 3))
-def test_parts_with_policy_each_equal_gather(train_n, test_n, more_n):
+def test_parts_with_policy_each_equal_gathered_rows(train_n, test_n, more_n):
     every_n = max(train_n, test_n) + more_n
     windows = make_windows([24], train_n=train_n, test_n=test_n, every_n=every_n)
     one, everything = capture("s0"), Selection(force_min_N=0.0)

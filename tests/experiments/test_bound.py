@@ -1,4 +1,4 @@
-"""Tests of the error bound against simulated chips, a linear estimate and a dipole, and of its scaling."""
+"""Tests of the lower bound on errors: against simulated chips, a linear estimate and a dipole; scaling with noise."""
 
 import math
 from dataclasses import replace
@@ -31,14 +31,15 @@ from tests.report.synthetic import scores
 from tests.simulation.scene import synthesis
 
 ROWS_N = 40_000
-SAMPLING = 6 / math.sqrt(ROWS_N)  # six standard errors, relative, of a variance of normal draws (sqrt(2 / n) each)
+# SAMPLING * sqrt(2) is six standard errors (sqrt(2 / n) each) of a sample variance, relative to the variance
+SAMPLING = 6 / math.sqrt(ROWS_N)
 CHIP = ChipDesign(gain_sel=6, noise_xy_uT=3.3, noise_z_uT=5.0, noise_temperature_degC=0.0)
 SCENE = synthesis()
 NO_LABEL_ERRORS = {"place_sd_mm": 0.0, "force_sd_N": 0.0}
 
 
 def linear_sensor(rng):
-    """Return slopes of 15 linear channels with coupled x and y, and of a force that depends on depth alone."""
+    """Return the slopes of 15 channels (x and y are coupled) and of the force (which depends on depth only)."""
     db_slopes = rng.normal(size=(1, 15, 3)) * np.array([2.0, 3.0, 8.0])
     return db_slopes + 0.7 * db_slopes[:, :, [1, 0, 2]], np.array([[0.0, 0.0, 1.7]])
 
@@ -57,20 +58,20 @@ def test_linear_estimate_reaches_the_bound():
     truth[:, 2] *= force_slopes[0, 2]
     label_errors = np.array([labels["place_sd_mm"]] * 2 + [labels["force_sd_N"]]) * rng.standard_normal((ROWS_N, 3))
     scores = score(truth + label_errors, estimated)
-    assert 20 < scores["accuracy_pct"] < 98  # the test is meaningful
+    assert 20 < scores["accuracy_pct"] < 98  # not near 0 or 100 %, where any estimate would agree
     assert expected["accuracy_pct"][0] == pytest.approx(scores["accuracy_pct"], abs=100 * SAMPLING / 2)
     assert expected["mse_xy_mm2"][0] == pytest.approx(scores["mse_xy_mm2"], rel=SAMPLING * math.sqrt(2))
     assert expected["mse_f_N2"][0] == pytest.approx(scores["mse_f_N2"], rel=SAMPLING * math.sqrt(2))
 
 
 @given(st.floats(0.05, 5.0), st.floats(0.05, 5.0))
-def test_uncorrelated_probability_factorises(h, k):
+def test_probability_of_uncorrelated_errors_is_a_product(h, k):
     expected = math.erf(h / math.sqrt(2)) * math.erf(k / math.sqrt(2))
     assert probability_within(np.array([[h, k]]), np.zeros(1))[0] == pytest.approx(expected, abs=1e-12)
 
 
 @given(st.floats(0.1, 3.0), st.floats(0.1, 3.0), st.floats(-0.95, 0.95))
-def test_correlated_probability_equals_an_integral(h, k, r):
+def test_probability_of_correlated_errors_equals_an_integral(h, k, r):
     nodes, weights = np.polynomial.legendre.leggauss(200)
     x, root = h * nodes, math.sqrt(1 - r**2)
     reach = np.vectorize(math.erf)
@@ -79,18 +80,18 @@ def test_correlated_probability_equals_an_integral(h, k, r):
     assert probability_within(np.array([[h, k]]), np.array([r]))[0] == pytest.approx(expected, abs=1e-10)
 
 
-def test_variance_equals_that_of_sampled_readings():
+def test_noise_variance_equals_that_of_sampled_readings():
     board, readings_n, noload_n = draw_board(SCENE.main_boards.design, SCENE.spreads, seed=1, name="b0"), 2, 10
-    still = np.zeros((ROWS_N // 4 * (readings_n + noload_n), 5, 3))
-    b_uT = read_field(still, board, design=CHIP, rng=rng_for(1, "still"))[0].astype(float)
+    no_field = np.zeros((ROWS_N // 4 * (readings_n + noload_n), 5, 3))
+    b_uT = read_field(no_field, board, design=CHIP, rng=rng_for(1, "still"))[0].astype(float)
     dwells_uT = b_uT.reshape(-1, readings_n + noload_n, 15)
     db_uT = dwells_uT[:, :readings_n].mean(axis=1) - dwells_uT[:, readings_n:].mean(axis=1)
     expected = noise_var_uT2(CHIP, 5, readings_n=readings_n, noload_frames_n=noload_n)
     np.testing.assert_allclose(db_uT.var(axis=0), expected, rtol=SAMPLING * 2)
 
 
-def test_slopes_equal_those_of_a_dipole():
-    def read(mm):  # Bz at a chip 3 mm below a moment along z that the poke moves down
+def test_slopes_of_a_dipole_field_equal_the_closed_form():
+    def read(mm):  # Bz of a dipole along z, 3 mm above the chip, which the poke moves down
         x, y, z = mm[:, 0], mm[:, 1], 3.0 - mm[:, 2]
         r2 = x**2 + y**2 + z**2
         return ((3 * z**2 - r2) / r2**2.5)[:, None]
@@ -101,7 +102,8 @@ def test_slopes_equal_those_of_a_dipole():
     per_rho = (3 * r2 - 15 * z**2) / r2**3.5
     per_z = (9 * z * r2 - 15 * z**3) / r2**3.5
     expected = np.stack([x * per_rho, y * per_rho, -per_z], axis=1)[:, None]
-    np.testing.assert_allclose(slopes(read, pokes_mm), expected, rtol=1e-3, atol=1e-6)  # quadratic in the step
+    # the error of central differences is quadratic in the step
+    np.testing.assert_allclose(slopes(read, pokes_mm), expected, rtol=1e-3, atol=1e-6)
 
 
 @given(st.floats(0.1, 10.0))
@@ -116,7 +118,7 @@ def test_bound_scales_with_noise_and_readings(factor):
     np.testing.assert_allclose(2 * sds[0], sds[1], rtol=1e-9)
 
 
-def test_bound_falls_with_depth_and_exact_labels():
+def test_bound_falls_with_depth_and_grows_with_label_errors():
     numbers = bound_errors(SCENE, seed=1)
     assert [row["depth_mm"] for row in numbers["by_depth"]] == sorted(SCENE.main.depths_mm)
     assert (numbers["places_n"], numbers["above_the_skin_n"]) == (65, 0)
@@ -160,7 +162,7 @@ def test_network_is_compared_with_the_bound():
     assert set(table["source"]) == {"simulated"}
 
 
-def test_pokes_without_contact_are_noted():
+def test_caption_counts_pokes_without_contact():
     assert "left out" not in tables(NUMBERS, "simulated")["bound"].attrs["meaning"]
     meaning = tables(NUMBERS | {"above_the_skin_n": 65}, "simulated")["bound"].attrs["meaning"]
     assert "65 pokes that do not touch the skin are excluded" in meaning

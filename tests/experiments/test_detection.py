@@ -54,17 +54,18 @@ def linear_skin(n):
     return target, target @ rng.normal(0, 30, (3, 15))
 
 
-def test_residual_of_known_contact_and_foreign_field():
+def test_residual_is_zero_for_known_contacts_and_large_for_others():
     target, db_uT = linear_skin(200)
-    np.testing.assert_allclose(residual((target, db_uT), target[:9], db_uT[:9]), 0, atol=1e-9)  # rounding
-    assert residual((target, db_uT), target[:9], -db_uT[:9]).min() > 1.5  # 2, less the share of the noise
+    # zero, except for rounding
+    np.testing.assert_allclose(residual((target, db_uT), target[:9], db_uT[:9]), 0, atol=1e-9)
+    assert residual((target, db_uT), target[:9], -db_uT[:9]).min() > 1.5  # without noise, it would be 2
 
 
-def test_residual_without_forces_uses_places():
+def test_residual_without_forces_interpolates_places():
     target, db_uT = linear_skin(200)
     unknown = np.column_stack([target[:, :2], np.full(200, np.nan)])
     ours = residual((unknown, db_uT), target[:9], db_uT[:9])
-    np.testing.assert_allclose(ours, 0, atol=1e-9)  # rounding
+    np.testing.assert_allclose(ours, 0, atol=1e-9)  # zero, except for rounding
 
 
 def test_disagreement_is_rms_distance_from_the_mean():

@@ -1,4 +1,4 @@
-"""Tests of dynamic presses on a linear skin: lags and errors in closed form, filters compared with naive loops."""
+"""Tests of filters for dynamic presses on a linear skin: lags and errors in closed form, filters as naive loops."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ RATE_HZ = 400.0
 
 
 def linear_presses(durations_n=(40, 100, 300), noise_uT=0.0, delay_s=0.0):
-    """Return presses on a skin with channels for x, y and F, 100 uT per unit; force readings lag by `delay_s`."""
+    """Return presses on a linear skin (channels x, y, F: 100 uT per mm or N); force labels lag by `delay_s`."""
     rng = rng_for(0, "dynamics")
     labels, fields, t_s, indentation = [], [], [], []
     for press_i, frames_n in enumerate(durations_n):
@@ -66,39 +66,42 @@ def test_window_stays_within_its_press():
     assert (presses.true[presses.scored, 2] >= 0.2).all()
 
 
-def test_single_readings_are_exact_and_the_mean_lags():
+def test_single_readings_have_no_lag_and_running_means_do():
     numbers = score_presses(linear_presses(), [inverse], board="b0")
-    assert numbers["all"]["one"]["mse_f_N2"]["mean"] < 1e-12  # float32
-    assert numbers["lag_ms"]["one"]["mean"] == pytest.approx(0.0, abs=0.051)  # half the search step
-    assert numbers["lag_ms"]["mean5"]["mean"] == pytest.approx(5.0, abs=0.15)  # the force is curved at its ends
+    assert numbers["all"]["one"]["mse_f_N2"]["mean"] < 1e-12  # zero, except for rounding to float32
+    # tolerance: half the step of the search for the lag
+    assert numbers["lag_ms"]["one"]["mean"] == pytest.approx(0.0, abs=0.051)
+    # the lag is less exact where the force is curved, at both ends
+    assert numbers["lag_ms"]["mean5"]["mean"] == pytest.approx(5.0, abs=0.15)
     assert numbers["all"]["mean5"]["mse_f_N2"]["mean"] > 100 * numbers["all"]["mean5_of_middle"]["mse_f_N2"]["mean"]
 
 
-def test_mean_is_worse_for_faster_presses():
+def test_running_mean_has_larger_errors_for_faster_presses():
     errors = [
         one["mean5"]["mse_f_N2"]["mean"]
         for one in score_presses(linear_presses(), [inverse], board="b0")["by_duration"]
     ]
     assert errors == sorted(errors, reverse=True)
-    # A lag of 5 ms in 2 N sin^1.5 over 0.1 s gives an error of at most 5e-3 * 2 * 1.5 * pi / 0.1 * 0.62 = 0.29 N
+    # A lag of 5 ms in a press of 2 N sin^1.5 and 0.1 s: error of at most 5e-3 * 2 * 1.5 * pi / 0.1 * 0.62 = 0.29 N
     assert 0.02 < np.sqrt(errors[0]) < 0.29
 
 
-def test_mean_is_better_for_large_noise():
+def test_running_mean_has_smaller_errors_for_large_noise():
     slow = score_presses(linear_presses((2000,), noise_uT=20.0), [inverse], board="b0")["all"]
     assert slow["mean5"]["mse_f_N2"]["mean"] == pytest.approx(slow["one"]["mse_f_N2"]["mean"] / 5, rel=0.15)
 
 
 @given(st.floats(-4.0, 15.0), st.floats(0.1, 10.0))
-def test_delay_is_estimated_for_any_factor(delay_ms, factor):
+def test_delay_is_estimated_for_any_scale_of_the_force(delay_ms, factor):
     t_s = np.arange(200) / RATE_HZ
     force_N = np.sin(np.pi * t_s / 0.5) ** 2
     late_N = factor * np.interp(t_s - delay_ms / 1e3, t_s, force_N)
-    own = slice(20, 180)  # away from the ends, where interpolation is constant
-    assert lag_ms(t_s[own], late_N[own], t_s, force_N) == pytest.approx(delay_ms, abs=0.16)  # search step, curvature
+    inner = slice(20, 180)  # without both ends, beyond which interpolation is constant
+    # search step and curvature
+    assert lag_ms(t_s[inner], late_N[inner], t_s, force_N) == pytest.approx(delay_ms, abs=0.16)
 
 
-def test_late_force_readings_give_a_delay():
+def test_late_force_labels_give_a_delay():
     assert score_presses(linear_presses(delay_s=1e-3), [inverse], board="b0")["lag_ms"]["one"]["mean"] == pytest.approx(
         1.0, abs=0.15
     )
@@ -115,7 +118,7 @@ def test_filters_are_compared_in_pairs_on_one_board():
     whole = score_presses(linear_presses(noise_uT=20.0), [inverse, inverse], board="b0")["all"]
     difference = whole["paired"]["mean5_minus_one"]
     less = whole["mean5"]["mse_f_N2"]["mean"] - whole["one"]["mse_f_N2"]["mean"]
-    assert difference["mse_f_N2"] == {"mean": pytest.approx(less), "n": 1}  # two networks, one board
+    assert difference["mse_f_N2"] == {"mean": pytest.approx(less), "n": 1}  # the mean of two networks; one board
     assert set(difference["by_board"]) == {"b0"}
 
 

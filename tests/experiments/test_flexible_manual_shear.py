@@ -1,4 +1,4 @@
-"""Tests of the experiments flexible, manual and shear: scores, differences of variants, tables and figures."""
+"""Tests of experiments flexible, manual and shear: scores, differences between variants, tables and figures."""
 
 import xml.etree.ElementTree as ET
 
@@ -36,7 +36,7 @@ from reskin.seeds import rng_for
 from tests.data.tables import readings
 from tests.report.synthetic import card, texts_of
 
-SINGLE = 1e-4  # sums of single-precision forces of a few newtons
+SINGLE = 1e-4  # rounding of sums of single-precision forces of a few N
 
 
 BOARD = {"s0": "b0", "s1": "b0", "s2": "b1"}
@@ -77,10 +77,10 @@ def test_bias_in_percent_of_the_force():
     assert force_biases(predictions)["bias_f_N"][AFTER]["mean"] == 0
 
 
-def test_board_is_the_mean_of_skins_and_seeds():
-    own = [one for one in PREDICTIONS if one.variant == AFTER]
+def test_score_of_a_board_is_the_mean_over_skins_and_seeds():
+    adapted = [one for one in PREDICTIONS if one.variant == AFTER]
     skins = {
-        skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in own if one.skin == skin])
+        skin: np.mean([score(one.true, one.predicted)["mse_xy_mm2"] for one in adapted if one.skin == skin])
         for skin in BOARD
     }
     boards = [(skins["s0"] + skins["s1"]) / 2, skins["s2"]]
@@ -98,19 +98,21 @@ def test_differences_equal_the_summary_of_cards():
         ]
         for variant in (BEFORE, AFTER)
     }  # fmt: skip
-    of, over = (by_skin(tidy(cards[variant])) for variant in (AFTER, BEFORE))
+    after, before = (by_skin(tidy(cards[variant])) for variant in (AFTER, BEFORE))
     result = compare_variants(PREDICTIONS, AFTER, BEFORE)
     for name in METRICS:
         del result[name]["sd_seeds"]
-    assert result == paired(of, over)
+    assert result == paired(after, before)
 
 
 def scores_by_seed(variant: str, skin: str) -> np.ndarray:
-    own = sorted((one for one in PREDICTIONS if (one.variant, one.skin) == (variant, skin)), key=lambda one: one.seed_i)
-    return np.array([score(one.true, one.predicted)["mse_xy_mm2"] for one in own])
+    by_seed = sorted(
+        (one for one in PREDICTIONS if (one.variant, one.skin) == (variant, skin)), key=lambda one: one.seed_i
+    )
+    return np.array([score(one.true, one.predicted)["mse_xy_mm2"] for one in by_seed])
 
 
-def test_seed_differences_are_paired():
+def test_differences_are_paired_by_seed():
     result = summarise_variants(PREDICTIONS)[AFTER]["mse_xy_mm2"]
     assert result["sd_seeds"] == pytest.approx(np.mean([scores_by_seed(AFTER, skin).std(ddof=1) for skin in BOARD]))
     result = compare_variants(PREDICTIONS, AFTER, BEFORE)["mse_xy_mm2"]
@@ -136,14 +138,14 @@ def test_hand_poke_summary_has_counts_and_differences():
         assert difference == pytest.approx(after - before)
 
 
-def test_no_control_gives_no_difference():
+def test_without_control_there_is_no_difference():
     summary = summarise_manual([one for one in PREDICTIONS if one.variant != CONTROL], pokes_n=[3], lines_n=[1])
     assert CONTROL not in summary
     assert "after_minus_control" not in summary["paired"]
 
 
 @given(st.floats(0.5, 3))
-def test_strength_ratio_equals_the_scale_of_fields(ratio):
+def test_strength_ratio_is_the_ratio_of_fields(ratio):
     rng = rng_for(1, "fields")
     depth_mm = np.tile(np.array([0.2, 0.8, 1.2], np.float32), 20)
     db_uT = rng.normal(0, 50, (60, 15)).astype(np.float32)
@@ -158,7 +160,7 @@ def test_strength_ratio_equals_the_scale_of_fields(ratio):
     assert result["n"] == 3
 
 
-def test_unshared_depths_are_ignored():
+def test_depths_of_only_one_variant_are_ignored():
     one, other = ({d: np.array([float(i + d)]) for d in depths} for i, depths in ((1, (0.2, 0.4)), (3, (0.4, 0.6))))
     assert strength_ratio([one], [other]) == {"mean": pytest.approx(1.4 / 3.4), "n": 1}
 
@@ -167,10 +169,10 @@ def test_figure_shows_readings_of_both_variants():
     many = [
         VariantPrediction(variant, "b0", "s0", 0, truth("s0", 900), truth("s0", 900)) for variant in (BEFORE, AFTER)
     ]
-    drawn = draw_forces(many, rng_for(0, "drawn"))
-    assert drawn[BEFORE]["true_N"] == drawn[AFTER]["true_N"] == drawn[AFTER]["predicted_N"]
-    assert len(drawn[BEFORE]["true_N"]) == DRAWN_N
-    assert set(np.round(truth("s0", 900)[:, 2].astype(float), 3)) >= set(drawn[BEFORE]["true_N"])
+    plotted = draw_forces(many, rng_for(0, "drawn"))
+    assert plotted[BEFORE]["true_N"] == plotted[AFTER]["true_N"] == plotted[AFTER]["predicted_N"]
+    assert len(plotted[BEFORE]["true_N"]) == DRAWN_N
+    assert set(np.round(truth("s0", 900)[:, 2].astype(float), 3)) >= set(plotted[BEFORE]["true_N"])
 
 
 def test_flexible_numbers_list_variants_and_bias():
@@ -187,7 +189,7 @@ def make_drag(seed: int, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
 @given(st.integers(0, 1000))
 def test_errors_equal_scikit_learn(seed):
     true, predicted = make_drag(seed)
-    ours, rel = score5(true, predicted), 1e-5  # single-precision input
+    ours, rel = score5(true, predicted), 1e-5  # relative tolerance for single-precision input
     assert ours["mse_xy_mm2"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]), rel=rel)
     assert ours["mse_fxy_N2"] == pytest.approx(mean_squared_error(true[:, 2:4], predicted[:, 2:4]), rel=rel)
     assert ours["mse_fz_N2"] == pytest.approx(mean_squared_error(true[:, 4], predicted[:, 4]), rel=rel)
@@ -206,7 +208,7 @@ def test_explained_variance_is_scale_invariant(seed, size):
     assert other["mse_xy_mm2"] == pytest.approx(one["mse_xy_mm2"])
 
 
-def test_explained_variance_of_truth_and_mean():
+def test_explained_variance_is_1_for_truth_and_0_for_the_mean():
     true, _ = make_drag(0)
     assert score5(true, true)["explained_fxy"] == 1
     mean = np.broadcast_to(true.mean(axis=0, dtype=np.float64), true.shape)
@@ -273,14 +275,14 @@ CASES = {
 @pytest.mark.parametrize("experiment", CASES)
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
 def test_rows_and_figures_have_their_source(experiment, source):
-    module, numbers, drawn = CASES[experiment]
+    module, numbers, figure_data = CASES[experiment]
     (table,) = module.tables(numbers, source).values()
     assert set(table["source"]) == {source}
-    if drawn:
-        (text,) = module.figures(numbers, drawn, source).values()
+    if figure_data:
+        (text,) = module.figures(numbers, figure_data, source).values()
         assert f"({source})" in texts_of(text)
         ET.fromstring(text)
-        assert [text] == list(module.figures(numbers, drawn, source).values())
+        assert [text] == list(module.figures(numbers, figure_data, source).values())
 
 
 def test_shear_table_has_both_splits():

@@ -1,4 +1,4 @@
-"""Tests of a simulated gripper with force feedback from a linear skin."""
+"""Tests of a simulated gripper that controls the force estimated by a linear skin."""
 
 import numpy as np
 import pytest
@@ -31,13 +31,13 @@ def test_skin_and_object_bear_the_same_force():
 
 
 @pytest.mark.parametrize(("factor", "held"), [(1.0, 100.0), (1.3, 0.0)])
-def test_gripper_holds_the_estimated_force(factor, held):
+def test_gripper_holds_the_estimated_force_not_the_true_one(factor, held):
     held_N = hold(finger(), lambda b_uT: factor * true_force(b_uT), 1.0, SETTINGS, rng_for(0, "hold"))
     np.testing.assert_allclose(held_N[50:].mean(), 1 / factor, rtol=0.05)
     assert judge({"b0": [held_N]}, 1.0)["held_pct"] == held
 
 
-def test_calibration_by_one_press_removes_a_factor():
+def test_calibration_by_one_press_removes_a_scale_error():
     skin = finger(noise_uT=1.0)
     press = Press(1.0, skin.read(np.ones(5), rng_for(0, "press")).mean(axis=0))
     forces = scale_to_press(lambda b_uT: 1.3 * true_force(b_uT), press)
@@ -65,7 +65,7 @@ def test_opposite_errors_of_networks_do_not_cancel():
 def test_tables_list_every_aim_and_feedback():
     settings = SETTINGS.model_copy(update={"aims_N": (0.5,)})
     networks = {"b0": [lambda db_uT: true_force(db_uT + 50.0)[:, None] + np.zeros(3)]}
-    numbers, drawn = hold_all([finger(noise_uT=1.0)], networks, settings, seed=1)
+    numbers, figure_data = hold_all([finger(noise_uT=1.0)], networks, settings, seed=1)
     assert [(row["aim_N"], row["feedback"], row["press"]) for row in numbers["rows"]] == [
         (0.5, "networks", "none"), (0.5, "networks", "factor"), (0.5, "map", "none"), (0.5, "map", "factor"),
         (0.5, "map", "label"),
@@ -73,4 +73,4 @@ def test_tables_list_every_aim_and_feedback():
     table = gripper.tables(numbers, "simulated")["gripper"]
     assert table["runs"].tolist() == [2] * 5
     assert table["held, % of runs"][0] == "100"
-    assert "0.5 N" in gripper.figures(numbers, drawn, "simulated")["gripper.svg"]
+    assert "0.5 N" in gripper.figures(numbers, figure_data, "simulated")["gripper.svg"]

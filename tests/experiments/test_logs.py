@@ -1,4 +1,4 @@
-"""Tests on synthetic logs: quiet start, contacts, scores and errors; a pitching board in the earth's field."""
+"""Tests of estimates from logs: start without contact, contacts, scores, a board that pitches in the earth's field."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ NOISE_uT = 3.0
 
 
 def make_log(quiet_s=2.0, steps_n=4, name="walk"):
-    """Return a log of 15 channels: rest, then alternately 0.3 s in contact and 0.2 s off; 200 uT per newton."""
+    """Return times, fields and forces: rest, then steps of 0.3 s in contact and 0.2 s off; 200 uT per newton."""
     quiet_n, on_n, off_n = round(quiet_s * RATE_HZ), 75, 50
     force_N = np.zeros(quiet_n + steps_n * (on_n + off_n))
     for step_i in range(steps_n):
@@ -87,7 +87,7 @@ def test_contacts_forces_and_noise_are_recovered():
     assert scores["contacts_true_n"] == 4
     assert scores["missed_readings_n"] == scores["false_readings_n"] == 0
     assert scores["accuracy_pct"] == 100.0
-    # Noise variance of the mean of 15 channels, in N^2; the no-load reading adds 1 / 500 of it.
+    # Variance of the mean of 15 noisy channels, in N^2; the no-load reading adds 1 / 500 of this variance.
     assert scores["mse_f_N2"] == pytest.approx((NOISE_uT / 200) ** 2 / 15, rel=0.3)
 
 
@@ -96,17 +96,19 @@ def test_network_errors_do_not_cancel():
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([0, 0, by], np.float32) for by in (-1.0, 1.0, 2.0)]
     found = estimate(t_s, b_uT, networks, where="log")
     scores = score_contacts(found, truth(force_N))
-    assert scores["mse_f_N2"] == pytest.approx((1 + 1 + 4) / 3, rel=0.01)  # that of the mean network is 0.44
+    # the mean prediction of the three networks would have 0.44
+    assert scores["mse_f_N2"] == pytest.approx((1 + 1 + 4) / 3, rel=0.01)
     assert scores["spread"]["mse_f_N2"] == pytest.approx(np.std([1, 1, 4], ddof=1), rel=0.02)
-    assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)  # three networks: 3, 5 and 6 N
+    # mean of the maxima 3, 5 and 6 N of three networks
+    assert describe(found)["force_max_N"] == pytest.approx(4 + 2 / 3, abs=0.05)
     assert "spread" not in score_contacts(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
 
 
-def test_plotted_series_is_the_first_network_with_range():
+def test_plotted_series_has_the_first_network_and_the_range_of_all():
     t_s, b_uT, force_N = make_log(steps_n=40)
     networks = [lambda db_uT, by=by: predict(db_uT) + np.array([by, 0, 0], np.float32) for by in (0.0, 1.0, -2.0)]
-    drawn = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
-    assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in drawn[which]["x_mm"] if x_mm is not None)
+    plotted = thin(estimate(t_s, b_uT, networks, where="log"), truth(force_N))
+    assert {6.0, 8.0, 9.0} == {max(x_mm for x_mm in plotted[which]["x_mm"] if x_mm is not None)
                                for which in ("low", "estimated", "high")}  # fmt: skip
     assert "low" not in thin(estimate(t_s, b_uT, networks[:1], where="log"), truth(force_N))
 
@@ -118,7 +120,7 @@ def test_short_runs_and_gaps_are_ignored(contact):
     assert contacts_n(np.array(contact, bool)) == sum(len(run) > 1 for run in runs)
 
 
-def test_truth_is_that_of_the_current_step():
+def test_truth_of_a_reading_is_that_of_its_step():
     true = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     found = truth_at(np.array([0.0, 1.5, 2.5, 3.5, 9.0]), np.array([1.0, 3.0]), np.array([2.0, 4.0]), true)
     np.testing.assert_array_equal(found, [[np.nan] * 3, true[0], [np.nan] * 3, true[1], [np.nan] * 3])
@@ -126,13 +128,13 @@ def test_truth_is_that_of_the_current_step():
 
 def test_plotted_series_is_thinned_and_empty_off_contact():
     t_s, b_uT, force_N = make_log(steps_n=40)
-    drawn = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
-    assert len(drawn["t_s"]) <= 1500
-    assert drawn["t_s"][0] == pytest.approx(0.004)
+    plotted = thin(estimate(t_s, b_uT, [predict], where="log"), truth(force_N))
+    assert len(plotted["t_s"]) <= 1500
+    assert plotted["t_s"][0] == pytest.approx(0.004)
     for which in ("estimated", "true"):
-        assert drawn[which]["F_N"][0] is None
-        assert None in drawn[which]["x_mm"]
-        assert 8.0 in drawn[which]["x_mm"]
+        assert plotted[which]["F_N"][0] is None
+        assert None in plotted[which]["x_mm"]
+        assert 8.0 in plotted[which]["x_mm"]
 
 
 def plain_board(name, chips_n):
@@ -142,8 +144,8 @@ def plain_board(name, chips_n):
 
 
 def instrument(noise_uT=0.0):
-    own = plain_board("b0", 5)
-    return Instrument(own, plain_board("aside", 1), own.turn, np.full(3, noise_uT))
+    board = plain_board("b0", 5)
+    return Instrument(board, plain_board("aside", 1), board.turn, np.full(3, noise_uT))
 
 
 def pitched_log(noise_uT=0.0):
@@ -155,7 +157,7 @@ def pitched_log(noise_uT=0.0):
 
 def test_pitching_board_reads_the_rotated_earth_field():
     np.testing.assert_allclose(earth_in_board_T(np.array([0.0])), EARTH_T[None])
-    # Pitched by the dip, the board's x axis is parallel to the earth's field.
+    # If the pitch equals the dip of the earth's field, the board's x axis is parallel to the field.
     along_T = earth_in_board_T(np.radians([EARTH_DIP_DEG]))
     np.testing.assert_allclose(along_T, [[EARTH_SIZE_T, 0, 0]], atol=1e-18)
 
@@ -165,7 +167,7 @@ def test_field_change_is_the_chord_of_the_rotation(pitch_rad):
     rotated_T = earth_in_board_T(np.array([pitch_rad]))[0]
     assert np.linalg.norm(rotated_T) == pytest.approx(EARTH_SIZE_T)
     chord_T = 2 * EARTH_SIZE_T * np.sin(abs(pitch_rad) / 2)
-    assert np.linalg.norm(rotated_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)  # rounding of 50 uT
+    assert np.linalg.norm(rotated_T - EARTH_T) == pytest.approx(chord_T, abs=1e-18)  # rounding error of fields of 50 uT
 
 
 def test_board_rests_then_swings_periodically():
@@ -173,7 +175,7 @@ def test_board_rests_then_swings_periodically():
     np.testing.assert_allclose(swing(t_s, start_s=1.0, period_s=0.5), [0, 0, 1, 0, -1, 0], atol=1e-12)
 
 
-def test_period_is_the_median_between_contacts():
+def test_swing_period_is_the_median_time_between_contacts():
     t_s = np.arange(12) / 10
     assert step_period_s(t_s, np.array([0, 1, 1, 0, 0, 1, 0, 0, 0, 0, 1, 1], bool)) == pytest.approx(0.45)
     assert step_period_s(t_s, np.arange(12) == 3) == PERIOD_S
@@ -188,7 +190,7 @@ def test_board_without_pitch_reads_no_earth_field():
     assert level["contacts_n"] == contacts_n(found.contact) == 4
     scores = score_contacts(found, log.true)
     assert level["false_readings_n"] == scores["false_readings_n"] == 0
-    assert level["mse_f_N2"] == pytest.approx(scores["mse_f_N2"], rel=1e-3)  # 1000 uT in float32: 6e-5 uT
+    assert level["mse_f_N2"] == pytest.approx(scores["mse_f_N2"], rel=1e-3)  # rounding of 1000 uT to float32: 6e-5 uT
 
 
 def test_reference_chip_removes_false_contacts_of_pitch():
@@ -196,8 +198,8 @@ def test_reference_chip_removes_false_contacts_of_pitch():
     assert [row["pitch_deg"] for row in rows] == list(PITCHES_DEG)
     false_n = [row["false_readings_n"] for row in rows]
     assert false_n == sorted(false_n)
-    # At 45 degrees the field of the five chips swings by up to sqrt(5) 38 uT = 86 uT. It is below the threshold of
-    # sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
+    # At 45 degrees, the norm of the field changes of five chips swings up to sqrt(5) 38 uT = 86 uT. It is below the
+    # contact threshold of sqrt(15) 3 uT + 18 uT = 30 uT for less than a third of the time.
     off_n = int((np.isnan(log.true[:, 2]) & (np.arange(len(log.t_s)) >= log.quiet_n)).sum())
     assert 0.6 * off_n < false_n[-1] < off_n
     for row in rows:
@@ -229,7 +231,7 @@ def test_log_without_truth_has_no_scores():
 FOUND = {"contacts_n": 5, "false_readings_n": 7, "missed_readings_n": 2, "mse_f_N2": 0.25}
 
 
-def test_pitched_log_has_its_own_table():
+def test_pitched_log_has_a_table():
     pitched = {"pitch_deg": 20.0} | FOUND | {"accuracy_pct": 50.0, "reference_chip": FOUND | {"false_readings_n": 0}}
     numbers = NUMBERS | {"contacts_true_n": 3, "turning": [pitched], "turning_period_s": 0.7, "earth_uT": 50.0}
     table = tables(numbers, "simulated")["logs_turning"]
@@ -241,24 +243,24 @@ def test_pitched_log_has_its_own_table():
     assert "logs_turning" not in tables(NUMBERS, "recorded")
 
 
-def test_text_has_the_rate_of_the_log():
+def test_caption_states_the_rate_of_the_log():
     table = tables(NUMBERS | {"rate_hz": 133.0}, "recorded")["logs"]
     assert "A log at 133 Hz with" in table.attrs["meaning"]
     assert "The board does not rotate" in table.attrs["meaning"]
 
 
-def test_spread_over_networks_is_shown():
+def test_table_shows_the_spread_over_networks():
     numbers = NUMBERS | {"accuracy_pct": 80.0, "spread": {"accuracy_pct": 2.5}}
     table = tables(numbers, "simulated")["logs"]
     assert table.set_index("what")["ours"]["accuracy, %"] == "80 ± 2.5"
     assert "over 3 network seeds" in table.attrs["meaning"]
-    drawn = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES, "low": SERIES, "high": SERIES}
-    assert "range over 3 network seeds" in figures(numbers, drawn, "simulated")["logs.svg"]
+    plotted = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES, "low": SERIES, "high": SERIES}
+    assert "range over 3 network seeds" in figures(numbers, plotted, "simulated")["logs.svg"]
 
 
 def test_figure_shows_the_truth_if_known():
-    drawn = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
-    assert ">true<" not in figures(NUMBERS, drawn, "recorded")["logs.svg"]
-    both = figures(NUMBERS, drawn | {"true": SERIES}, "simulated")["logs.svg"]
+    plotted = {"t_s": [0.0, 0.1, 0.2], "estimated": SERIES}
+    assert ">true<" not in figures(NUMBERS, plotted, "recorded")["logs.svg"]
+    both = figures(NUMBERS, plotted | {"true": SERIES}, "simulated")["logs.svg"]
     assert ">true<" in both
     assert "(simulated)" in both

@@ -1,4 +1,4 @@
-"""Tests of the errors of neglected effects against closed forms, their scaling, and their table."""
+"""Tests of the errors caused by neglected physical effects: closed forms, scaling, and the table."""
 
 import numpy as np
 import pytest
@@ -29,13 +29,13 @@ def rows_of(scene):
 
 @pytest.fixture(scope="module")
 def rows(few_nodes):
-    """Return the rows of all terms."""
+    """Return the table row of each effect, by its name."""
     return rows_of(with_protocol("grid", FEW))
 
 
 @pytest.fixture
 def not_inside(monkeypatch):
-    """Skip the effects inside the skin, which take most of the time."""
+    """Omit the effects inside the skin, which take most of the computing time."""
     monkeypatch.setattr(neglected_effects, "_inside", lambda on: [])
 
 
@@ -44,7 +44,7 @@ def test_effects_neglected_by_the_main_protocol(rows, not_inside):
         "ageing", "relaxation", "memory", "temperature", "friction", "the earth's field", "the skin's free edge",
         "the powder's own field",
     }  # fmt: skip
-    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # without drags
+    assert rows["friction"].field_pct == rows["friction"].force_pct == 0  # friction acts only in drags
     aged = rows_of(with_protocol("grid", FEW | {"terms": ["ageing"]}, terms={"ageing": SIZES}))
     assert aged["ageing"].done == "kept"
 
@@ -53,7 +53,7 @@ def test_protocols_of_each_effect(rows, not_inside):
     wear = FEW | {"skins_n": 1, "terms": ["ageing"]}
     found = rows_of(with_protocol("wear", wear, protocols={"grid": FEW, "wear": wear}, terms={"ageing": SIZES}))
     assert (found["ageing"].left_out_by, found["ageing"].computed_by) == (("grid",), ("wear",))
-    assert found["ageing"].done == "left out"  # by the main protocol
+    assert found["ageing"].done == "left out"  # the main protocol neglects ageing
     assert found["ageing"].force_pct == rows["ageing"].force_pct
     assert (found["friction"].left_out_by, found["friction"].computed_by) == (("grid", "wear"), ())
     assert found["the powder's own field"].left_out_by == found["the chips' steps"].computed_by == ()
@@ -63,32 +63,34 @@ def test_force_errors_of_ageing_and_relaxation(rows):
     left = softening(np.array([INDENTATIONS_N - 1]), settling=AGEING.settling, ageing=AGEING.ageing)[0]
     assert rows["ageing"].force_pct == pytest.approx(100 * (1 / left - 1), rel=1e-9)
     assert rows["relaxation"].force_pct == pytest.approx(100 * (1 / relaxed_share(RELAXATION) - 1), rel=1e-9)
-    assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0  # displacement is prescribed
+    # the depth of a press is given, so these effects change only the force
+    assert rows["ageing"].field_pct == rows["relaxation"].field_pct == 0
 
 
 def test_one_kelvin_changes_the_field_by_0_12_percent(rows):
-    of = synthesis()
-    board = draw_board(of.main_boards.design, of.spreads, seed=1, name="b0")
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=of.main_boards.quadrature.in_si())
+    scene = synthesis()
+    board = draw_board(scene.main_boards.design, scene.spreads, seed=1, name="b0")
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0", rule=scene.main_boards.quadrature.in_si())
     rest_T, _ = changes_of_field(board, skin, np.zeros((0, 3)))
     assert rows["temperature"].field_pct == pytest.approx(100 * (1 / 0.9988 - 1), rel=1e-6)
     assert rows["temperature"].rest_uT == pytest.approx(0.0012e6 * np.abs(rest_T).max(), rel=1e-6)
 
 
 def test_no_load_reading_removes_a_steady_field(rows):
-    assert 0 < rows["the earth's field"].field_pct < 1e-6  # rounding
+    assert 0 < rows["the earth's field"].field_pct < 1e-6  # rounding only
     assert rows["the earth's field"].rest_uT == pytest.approx(45)
 
 
-def test_kept_effects_matter(rows):
-    # Increments change 16-23 % on a bonded skin at 1.2 mm; on a sliding skin the linear far field dominates
+def test_included_effects_change_the_field(rows):
+    # Following the deformation in increments changes the field by 16-23 % on a bonded skin at 1.2 mm; on a sliding skin
+    # the linear far field dominates
     assert rows["increments"].field_pct > 2
     assert rows["rotation of the magnetisation"].field_pct > 5
     assert rows["slipping base"].field_pct > 50
     assert rows["the chips' steps"].field_pct < 0.5
 
 
-def test_bonded_base_is_a_kept_effect(rows, not_inside):
+def test_bonded_base_is_an_included_effect(rows, not_inside):
     hold = {
         "give_um": (48.0, 7.0),
         "away_um_mm": 6.0,
@@ -104,13 +106,13 @@ def test_bonded_base_is_a_kept_effect(rows, not_inside):
 
 def test_self_field_error_is_proportional_to_powder(rows, not_inside):
     half = rows_of(with_protocol("grid", FEW, skin=synthesis("skin", saturation_T=0.055).skin.model_dump()))
-    # 10 %: the field is half as strong, and the magnetisation is not quite linear in it
+    # 10 %: the magnetising field is half as strong, and the magnetisation is not quite linear in this field
     assert half["the powder's own field"].field_pct == pytest.approx(
         rows["the powder's own field"].field_pct / 2, rel=0.1
     )
 
 
-def test_rows_describe_their_measurement(rows):
+def test_rows_describe_how_they_are_computed(rows):
     assert all(row.how for row in rows.values())
 
 
@@ -133,7 +135,8 @@ def test_table_lists_the_protocols_of_each_effect():
         "the earth's field": "neglected",
         "temperature": "computed: grid, wear",
     }
-    assert table.index[-1] == "temperature"  # effects that the main protocol neglects come first
+    # effects that the main protocol neglects come first; it includes temperature
+    assert table.index[-1] == "temperature"
     assert table.loc["ageing"].tolist()[1:] == ["12", "–", "0.5", "so", "simulated"]
 
 

@@ -1,4 +1,4 @@
-"""Tests of the reference methods: pairs, foreign boards and controls against closed forms, and tables."""
+"""Tests of the reference methods: paired presses, foreign boards, controls (closed forms), and tables."""
 
 from typing import Any
 
@@ -44,13 +44,13 @@ MAP = np.eye(6) + 0.2 * rng_for(0, "skins differ").standard_normal((6, 6))
 
 
 def old_uT(place_mm: np.ndarray, force_N: np.ndarray) -> np.ndarray:
-    """Return fields of the known board, which are linear in log F at each place."""
+    """Return field changes of board b0, which are linear in log F at each place."""
     towards = np.cos(place_mm @ rng_for(0, "fields").standard_normal((2, 6)))
     return 100 * towards * (2 + np.log(force_N))[:, None]
 
 
 def make_rows() -> Rows:
-    """Return two boards with the same pokes, two readings each; `MAP` maps fields of b1 to those of b0."""
+    """Return rows of two boards with the same pokes, two readings each; `MAP` converts fields of b1 to those of b0."""
     place_mm = np.tile(np.repeat(PLACES_MM, 2, axis=0), (2, 1))
     force_N = np.tile(FORCES_N, 10)
     board = np.repeat(["b0", "b1"], 10)
@@ -70,11 +70,11 @@ DATA = SceneData("test", Settings("test", "test.yaml", {"seed": 0}, {}), make_ro
 FOLD = fold("b1-draw0", range(20), range(20, 40), range(20, 40))
 
 
-def test_pairs_have_the_same_place_and_force():
+def test_paired_presses_have_the_same_place_and_force():
     rows = make_rows()
-    rows.target[20:22, 2] = 2.0  # between the two known forces
-    rows.target[22:24, 2] = 9.0  # above the largest force
-    rows.target[24:26, :2] = 50.0  # not a known place
+    rows.target[20:22, 2] = 2.0  # between the two forces of b0
+    rows.target[22:24, 2] = 9.0  # above the largest force of b0
+    rows.target[24:26, :2] = 50.0  # not a place of b0
     found = pairs_uT(rows, FOLD.train, [np.arange(i, i + 2) for i in (20, 22, 24, 26)])
     place_mm = PLACES_MM[[0, 0]]
     np.testing.assert_allclose(found[:2], old_uT(place_mm, np.array([2.0, 4.0])), rtol=1e-5)
@@ -82,15 +82,15 @@ def test_pairs_have_the_same_place_and_force():
     np.testing.assert_allclose(found[3], rows.db_uT[6], rtol=1e-5)
 
 
-def test_many_pairs_map_a_new_board_to_the_known_ones():
+def test_map_from_many_pairs_recovers_fields_of_the_known_board():
     back_uT = standardised_uT(DATA, FOLD, pool_rows(DATA, FOLD))
-    np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # ridge penalty above 0
+    np.testing.assert_allclose(back_uT, DATA.rows.db_uT[:20], rtol=0.02, atol=2.0)  # the ridge penalty is above 0
     nowhere = fold("b1-draw0", range(2), range(36, 40), range(20, 40))
     with pytest.raises(ParamsError, match="no labelled poke is within"):
         standardised_uT(DATA, nowhere, pool_rows(DATA, nowhere))
 
 
-def test_collapsed_network_is_trained_again(monkeypatch):
+def test_collapsed_network_is_retrained(monkeypatch):
     good = draw_weights(paper_layers(15), rng_for(0, "good"))
     known = rng_for(0, "known").normal(size=(20, 15)).astype(np.float32)
     target = Predictor(good, "paper", "cpu")(known)
@@ -108,23 +108,23 @@ def test_control_pokes_are_those_of_the_next_board():
     assert [next_board(one, folds).name for one in folds] == ["b1-draw0", "b1-draw1", "b0-draw0", "b0-draw1"]
 
 
-def test_foreign_fields_keep_length_but_not_direction():
+def test_foreign_fields_have_equal_length_and_another_direction():
     chips = rng_for(0, "chips").standard_normal((3, 5, 3))
     for name, change in STRANGERS.items():
         np.testing.assert_allclose(np.linalg.norm(change(chips), axis=(1, 2)), np.linalg.norm(chips, axis=(1, 2)))
         assert not np.allclose(change(chips), chips), name
     np.testing.assert_allclose(chips @ np.linalg.matrix_power(QUARTER_TURN, 4), chips)
-    own = Board(chips[:1].reshape(1, -1), chips.reshape(3, -1), chips.reshape(3, -1))
-    exchanged = own.alter(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
+    this_board = Board(chips[:1].reshape(1, -1), chips.reshape(3, -1), chips.reshape(3, -1))
+    exchanged = this_board.alter(STRANGERS["two chips exchanged"]).pool_uT.reshape(3, 5, 3)
     np.testing.assert_array_equal(exchanged, chips[:, [0, 2, 1, 3, 4]])
 
 
-def test_alarms_exceed_each_boards_limit():
+def test_readings_above_the_limit_of_their_board_are_flagged():
     right = {"b0": np.array([0.1, 0.2, 0.3, 0.4]), "b1": np.array([0.1, 0.1, 0.2, 0.2])}
     foreign = {"b0": np.array([0.9, 0.9]), "b1": np.array([0.1, 0.9])}
     found = alarm_statistics(foreign, right, {"b0": 0.35, "b1": 0.15})
     assert found["alarm_pct"]["mean"] == pytest.approx((100 + 50) / 2)
-    assert found["auc"]["mean"] == pytest.approx((1.0 + 0.5 * 0.25 + 0.5) / 2)  # ties count half
+    assert found["auc"]["mean"] == pytest.approx((1.0 + 0.5 * 0.25 + 0.5) / 2)  # equal scores count half
     assert found["left_median"]["mean"] == pytest.approx((0.9 + 0.5) / 2)
     assert alarm_statistics(right, right, {"b0": 0.35, "b1": 0.15})["auc"]["mean"] == pytest.approx(0.5)
 
@@ -135,7 +135,7 @@ def test_flagged_readings_are_scored_by_board():
     assert limits_of(value, 0.0) == {"b0": 3.0, "b1": 9.0}
     found = score_flagged(value, off_mm, 0.0)
     assert found["flagged_pct"]["mean"] == pytest.approx((25 + 0) / 2)
-    assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}  # b1 has none
+    assert found["accuracy_pct_flagged"] == {"mean": 0.0, "n": 1}  # no reading of b1 is flagged
     assert found["mse_xy_mm2_flagged"]["mean"] == pytest.approx(2.0)
     assert found["accuracy_pct_others"]["mean"] == pytest.approx((100 + 75) / 2)
     assert found["mse_xy_mm2_others"]["n"] == 2
@@ -146,9 +146,9 @@ def points(method: str, given: str, off_mm: dict[str, float]) -> list[dict[str, 
     board = np.array(["b", "b"])
     found = []
     for name, by_mm in off_mm.items():
-        own = np.char.add(board, name)
+        skin = np.char.add(board, name)
         keys = {"method": method, "name": given, "labels_n": 0, "fold": f"b{name}", "seed_i": 0}
-        found.append(keys | {"scores": score_groups(true, true + [[by_mm, 0, 0], [0, 0, 0]], own, own)})
+        found.append(keys | {"scores": score_groups(true, true + [[by_mm, 0, 0], [0, 0, 0]], skin, skin)})
     return found
 
 
@@ -176,7 +176,7 @@ def test_control_is_paired_by_board():
     assert "over" not in rows["ridge", NONE]
 
 
-def test_tables_have_gains_reasons_and_sources():
+def test_tables_list_gains_reasons_and_sources():
     tables_by_name = tables(numbers(), "recorded")
     assert tables_by_name["rivals"]["method"].tolist() == ["ridge", "ridge, CORAL"]
     assert tables_by_name["rivals"]["why"].tolist() == ["–", WHY["CORAL"]]

@@ -1,4 +1,4 @@
-"""Tests of the results files of experiments: numbers, figure data and losses of captures."""
+"""Tests of the result files of experiments: numbers, figure data, and rows lost per capture."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from reskin.errors import SchemaError
 from tests.data import tables
 
 
-def test_every_capture_is_counted(tmp_path):
+def test_losses_of_every_capture_are_counted(tmp_path):
     for i in range(2):
         account = {"bytes_n": 82 * (i + 1), "skipped_resync_bytes_n": i}
         io.write_readings(tmp_path / f"b{i}_s0-wear.parquet", [tables.readings()], account)
@@ -21,7 +21,7 @@ def test_every_capture_is_counted(tmp_path):
     assert losses["left_out"] == {"low_force_rows_n": 3}
 
 
-def test_main_captures_have_no_separate_losses(tmp_path):
+def test_losses_of_main_captures_are_not_repeated(tmp_path):
     write_results(tmp_path / "contacts.json", {"pairs_n": 3}, {"along": [1.0]})
     written = json.loads((tmp_path / "contacts.json").read_text())
     assert written["losses"] == {"accounts": [], "left_out": {}}

@@ -1,4 +1,4 @@
-"""Tests of error against run time: quadratures and integrators against closed forms, refinement and order."""
+"""Tests of experiment runtime (error against run time): quadratures and integrators, compared with closed forms."""
 
 from dataclasses import replace
 from itertools import accumulate
@@ -88,17 +88,18 @@ def error_of(rows, method, cell_mm=None, layers_n=None) -> float:
     return row.error
 
 
-def test_skin_on_quadrature_nodes_equals_the_drawn_one():
+def test_skin_with_nodes_of_a_quadrature_equals_the_drawn_skin():
     even = spreads(skin_amplitude=0.0, skin_filler=0.0, skin_rotation_deg=0.0)
     drawn = draw_skin(design(), even, seed=0, name="s3", rule=COARSE)
     ours = with_nodes(trial(name="s3"), place_nodes(drawn.thickness_m, COARSE))
     np.testing.assert_array_equal(ours.nodes_m, drawn.nodes_m)
-    np.testing.assert_allclose(ours.moments_A_m2, drawn.moments_A_m2, rtol=1e-14)  # the unperturbed factors are 1
+    # without spreads, all amplitude factors are 1
+    np.testing.assert_allclose(ours.moments_A_m2, drawn.moments_A_m2, rtol=1e-14)
     assert (ours.seat_m == drawn.seat_m).all()
     assert ours.depth_zero_m == drawn.depth_zero_m
 
 
-def test_pokes_follow_the_pattern_of_the_skin():
+def test_pokes_are_placed_relative_to_the_magnet_pattern():
     one = trial(skin_seat_mm=1.0)
     assert np.abs(one.skin.seat_m).min() > 0
     places_mm = 1e3 * (one.pokes_m[:, :2] - one.skin.seat_m)
@@ -131,7 +132,8 @@ def test_boxes_fill_the_volume_of_the_lattice():
 
 
 def test_lifted_box_equals_charged_faces(monkeypatch):
-    # A single box fills the skin; it is too wide for a dipole. Between like poles it is magnetised along z.
+    # A single box fills the skin; the dipole approximation would be wrong. Between equal poles, it is magnetised along
+    # z.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(
@@ -163,29 +165,29 @@ def test_gauss_nodes_integrate_polynomials_exactly():
         assert share @ (x**power_x * y**power_y * z**power_z) == pytest.approx(mean, rel=1e-12, abs=1e-15)
 
 
-def test_path_follows_the_flow():
+def test_path_of_material_follows_the_flow():
     one = trial()
     skin = with_nodes(one, place_nodes(one.skin.thickness_m, COARSE))
-    path, poke_m, some = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
-    away_m = skin.nodes_m[some, :2] - poke_m[:2]
+    path, poke_m, material = paths(one, skin), one.pokes_m[3], slice(700, 1100, 40)
+    away_m = skin.nodes_m[material, :2] - poke_m[:2]
     r_m, z_m, depths_m = (
         np.linalg.norm(away_m, axis=1),
-        skin.nodes_m[some, 2],
+        skin.nodes_m[material, 2],
         one.pokes_m[:, 2] + skin.depth_zero_m,
     )
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
-    there = deformation.follow(r_m, z_m, deformation.depth_steps(tuple(np.unique(depths_m)), press), press=press)[-1]
-    outward_m = (path.nodes_m[3, some, :2] - poke_m[:2]) * away_m / r_m[:, None]
-    assert np.abs(there.r_m - r_m).max() > 20e-6
-    # 2 um: error of the spline between the nodes of the flow; the material moves by up to 1 mm
-    np.testing.assert_allclose(outward_m.sum(axis=1), there.r_m, atol=2e-6)
-    np.testing.assert_allclose(path.nodes_m[3, some, 2], there.z_m, atol=2e-6)
-    turn_rad = np.cross(path.turns_rad[3, some], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
+    followed = deformation.follow(r_m, z_m, deformation.depth_steps(tuple(np.unique(depths_m)), press), press=press)[-1]
+    outward_m = (path.nodes_m[3, material, :2] - poke_m[:2]) * away_m / r_m[:, None]
+    assert np.abs(followed.r_m - r_m).max() > 20e-6
+    # 2 um: error of the spline between the nodes of the flow, while the material moves by up to 1 mm
+    np.testing.assert_allclose(outward_m.sum(axis=1), followed.r_m, atol=2e-6)
+    np.testing.assert_allclose(path.nodes_m[3, material, 2], followed.z_m, atol=2e-6)
+    turn_rad = np.cross(path.turns_rad[3, material], [0.0, 0.0, 1.0])[:, :2]  # from z towards r
     angle_rad = (turn_rad * away_m / r_m[:, None]).sum(axis=1)
-    np.testing.assert_allclose(angle_rad, deformation.rotation_angle(there.f), atol=5e-3)
+    np.testing.assert_allclose(angle_rad, deformation.rotation_angle(followed.f), atol=5e-3)
 
 
-def test_errors_are_those_of_the_worst_skin():
+def test_error_is_that_of_the_worst_skin():
     trials = [trial(), trial(name="s1")]
     truth_T = [np.ones((4, 5, 3)), 2 * np.ones((4, 5, 3))]
     factors = [np.array([1.1, 0.9, 1.0, 1.0]), np.array([1.0, 1.0, 1.3, 1.3])]
@@ -200,7 +202,7 @@ def test_errors_are_those_of_the_worst_skin():
 
 def test_midpoint_layers_have_the_specified_error(quadratures):
     rows, _ = quadratures
-    # 9-74 % at 0.5 mm x 4 layers; about 1 % with six Gauss nodes
+    # The error is 9-74 % with boxes of 0.5 mm in 4 layers, and about 1 % with six Gauss nodes.
     assert 0.09 < error_of(rows, "midpoint", 0.5, 4) < 0.74
     assert error_of(rows, "Gauss in z", 0.5, 6) < 0.02
     assert error_of(rows, "midpoint", 0.5, 8) > 2 * error_of(rows, "Gauss in z", 0.5, 4)
@@ -222,34 +224,34 @@ def test_reference_is_ten_times_better_than_the_limit(quadratures):
     assert 0 < rows[0].error < 0.1 * ERROR_MAX
 
 
-def test_magpylib_equals_the_kernel(quadratures):
+def test_fields_of_magpylib_and_of_the_kernel_are_equal(quadratures):
     _, calls = quadratures
     calls = {one.key[1]: one.call for one in calls if one.key[2] == rule_name(COARSE)}
     kernel_T = calls["kernel alone"]()
     for name in ("magpylib.core dipoles", "magpylib dipoles"):
-        # magpylib's fields are differences of two sums, and its mu_0 is that of another CODATA year.
+        # The field changes of magpylib are differences of two sums, and magpylib uses mu_0 of another CODATA year.
         np.testing.assert_allclose(calls[name](), kernel_T, atol=1e-7 * np.abs(kernel_T).max())
 
 
 def test_field_by_flow_equals_field_by_paths():
     one = trial()
     ours_T, theirs_T = (METHODS[name](one, COARSE).call() for name in ("Gauss in z", "kernel alone"))
-    # 0.5 %: both interpolate, between different nodes; without the rotation the error of dB exceeds dB
+    # 0.5 %: both methods interpolate, between different nodes. Without the rotation, the error would exceed dB.
     assert np.linalg.norm(ours_T - theirs_T) < 0.005 * np.linalg.norm(ours_T)
 
 
-def test_distant_boxes_are_dipoles():
+def test_field_of_distant_boxes_equals_that_of_dipoles():
     deep = replace(BOARD, chips_m=BOARD.chips_m - (0.0, 0.0, 40e-3))
     one = trial(deep)
     boxes_T = METHODS["magpylib cuboids"](one, Quadrature(2e-3, 2)).call()
     dipoles_T = prepare(one, midpoints(one.skin.thickness_m, Quadrature(2e-3, 2))).call()
-    # 1 %: (cell / distance)^2 is 0.2 %, and the flows are interpolated between different nodes
+    # 1 %: (cell / distance)^2 is 0.2 %, and the two flows are interpolated between different nodes.
     assert np.linalg.norm(boxes_T - dipoles_T) < 0.01 * np.linalg.norm(dipoles_T)
 
 
-def test_each_rule_has_one_row_to_be_timed(quadratures):
+def test_each_rule_is_timed_in_one_row(quadratures):
     rows, calls = quadratures
-    expected = {(method, rule_name(rule)) for method, own in TRIED.items() for rule in own}
+    expected = {(method, rule_name(rule)) for method, rules_of_method in TRIED.items() for rule in rules_of_method}
     assert {(row.method, row.setting) for row in rows[1:]} == expected
     assert len(rows) == 1 + len(expected)
     assert [one.key for one in calls] == [row.key for row in rows[1:]]
@@ -272,7 +274,7 @@ ROWS = [
     row(CANDIDATES, 1, 4, 1936, 0.08),
     BETTER,
     GOOD,
-    row("midpoint", 2, 9, 900, 0.001),  # midpoint rules are not candidates
+    row("midpoint", 2, 9, 900, 0.001),  # not a candidate: a midpoint rule
 ]
 
 
@@ -290,7 +292,7 @@ def test_no_rule_is_chosen_above_the_limit():
     assert choice.differs
 
 
-def test_untried_rule_in_use_has_no_error():
+def test_rule_in_use_that_was_not_tried_has_no_error():
     assert choose(ROWS, used=Quadrature(0.1e-3, 20)).used_error is None
 
 
@@ -299,7 +301,7 @@ def test_untried_rule_in_use_has_no_error():
     st.floats(0, 1),
     st.floats(0, 1),
 )
-def test_looser_limit_never_costs_more(points, strict, extra):
+def test_looser_error_limit_never_chooses_a_slower_rule(points, strict, extra):
     rows = [row(CANDIDATES, i, 1, nodes_n, error) for i, (nodes_n, error) in enumerate(points)]
     strictly, loosely = (choose(rows, used=DEFAULT_QUADRATURE, error_max=most) for most in (strict, strict + extra))
     if strictly.nodes_n is not None:
@@ -315,7 +317,7 @@ def test_timing_alternates_the_order_of_methods():
 
 
 def test_times_are_medians_per_indentation(monkeypatch):
-    now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])  # before and after each of three calls
+    now_s = accumulate([0.0, 0.005, 1.0, 0.5, 1.0, 0.005])  # clock readings before and after each of three calls
     monkeypatch.setattr("pipeline.experiments.runtime.perf_counter", lambda: next(now_s))
     (slow,) = time_calls([TimedCall(("study", "naps", "x"), lambda: None, 5)], 3)
     assert slow.key == ("study", "naps", "x")
@@ -346,7 +348,7 @@ def select(rows, ratio, method) -> list[Precision]:
     return [row for row in rows if row.study == runtime.study_name(ratio) and row.method == method]
 
 
-def test_stiffness_1e7_is_that_of_the_skin():
+def test_skin_has_a_stiffness_ratio_of_1e7():
     np.testing.assert_allclose(runtime.stiff(1e7).tau_s, SKIN_RELAXATION.tau_s, rtol=1e-12)
 
 
@@ -359,7 +361,7 @@ def test_stiffness_is_the_ratio_of_relaxation_times(ratio):
 
 
 def test_exact_force_equals_a_convolution():
-    # Lee & Radok 1960, by adaptive quadrature
+    # Reference: the convolution integral of Lee & Radok (1960), by adaptive quadrature.
     prony, (time_s, elastic) = runtime.stiff(1e5), repeated_presses(2)
     speeds = np.diff(elastic) / np.diff(time_s)
 
@@ -373,7 +375,7 @@ def test_exact_force_equals_a_convolution():
         assert force == pytest.approx(sum(parts), rel=1e-10, abs=1e-12)
 
 
-def test_twenty_pokes_take_thirty_seconds():
+def test_twenty_simulated_pokes_last_thirty_seconds():
     time_s, elastic = repeated_presses(20)
     assert time_s[-1] == pytest.approx(30.0)
     assert len(time_s) == 61
@@ -382,7 +384,7 @@ def test_twenty_pokes_take_thirty_seconds():
 
 
 @pytest.mark.parametrize("ratio", RATIOS)
-def test_exact_update_is_exact_at_any_stiffness(relaxations, ratio):
+def test_exact_update_has_no_error_at_any_stiffness(relaxations, ratio):
     (exact,) = select(relaxations[0], ratio, EXACT)
     assert exact.error < 1e-14
     assert exact.work_n == 0
@@ -401,14 +403,14 @@ def test_every_method_has_a_row_per_stiffness_and_setting(relaxations):
 
 @pytest.mark.parametrize("method", SOLVERS)
 def test_smaller_tolerance_costs_calls_and_reduces_the_error(relaxations, method):
-    for ratio in RATIOS[1:5]:  # at 1e3 even the loose tolerance reaches rounding error
+    for ratio in RATIOS[1:5]:  # excludes 1e3, at which even the loose tolerance reaches rounding error
         loose, tight = select(relaxations[0], ratio, method)
         assert tight.error < loose.error
         assert tight.work_n > loose.work_n
 
 
 def test_euler_is_of_first_order(relaxations):
-    # 20 %: the second order term
+    # Tolerance 20 %: the term of second order.
     wide, narrow = select(relaxations[0], 1e3, EULER)
     assert wide.error / narrow.error == pytest.approx(10, rel=0.2)
 
@@ -452,8 +454,8 @@ def test_solver_failure_is_reported(monkeypatch):
     assert {one.failure for one in select(rows, 1e7, "BDF")} == {Failed.message}
 
 
-def test_number_of_pokes_hardly_changes_the_error():
-    # A few pokes represent many within a factor of two, while errors span ten decades.
+def test_error_hardly_depends_on_the_number_of_pokes():
+    # Errors of few and of many pokes agree within a factor of two, which suffices: errors span ten decades.
     once, thrice = (
         study_integrators(settings(ratios=(1e7,), tolerances=(1e-5,), pokes_n=pokes_n))[0] for pokes_n in (2, 6)
     )

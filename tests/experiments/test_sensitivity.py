@@ -1,4 +1,4 @@
-"""Tests of resolved weights, compared with naive loops, the normal distribution and SciPy."""
+"""Tests of experiment sensitivity (smallest resolved weight) against loops, the normal distribution and SciPy."""
 
 from itertools import pairwise
 
@@ -28,12 +28,12 @@ ALONG = np.array([0.6, 0.0, -0.8])
 
 
 def fillings(fillings_n=40, readings_n=5, noise_uT=NOISE_uT, name="glass"):
-    """Return readings of a linear skin with three channels."""
+    """Return readings [filling, level, reading, channel] of a linear skin under a glass that is filled in steps."""
     noise = noise_uT * rng_for(0, name).standard_normal((fillings_n, len(WEIGHT_N), readings_n, 3))
     return (GAIN_uT_PER_N * WEIGHT_N[:, None, None] * ALONG + noise).astype(np.float32)
 
 
-def test_shares_equal_a_loop_over_pairs():
+def test_fractions_in_the_right_order_equal_a_loop_over_pairs():
     response = rng_for(0, "pairs").integers(0, 4, size=(2, 5, 3)).astype(float)
     for steps_n in range(1, 5):
         right = [
@@ -46,48 +46,50 @@ def test_shares_equal_a_loop_over_pairs():
         assert ordered_share(response)[steps_n - 1] == pytest.approx(np.mean(right))
 
 
-def test_shares_equal_the_normal_distribution():
+def test_fractions_in_the_right_order_equal_the_normal_distribution():
     shares = analyse_levels(fillings(), WEIGHT_N)[1]["by_direction"]
     z = GAIN_uT_PER_N * STEP_N * np.arange(1, 4) / (np.sqrt(2) * NOISE_uT)
-    np.testing.assert_allclose(shares["one_reading"][:3], norm.cdf(z), atol=0.015)  # 12,500 dependent pairs
-    np.testing.assert_allclose(shares["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)  # 500 pairs
+    # sampling error of 12,500 dependent pairs
+    np.testing.assert_allclose(shares["one_reading"][:3], norm.cdf(z), atol=0.015)
+    # sampling error of 500 pairs
+    np.testing.assert_allclose(shares["five_readings"][:3], norm.cdf(np.sqrt(5) * z), atol=0.03)
 
 
 def test_gain_and_noise_are_recovered():
-    numbers, drawn = analyse_levels(fillings(), WEIGHT_N)
-    assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)  # an error of 0.5 uT in 150 uT
-    assert numbers["noise_uT"] == pytest.approx(NOISE_uT, rel=0.05)  # 2080 degrees of freedom: 1.6 %
-    # The smallest resolved difference is 1.645 sqrt(2) sd / gain, rounded up to the next step.
+    numbers, figure_data = analyse_levels(fillings(), WEIGHT_N)
+    assert numbers["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N, rel=0.01)  # 0.5 uT in 150 uT
+    assert numbers["noise_uT"] == pytest.approx(NOISE_uT, rel=0.05)  # 2080 degrees of freedom: standard error of 1.6 %
+    # The smallest resolved weight is 1.645 sqrt(2) noise / gain, rounded up to the next level.
     assert numbers["smallest_step_N"]["one_reading"] == pytest.approx(0.04)
     assert numbers["smallest_step_N"]["five_readings"] == pytest.approx(0.02)
     assert numbers["smallest_step_mL"]["five_readings"] == pytest.approx(
         2.04, abs=0.01
     )  # 0.02 N / 9.81 m/s^2 is 2.04 g
-    assert len(drawn["response_uT"]) == numbers["levels_n"] == 26
+    assert len(figure_data["response_uT"]) == numbers["levels_n"] == 26
 
 
-def test_direction_is_fitted_on_the_first_half():
+def test_direction_is_fitted_to_the_first_half_of_fillings():
     uT = fillings(noise_uT=0.0)
-    np.testing.assert_allclose(direction(uT[:20].astype(float)), ALONG, atol=1e-6)  # float32
+    np.testing.assert_allclose(direction(uT[:20].astype(float)), ALONG, atol=1e-6)  # rounding to float32
     turned = uT.copy()
-    turned[20:] = turned[20:, :, :, [1, 0, 2]]  # the second half has another direction
+    turned[20:] = turned[20:, :, :, [1, 0, 2]]  # in the second half, the field changes in another direction
     assert analyse_levels(turned, WEIGHT_N)[0]["gain_uT_per_N"] == pytest.approx(GAIN_uT_PER_N * 0.64, rel=1e-4)
 
 
 @given(st.floats(0.1, 10.0))
-def test_shares_are_scale_invariant(factor):
+def test_fractions_do_not_depend_on_the_scale_of_fields(factor):
     uT = fillings(4)
-    one, other = (analyse_levels((own * uT).astype(np.float32), WEIGHT_N)[0] for own in (1.0, factor))
+    one, other = (analyse_levels((scale * uT).astype(np.float32), WEIGHT_N)[0] for scale in (1.0, factor))
     assert one["smallest_step_N"] == other["smallest_step_N"]
 
 
-def test_smallest_step_follows_the_last_failing_one():
+def test_smallest_resolved_step_follows_the_last_unresolved_one():
     assert smallest_step_N(np.array([0.96, 0.94, 0.95, 1.0]), 0.1) == pytest.approx(0.3)
     assert smallest_step_N(np.array([0.95, 1.0]), 0.1) == pytest.approx(0.1)
     assert smallest_step_N(np.array([1.0, 0.9]), 0.1) is None
 
 
-def test_skin_without_signal_has_no_smallest_step():
+def test_skin_without_signal_resolves_no_step():
     numbers, _ = analyse_levels(fillings(noise_uT=1e6), WEIGHT_N)
     assert numbers["smallest_step_N"] == numbers["smallest_step_mL"] == {}
     assert not numbers["monotonic"]["holds"]
@@ -95,7 +97,7 @@ def test_skin_without_signal_has_no_smallest_step():
 
 
 def two_fillings(values, spread):
-    """Return two fillings with mean `values` in steps of 0.1 N, whose rises differ by `spread`."""
+    """Return two fillings with mean field `values` at levels 0.1 N apart; the rises of the two differ by `spread`."""
     wobble = spread / 2 * (-1.0) ** np.arange(len(values)) / 2
     return np.array([values + wobble, values - wobble]), 0.1 * np.arange(len(values))
 
@@ -106,8 +108,8 @@ def two_fillings(values, spread):
 )
 def test_falls_and_rank_correlation(values, spread):
     found = monotonic(*two_fillings(np.array(values, float), spread))
-    gain = linregress(np.arange(len(values)), values).slope  # per step
-    noise = spread / np.sqrt(2)  # of two rises that differ by `spread`
+    gain = linregress(np.arange(len(values)), values).slope  # uT per level
+    noise = spread / np.sqrt(2)  # standard deviation of two values that differ by `spread`
     steps_n = int(np.ceil(1.6448536 * noise / gain)) if gain > 0 else len(values)
     if steps_n < len(values):
         pairs = list(zip(values, values[steps_n:], strict=False))
@@ -121,13 +123,14 @@ def test_falls_and_rank_correlation(values, spread):
     assert found["spearman"] == pytest.approx(spearmanr(np.arange(len(values)), values).statistic)
 
 
-def test_monotonicity_does_not_depend_on_the_filling_step():
-    fine_N = 0.002 * np.arange(251)  # the range of WEIGHT_N in steps of a tenth
+def test_monotonicity_does_not_depend_on_the_step_of_filling():
+    fine_N = 0.002 * np.arange(251)  # the range of WEIGHT_N, with steps a tenth as large
     noise = NOISE_uT * rng_for(0, "fine").standard_normal((40, len(fine_N), 5, 3))
     fine = (GAIN_uT_PER_N * fine_N[:, None, None] * ALONG + noise).astype(np.float32)
     pourings = ((fine, fine_N), (fillings(), WEIGHT_N))
     found, coarse = (analyse_levels(uT, weight_N)[0]["monotonic"] for uT, weight_N in pourings)
-    assert found["neighbours"]["falls_n"] > 0  # a mean rise of 0.6 uT has noise of 5 sqrt(2 / 100) = 0.7 uT
+    # the mean rise per level is 0.6 uT, with noise of 5 sqrt(2 / 100) = 0.7 uT
+    assert found["neighbours"]["falls_n"] > 0
     assert found["holds"]
     assert coarse["holds"]
     assert found["step_N"] <= coarse["step_N"] == pytest.approx(0.02)
@@ -135,24 +138,24 @@ def test_monotonicity_does_not_depend_on_the_filling_step():
 
 def test_significant_fall_is_not_monotonic():
     uT = fillings()
-    uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # drops by half
+    uT[:, 13:] -= uT[:, 13:].mean(axis=(0, 1, 2)) / 2  # the field drops by half at level 13
     assert not analyse_levels(uT, WEIGHT_N)[0]["monotonic"]["holds"]
 
 
-def test_number_of_falls_by_noise_equals_its_expectation():
+def test_expected_number_of_falls_by_noise():
     rng = rng_for(0, "falls")
     rise_uT, noise_uT, fillings_n = 0.5, 2.0, 10
     response_uT = rise_uT * np.arange(2001) + noise_uT * rng.standard_normal((fillings_n, 2001))
     found = monotonic(response_uT, 0.01 * np.arange(2001))["neighbours"]
-    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # 576
-    assert found["expected_falls_n"] == pytest.approx(expected_n, rel=0.02)  # noise known to 1 %
+    expected_n = 2000 * norm.cdf(-rise_uT / (noise_uT * np.sqrt(2 / fillings_n)))  # expected: 576 falls
+    assert found["expected_falls_n"] == pytest.approx(expected_n, rel=0.02)  # the noise is estimated to 1 %
     assert found["falls_n"] == pytest.approx(expected_n, abs=4 * np.sqrt(expected_n))
 
 
-def test_readings_are_sorted_by_filling_weight():
+def test_readings_are_sorted_by_filling_and_weight():
     db_uT = np.arange(24, dtype=np.float32).reshape(12, 2)
     indentation = np.repeat([0, 1], 6).astype(np.int32)
-    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # two fillings
+    force_N = np.repeat([0.0, 0.1, 0.2, 0.2, 0.1, 0.3], 2).astype(np.float32)  # two fillings, mixed
     levels = group_by_level(db_uT, indentation, force_N, levels_n=3, where="glass")
     assert levels.shape == (2, 3, 2, 2)
     np.testing.assert_array_equal(levels.reshape(12, 2), db_uT)
@@ -195,7 +198,7 @@ def test_monotonicity_is_judged_at_a_stated_step():
 
 
 def test_figure_has_its_source_and_is_reproducible():
-    numbers, drawn = glass(0.0)
-    figure = figures(numbers, drawn, "simulated")["sensitivity.svg"]
+    numbers, figure_data = glass(0.0)
+    figure = figures(numbers, figure_data, "simulated")["sensitivity.svg"]
     assert "(simulated)" in figure
-    assert figure == figures(numbers, drawn, "simulated")["sensitivity.svg"]
+    assert figure == figures(numbers, figure_data, "simulated")["sensitivity.svg"]

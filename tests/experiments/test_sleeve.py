@@ -1,4 +1,4 @@
-"""Tests of contact positions on a large skin: held-out indentations, borders, rates, scores, table and map."""
+"""Tests of experiment sleeve (a large skin over several boards): held-out indentations, borders, rate, scores, map."""
 
 import re
 from xml.etree import ElementTree
@@ -33,7 +33,7 @@ SIDES_MM = np.array(AREA.sides_mm)
 
 
 def rows_of(*pokes_n, readings_n=3):
-    """Return rows of captures c0, c1, ... with the given numbers of indentations."""
+    """Return rows of captures c0, c1, ...; arguments are the numbers of indentations of the captures."""
     capture = np.repeat([f"c{i}" for i in range(len(pokes_n))], [readings_n * n for n in pokes_n])
     f = len(capture)
     empty, who = np.zeros((f, 3), np.float32), np.array(["b0"] * f)
@@ -42,7 +42,7 @@ def rows_of(*pokes_n, readings_n=3):
 
 
 def predictions(seed=0, n=60, wrong_mm=1.0):
-    """Return true and predicted x, y, F of n indentations with three readings each, and the indentation numbers."""
+    """Return true values, predictions (x, y, F) and indentation numbers of n indentations with three readings each."""
     rng = rng_for(seed, "answers")
     true = np.repeat(np.column_stack([rng.uniform((4, 4), SIDES_MM - 4, (n, 2)), rng.uniform(0, 3, n)]), 3, axis=0)
     return true, true + wrong_mm * rng.standard_normal(true.shape), np.repeat(np.arange(n), 3)
@@ -62,7 +62,8 @@ def readings_of(t_s, indentation, reading_i):
 def test_borders_of_two_rows_of_four_boards():
     assert AREA.borders_mm[0] == pytest.approx((25.4,))
     assert AREA.borders_mm[1] == pytest.approx((25.4, 50.8, 76.2))
-    np.testing.assert_allclose(AREA.chips_mm[:2], [(12.7, 12.7), (19.7, 12.7)])  # centre and right chip of board 0
+    # the centre chip and the right chip of board 0
+    np.testing.assert_allclose(AREA.chips_mm[:2], [(12.7, 12.7), (19.7, 12.7)])
     np.testing.assert_allclose(AREA.chips_mm[-2:], [(38.1, 88.9), (45.1, 88.9)])
 
 
@@ -88,7 +89,7 @@ def test_last_indentations_are_held_out(pokes_n, test_fraction):
 
 
 @pytest.mark.parametrize("test_fraction", [0.05, 0.99])
-def test_empty_side_is_an_error(test_fraction):
+def test_split_with_an_empty_side_is_an_error(test_fraction):
     with pytest.raises(ParamsError, match="would be held out: one side is empty"):
         hold_out_last(rows_of(9), test_fraction)
 
@@ -98,7 +99,7 @@ def test_rate_is_measured_within_indentations(rate, pause_s):
     t_s = np.concatenate([np.arange(5), 5 + rate * pause_s + np.arange(5)]) / rate
     reading_i = [0, 1, 2, 3, 4] * 2
     found_hz = rate_hz([readings_of(t_s, [0] * 5 + [1] * 5, reading_i)])
-    assert found_hz == pytest.approx(rate, rel=1e-6)  # 1e3 s in double precision, over steps of 2.5 ms: 1e-10
+    assert found_hz == pytest.approx(rate, rel=1e-6)  # rounding of times of 1e3 s: 1e-10 of a step of 2.5 ms
 
 
 def test_rate_of_single_readings_is_an_error():
@@ -112,7 +113,7 @@ def test_scores_equal_scikit_learn_and_loops():
     far_mm = [np.hypot(p[0] - t[0], p[1] - t[1]) for t, p in zip(true, predicted, strict=True)]
     assert scored["mse_xy_mm2"]["mean"] == pytest.approx(mean_squared_error(true[:, :2], predicted[:, :2]))
     assert scored["mse_f_N2"]["mean"] == pytest.approx(mean_squared_error(true[:, 2], predicted[:, 2]))
-    assert scored["median_error_mm"]["mean"] == pytest.approx(np.sort(far_mm)[89:91].mean())  # of 180
+    assert scored["median_error_mm"]["mean"] == pytest.approx(np.sort(far_mm)[89:91].mean())  # median of 180
     assert scored["p95_error_mm"]["mean"] == pytest.approx(np.quantile(far_mm, 0.95))
     near = [far for far, one in zip(far_mm, true, strict=True) if AREA.near_border(one[None, :2])[0]]
     assert scored["near_seam"]["median_error_mm"]["mean"] == pytest.approx(np.median(near))
@@ -121,7 +122,7 @@ def test_scores_equal_scikit_learn_and_loops():
 
 
 @given(st.floats(0, 20), st.integers(0, 100))
-def test_constant_offset_is_the_error_of_all_scores(off_mm, seed):
+def test_all_place_errors_of_a_constant_offset_equal_the_offset(off_mm, seed):
     true, _, indentation = predictions(seed)
     scored = score_places(true, [true + (0.6 * off_mm, -0.8 * off_mm, 0.0)], indentation, AREA)
     for part in (scored, scored["near_seam"], scored["inside"]):
@@ -137,7 +138,7 @@ def test_no_border_scores_without_pokes_near_a_border():
     assert scored["inside"]["pokes_n"] == 60
 
 
-def test_seeds_have_a_mean_and_a_standard_deviation():
+def test_scores_have_mean_and_standard_deviation_over_seeds():
     assert over_seeds([{"a": 1.0}]) == {"a": {"mean": 1.0, "n": 1}}
     two = over_seeds([{"a": 1.0}, {"a": 3.0}])["a"]
     assert (two["mean"], two["n"], two["sd"]) == (2.0, 2, pytest.approx(np.sqrt(2)))
@@ -146,11 +147,11 @@ def test_seeds_have_a_mean_and_a_standard_deviation():
 def test_each_tested_indentation_is_plotted_once():
     true, predicted, indentation = predictions(n=20)
     order = rng_for(0, "order").permutation(60)
-    drawn = draw_errors(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
-    np.testing.assert_allclose(drawn["x_mm"], true[::3, 0], atol=0.0051)  # rounded to 0.01 mm
-    np.testing.assert_allclose(drawn["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
-    assert len(drawn["chips_x_mm"]) == len(CROSS_MM)
-    assert (drawn["borders_x_mm"], drawn["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
+    plotted = draw_errors(AREA, true[order], errors_mm(true, predicted)[order], indentation[order])
+    np.testing.assert_allclose(plotted["x_mm"], true[::3, 0], atol=0.0051)  # rounded to 0.01 mm
+    np.testing.assert_allclose(plotted["error_mm"], errors_mm(true, predicted).reshape(20, 3).mean(axis=1), atol=0.0051)
+    assert len(plotted["chips_x_mm"]) == len(CROSS_MM)
+    assert (plotted["borders_x_mm"], plotted["area_mm"]) == ([pytest.approx(25.4)], [50.8, 101.6])
     assert isinstance(AREA, Area)
 
 
@@ -163,12 +164,12 @@ def numbers_and_figure_data(n=40):
     numbers = {
         "chips_n": 16, "rate_hz": 132.98, "area_mm": list(AREA.sides_mm), "pokes_n": 5 * n, "trained_n": 4 * n,
         "tested_n": n, "near_mm": NEAR_MM, **score_places(true, [predicted], indentation, AREA),
-        "variants": {name: score_places(true, own, indentation, AREA) for name, own in others.items()},
+        "variants": {name: score_places(true, outputs, indentation, AREA) for name, outputs in others.items()},
     }  # fmt: skip
     return numbers, draw_errors(AREA, true, errors_mm(true, predicted), indentation)
 
 
-def test_table_lists_methods_with_source_and_no_paper_number():
+def test_table_lists_methods_and_source_without_a_paper_number():
     numbers, _ = numbers_and_figure_data()
     table = tables(numbers, "simulated")["sleeve"]
     assert table["method"].tolist() == ["the paper's network", "network, recipe shape", "k nearest neighbours (dB)"]
@@ -177,15 +178,14 @@ def test_table_lists_methods_with_source_and_no_paper_number():
     assert table["seeds"].tolist() == ["1", "2", "1"]
     assert "±" in table["accuracy, %"][1]
     assert "column `seeds` gives their number" in table.attrs["spread"]
-    assert float(table["median error, mm"][0]) == pytest.approx(
-        numbers["median_error_mm"]["mean"], rel=5e-3
-    )  # 3 digits
+    # the table has three digits
+    assert float(table["median error, mm"][0]) == pytest.approx(numbers["median_error_mm"]["mean"], rel=5e-3)
     near = numbers["near_seam"]["median_error_mm"]["mean"]
     assert float(table["median near a border between boards, mm"][0]) == pytest.approx(near, rel=5e-3)
     assert f"first {4 * 40} pokes" in table.attrs["meaning"]
 
 
-def test_part_without_pokes_is_a_dash():
+def test_score_of_an_area_without_pokes_is_a_dash():
     numbers, _ = numbers_and_figure_data()
     del numbers["near_seam"]
     table = tables(numbers, "simulated")["sleeve"]
@@ -193,21 +193,21 @@ def test_part_without_pokes_is_a_dash():
     assert "0 of them less than" in table.attrs["meaning"]
 
 
-def test_setup_is_compared_with_the_papers():
+def test_table_compares_the_setup_with_the_papers():
     table = tables(numbers_and_figure_data()[0], "simulated")["sleeve_set_up"].set_index("what")
     assert table.loc["chips", ["ours", "paper"]].tolist() == ["16", "40"]
     assert table.loc["rate, Hz", ["ours", "paper"]].tolist() == ["133.0", "133"]
 
 
 def test_map_shows_tested_pokes_chips_and_source():
-    numbers, drawn = numbers_and_figure_data()
-    texts = figures(numbers, drawn, "simulated")
+    numbers, figure_data = numbers_and_figure_data()
+    texts = figures(numbers, figure_data, "simulated")
     assert list(texts) == ["sleeve.svg"]
     marks = [
         len(group.findall(f".//{SVG}use")) for group in ElementTree.fromstring(texts["sleeve.svg"]).iter(f"{SVG}g")
     ]
-    assert len(drawn["x_mm"]) == 40
-    assert len(drawn["chips_x_mm"]) in marks
+    assert len(figure_data["x_mm"]) == 40
+    assert len(figure_data["chips_x_mm"]) in marks
     assert 40 in marks
     text = " ".join(re.findall(r">([^<>]+)</text>", texts["sleeve.svg"]))
     for label in ("(simulated)", "x / mm", "y / mm", "place error", "border between boards"):
@@ -215,8 +215,10 @@ def test_map_shows_tested_pokes_chips_and_source():
 
 
 def test_figure_bytes_depend_only_on_predictions_and_source():
-    numbers, drawn = numbers_and_figure_data()
-    once, again, other = (figures(numbers, drawn, source)["sleeve.svg"] for source in ("simulated", "simulated", "x"))
+    numbers, figure_data = numbers_and_figure_data()
+    once, again, other = (
+        figures(numbers, figure_data, source)["sleeve.svg"] for source in ("simulated", "simulated", "x")
+    )
     assert once == again
     assert once != other
-    assert np.isfinite(drawn["error_mm"]).all()
+    assert np.isfinite(figure_data["error_mm"]).all()

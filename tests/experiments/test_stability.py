@@ -1,4 +1,4 @@
-"""All stability cases pass, stiff, extreme and broken ones included, and planted faults are detected."""
+"""Tests that all stability cases of experiment stability pass, and that the cases detect planted faults."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,15 +37,15 @@ def failed(cases):
 @pytest.fixture(scope="module")
 def cases():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(physics, "POKES_N", 100)  # type checks under traced memory are slow
+        patch.setattr(physics, "POKES_N", 100)  # fewer pokes: array checks are slow while memory is traced
         return survey(DESIGN, SEED)
 
 
-def test_every_case_holds(cases):
+def test_every_case_passes(cases):
     assert failed(cases) == set()
 
 
-def test_rows_are_unique_and_describe_their_outcome(cases):
+def test_rows_are_unique_and_describe_the_outcome(cases):
     assert len({(case.area, case.case) for case in cases}) == len(cases)
     assert {case.area for case in cases} == {"time", "physics", "chip", "wire"}
     assert all(case.should and case.happened for case in cases)
@@ -61,7 +61,7 @@ def sliding():
     return sliding_cases(BOARD, DESIGN.spreads, skin=DESIGN.skin, seed=SEED)
 
 
-def test_undamped_base_is_detected(monkeypatch):
+def test_base_without_damping_is_detected(monkeypatch):
     monkeypatch.setattr(contact, "_in_series", lambda layer_N_per_m, _: layer_N_per_m[:, None, None] * np.eye(2))
     assert failed(sliding()) == {
         "a drag with friction 10 on a skin that slides",
@@ -70,12 +70,12 @@ def test_undamped_base_is_detected(monkeypatch):
 
 
 def test_slide_without_rotation_and_linear_depth_are_detected(monkeypatch):
-    def straight(force_N, *, thickness_m, **of):
+    def straight(force_N, *, thickness_m, **kwargs):
         curve_m = np.linspace(0, slide.DEEPEST * thickness_m, 2000)
-        return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **of), curve_m)
+        return np.interp(force_N, slide.force_at(curve_m, thickness_m=thickness_m, **kwargs), curve_m)
 
     rigid = slide.rigid_motion
-    monkeypatch.setattr(slide, "rigid_motion", lambda *of: replace(rigid(*of), spin_rad=np.zeros(len(of[0]))))
+    monkeypatch.setattr(slide, "rigid_motion", lambda *args: replace(rigid(*args), spin_rad=np.zeros(len(args[0]))))
     monkeypatch.setattr(slide, "depth_at", straight)
     assert failed(sliding()) == {
         "the slide of a skin that is poked at its free edge",
@@ -98,7 +98,7 @@ def test_too_short_depth_table_is_detected(monkeypatch):
     }
 
 
-def test_wrong_layer_compliance_is_detected_by_all_tips(monkeypatch):
+def test_wrong_layer_compliance_is_detected_for_all_tips(monkeypatch):
     compliance, kept = layer.slipping_compliance, (layer.contact_of_depth, layer._force_curve)
     monkeypatch.setattr(layer, "slipping_compliance", lambda kh: compliance(1.5 * kh))
     for one in kept:
@@ -124,11 +124,11 @@ def test_skin_without_springs_has_no_such_case():
 
 @pytest.mark.parametrize(("chips_n", "gain_sel"), [(1, 7), (8, 0)])
 def test_streams_of_other_boards_are_checked(monkeypatch, chips_n, gain_sel):
-    monkeypatch.setattr(wire, "BLOCKS_N", 1)  # faster under traced memory
+    monkeypatch.setattr(wire, "BLOCKS_N", 1)  # a single block is faster while memory is traced
     assert failed(wire_cases(gain_sel, chips_n, SEED)) == set()
 
 
-def test_unraised_error_and_nan_do_not_hold():
+def test_case_without_the_expected_error_and_nan_fail():
     def raises():
         raise CaptureError("here: a thing must be so; got nothing. Mend it.")
 
@@ -137,20 +137,20 @@ def test_unraised_error_and_nan_do_not_hold():
     assert not error_case("wire", "a", should="b", happened="c", error=np.nan, limit=1.0).holds
 
 
-def test_other_errors_are_not_the_expected_one():
+def test_errors_of_another_type_are_not_caught():
     with pytest.raises(ZeroDivisionError):
         rejection_case("wire", "a", should="b", attempt=lambda: 1 / 0)
 
 
-def test_peak_memory_is_that_held_at_once():
+def test_peak_memory_counts_arrays_that_exist_at_once():
     def one_after_another():
         for _ in range(3):
             np.ones(125_000)
 
-    assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)  # overhead of the array
+    assert peak_bytes(one_after_another) == pytest.approx(1e6, rel=0.1)  # 10 %: overhead of the array object
 
 
-# Each of the following tests disables a guard.
+# Each of the following tests disables one guard of the library; a stability case must detect that.
 
 
 def test_naive_small_step_quotient_is_detected(monkeypatch):

@@ -1,4 +1,4 @@
-"""Extreme cases of training pass, and planted faults in the training code are detected."""
+"""Tests that extreme cases of training pass, and that they detect planted faults of the training code."""
 
 from dataclasses import replace
 
@@ -24,11 +24,11 @@ def cases():
     return learning_cases(SEED)
 
 
-def test_every_case_holds(cases):
+def test_every_case_passes(cases):
     assert failed(cases) == set()
 
 
-def test_rows_are_unique_and_describe_their_outcome(cases):
+def test_rows_are_unique_and_describe_the_outcome(cases):
     assert len({case.case for case in cases}) == len(cases)
     assert {case.area for case in cases} == {"learning"}
     assert all(case.should and case.happened for case in cases)
@@ -39,7 +39,7 @@ def test_cases_are_reproducible(cases):
     assert set(triplet_cases(SEED)) <= set(cases)
 
 
-# Each of the following tests disables a guard.
+# Each of the following tests disables one guard of the training code; a case must detect that.
 
 
 @pytest.mark.filterwarnings("ignore:invalid value encountered")
@@ -55,7 +55,7 @@ def test_too_high_scale_floor_is_detected(monkeypatch):
     assert failed(scaling_cases(SEED)) == {"labels times 2^-20"}
 
 
-def test_triplet_loss_of_roots_is_detected(monkeypatch):
+def test_triplet_loss_with_square_roots_is_detected(monkeypatch):
     def triplet_loss_of_roots(anchor, positive, negative):
         nearer, farther = ((anchor - one).pow(2).sum(-1).sqrt() for one in (positive, negative))
         return torch.relu(nearer - farther + 1e-3).mean(-1)

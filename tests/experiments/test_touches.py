@@ -1,4 +1,4 @@
-"""Tests of single and double touches on a simulated pad with additive fields."""
+"""Tests of experiment touches (one or two numbered places are touched), on a simulated pad whose fields add up."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -32,7 +32,7 @@ NOISE_uT = 2.0
 
 
 def pad(rows_n=40):
-    """Return recordings of all places and pairs: dB is force times the direction of the place, plus noise."""
+    """Return recordings of each place and pair of places: field change = force x direction of the place, plus noise."""
     rng = rng_for(0, "touches", "pad")
     directions = dict(zip(PLACES, 400 * rng.normal(size=(len(PLACES), 15)), strict=True))
     result = []
@@ -50,7 +50,7 @@ def cut():
     return [split_by_time(one, SECTION) for one in single], double
 
 
-def test_split_has_every_row_once_in_time_order():
+def test_every_row_is_on_one_side_in_time_order():
     recording = pad()[0][0]
     blocks = split_by_time(recording, SECTION)
     parts = [blocks.train, blocks.aside, blocks.test]
@@ -65,7 +65,7 @@ def test_residual_equals_bounded_least_squares():
     basis = np.stack([known[2], known[4]], axis=1)
     costs = [lsq_linear(basis, row.astype(float), (0, np.inf)).cost for row in db_uT]
     naive = np.sqrt(2 * np.array(costs)) / np.linalg.norm(db_uT.astype(float), axis=1)
-    np.testing.assert_allclose(relative_residual(known, (2, 4), db_uT), naive, rtol=1e-6)  # two solvers
+    np.testing.assert_allclose(relative_residual(known, (2, 4), db_uT), naive, rtol=1e-6)  # two least-squares solvers
 
 
 def test_residual_of_the_touched_pair_is_noise(cut):
@@ -74,11 +74,11 @@ def test_residual_of_the_touched_pair_is_noise(cut):
     assert len(numbers["pairs"]) == 6
     for pair in numbers["pairs"]:
         assert pair["rank"] == 1
-        assert pair["left_over_pct"] < 2  # the noise of 15 channels is 8 uT in about 4000 uT
+        assert pair["left_over_pct"] < 2  # noise: 8 uT over 15 channels, of about 4000 uT
         assert pair["best_alone_pct"] > 10 * pair["left_over_pct"]
 
 
-def test_single_touch_at_an_unknown_place_is_called_two(cut):
+def test_single_touch_at_an_unknown_place_is_mistaken_for_two(cut):
     result = evaluate_detection(*cut, SECTION, 0)
     for name in result["detected_pct"]:
         assert result["unseen_place_called_two_pct"][name] > 90
@@ -94,7 +94,7 @@ def test_places_and_forces_are_predicted(cut):
     assert force["by_time"]["mean"] < 0.02 * force["variance"]["mean"]
 
 
-def test_recordings_need_numbered_places():
+def test_recordings_without_numbered_places_are_an_error():
     readings = make_readings(f=60, Fz_N=np.linspace(0, 2, 60, dtype=np.float32))
     result = touched_rows(readings, {"rows_n": 60, "place_7_rows_n": 60}, Selection(force_min_N=1.0))
     assert result.places == (7,)
@@ -117,7 +117,7 @@ def test_unusable_recordings_are_skipped_with_a_reason():
     assert result.left_out["(1, 2)"] == "place 1 not recorded alone"
 
 
-def test_recordings_of_pairs_alone_give_a_reason():
+def test_recordings_of_only_pairs_are_skipped_with_a_reason():
     _, double = pad()
     result = sort_recordings(double)
     assert result.problem == "places recorded alone: 0; at least 2 are needed. Add their recordings to this scene."
@@ -131,12 +131,12 @@ def test_recordings_of_pairs_alone_give_a_reason():
     assert len(shown["touches"]) == 1 + len(double)
 
 
-def test_fractions_must_leave_test_rows():
+def test_fractions_that_leave_no_test_rows_are_an_error():
     with pytest.raises(ValidationError, match="the rest are the test rows"):
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 
 
-def test_pairs_are_shown_only_where_touched(cut):
+def test_table_shows_only_touched_pairs(cut):
     blocks, double = cut
     for pairs in (double, []):
         numbers = {

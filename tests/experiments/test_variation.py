@@ -1,4 +1,4 @@
-"""Tests of experiment variation: changes over time and between skins, its table and its figures."""
+"""Tests of experiment variation: changes over time and between skins, table and figures."""
 
 import xml.etree.ElementTree as ET
 
@@ -24,7 +24,7 @@ from tests.data.tables import readings
 
 
 def capture(passes_n: int = 4):
-    """Return passes over three places at two depths, with two readings per contact and random fields."""
+    """Return readings with random fields: passes over three places at two depths, two readings per contact."""
     stops = [(x_mm, depth_mm) for _ in range(passes_n) for depth_mm in (0.6, 1.2) for x_mm in (0, 2, 4)]
     x_mm, depth_mm = np.repeat(np.array(stops, np.float32), 2, axis=0).T
     f = len(x_mm)
@@ -50,7 +50,7 @@ def test_visits_equal_a_loop_over_readings():
             naive.setdefault(int(one.n_contacts[i]), []).append(np.stack([one.b_uT[i], one.b_uT[i] - one.noload_uT[i]]))
     assert found.contacts_n.tolist() == list(naive) == [4, 10, 16, 22]
     expected = np.array([np.mean(pair, axis=0) for pair in naive.values()])
-    # float32 rounding of fields of 100 uT is 1e-5 uT
+    # rounding of fields of 100 uT to float32 is 1e-5 uT
     np.testing.assert_allclose(found.b_uT, expected[:, 0], atol=1e-4)
     np.testing.assert_allclose(found.db_uT, expected[:, 1], atol=1e-4)
 
@@ -70,19 +70,19 @@ def test_unvisited_place_is_an_error(place_mm, depth_mm, listed):
 
 def test_change_over_time_uses_the_last_visit():
     visited = visits([[0, 0], [9, 9], [3, -1], [50, 50]], [[2, 2], [8, 8], [2, 4], [99, 99]], [7, 8, 9, 17])
-    numbers, drawn = over_time(visited, 10)
+    numbers, plotted = over_time(visited, 10)
     assert numbers == {
         "visits_n": 3, "contacts_n": 2, "first_db_uT": 2.0,
         "raw_change_uT": pytest.approx(5**0.5), "raw_change_pct": pytest.approx(50 * 5**0.5),
         "db_change_uT": pytest.approx(2**0.5), "db_change_pct": pytest.approx(50 * 2**0.5),
     }  # fmt: skip
-    assert drawn == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
+    assert plotted == {"contacts_n": [7, 8, 9], "b_uT": [[0, 0], [9, 9], [3, -1]]}
 
 
-def test_plotted_visits_include_first_and_last():
-    _, drawn = over_time(visits([[i] for i in range(500)], [[1]] * 500), 10_000)
-    assert len(drawn["contacts_n"]) == LINES_MAX_N
-    assert (drawn["contacts_n"][0], drawn["contacts_n"][-1]) == (0, 499)
+def test_plotted_visits_include_the_first_and_the_last():
+    _, plotted = over_time(visits([[i] for i in range(500)], [[1]] * 500), 10_000)
+    assert len(plotted["contacts_n"]) == LINES_MAX_N
+    assert (plotted["contacts_n"][0], plotted["contacts_n"][-1]) == (0, 499)
 
 
 @given(st.floats(-500, 500), st.floats(0.5, 3))
@@ -94,24 +94,24 @@ def test_no_load_drift_changes_only_raw_readings(drift_uT, scale):
     assert numbers["db_change_uT"] == 0
 
 
-def test_spread_between_skins_is_rms_over_pairs():
+def test_spread_between_skins_is_the_rms_over_pairs():
     lines = {"s0": [1.0, 2.0], "s1": [4.0, 2.0], "s2": [1.0, 8.0]}
-    numbers, drawn = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
+    numbers, plotted = over_skins({skin: visits([line] * 2, [line] * 2) for skin, line in lines.items()})
     pairs = [(one, other) for one in lines for other in lines if one < other]
     squares = [(a - b) ** 2 for one, other in pairs for a, b in zip(lines[one], lines[other], strict=True)]
     size_uT = np.sqrt(np.mean([value**2 for line in lines.values() for value in line]))
     assert numbers["spread_uT"] == pytest.approx(np.sqrt(np.mean(squares)))
     assert numbers["spread_pct"] == pytest.approx(100 * np.sqrt(np.mean(squares)) / size_uT)
-    assert drawn == lines
+    assert plotted == lines
 
 
-def test_line_is_the_mean_over_visits():
-    numbers, drawn = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
-    assert drawn == {"s0": [2, 4]}
+def test_plotted_line_is_the_mean_over_visits():
+    numbers, plotted = over_skins({"s0": visits([[0, 0]] * 2, [[1, 2], [3, 6]])})
+    assert plotted == {"s0": [2, 4]}
     assert "spread_uT" not in numbers
 
 
-def test_skins_are_ordered_across_boards():
+def test_skins_of_different_boards_alternate():
     boards = {"b0_s0": "b0", "b0_s1": "b0", "b1_s0": "b1", "b2_s0": "b2", "b2_s1": "b2"}
     assert first_of_each_board(boards, 4) == ["b0_s0", "b1_s0", "b2_s0", "b0_s1"]
     with pytest.raises(ParamsError, match="at most the 5 skins of the main captures; got 6"):
@@ -147,7 +147,7 @@ def test_places_have_changes_and_spread():
     assert "obvious variation across the samples" in to_markdown(table)
 
 
-def test_pace_and_temperature_are_in_the_notes():
+def test_notes_state_time_per_contact_and_temperature():
     text = to_markdown(tables(numbers(), "simulated")["variation"])
     assert "to the next is 0.0575 s; the whole capture lasts 1,166 s." in text
     assert "A real rig takes seconds per contact" in text

@@ -1,4 +1,4 @@
-"""The simulator agrees with independent references, and planted faults of the simulator are detected."""
+"""Tests that the simulator passes all checks against independent references, and that checks detect planted faults."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,11 +37,11 @@ def checks():
     return verify(DESIGN, depths_m=DEPTHS_M, seed=SEED)
 
 
-def test_every_check_holds(checks):
+def test_every_check_passes(checks):
     assert failed(checks) == set()
 
 
-def test_rows_describe_their_check(checks):
+def test_rows_describe_the_checks(checks):
     for check in checks:
         assert all((check.subject, check.law, check.against, check.unit, check.reason))
         assert np.isfinite(check.error)
@@ -60,7 +60,7 @@ def test_checks_are_reproducible():
         assert check_all() == check_all()
 
 
-def test_nan_and_exceeded_tolerance_do_not_hold():
+def test_nan_and_exceeded_tolerance_fail():
     check = Check("a", "b", "c", error=1.0, unit="1", tolerance=1.0, reason="d")
     assert check.holds
     assert not replace(check, error=1.0 + 1e-12).holds
@@ -73,7 +73,7 @@ def test_no_spread_gives_no_difference():
     assert not any(exact.values())
 
 
-# Each of the following tests plants a fault in the simulator, which a check must detect.
+# Each of the following tests plants one fault in the simulator; a check must detect the fault.
 
 
 def test_wrong_sign_inside_magnets_is_detected(monkeypatch):
@@ -90,9 +90,10 @@ def test_wrong_array_field_violates_maxwell(monkeypatch):
     assert f"magnetising array, {DESIGN.skin.polarity}: div B = 0" in failed(check_field(DESIGN.skin, SEED))
 
 
-def test_tolerance_of_the_field_constant(monkeypatch):
+def test_wrong_field_constant_is_detected_beyond_its_tolerance(monkeypatch):
     monkeypatch.setattr(change, "MU0_4PI", 1e-7)
-    assert failed(check_field(DESIGN.skin, SEED)) == set()  # 1.3e-10, less than between two CODATA years
+    # relative error 1.3e-10: less than between mu_0 of two CODATA years
+    assert failed(check_field(DESIGN.skin, SEED)) == set()
     monkeypatch.setattr(change, "MU0_4PI", 1.001e-7)
     assert failed(check_field(DESIGN.skin, SEED)) == {
         "change of field: dipoles that move and turn",
@@ -102,7 +103,7 @@ def test_tolerance_of_the_field_constant(monkeypatch):
 
 
 def test_unbonded_layer_is_detected_by_every_reference(monkeypatch):
-    monkeypatch.setattr(layer, "bonded_compliance", np.ones_like)  # a half-space
+    monkeypatch.setattr(layer, "bonded_compliance", np.ones_like)  # the compliance of a half-space
     layer._force_curve.cache_clear()
     layer.contact_of_depth.cache_clear()
     try:
@@ -149,7 +150,8 @@ def test_naive_small_step_quotient_is_detected(monkeypatch):
 
 
 def test_wrong_chip_step_is_detected(monkeypatch):
-    monkeypatch.setattr(chip, "STEP_AT_GAIN_ONE_uT", (0.161, 0.161, 0.294))  # the data sheet's other HALLCONF
+    # steps of another HALLCONF setting in the data sheet
+    monkeypatch.setattr(chip, "STEP_AT_GAIN_ONE_uT", (0.161, 0.161, 0.294))
     wrong = failed(check_electronics(DESIGN.chip, SEED))
     assert "chip: uT a count, GAIN_SEL 6 and 7" in wrong
     assert "chip: past its range, GAIN_SEL 7, to 50 mT" in wrong

@@ -1,4 +1,4 @@
-"""Tests of the simulated worlds that show which settings decide table 2."""
+"""Tests of experiment worlds: simulated variants of scene decide that show which settings determine table 2."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def test_law_error_has_size_and_smoothness_and_is_reproducible():
     parts = [np.linalg.norm(law_error(f"b{i}_s0"), axis=1) / np.linalg.norm(CHANGE_uT, axis=1) for i in range(8)]
     assert np.sqrt(np.mean(np.square(parts))) == pytest.approx(0.4, rel=0.1)
     unit = law_error() / np.linalg.norm(CHANGE_uT, axis=1, keepdims=True)
-    step = np.linalg.norm(np.diff(unit.reshape(33, 33, 15), axis=1), axis=2)  # 0.5 mm apart
+    step = np.linalg.norm(np.diff(unit.reshape(33, 33, 15), axis=1), axis=2)  # between places 0.5 mm apart
     assert step.mean() < 0.25 * np.linalg.norm(unit, axis=1).mean()
     np.testing.assert_array_equal(law_error(), law_error())
     assert not np.allclose(law_error(), law_error("b1_s0"))
@@ -46,7 +46,7 @@ def test_law_error_shares_variance_between_skins():
 
 @pytest.fixture(scope="module")
 def decide_settings() -> Settings:
-    """Return a small version of the scene decide: three boards with one skin each, few steps."""
+    """Return the settings of scene decide, reduced to three boards with one skin each and few training steps."""
     scene = YAML(typ="safe").load((ROOT / "pipeline/scenes/decide.yaml").read_text())
     scene["simulate"]["boards"]["rigid"] |= {
         "boards_n": 3, "skins_per_board_n": 1, "quadrature": {"cell_mm": 3.0, "layers_n": 2},
@@ -73,9 +73,9 @@ def test_worlds_have_the_rows_of_table_2(decide_settings, tmp_path):
     table = show.tables(numbers, "simulated")["worlds"]
     assert table["row"].tolist()[:2] == ["single-sensor", "multi-sensor"]
     assert len(table) == 8
-    drawn = show.figures(numbers, {}, "simulated")["worlds.svg"]
+    svg = show.figures(numbers, {}, "simulated")["worlds.svg"]
     for scene in ("What decides table 2 (simulated", "friction under the tip", "adapted"):
-        assert scene in texts_of(drawn)
+        assert scene in texts_of(svg)
 
 
 def test_worlds_differ_in_one_setting(decide_settings):
@@ -87,7 +87,7 @@ def test_worlds_differ_in_one_setting(decide_settings):
         "amplitude_and_gap-2", "friction-0.35", "friction-1.7",
     ]  # fmt: skip
     default, with_error, slippery = (rows_of(listed[i], section, 1) for i in (0, 2, 7))
-    np.testing.assert_array_equal(default.target, with_error.target)  # places and forces are equal
+    np.testing.assert_array_equal(default.target, with_error.target)  # the worlds have equal places and forces
     assert not np.allclose(default.db_uT, with_error.db_uT, rtol=0.05)
     np.testing.assert_array_equal(default.target, slippery.target)
     assert np.linalg.norm(default.db_uT - slippery.db_uT) > 0.01 * np.linalg.norm(default.db_uT)

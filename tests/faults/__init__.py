@@ -1,1 +1,1 @@
-"""Fault injection into a finished checkout: `make faults` writes docs/faults.md."""
+"""Fault injection: `make faults` damages copies of a checkout whose pipeline has run, and writes docs/faults.md."""

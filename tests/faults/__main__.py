@@ -1,7 +1,7 @@
 """Inject every fault and write the table: python -m tests.faults [--only WORD] [--work FOLDER] [--out FILE].
 
-Clones the last commit, runs a small scene with a few experiments there, and injects each fault into a copy of it.
-Needs Linux; faults that mount file systems need root.
+The program clones the last commit, runs a small scene with a few experiments in the clone, and injects each fault into
+a new copy of the clone. It needs Linux; faults that mount file systems need root.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from reskin import io
-from tests.faults import files, kills, together, tracking  # noqa: F401 (each adds its faults)
+from tests.faults import files, kills, together, tracking  # noqa: F401 (importing a module adds its faults)
 from tests.faults.harness import CASES, Checkout, Row, copy, line, make_template, not_run, table
 from tests.repositories import git
 from tests.stages.checkout import ROOT
@@ -50,12 +50,12 @@ def main() -> None:
 
 
 def inject(case, template: Checkout, folder: Path) -> tuple[Row, float]:
-    """Inject a fault into a fresh copy; return its row and the seconds that it took."""
+    """Inject a fault into a new copy of the finished checkout; return the fault's table row and the seconds taken."""
     shutil.rmtree(folder, ignore_errors=True)
-    at, start_s = copy(template, folder), time.monotonic()
+    checkout, start_s = copy(template, folder), time.monotonic()
     try:
-        row = case(at)
-    except Exception as error:  # the table shows the error
+        row = case(checkout)
+    except Exception as error:  # the table shows this error as the outcome
         traceback.print_exc()
         row = Row(
             "", None, "not known", "–", [f"the fault could not be injected ({type(error).__name__} {error})"[:300]]
@@ -64,7 +64,7 @@ def inject(case, template: Checkout, folder: Path) -> tuple[Row, float]:
 
 
 def page(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    """Format the page, with marked rows for faults that have not been injected yet."""
+    """Return the content of docs/faults.md; rows of faults that have not been injected yet are marked."""
     ran = [rows[name] for name in CASES if name in rows]
     lines = [rows[name]["line"] if name in rows else not_run(name, how) for name, (how, _) in CASES.items()]
     return INTRODUCTION.format(

@@ -1,4 +1,4 @@
-"""A finished checkout, its copies into which faults are injected, and the verdict on each fault."""
+"""Copies of a finished checkout, into which faults are injected, and the judgement of what each fault causes."""
 
 import os
 import re
@@ -20,18 +20,18 @@ from tests.stages.checkout import ROOT, variables
 
 SCENE = "faults"
 EXPERIMENTS = ("single_random", "transfer", "lobo", "triplet", "adapt", "baselines", "sensitivity", "audit")
-PROTOCOLS = ("grid", "glass")  # needed by these experiments
+PROTOCOLS = ("grid", "glass")  # protocols that the experiments above need
 SECTIONS = (
     "source", "seed", "selection", "train_single", "train_multi", "train_triplet", "adapt", "train_classical", "audit",
 )  # fmt: skip
 SPLIT = ("random_test_fraction", "random_repeats_n", "transfer_skins_n", "pool_passes_n")
-LIMIT_S = 600.0  # a command that takes longer hangs
+LIMIT_S = 600.0  # a command that takes longer counts as hanging
 TRACES = "Traceback (most recent call last)"
 
 
 @dataclass(frozen=True)
 class Result:
-    """The exit status of a command (None: it took longer than the limit), its output, and how long it took."""
+    """Exit status of a command (None if it was killed at the time limit), output, and duration in s."""
 
     status: int | None
     output: str
@@ -39,20 +39,20 @@ class Result:
 
     @property
     def ran(self) -> list[str]:
-        """The stages that DVC ran."""
+        """Return the names of the stages that DVC ran."""
         return re.findall(r"^Running stage '([^']+)'", self.output, re.MULTILINE)
 
 
 class Checkout:
-    """A folder in which commands run, with its own code."""
+    """A copy of the repository, in which commands run with the copy's code."""
 
     def __init__(self, folder: Path, output: Path | None = None, template: "Checkout | None" = None) -> None:
         self.folder = folder
-        self.template = template or self  # the finished checkout of which this is a copy
+        self.template = template or self  # the finished checkout from which this one was copied
         self._output = output or folder.with_suffix(".output")
 
     def start(self, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
-        """Start a command in a process group of its own; its output goes into a file."""
+        """Start a command in a new process group; its output is written to a file."""
         env = variables(self.folder, **environment)
         env["PATH"] = f"{self.folder / '.venv/bin'}{os.pathsep}{env['PATH']}"
         with self._output.open("wb") as output:
@@ -61,7 +61,7 @@ class Checkout:
             )
 
     def end(self, process: subprocess.Popen[bytes], start_s: float, limit_s: float = LIMIT_S) -> Result:
-        """Wait for a command; kill its process group if it takes too long."""
+        """Wait for a command to end; at the time limit, kill the process group."""
         try:
             status: int | None = process.wait(limit_s)
         except subprocess.TimeoutExpired:
@@ -71,16 +71,16 @@ class Checkout:
         return Result(status, self.output(), time.monotonic() - start_s)
 
     def run(self, *arguments: str, limit_s: float = LIMIT_S, **environment: str) -> Result:
-        """Run a command to its end."""
+        """Run a command; return its result."""
         start_s = time.monotonic()
         return self.end(self.start(*arguments, **environment), start_s, limit_s)
 
     def output(self) -> str:
-        """Return the output of the last command so far, without the name of the folder."""
+        """Return the output so far of the last command; the name of the checkout's folder is removed."""
         return self._output.read_text(errors="replace").replace(f"{self.folder}/", "")
 
     def stage(self, name: str, find_s: float = LIMIT_S) -> psutil.Process:
-        """Wait until DVC has started a stage, and return its process."""
+        """Wait until DVC has started a stage; return the process of the stage."""
         command = ["-m", "pipeline", name]
         until_s = time.monotonic() + find_s
         while time.monotonic() < until_s:
@@ -90,21 +90,21 @@ class Checkout:
             time.sleep(0.05)
         raise AssertionError(f"stage {name} must start within {find_s:.0f} s:\n{self.output()[-2000:]}")
 
-    def until(self, happened: Callable[[], bool], process: psutil.Process, limit_s: float = LIMIT_S) -> bool:
-        """Wait for a condition; return False if the process ends first."""
+    def until(self, condition: Callable[[], bool], process: psutil.Process, limit_s: float = LIMIT_S) -> bool:
+        """Wait until `condition` returns true; return False if the process ends or the time limit is reached first."""
         until_s = time.monotonic() + limit_s
-        while not happened():
+        while not condition():
             if not alive(process) or time.monotonic() > until_s:
                 return False
             time.sleep(0.01)
         return alive(process)
 
     def trainings(self) -> dict[str, int]:
-        """Return the files of finished training runs and the times at which they were written."""
+        """Return the modification time (ns) of the result file of each finished training run, by file name."""
         return {file.name: file.stat().st_mtime_ns for file in (self.folder / ".reskin/cells").glob("*.safetensors")}
 
     def lock(self) -> dict[str, dict[str, str]]:
-        """Return the hash of every output in dvc.lock, by stage."""
+        """Return the hashes in dvc.lock: the hash of each output, by stage and path."""
         lock = YAML(typ="safe").load((self.folder / "dvc.lock").read_text())
         return {
             stage: {out["path"]: out["md5"] for out in entry.get("outs", [])} for stage, entry in lock["stages"].items()
@@ -116,7 +116,7 @@ class Checkout:
         return next(entry["cmd"].split() for entry in entries if f" {stage} " in entry["cmd"])
 
     def reset(self, *names: str, trainings: bool = True) -> None:
-        """Remove the entries and outputs of stages, and finished training runs, so that the stages run again."""
+        """Remove entries in dvc.lock, outputs and cached training runs of these stages, so that they run again."""
         file = self.folder / "dvc.lock"
         lock = YAML().load(file.read_text())
         for name in names:
@@ -125,13 +125,13 @@ class Checkout:
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         with file.open("w") as stream:
             YAML().dump(lock, stream)
-        shutil.rmtree(self.folder / ".dvc/cache/runs", ignore_errors=True)  # runs since the template was made
+        shutil.rmtree(self.folder / ".dvc/cache/runs", ignore_errors=True)  # DVC's run cache would restore the outputs
         for name in self.trainings() if trainings else ():
             (self.folder / ".reskin/cells" / name).unlink()
 
 
 def alive(process: psutil.Process) -> bool:
-    """Return whether a process runs and is not a zombie."""
+    """Return whether a process is running (not a zombie)."""
     try:
         return process.status() != psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
@@ -146,26 +146,26 @@ def _cwd(process: psutil.Process) -> Path | None:
 
 
 def make_template(folder: Path) -> tuple[Checkout, Result]:
-    """Clone the last commit, and run the small scene there."""
+    """Clone the last commit and run the small scene; return the clone and the result of `dvc repro`."""
     subprocess.run(["git", "clone", "--quiet", "--shared", str(ROOT), str(folder)], check=True)
     (folder / ".venv").symlink_to(ROOT / ".venv")
     scenes = folder / "pipeline/scenes"
     with (scenes / f"{SCENE}.yaml").open("w") as stream:
         YAML().dump(small_scene(YAML(typ="safe").load((scenes / "ci.yaml").read_text())), stream)
     (folder / "dvc.lock").unlink()
-    at = Checkout(folder)
+    checkout = Checkout(folder)
     for command in (["python", "-m", "pipeline", "scenes", "use", SCENE], ["dvc", "repro"]):
-        done = at.run(*command, limit_s=6 * LIMIT_S)
+        done = checkout.run(*command, limit_s=6 * LIMIT_S)
         if done.status:
             raise AssertionError(f"{' '.join(command)} failed:\n{done.output[-3000:]}")
     git(folder, "add", "--all")
     git(folder, "commit", "--quiet", "--message", "finished")
-    shutil.rmtree(folder / ".dvc/cache/runs")  # otherwise, DVC restores the files that a fault damages
-    return at, done
+    shutil.rmtree(folder / ".dvc/cache/runs")  # otherwise, DVC would restore the files that a fault damages
+    return checkout, done
 
 
 def small_scene(ci: dict) -> dict:
-    """Return the settings of a few experiments of scene ci."""
+    """Return the settings of scene ci, reduced to a few experiments."""
     scene = {name: ci[name] for name in SECTIONS} | {"experiments": list(EXPERIMENTS)}
     scene["split"] = {name: ci["split"][name] for name in SPLIT}
     scene["simulate"] = {
@@ -176,15 +176,15 @@ def small_scene(ci: dict) -> dict:
 
 
 def copy(template: Checkout, folder: Path) -> Checkout:
-    """Copy a finished checkout."""
+    """Copy a checkout to another folder."""
     subprocess.run(["cp", "-r", "--preserve=all", "--reflink=auto", str(template.folder), str(folder)], check=True)
     return Checkout(folder, template=template)
 
 
 def message_of(output: Sequence[str] | str) -> str:
-    """Return the error message in an output: that of the stage or, without one, that of DVC."""
+    """Return the error message in a command's output: that of the stage if there is one, else that of DVC."""
     lines = output.splitlines() if isinstance(output, str) else list(output)
-    # "is invalid" is DVC's message about its own files.
+    # DVC reports its own damaged files with the words "is invalid".
     for start in ("error:", "warning:", "ERROR:", "WARNING:", "is invalid"):
         found = [line for line in lines if line.startswith(start) or f" {start} " in f" {line}"]
         if found:
@@ -198,7 +198,7 @@ TITLES = ("fault", "how injected", "what the user sees", "exit status", "lost", 
 
 @dataclass
 class Row:
-    """The outcome of a fault. `known` explains a shortcoming."""
+    """The outcome of a fault; `known` explains a shortcoming that is accepted."""
 
     message: str
     status: int | None
@@ -210,11 +210,11 @@ class Row:
 
 Case = Callable[[Checkout], Row]
 NOT_RUN = Result(0, "", 0.0)
-CASES: dict[str, tuple[str, Case]] = {}  # by name: description and function that injects it
+CASES: dict[str, tuple[str, Case]] = {}  # name of each fault: its description, and the function that injects it
 
 
 def fault(name: str, how: str) -> Callable[[Case], Case]:
-    """Add a fault to the table."""
+    """Return a decorator that adds a function as the fault `name`; `how` describes the injection."""
 
     def add(case: Case) -> Case:
         CASES[name] = (how, case)
@@ -224,25 +224,28 @@ def fault(name: str, how: str) -> Callable[[Case], Case]:
 
 
 def judge(
-    at: Checkout, first: Result, again: Result, *, may_run: Iterable[str] | None = None,
+    checkout: Checkout, first: Result, again: Result, *, may_run: Iterable[str] | None = None,
     finished: dict[str, int] | None = None, fails: bool = True,
 ) -> Row:  # fmt: skip
-    """Compare the state after a fault, and after the next run, with the undisturbed run.
+    """Return the outcome of a fault: compare the run with the fault, and the run after it, with an undisturbed run.
 
-    may_run: stages that the next run may run. finished: training runs that finished before it. fails: the first run
-    must fail.
+    first, again: results of the two runs. may_run: stages that the second run may run (None: any). finished: training
+    runs that finished before the second run. fails: whether the first run must fail.
     """
-    after, undisturbed, reused = at.lock(), at.template.lock(), _whole(finished or {}, at.trainings())
+    after, undisturbed, reused = checkout.lock(), checkout.template.lock(), _whole(finished or {}, checkout.trainings())
     torn_n = len(finished or {}) - len(reused)
-    trained = sum(written != reused.get(name) for name, written in at.trainings().items())
-    again_trained = [name for name, written in at.trainings().items() if name in reused and written != reused[name]]
+    trained = sum(written != reused.get(name) for name, written in checkout.trainings().items())
+    again_trained = [
+        name for name, written in checkout.trainings().items() if name in reused and written != reused[name]
+    ]
     different = [stage for stage in undisturbed if after.get(stage) != undisturbed[stage]]
     unexpected = sorted(set(again.ran) - set(may_run)) if may_run is not None else []
     checks = {
         "a traceback": TRACES in first.output + again.output,
         "a hang": first.status is None or again.status is None,
         "no failure": fails and first.status == 0,
-        "no message": (first.status or 0) > 0 and not message_of(first.output),  # a killed process prints nothing
+        # a negative status means a killed process, which prints nothing
+        "no message": (first.status or 0) > 0 and not message_of(first.output),
         f"the next run fails: {message_of(again.output)}": again.status not in (0, None),
         f"other results: {', '.join(different)}": bool(different),
         f"finished stages ran again: {', '.join(unexpected)}": bool(unexpected),
@@ -258,14 +261,14 @@ def judge(
 
 
 def _whole(trainings: dict[str, int], later: dict[str, int]) -> dict[str, int]:
-    """Keep the training runs of complete stacks; the runs of a stack finish together."""
-    members = [Counter(name.rpartition("-")[0] for name in each) for each in (trainings, later)]
+    """Return only the training runs of stacks that were written completely; the runs of a stack finish together."""
+    members = [Counter(name.rpartition("-")[0] for name in runs) for runs in (trainings, later)]
     whole = {stack for stack, files_n in members[0].items() if members[1][stack] == files_n}
     return {name: written for name, written in trainings.items() if name.rpartition("-")[0] in whole}
 
 
 def line(name: str, how: str, row: Row, seconds: float) -> str:
-    """Format a row of the table."""
+    """Format the outcome of a fault as a row of the Markdown table."""
     status = "hang" if row.status is None else str(row.status)
     verdict = "green" if not row.faults else f"red: {'; '.join(row.faults)}"
     if row.known:
@@ -276,7 +279,7 @@ def line(name: str, how: str, row: Row, seconds: float) -> str:
 
 
 def not_run(name: str, how: str) -> str:
-    """Format the row of a fault that has not been injected yet."""
+    """Format the Markdown row of a fault that has not been injected yet."""
     return f"| {_plain(name)} | {_plain(how)} |{' – |' * 5} not run yet |"
 
 
@@ -289,5 +292,5 @@ def _plain(text: str) -> str:
 
 
 def table(lines: Sequence[str]) -> str:
-    """Join the rows to a table."""
+    """Return the Markdown table with these rows."""
     return "\n".join(["| " + " | ".join(TITLES) + " |", "|" + "---|" * len(TITLES), *lines]) + "\n"

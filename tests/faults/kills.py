@@ -1,4 +1,4 @@
-"""Faults of processes that are killed in mid-run: every kind of stage, DVC itself, a worker."""
+"""Faults of processes that are killed while they run: a stage of each kind, DVC, a worker process."""
 
 import signal
 import time
@@ -14,52 +14,52 @@ STAGES = (
     "audit", "report", "publish",
 )  # fmt: skip
 ATTEMPTS_N = 4
-ADDRESS_SPACE_MAX = 100 * 2**20  # bytes
+ADDRESS_SPACE_MAX = 100 * 2**20  # bytes of address space
 
 
 def address(stage: str) -> str:
-    """Return the name of a stage in DVC."""
+    """Return DVC's name of a stage: `stage@scene`."""
     return stage if stage == "code" else f"{stage}@{SCENE}"
 
 
-def run_and_kill(at: Checkout, stage: str, part: float) -> Result | None:
-    """Run a stage through DVC, and kill its process after a part of its earlier duration; None if it ended first."""
-    cost = at.folder / ".reskin/costs" / SCENE / f"{stage}.json"
+def run_and_kill(checkout: Checkout, stage: str, part: float) -> Result | None:
+    """Run a stage by DVC; kill the stage after the fraction `part` of its previous duration; None if it ends first."""
+    cost = checkout.folder / ".reskin/costs" / SCENE / f"{stage}.json"
     wait_s = part * (io.read_json(cost)["seconds"] if cost.exists() else 2.0)
     if stage == "publish":
-        (at.folder / "mlflow.db").unlink()  # otherwise there is nothing to write
+        (checkout.folder / "mlflow.db").unlink()  # otherwise, all runs are already published
     start_s = time.monotonic()
-    repro = at.start("dvc", "repro", address(stage))
-    process = at.stage(stage)
+    repro = checkout.start("dvc", "repro", address(stage))
+    process = checkout.stage(stage)
     if stage in TRAINS:
-        at.until(lambda: bool(at.trainings()), process)
+        checkout.until(lambda: bool(checkout.trainings()), process)
     else:
-        at.until(lambda: f"{stage}: stage " in at.output() or stage == "code", process)
+        checkout.until(lambda: f"{stage}: stage " in checkout.output() or stage == "code", process)
         kill_s = time.monotonic() + wait_s
-        at.until(lambda: time.monotonic() > kill_s, process)
+        checkout.until(lambda: time.monotonic() > kill_s, process)
     if alive(process):
         process.kill()
-    result = at.end(repro, start_s)
+    result = checkout.end(repro, start_s)
     return result if result.status else None
 
 
 def add_kill(stage: str) -> None:
-    """Add the fault of a killed stage."""
+    """Add a fault: the process of this stage is killed."""
 
     @fault(
         f"kill -9 in `{stage}`",
         "SIGKILL to the stage's process in mid-run"
         + ("" if stage not in TRAINS else ", as soon as a training run is finished"),
     )
-    def case(at: Checkout) -> Row:
+    def case(checkout: Checkout) -> Row:
         for i in range(ATTEMPTS_N):
-            at.reset(address(stage))
-            if result := run_and_kill(at, stage, 0.5 / 2**i):
+            checkout.reset(address(stage))
+            if result := run_and_kill(checkout, stage, 0.5 / 2**i):
                 break
         else:
             raise AssertionError(f"{stage} ended before it could be killed")
-        finished = at.trainings() if stage in TRAINS else None
-        return judge(at, result, at.run("dvc", "repro"), may_run=[address(stage)], finished=finished)
+        finished = checkout.trainings() if stage in TRAINS else None
+        return judge(checkout, result, checkout.run("dvc", "repro"), may_run=[address(stage)], finished=finished)
 
 
 for name in STAGES:
@@ -70,24 +70,24 @@ for name in STAGES:
     "kill -9 of `dvc repro` itself",
     "SIGKILL to DVC while `train_triplet` runs; the stage continues alone, and the next run starts at once",
 )
-def kill_dvc(at: Checkout) -> Row:
+def kill_dvc(checkout: Checkout) -> Row:
     stage = address("train_triplet")
-    at.reset(stage)
+    checkout.reset(stage)
     start_s = time.monotonic()
-    repro = at.start("dvc", "repro", stage)
-    process = at.stage("train_triplet")
-    at.until(lambda: bool(at.trainings()), process)
+    repro = checkout.start("dvc", "repro", stage)
+    process = checkout.stage("train_triplet")
+    checkout.until(lambda: bool(checkout.trainings()), process)
     repro.send_signal(signal.SIGKILL)
-    result, finished = at.end(repro, start_s), at.trainings()
-    again = at.run("dvc", "repro")
-    at.until(lambda: False, process, 60.0)  # orphaned processes have time to end
-    return judge(at, result, again, may_run=[stage], finished=finished)
+    result, finished = checkout.end(repro, start_s), checkout.trainings()
+    again = checkout.run("dvc", "repro")
+    checkout.until(lambda: False, process, 60.0)  # give orphaned processes time to end
+    return judge(checkout, result, again, may_run=[stage], finished=finished)
 
 
-def _worker(at: Checkout, stage: str) -> tuple[psutil.Process, psutil.Process]:
-    """Return a stage's process and one of its workers, once a training run is finished."""
-    process = at.stage(stage)
-    at.until(lambda: bool(at.trainings()), process)
+def _worker(checkout: Checkout, stage: str) -> tuple[psutil.Process, psutil.Process]:
+    """Wait for a stage's first finished training run; return the stage's process and its largest worker process."""
+    process = checkout.stage(stage)
+    checkout.until(lambda: bool(checkout.trainings()), process)
     workers = [child for child in process.children(recursive=True) if _is_worker(child)]
     return process, max(workers, key=lambda child: child.memory_info().rss)
 
@@ -104,46 +104,46 @@ def _is_worker(process: psutil.Process) -> bool:
     "worker out of memory, killed by the kernel",
     "SIGKILL to a worker process of `train_triplet` after a finished training run",
 )
-def kill_worker(at: Checkout) -> Row:
+def kill_worker(checkout: Checkout) -> Row:
     stage = address("train_triplet")
-    at.reset(stage)
+    checkout.reset(stage)
     start_s = time.monotonic()
-    repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
-    _worker(at, "train_triplet")[1].kill()
-    result, finished = at.end(repro, start_s), at.trainings()
-    return judge(at, result, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+    repro = checkout.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
+    _worker(checkout, "train_triplet")[1].kill()
+    result, finished = checkout.end(repro, start_s), checkout.trainings()
+    return judge(checkout, result, checkout.run("dvc", "repro"), may_run=[stage], finished=finished)
 
 
 @fault(
     "worker out of memory, reported by the allocator",
     "after a finished training run, RLIMIT_AS of a worker of `train_triplet` is set to 100 MB, less than it uses",
 )
-def starve_worker(at: Checkout) -> Row:
+def starve_worker(checkout: Checkout) -> Row:
     stage = address("train_triplet")
-    at.reset(stage)
+    checkout.reset(stage)
     start_s = time.monotonic()
-    repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
-    worker = _worker(at, "train_triplet")[1]
+    repro = checkout.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:1")
+    worker = _worker(checkout, "train_triplet")[1]
     worker.rlimit(psutil.RLIMIT_AS, (ADDRESS_SPACE_MAX, ADDRESS_SPACE_MAX))
-    result, finished = at.end(repro, start_s), at.trainings()
-    return judge(at, result, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+    result, finished = checkout.end(repro, start_s), checkout.trainings()
+    return judge(checkout, result, checkout.run("dvc", "repro"), may_run=[stage], finished=finished)
 
 
 @fault(
     "kill -9 of a stage with workers",
     "SIGKILL to the process of `train_triplet`; its workers must end too",
 )
-def kill_parent(at: Checkout) -> Row:
+def kill_parent(checkout: Checkout) -> Row:
     stage = address("train_triplet")
-    at.reset(stage)
+    checkout.reset(stage)
     start_s = time.monotonic()
-    repro = at.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:2")
-    process, _ = _worker(at, "train_triplet")
+    repro = checkout.start("dvc", "repro", stage, RESKIN_EXECUTOR="processes:2")
+    process, _ = _worker(checkout, "train_triplet")
     workers = process.children(recursive=True)
     process.kill()
-    result = at.end(repro, start_s)
+    result = checkout.end(repro, start_s)
     _, left = psutil.wait_procs(workers, 10)
-    finished = at.trainings()
-    row = judge(at, result, at.run("dvc", "repro"), may_run=[stage], finished=finished)
+    finished = checkout.trainings()
+    row = judge(checkout, result, checkout.run("dvc", "repro"), may_run=[stage], finished=finished)
     row.faults += [f"{len(left)} workers outlive their stage"] if any(alive(one) for one in left) else []
     return row

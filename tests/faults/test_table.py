@@ -1,6 +1,6 @@
-"""Tests that the committed table has a row for every fault, and that rows show outcome and message."""
+"""Tests that docs/faults.md has a row for every fault, and that a row shows the error message and the outcome."""
 
-from tests.faults import files, kills, together, tracking  # noqa: F401 (each adds its faults)
+from tests.faults import files, kills, together, tracking  # noqa: F401 (importing a module adds its faults)
 from tests.faults.__main__ import OUT
 from tests.faults.harness import CASES, Row, line, message_of
 

@@ -1,4 +1,4 @@
-"""Faults of concurrent commands, clocks, added recordings, and unfinished git operations."""
+"""Faults of concurrent commands, wrong clocks, interrupted `reskin add`, and unfinished git operations."""
 
 import shutil
 import signal
@@ -23,14 +23,14 @@ RAW = f"data/raw/rig/{CAPTURE}"
 
 
 @fault("two `dvc repro` at once", "the second starts while the first runs `train_triplet`")
-def two(at: Checkout) -> Row:
-    at.reset(TRIPLET)
+def two(checkout: Checkout) -> Row:
+    checkout.reset(TRIPLET)
     start_s = time.monotonic()
-    first, other = at.start("dvc", "repro"), Checkout(at.folder, at.folder.with_suffix(".other"))
-    at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
+    first, other = checkout.start("dvc", "repro"), Checkout(checkout.folder, checkout.folder.with_suffix(".other"))
+    checkout.until(lambda: bool(checkout.trainings()), checkout.stage("train_triplet"))
     second = other.run("dvc", "repro")
-    one, finished = at.end(first, start_s), at.trainings()
-    row = judge(at, second, at.run("dvc", "repro"), may_run=[], finished=finished)
+    one, finished = checkout.end(first, start_s), checkout.trainings()
+    row = judge(checkout, second, checkout.run("dvc", "repro"), may_run=[], finished=finished)
     row.faults += [] if one.status == 0 else ["the first fails"]
     return row
 
@@ -39,49 +39,53 @@ def two(at: Checkout) -> Row:
     "two `dvc repro` at once, of different stages",
     "the second runs `sensitivity` while the first runs `train_triplet`",
 )
-def two_stages(at: Checkout) -> Row:
-    at.reset(TRIPLET, address("sensitivity"))
+def two_stages(checkout: Checkout) -> Row:
+    checkout.reset(TRIPLET, address("sensitivity"))
     start_s = time.monotonic()
-    first, other = at.start("dvc", "repro", TRIPLET), Checkout(at.folder, at.folder.with_suffix(".other"))
-    at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
+    first, other = (
+        checkout.start("dvc", "repro", TRIPLET),
+        Checkout(checkout.folder, checkout.folder.with_suffix(".other")),
+    )
+    checkout.until(lambda: bool(checkout.trainings()), checkout.stage("train_triplet"))
     second = other.run("dvc", "repro", address("sensitivity"))
-    one, finished = at.end(first, start_s), at.trainings()
-    yet_to_run = [address("sensitivity")] if second.status else []  # a refused command has run nothing
-    row = judge(at, second, at.run("dvc", "repro"), may_run=yet_to_run, finished=finished, fails=False)
+    one, finished = checkout.end(first, start_s), checkout.trainings()
+    # if the second command was refused, its stage still has to run
+    yet_to_run = [address("sensitivity")] if second.status else []
+    row = judge(checkout, second, checkout.run("dvc", "repro"), may_run=yet_to_run, finished=finished, fails=False)
     row.faults += [] if one.status == 0 else ["the first fails"]
     row.faults += ["refused, and it ran"] if second.status and second.ran else []
     row.message = row.message or "nothing: both run to their end"
     return row
 
 
-def _add(at: Checkout) -> list[str]:
-    """Write a recorded scene and a recording; return the command that adds it."""
-    with (at.folder / "pipeline/scenes/rig.yaml").open("w") as stream:
+def _add(checkout: Checkout) -> list[str]:
+    """Write a recorded scene and a recording; return the command that adds the recording to the scene."""
+    with (checkout.folder / "pipeline/scenes/rig.yaml").open("w") as stream:
         YAML().dump(recorded_scene(), stream)
-    recording = at.folder.with_name("recording")
+    recording = checkout.folder.with_name("recording")
     recording.mkdir(exist_ok=True)
     write(recording, *PRESSES)
     labels = ["--layout", "lab", "--board", "board1", "--skin", "skin1", "--scene", "rig"]
     return ["python", "-m", "pipeline", "add", str(recording / "readings.csv"), *labels]
 
 
-def _ingest(at: Checkout) -> Result:
-    return at.run("dvc", "repro", INGEST)
+def _ingest(checkout: Checkout) -> Result:
+    return checkout.run("dvc", "repro", INGEST)
 
 
 @fault(
     "`reskin add` beside a running `dvc repro`",
     "a recording is added while `train_triplet` runs, and again after its end",
 )
-def add_beside(at: Checkout) -> Row:
-    at.reset(TRIPLET)
-    command, start_s = _add(at), time.monotonic()
-    first, other = at.start("dvc", "repro"), Checkout(at.folder, at.folder.with_suffix(".other"))
-    at.until(lambda: bool(at.trainings()), at.stage("train_triplet"))
+def add_beside(checkout: Checkout) -> Row:
+    checkout.reset(TRIPLET)
+    command, start_s = _add(checkout), time.monotonic()
+    first, other = checkout.start("dvc", "repro"), Checkout(checkout.folder, checkout.folder.with_suffix(".other"))
+    checkout.until(lambda: bool(checkout.trainings()), checkout.stage("train_triplet"))
     added = other.run(*command)
-    one = at.end(first, start_s)
-    later = at.run(*command)
-    row = judge(at, added, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    one = checkout.end(first, start_s)
+    later = checkout.run(*command)
+    row = judge(checkout, added, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += [] if (one.status, later.status) == (0, 0) else ["the run, or the later add, fails"]
     row.next_run = f"added after its end; {row.next_run}"
     return row
@@ -91,20 +95,22 @@ def add_beside(at: Checkout) -> Row:
     "kill -9 of `reskin add`",
     "SIGKILL as soon as its folder exists; `dvc repro`; `reskin add`; what its message says, and `reskin add` again",
 )
-def kill_add(at: Checkout) -> Row:
-    command, start_s = _add(at), time.monotonic()
-    adding = at.start(*command)
-    while adding.poll() is None and not (at.folder / RAW).exists():
+def kill_add(checkout: Checkout) -> Row:
+    command, start_s = _add(checkout), time.monotonic()
+    adding = checkout.start(*command)
+    while adding.poll() is None and not (checkout.folder / RAW).exists():
         time.sleep(0.002)
     adding.send_signal(signal.SIGKILL)
-    at.end(adding, start_s)
-    still = at.run("dvc", "repro")
-    again = at.run(*command)
-    shutil.rmtree(at.folder / RAW)
-    later = at.run(*command)
-    row = judge(at, again, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    checkout.end(adding, start_s)
+    after_kill = checkout.run("dvc", "repro")
+    again = checkout.run(*command)
+    shutil.rmtree(checkout.folder / RAW)
+    later = checkout.run(*command)
+    row = judge(checkout, again, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += (
-        [] if (still.status, still.ran, later.status) == (0, [], 0) else [f"{still.ran}, {later.output[-200:]}"]
+        []
+        if (after_kill.status, after_kill.ran, later.status) == (0, [], 0)
+        else [f"{after_kill.ran}, {later.output[-200:]}"]
     )
     return row
 
@@ -113,17 +119,17 @@ def kill_add(at: Checkout) -> Row:
     "kill -9 in `ingest`",
     "SIGKILL to the stage's process as soon as it exists; the recording has layout `lab`",
 )
-def kill_ingest(at: Checkout) -> Row:
-    at.run(*_add(at))
-    undisturbed = _ingest(at)
-    expected = at.lock()[INGEST]
-    at.reset(INGEST, trainings=False)
+def kill_ingest(checkout: Checkout) -> Row:
+    checkout.run(*_add(checkout))
+    undisturbed = _ingest(checkout)
+    expected = checkout.lock()[INGEST]
+    checkout.reset(INGEST, trainings=False)
     start_s = time.monotonic()
-    repro = at.start("dvc", "repro", INGEST)
-    at.stage("ingest").kill()
-    result = at.end(repro, start_s)
-    row = judge(at, result, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
-    row.faults += [] if (undisturbed.status, at.lock()[INGEST]) == (0, expected) else ["other readings"]
+    repro = checkout.start("dvc", "repro", INGEST)
+    checkout.stage("ingest").kill()
+    result = checkout.end(repro, start_s)
+    row = judge(checkout, result, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+    row.faults += [] if (undisturbed.status, checkout.lock()[INGEST]) == (0, expected) else ["other readings"]
     return row
 
 
@@ -132,19 +138,21 @@ def kill_ingest(at: Checkout) -> Row:
     "the last third is cut off `readings.csv` of an added recording, which is ingested and committed; "
     "then `dvc repro`; for the next run, `git restore` of its `.dvc` file and `dvc checkout --force`",
 )
-def cut_recording(at: Checkout) -> Row:
-    at.run(*_add(at))
-    _ingest(at)
-    expected = at.lock()[INGEST]
-    git(at.folder, "add", "--all")
-    git(at.folder, "commit", "--quiet", "--message", "added")
-    _truncate(at.folder / RAW / "readings.csv")
-    result = _ingest(at)
-    git(at.folder, "restore", f"{RAW}.dvc")
-    restored = at.run("dvc", "checkout", "--force", f"{RAW}.dvc")
-    row = judge(at, result, at.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
+def cut_recording(checkout: Checkout) -> Row:
+    checkout.run(*_add(checkout))
+    _ingest(checkout)
+    expected = checkout.lock()[INGEST]
+    git(checkout.folder, "add", "--all")
+    git(checkout.folder, "commit", "--quiet", "--message", "added")
+    _truncate(checkout.folder / RAW / "readings.csv")
+    result = _ingest(checkout)
+    git(checkout.folder, "restore", f"{RAW}.dvc")
+    restored = checkout.run("dvc", "checkout", "--force", f"{RAW}.dvc")
+    row = judge(checkout, result, checkout.run("dvc", "repro", INGEST, *FINISHED), may_run=[INGEST])
     row.faults += (
-        [] if restored.status == 0 and at.lock()[INGEST] == expected else [f"not restored: {restored.output[-300:]}"]
+        []
+        if restored.status == 0 and checkout.lock()[INGEST] == expected
+        else [f"not restored: {restored.output[-300:]}"]
     )
     return row
 
@@ -165,26 +173,28 @@ _set_back("time_ns", 86400 * 10**9)
     "by a day, 2 s after each process of `dvc repro` starts (`time.time` is replaced by a sitecustomize), so that "
     "files of finished stages are from the future; the next run has the right clock",
 )
-def clock(at: Checkout) -> Row:
+def clock(checkout: Checkout) -> Row:
     stages = [TRIPLET, address("adapt"), address("report"), address("publish")]
-    at.reset(*stages)
-    shim = at.folder.with_name("shim")
+    checkout.reset(*stages)
+    shim = checkout.folder.with_name("shim")
     shim.mkdir(exist_ok=True)
     (shim / "sitecustomize.py").write_text(CLOCK_SET_BACK)
-    for file in (at.folder / "data/indentations").rglob("*.parquet"):
+    for file in (checkout.folder / "data/indentations").rglob("*.parquet"):
         subprocess.run(["touch", "--date", "tomorrow", str(file)], check=True)
-    first = at.run("dvc", "repro", PYTHONPATH=f"{shim}:{at.folder}")
-    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.trainings(), fails=False)
+    first = checkout.run("dvc", "repro", PYTHONPATH=f"{shim}:{checkout.folder}")
+    row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[], finished=checkout.trainings(), fails=False)
     row.faults += [] if set(first.ran) == set(stages) else [f"ran {first.ran}"]
     row.message = row.message or "nothing"
     return row
 
 
-def _damage_and_restore(at: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True) -> Row:
-    (at.folder / file).write_text(content)
-    result = at.run(*command)
-    git(at.folder, "restore", file)
-    return judge(at, result, at.run("dvc", "repro"), may_run=[], fails=fails)
+def _damage_and_restore(
+    checkout: Checkout, file: str, content: str, command: tuple[str, ...], *, fails: bool = True
+) -> Row:
+    (checkout.folder / file).write_text(content)
+    result = checkout.run(*command)
+    git(checkout.folder, "restore", file)
+    return judge(checkout, result, checkout.run("dvc", "repro"), may_run=[], fails=fails)
 
 
 CONFLICT = "<<<<<<< HEAD\n{}=======\n{}>>>>>>> other\n"
@@ -194,25 +204,25 @@ CONFLICT = "<<<<<<< HEAD\n{}=======\n{}>>>>>>> other\n"
     "git: conflict left in dvc.lock",
     "conflict markers in `dvc.lock`; `dvc repro`; `git restore dvc.lock` for the next run",
 )
-def conflict_lock(at: Checkout) -> Row:
-    text = (at.folder / "dvc.lock").read_text()
-    return _damage_and_restore(at, "dvc.lock", CONFLICT.format(text, text), ("dvc", "repro"))
+def conflict_lock(checkout: Checkout) -> Row:
+    text = (checkout.folder / "dvc.lock").read_text()
+    return _damage_and_restore(checkout, "dvc.lock", CONFLICT.format(text, text), ("dvc", "repro"))
 
 
 @fault(
     "git: conflict left in data/captures.yaml",
     "conflict markers; `reskin scenes check`; `git restore` for the next run",
 )
-def conflict_captures(at: Checkout) -> Row:
+def conflict_captures(checkout: Checkout) -> Row:
     command = ("python", "-m", "pipeline", "scenes", "check")
     text = CONFLICT.format("captures: {a: {}}\n", "captures: {b: {}}\n")
-    return _damage_and_restore(at, "data/captures.yaml", text, command)
+    return _damage_and_restore(checkout, "data/captures.yaml", text, command)
 
 
 @fault("dvc.lock cut", "its last twentieth is cut off; `dvc repro`; `git restore dvc.lock` for the next run")
-def cut_lock(at: Checkout) -> Row:
-    text = (at.folder / "dvc.lock").read_text()
-    row = _damage_and_restore(at, "dvc.lock", text[: len(text) * 19 // 20], ("dvc", "repro"), fails=False)
+def cut_lock(checkout: Checkout) -> Row:
+    text = (checkout.folder / "dvc.lock").read_text()
+    row = _damage_and_restore(checkout, "dvc.lock", text[: len(text) * 19 // 20], ("dvc", "repro"), fails=False)
     row.message = row.message or "nothing: stages that are missing in it run again"
     return row
 
@@ -221,12 +231,12 @@ def cut_lock(at: Checkout) -> Row:
     "git: index.lock left by a killed git",
     "`.git/index.lock` exists while `split` and later stages run; it is removed for the next run",
 )
-def index_lock(at: Checkout) -> Row:
-    at.reset(address("split"), trainings=False)
-    (at.folder / ".git/index.lock").touch()
-    first = at.run("dvc", "repro")
-    Path(at.folder / ".git/index.lock").unlink()
-    row = judge(at, first, at.run("dvc", "repro"), may_run=[], finished=at.trainings(), fails=False)
+def index_lock(checkout: Checkout) -> Row:
+    checkout.reset(address("split"), trainings=False)
+    (checkout.folder / ".git/index.lock").touch()
+    first = checkout.run("dvc", "repro")
+    Path(checkout.folder / ".git/index.lock").unlink()
+    row = judge(checkout, first, checkout.run("dvc", "repro"), may_run=[], finished=checkout.trainings(), fails=False)
     row.faults += [] if first.ran == [address("split")] else [f"ran {first.ran}"]
     row.message = row.message or "nothing: no stage needs it"
     return row

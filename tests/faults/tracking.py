@@ -1,4 +1,4 @@
-"""Faults of MLflow: servers that are missing, silent or die during a run, and a store that is locked."""
+"""Faults of MLflow: a server that is missing, does not respond or dies during a run, and a locked database."""
 
 import http.server
 import re
@@ -19,9 +19,9 @@ from reskin import io
 from tests.faults.harness import NOT_RUN, SCENE, Checkout, Result, Row, fault, judge
 
 
-def _report(at: Checkout, first: Result, again: Result | None) -> Row:
-    """Check that the stage succeeds soon with one warning, and that `reskin publish`, if it ran, sends everything."""
-    row, warned_n = judge(at, first, again or NOT_RUN, fails=False), first.output.count("warning:")
+def _report(checkout: Checkout, first: Result, again: Result | None) -> Row:
+    """Judge stage publish: it must succeed soon, with one warning; a later `reskin publish` must send all runs."""
+    row, warned_n = judge(checkout, first, again or NOT_RUN, fails=False), first.output.count("warning:")
     row.lost, row.next_run = "nothing", "as for a server that refuses"
     if again:
         counts = re.findall(r"MLflow runs (\{.*\})", again.output)
@@ -29,35 +29,35 @@ def _report(at: Checkout, first: Result, again: Result | None) -> Row:
         row.faults += [] if counts else ["not sent later"]
     row.faults += [f"{warned_n} warnings"] if warned_n != 1 else []
     row.faults += [f"exit status {first.status}"] if first.status else []
-    took_s, undisturbed_s = (_took_s(each) for each in (at, at.template))
+    took_s, undisturbed_s = (_took_s(each) for each in (checkout, checkout.template))
     row.message += f" (stage publish: {took_s:.0f} s; undisturbed {undisturbed_s:.0f} s)"
     row.faults += ["held up"] if took_s > 2 * undisturbed_s + 60 else []
     return row
 
 
-def _took_s(at: Checkout) -> float:
-    return float(io.read_json(at.folder / f".reskin/costs/{SCENE}/publish.json")["seconds"])
+def _took_s(checkout: Checkout) -> float:
+    return float(io.read_json(checkout.folder / f".reskin/costs/{SCENE}/publish.json")["seconds"])
 
 
-def _publish_to(at: Checkout, uri: str) -> Row:
-    direct = {"no_proxy": "*", "NO_PROXY": "*"}  # otherwise a proxy may respond instead
-    return _report(at, at.run(*at.command("publish"), MLFLOW_TRACKING_URI=uri, **direct), None)
+def _publish_to(checkout: Checkout, uri: str) -> Row:
+    direct = {"no_proxy": "*", "NO_PROXY": "*"}  # otherwise, a proxy may respond instead of the server
+    return _report(checkout, checkout.run(*checkout.command("publish"), MLFLOW_TRACKING_URI=uri, **direct), None)
 
 
 @fault(
     "tracking server refuses",
     "MLFLOW_TRACKING_URI names a port where nobody listens; stage `publish` runs",
 )
-def refused(at: Checkout) -> Row:
-    (at.folder / "mlflow.db").unlink()
+def refused(checkout: Checkout) -> Row:
+    (checkout.folder / "mlflow.db").unlink()
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    first = at.run(*at.command("publish"), MLFLOW_TRACKING_URI=f"http://127.0.0.1:{port}")
-    return _report(at, first, at.run("python", "-m", "pipeline", "publish"))
+    first = checkout.run(*checkout.command("publish"), MLFLOW_TRACKING_URI=f"http://127.0.0.1:{port}")
+    return _report(checkout, first, checkout.run("python", "-m", "pipeline", "publish"))
 
 
 BLACK_HOLE = "10.255.255.1"
-IN_BLACK_HOLE = (  # own network namespace; packets to its only neighbour are discarded
+IN_BLACK_HOLE = (  # a network namespace in which packets to the only neighbour are discarded
     "ip link set lo up && ip link add hole0 type veth peer name hole1 && ip address add 10.255.255.2/24 dev hole0 && "
     "ip link set hole1 up && ip link set hole0 up && "
     f"ip neighbour add {BLACK_HOLE} lladdr 02:00:00:00:00:01 dev hole0 && exec "
@@ -68,21 +68,23 @@ IN_BLACK_HOLE = (  # own network namespace; packets to its only neighbour are di
     "tracking server black-holed, nothing comes back",
     f"a network that discards all packets to {BLACK_HOLE}, as a firewall may do",
 )
-def no_route(at: Checkout) -> Row:
-    command = ("unshare", "--net", "sh", "-c", IN_BLACK_HOLE + shlex.join(at.command("publish")))
+def no_route(checkout: Checkout) -> Row:
+    command = ("unshare", "--net", "sh", "-c", IN_BLACK_HOLE + shlex.join(checkout.command("publish")))
     return _report(
-        at, at.run(*command, MLFLOW_TRACKING_URI=f"http://{BLACK_HOLE}:5000", no_proxy="*", NO_PROXY="*"), None
+        checkout,
+        checkout.run(*command, MLFLOW_TRACKING_URI=f"http://{BLACK_HOLE}:5000", no_proxy="*", NO_PROXY="*"),
+        None,
     )
 
 
 @fault("tracking server black-holed, silent", "a socket that accepts connections and never responds")
-def silent(at: Checkout) -> Row:
+def silent(checkout: Checkout) -> Row:
     with socket.create_server(("127.0.0.1", 0)) as server:
-        return _publish_to(at, f"http://127.0.0.1:{server.getsockname()[1]}")
+        return _publish_to(checkout, f"http://127.0.0.1:{server.getsockname()[1]}")
 
 
 class OnlyHealth(http.server.BaseHTTPRequestHandler):
-    """Respond to /health only."""
+    """HTTP server that responds to /health and leaves all other requests unanswered."""
 
     def do_GET(self) -> None:
         if self.path == "/health":
@@ -101,21 +103,21 @@ class OnlyHealth(http.server.BaseHTTPRequestHandler):
     "tracking server hangs after its health check",
     "a server that responds to /health only",
 )
-def hangs(at: Checkout) -> Row:
+def hangs(checkout: Checkout) -> Row:
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), OnlyHealth)
     server.daemon_threads = True
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        return _publish_to(at, f"http://127.0.0.1:{server.server_port}")
+        return _publish_to(checkout, f"http://127.0.0.1:{server.server_port}")
     finally:
         server.shutdown()
 
 
 @contextmanager
-def _mlflow_server(at: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """Run MLflow's own server on a store of this checkout."""
-    other = Checkout(at.folder, at.folder.with_suffix(".server"))
-    store, artifacts = f"sqlite:///{at.folder}/team.db", f"{at.folder}/team"
+def _mlflow_server(checkout: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Run an MLflow server on the store of this checkout."""
+    other = Checkout(checkout.folder, checkout.folder.with_suffix(".server"))
+    store, artifacts = f"sqlite:///{checkout.folder}/team.db", f"{checkout.folder}/team"
     server = other.start(
         "mlflow", "server", "--backend-store-uri", store, "--artifacts-destination", artifacts, "--port", str(port),
         "--workers", "1",
@@ -134,20 +136,20 @@ def _mlflow_server(at: Checkout, port: int) -> Iterator[subprocess.Popen[bytes]]
         server.wait()
 
 
-def _signal_server_in_mid_run(at: Checkout, number: signal.Signals) -> Row:
+def _signal_server_in_mid_run(checkout: Checkout, number: signal.Signals) -> Row:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     uri = f"http://127.0.0.1:{port}"
-    with _mlflow_server(at, port) as server:
+    with _mlflow_server(checkout, port) as server:
         start_s = time.monotonic()
-        publishing = at.start(*at.command("publish"), MLFLOW_TRACKING_URI=uri)
-        process = at.stage("publish")
-        at.until(lambda: _finished_n(at.folder / "team.db") >= 3, process)
+        publishing = checkout.start(*checkout.command("publish"), MLFLOW_TRACKING_URI=uri)
+        process = checkout.stage("publish")
+        checkout.until(lambda: _finished_n(checkout.folder / "team.db") >= 3, process)
         subprocess.run(["kill", f"-{number.value}", "--", f"-{server.pid}"], check=True)
-        first = at.end(publishing, start_s)
-    written_n = _finished_n(at.folder / "team.db")
-    with _mlflow_server(at, port):
-        row = _report(at, first, at.run("python", "-m", "pipeline", "publish", MLFLOW_TRACKING_URI=uri))
+        first = checkout.end(publishing, start_s)
+    written_n = _finished_n(checkout.folder / "team.db")
+    with _mlflow_server(checkout, port):
+        row = _report(checkout, first, checkout.run("python", "-m", "pipeline", "publish", MLFLOW_TRACKING_URI=uri))
     row.next_run += f", {written_n} runs were there"
     return row
 
@@ -164,40 +166,40 @@ def _finished_n(store: Path) -> int:
     "tracking server dies in mid-run",
     "SIGKILL to `mlflow server` once 3 runs are written; it is started again for the next run",
 )
-def dies(at: Checkout) -> Row:
-    return _signal_server_in_mid_run(at, signal.SIGKILL)
+def dies(checkout: Checkout) -> Row:
+    return _signal_server_in_mid_run(checkout, signal.SIGKILL)
 
 
 @fault(
     "tracking server stops answering in mid-run",
     "SIGSTOP to `mlflow server` once 3 runs are written",
 )
-def stops(at: Checkout) -> Row:
-    return _signal_server_in_mid_run(at, signal.SIGSTOP)
+def stops(checkout: Checkout) -> Row:
+    return _signal_server_in_mid_run(checkout, signal.SIGSTOP)
 
 
 @fault(
     "MLflow's SQLite held by another program",
     "BEGIN EXCLUSIVE on `mlflow.db` during the whole run",
 )
-def locked(at: Checkout) -> Row:
-    with closing(sqlite3.connect(at.folder / "mlflow.db")) as other:
+def locked(checkout: Checkout) -> Row:
+    with closing(sqlite3.connect(checkout.folder / "mlflow.db")) as other:
         other.execute("BEGIN EXCLUSIVE")
-        return _report(at, at.run(*at.command("publish")), None)
+        return _report(checkout, checkout.run(*checkout.command("publish")), None)
 
 
 @fault(
     "MLflow's SQLite held in mid-run",
     "BEGIN EXCLUSIVE on a new `mlflow.db` once 3 runs are written, until the run has ended",
 )
-def locked_in_mid_run(at: Checkout) -> Row:
-    store = at.folder / "mlflow.db"
+def locked_in_mid_run(checkout: Checkout) -> Row:
+    store = checkout.folder / "mlflow.db"
     store.unlink()
-    shutil.rmtree(at.folder / "mlartifacts")
+    shutil.rmtree(checkout.folder / "mlartifacts")
     start_s = time.monotonic()
-    publishing = at.start(*at.command("publish"))
-    at.until(lambda: _finished_n(store) >= 3, at.stage("publish"))
+    publishing = checkout.start(*checkout.command("publish"))
+    checkout.until(lambda: _finished_n(store) >= 3, checkout.stage("publish"))
     with closing(sqlite3.connect(store, timeout=30)) as other:
         other.execute("BEGIN EXCLUSIVE")
-        first = at.end(publishing, start_s)
-    return _report(at, first, at.run("python", "-m", "pipeline", "publish"))
+        first = checkout.end(publishing, start_s)
+    return _report(checkout, first, checkout.run("python", "-m", "pipeline", "publish"))

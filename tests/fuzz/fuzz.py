@@ -1,8 +1,9 @@
 """Fuzz one target or all: python tests/fuzz/fuzz.py TARGET|all SECONDS [KEEP].
 
-With `pip install atheris`, code coverage guides new inputs (libFuzzer). Without it, inputs are random changes of the
-corpus and of KEEP, which find less. Inputs that reach new code are kept in the folder KEEP, if given. A failing
-input is left in the working directory as `crash-...`; move it to `corpus/TARGET/`.
+If atheris is installed (`pip install atheris`), code coverage guides the inputs (libFuzzer), and inputs that reach new
+code are saved in the folder KEEP, if given. Without atheris, inputs are random changes of the files in the corpus and
+in KEEP, which find fewer errors. An input that fails is written to the working directory as `crash-...`; move the file
+to `corpus/TARGET/`.
 """
 
 import operator
@@ -19,12 +20,12 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 CORPUS = Path(__file__).parent / "corpus"
 BYTES_MAX_N, MEMORY_MAX_MB, HANG_S = 4096, 2048, 20
 PRINT_EVERY_N = 10_000
-# In the order of Python's opcodes.
+# Comparison operators, in the order of the argument of Python's opcode COMPARE_OP.
 COMPARISONS = (operator.lt, operator.le, operator.eq, operator.ne, operator.gt, operator.ge)
 
 
 def fuzz_guided(name: str, seconds: int, keep: Path | None) -> None:
-    """Fuzz with libFuzzer; new inputs go to the folder `keep`, or to a temporary one."""
+    """Fuzz a target with libFuzzer; save inputs that reach new code in the folder `keep` or in a temporary folder."""
     import tempfile
 
     import atheris
@@ -33,7 +34,7 @@ def fuzz_guided(name: str, seconds: int, keep: Path | None) -> None:
     with atheris.instrument_imports(include=["reskin"]):
         from tests.fuzz.targets import feed
     for file in (CORPUS / name).iterdir():
-        feed(name, file.read_bytes())  # import all modules first, so that imports are not taken for a hang
+        feed(name, file.read_bytes())  # a first call imports all modules, so that slow imports do not count as a hang
     with tempfile.TemporaryDirectory() as found:
         limits = [f"-max_total_time={seconds}", f"-max_len={BYTES_MAX_N}", f"-rss_limit_mb={MEMORY_MAX_MB}"]
         if keep is not None:
@@ -47,7 +48,7 @@ def fuzz_guided(name: str, seconds: int, keep: Path | None) -> None:
 
 
 def exclude_arrays(atheris: ModuleType) -> None:
-    """Compare arrays without atheris 3.0, which leaks memory on such comparisons and learns nothing from them."""
+    """Patch atheris 3.0 to ignore comparisons of arrays, on which it leaks memory."""
 
     def compare(left: object, right: object, comparison_i: int, *where: object) -> object:
         if isinstance(left, np.ndarray) or isinstance(right, np.ndarray):
@@ -59,13 +60,13 @@ def exclude_arrays(atheris: ModuleType) -> None:
 
 
 def resident_MB() -> float:
-    """Return the memory of this process; NaN if the system has no /proc."""
+    """Return the resident memory of this process in MB; NaN on systems without /proc."""
     statm = Path("/proc/self/statm")
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6 if statm.exists() else float("nan")
 
 
 def fuzz_randomly(name: str, seconds: int, keep: Path | None) -> None:
-    """Feed random changes of the corpus and of kept inputs."""
+    """Fuzz a target with random changes of the inputs in the corpus and in the folder `keep`."""
     from reskin.seeds import rng_for
     from tests.fuzz.targets import feed
 
@@ -75,8 +76,8 @@ def fuzz_randomly(name: str, seconds: int, keep: Path | None) -> None:
     while time.monotonic() < end_s:
         data = bytearray(seeds[rng.integers(len(seeds))])
         for _ in range(rng.integers(1, 8)):
-            at = int(rng.integers(len(data) + 1))
-            data[at : at + int(rng.integers(3))] = rng.bytes(int(rng.integers(4)))
+            byte_i = int(rng.integers(len(data) + 1))
+            data[byte_i : byte_i + int(rng.integers(3))] = rng.bytes(int(rng.integers(4)))
         Path("crash-last").write_bytes(data)
         feed(name, bytes(data))
         if tried_n % PRINT_EVERY_N == 0:
@@ -89,8 +90,8 @@ def fuzz_randomly(name: str, seconds: int, keep: Path | None) -> None:
 def main(name: str, seconds: int, *keep: str) -> None:
     if name == "all":
         names = sorted(folder.name for folder in CORPUS.iterdir())
-        for each in names:
-            subprocess.run([sys.executable, __file__, each, str(seconds // len(names)), *keep], check=True)
+        for target in names:
+            subprocess.run([sys.executable, __file__, target, str(seconds // len(names)), *keep], check=True)
         return
     try:
         import atheris  # noqa: F401

@@ -1,7 +1,7 @@
-"""Fuzz targets: one function for each kind of input from outside.
+"""Fuzz targets: one function per kind of external input.
 
-A target takes any bytes and may raise only a `ReskinError`. `fuzz.py` runs the targets for a given time,
-`test_corpus.py` runs them on the committed corpus.
+A target accepts arbitrary bytes; the only exception that it may raise is a `ReskinError`. `fuzz.py` runs the targets on
+random inputs for a given time, `test_corpus.py` runs them on the committed corpus.
 """
 
 import tempfile
@@ -36,7 +36,7 @@ LIVE = Session("none", [], "no board")
 
 
 def stream(data: bytes) -> None:
-    """A stream of any wire format: every byte is accounted for, and chunks do not matter."""
+    """Decode a stream: every byte must be in a frame or counted as skipped, and chunks must not change the result."""
     wire, chips_n, cut_n = WIRES[data[0] % len(WIRES)], 1 + data[1] % 8, 1 + data[2]
     whole, parts = FrameStream(wire, chips_n), FrameStream(wire, chips_n)
     found = [whole.feed(data[3:]), whole.close()]
@@ -52,12 +52,12 @@ def stream(data: bytes) -> None:
 
 
 def page(data: bytes) -> None:
-    """Messages of a page: there are three commands, and everything else is ignored."""
+    """Receive a message from a page: there are three commands; all other messages must be ignored."""
     receive(LIVE, data.decode(errors="replace"))
 
 
 def request(data: bytes) -> None:
-    """A request's host, origin and token: only requests from this machine to this machine are accepted."""
+    """Check a request's host, origin and token: only requests from this machine to this machine may be accepted."""
     host, origin, token = ([*data.decode("latin-1").split("\n"), "", "", ""])[:3]
     headers = {"Host": host} | ({"Origin": origin} if origin else {})
     mocked = make_mocked_request("GET", "/?" + token.replace(" ", "+"), headers=headers)
@@ -73,7 +73,7 @@ def request(data: bytes) -> None:
 
 
 def card(data: bytes) -> None:
-    """A model's card, with an empty weights file."""
+    """Read a network whose card is `data` and whose weights file is empty."""
     (FOLDER / "m.safetensors").write_bytes(b"\x08\0\0\0\0\0\0\0{}      ")
     (FOLDER / "m.json").write_bytes(data)
     read_network(FOLDER / "m.safetensors")
@@ -97,7 +97,7 @@ def _log(data: bytes) -> None:
 
 
 def labels(data: bytes) -> None:
-    """Rows of a robot's table, in chunks: they become a valid probe log or none."""
+    """Read rows of a robot's table in chunks: the probe log written from them must be valid, if there is one."""
     table, dwells, cut_n = SampleTable("labels"), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
@@ -107,7 +107,7 @@ def labels(data: bytes) -> None:
 
 
 def gauge(data: bytes) -> None:
-    """The output of a force gauge, a few bytes every 10 ms."""
+    """Read the output of a force gauge, a few bytes every 10 ms."""
     lines, dwells, cut_n = GaugeLines(), DwellBuilder(), 1 + data[0]
     _write_log(
         dwell
@@ -130,7 +130,7 @@ def _write_log(dwells: Iterator[Dwell]) -> None:
 
 
 def typed(data: bytes) -> None:
-    """Keyboard input at a prompt: an existing place and a force, or the prompt is repeated."""
+    """Read keyboard input at a prompt for a place and a force; the resulting label must have an existing place."""
     first, *lines = data.decode(errors="replace").split("\n")
     if (places := parse_places(first)) is None:
         return
@@ -140,7 +140,7 @@ def typed(data: bytes) -> None:
 
 
 def _files(layout: str, names: tuple[str, ...], **options: str) -> Callable[[bytes], None]:
-    """Return a target for a recording of several files, which are separated by a line of dashes."""
+    """Return a target that reads a recording of several files; a line of dashes in the data separates the files."""
     settings = make_header(layout=layout, chips_n=1, capture="fuzz", options=options)
 
     def read(data: bytes) -> None:
@@ -173,10 +173,10 @@ TARGETS: Mapping[str, Callable[[bytes], None]] = {
 }  # fmt: skip
 
 
-HEADS_N = {"stream": 3, "labels": 1, "gauge": 1}  # number of leading bytes that configure the target
+HEADS_N = {"stream": 3, "labels": 1, "gauge": 1}  # number of leading bytes of the input that configure the target
 
 
 def feed(name: str, data: bytes) -> None:
-    """Pass bytes to a target; a `ReskinError` is a valid result."""
+    """Run a target on bytes; a `ReskinError` is a valid result."""
     with suppress(ReskinError):
         TARGETS[name](data.ljust(HEADS_N[name], b"\0") if name in HEADS_N else data)

@@ -1,4 +1,4 @@
-"""Helpers: emulated boards, a linear model that is exact for their two pokes, and readers that play scripts."""
+"""Helpers for tests of live boards: scripts with two alternating pokes, a model of these pokes, and readers."""
 
 import threading
 from collections.abc import Iterator
@@ -20,14 +20,14 @@ from tests.recordings.headers import make_header
 RATE_HZ = 400.0
 QUIET_S, POKED_S = 1.5, 1.0
 PAUSE_S = 2.0
-PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x and y in mm, force in N, of alternating pokes
+PLACES = np.array([[4.0, 12.0, 0.8], [12.0, 4.0, 1.6]])  # x (mm), y (mm), force (N) of the two pokes that alternate
 INPUT_SCALE_uT = 300.0
 
 
 def make_script(
     *, pokes_n: int = 2, chips_n: int = 5, wire: Wire = "binary", rate_hz: float = RATE_HZ, quiet_s: float = QUIET_S
 ) -> Script:
-    """Make a quiet start, then pokes with pauses; noise of 3 uT on a grid of 0.15 and 0.242 uT."""
+    """Return a script: no contact at first, then pokes with pauses; noise 3 uT, LSB 0.15 (x, y) and 0.242 uT (z)."""
     frames_n = round((quiet_s + pokes_n * (POKED_S + PAUSE_S)) * rate_hz)
     t_s, rng = np.arange(frames_n) / rate_hz, rng_for(0, "board")
     poke_i, since_s = np.divmod(t_s - quiet_s, POKED_S + PAUSE_S)
@@ -42,15 +42,16 @@ def make_script(
 
 
 def changes_uT(chips_n: int) -> np.ndarray:
-    """Field changes of the two pokes [2 ch], unlike those of a distant magnet."""
+    """Return the field changes of the two pokes [2 ch]: different at each chip, unlike those of a distant magnet."""
     return 200.0 * rng_for(1, "pokes").standard_normal((2, 3 * chips_n))
 
 
 def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips_n: int = 5) -> Path:
-    """Write a linear network that is exact for the two pokes, shifted by `off_mm` along x."""
-    linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T  # [3 ch]
+    """Write a linear network whose predictions for the two pokes are exact, except for an offset `off_mm` along x."""
+    # weights of the linear model [3 ch]
+    linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T
     weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}
-    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # a ReLU passes one of each pair
+    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # of a value and its negative, a ReLU passes one
     for layer_i in range(2, 6):
         weights[f"layer{layer_i}.weight"][:6, :6] = np.eye(6)
     weights["layer6.weight"][:, :6] = np.hstack([np.eye(3), -np.eye(3)])
@@ -68,7 +69,7 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
 
 
 def write_script(script: Script, folder: Path) -> Path:
-    """Write a script as a recorded capture."""
+    """Write the bytes of a script to a folder as `reskin record` does."""
     ends = np.cumsum([len(piece) for piece in script.pieces])
     files = {
         STREAM_FILE: b"".join(script.pieces),
@@ -82,9 +83,9 @@ def write_script(script: Script, folder: Path) -> Path:
 
 
 class ScriptReader:
-    """A reader that returns a script's bytes at the script's own times, without a port or a thread.
+    """A reader that returns the bytes of a script, with the times of the script, without a port or a thread.
 
-    So results do not depend on the load of the machine.
+    Results therefore do not depend on the load of the machine.
     """
 
     plugged_in, was_plugged_in, problem, missed_bytes_n, taken_s = True, True, "", 0, 0.0
@@ -93,10 +94,10 @@ class ScriptReader:
         self._script, self._frames_n, self._i = script, frames_n, 0
 
     def start(self, *, must_exist: bool) -> None:
-        """Nothing has to be opened."""
+        """Do nothing: there is no port to open."""
 
     def stop(self) -> None:
-        """Nothing has to be closed."""
+        """Do nothing: there is no port to close."""
 
     @property
     def at_end(self) -> bool:
@@ -122,7 +123,7 @@ def play_to_skin(script: Script, models: Models = ()) -> tuple[LiveSkin, list[Es
 
 
 def zero_requests(monkeypatch) -> list[LiveSkin]:
-    """Collect the skins on which `zero` is called; on a busy machine, zeroing can end before the page shows it."""
+    """Return a list to which each call of `LiveSkin.zero` appends its skin; the page may show zeroing too briefly."""
     zeroed, zero = [], LiveSkin.zero
     monkeypatch.setattr(LiveSkin, "zero", lambda skin: (zero(skin), zeroed.append(skin)))
     return zeroed
@@ -134,7 +135,7 @@ class FailingModel:
     channels_n, name = 15, "a model that raises"
 
     def set_noload(self, b_uT: np.ndarray) -> None:
-        """Take any no-load reading."""
+        """Accept any no-load reading."""
 
     def __call__(self, db_uT: np.ndarray) -> None:
         raise RuntimeError("out of memory")

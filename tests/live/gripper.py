@@ -1,6 +1,6 @@
-"""A gripper with a simulated skin on its finger closes on a spring and controls the estimated force.
+"""A gripper with a simulated skin on its finger that closes on a spring and controls the estimated force.
 
-Frames pass through the wire format, the no-load reading and the estimate, as those of a board do.
+Frames are encoded, decoded, zeroed and estimated as those of a real board.
 """
 
 import warnings
@@ -19,7 +19,7 @@ from reskin.seeds import rng_for
 from tests.live.boards import RATE_HZ
 
 AIM_N, GAIN_MM_N = 0.5, 0.1
-PERIOD_S, SETTLED_S = 6.0, 1.0  # period of the object's stiffness; time after which the force is evaluated
+PERIOD_S, SETTLED_S = 6.0, 1.0  # period with which the object's stiffness varies; start of the evaluation of the force
 SOFT_N_MM, HARD_N_MM = 0.3, 3.0
 NOISE_uT, STEP_uT = 3.0, np.array([0.15, 0.15, 0.242])
 DEPTHS_MM = np.linspace(0.02, 1.5, 60)
@@ -27,7 +27,7 @@ DEPTHS_MM = np.linspace(0.02, 1.5, 60)
 
 @dataclass(frozen=True)
 class FittedNetwork(Network):
-    """A network of one skin, fitted to labelled pokes all over it (paper section 5)."""
+    """A network trained on labelled pokes of one skin (paper section 5)."""
 
     regressor: MLPRegressor = field(default_factory=MLPRegressor)
 
@@ -37,7 +37,7 @@ class FittedNetwork(Network):
 
 
 def fit(seed: int, pokes_n: int = 600) -> FittedNetwork:
-    """Fit a network to simulated pokes of a skin, each read once."""
+    """Train a network on simulated pokes of the skin with this seed, with one reading per poke."""
     rng = rng_for(seed, "gripper")
     pokes = np.column_stack([rng.uniform(2, 14, (pokes_n, 2)), rng.uniform(DEPTHS_MM[0], DEPTHS_MM[-1], pokes_n)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed)
@@ -47,25 +47,25 @@ def fit(seed: int, pokes_n: int = 600) -> FittedNetwork:
         hidden_layer_sizes=(64, 64), solver="lbfgs", alpha=1e-3, max_iter=1500, max_fun=10**6, random_state=seed
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # not converged
+        warnings.simplefilter("ignore")  # scikit-learn warns that the training has not converged
         net.fit(scaler.encode(db_uT), scaler.encode_target(target))
     card = {"input": {"channels_n": 15}, "recipe": {"inputs": "raw"}}
     return FittedNetwork(card, scaler.arrays(), net)
 
 
 class Finger:
-    """The readings of a skin's chips when its centre is pressed with a force: simulated once, then interpolated."""
+    """The readings of a skin pressed at `at_mm` as a function of the force, interpolated between simulated forces."""
 
     def __init__(self, seed: int, at_mm: tuple[float, float] = (8.0, 8.0)) -> None:
         pokes = np.column_stack([np.tile(at_mm, (len(DEPTHS_MM), 1)), DEPTHS_MM])
-        quiet = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}  # noise is added to each frame
+        quiet = {"noise_xy_uT": 0.0, "noise_z_uT": 0.0}  # simulated without noise, which is added to each frame later
         noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=seed), pokes, seed=seed, chip=quiet)
         self.noload_uT = noload_uT.mean(axis=0)
         self._change_uT = np.vstack([np.zeros(15), b_uT - self.noload_uT])
         self._force_N, self._depth_mm = np.append(0, force_N), np.append(0, DEPTHS_MM)
 
     def force_at(self, closed_mm: float, stiffness_N_mm: float) -> float:
-        """Find the force at which skin and spring in series are in equilibrium."""
+        """Return the force in N at which skin and spring, in series, are in equilibrium at this closure."""
         total_mm = self._depth_mm + self._force_N / stiffness_N_mm
         return float(np.interp(max(closed_mm, 0.0), total_mm, self._force_N))
 
@@ -74,7 +74,7 @@ class Finger:
 
 
 class FingerReader:
-    """A reader whose next frame shows the current force."""
+    """A reader that returns one frame at a time, for the current force on the finger."""
 
     plugged_in, problem, missed_bytes_n = True, "", 0
 
@@ -100,7 +100,7 @@ class FingerReader:
 def grip(
     finger: Finger, models: Models, rng: np.random.Generator, *, aim_N: float = AIM_N, seconds: float = PERIOD_S
 ) -> np.ndarray:
-    """Hold an object whose stiffness varies tenfold; return true and estimated force in N of every step [f 2]."""
+    """Hold an object whose stiffness varies tenfold; return true and estimated force in N at every time step [f 2]."""
     skin, wire, closed_mm, forces_N = LiveSkin("gripper", models), FingerReader(finger, rng), 0.0, []
     skin.reader = wire
     while len(forces_N) < seconds * RATE_HZ:
@@ -109,7 +109,7 @@ def grip(
             continue
         estimate_N = float(estimates.target[-1, 2])
         forces_N.append((wire.force_N, estimate_N))
-        closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # the controller
+        closed_mm += GAIN_MM_N * (aim_N - estimate_N)  # proportional controller
         share = (1 - np.cos(2 * np.pi * len(forces_N) / RATE_HZ / PERIOD_S)) / 2
         wire.force_N = finger.force_at(closed_mm, SOFT_N_MM * (HARD_N_MM / SOFT_N_MM) ** share)
     return np.array(forces_N)

@@ -1,8 +1,8 @@
-"""Tests of the page in a real Chromium: contacts are drawn in place; buttons and keys zero, record and adapt.
+"""Tests of the live page in Chromium: contacts are drawn at the right place; buttons and keys zero, record and adapt.
 
-The environment variable RESKIN_BROWSER names the browser; by default, it is searched on the path. Without a browser,
-the tests are skipped. They use the browser's debugging protocol and need no further package. RESKIN_SCREENSHOTS names a
-folder for screenshots.
+The environment variable RESKIN_BROWSER is the path of the browser; by default, Chromium is searched on PATH. Without a
+browser, the tests are skipped. The tests use the browser's debugging protocol and need no additional package. If
+RESKIN_SCREENSHOTS names a folder, screenshots are saved there.
 """
 
 import asyncio
@@ -33,13 +33,13 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = os.environ.get("RESKIN_BROWSER") or next(filter(None, map(shutil.which, NAMES)), None)
 FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--remote-debugging-port=0")
 WIDTHS_PX = (400, 1400)
-# The colour of the dot at a place in mm, from the page's own scale.
+# JavaScript: the colour of the pixel at a place in mm, converted with the scale of the page.
 DOT = """((x, y) => { const {state, last, parts: {board}} = boards[0], ratio = devicePixelRatio, margin = MARGIN_PX,
   [wide, high] = state.skin_mm, [left, bottom] = state.corner_mm,
   scale = Math.min((board.clientWidth - 2 * margin) / wide, (innerHeight * .8 - 2 * margin) / high);
   return last.contact ? [...board.getContext("2d").getImageData(ratio * (margin + (x - left) * scale),
     ratio * (margin + (bottom + high - y) * scale), 1, 1).data].slice(0, 3) : []; })"""
-# The number of pixels in which a trace differs from the same trace drawn in one piece, and the number of drawn pixels.
+# JavaScript: the number of pixels in which a trace differs from the same trace redrawn at once, and of drawn pixels.
 COMPARE_TRACES = """((board, i) => {
   const count = i ? board.last.chips : 1, shown = board.traces[i];
   const anew = new Trace(shown.canvas, shown.first, shown.least);
@@ -58,7 +58,7 @@ pytestmark = [
 
 
 class Tab:
-    """A page of a browser, driven through its debugging protocol."""
+    """A page in a browser, controlled by the browser's debugging protocol."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._socket, self._numbers, self.errors = socket, count(1), []
@@ -92,7 +92,7 @@ class Tab:
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" else "")
 
     async def look(self, name: str, when: str = "boards[0].last.contact && !isNaN(boards[0].last.x)") -> None:
-        """Check that nothing is cut off on a phone and on a screen; save pictures if RESKIN_SCREENSHOTS is set."""
+        """Check that nothing is cut off at the widths of a phone and of a desktop; save screenshots if requested."""
         for wide in WIDTHS_PX:
             await self.call(
                 "Emulation.setDeviceMetricsOverride", width=wide, height=900, deviceScaleFactor=1, mobile=False
@@ -106,7 +106,7 @@ class Tab:
 
 
 def in_browser(folder: Path, act: Callable) -> Callable:
-    """Turn an action on a tab into an action on a server's address."""
+    """Return a function for `serve` that opens the page in a browser and calls `act` on its tab."""
 
     async def act_in_browser(address: str, client: aiohttp.ClientSession) -> None:
         profile = folder / "profile"
@@ -145,16 +145,17 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
                 f"Math.hypot(last.x - {x_mm}, last.y - {y_mm}) < .5)(boards[0])"
             )
             blue = await tab.until(f"{near} ? {DOT}({x_mm}, {y_mm}) : []")
-            assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3  # --link
+            # the colour `--link` in the page's style sheet
+            assert np.abs(np.array(blue) - (0x0B, 0x53, 0x94)).max() < 3
             await tab.until(f"({near}) && /x {x_mm:.0f}|x {x_mm - 1:.0f}/.test(boards[0].parts.place.textContent)")
             assert abs(float((await tab.text("force")).split()[0]) - force_N) < 0.5
         await tab.until(
             "(({rate}) => rate.innerText.endsWith('Hz') && parseFloat(rate.innerText) < 520)(boards[0].parts)"
         )
         await tab.look("network")
-        for trace_i in range(2):  # a scrolled and scaled trace looks like one drawn in one piece
+        for trace_i in range(2):  # a trace that was scrolled and rescaled looks like one that is redrawn at once
             differ_n, inked_n = await tab.value(f"{COMPARE_TRACES}(boards[0], {trace_i})")
-            assert differ_n < 0.01 * inked_n  # Chromium smooths short and long paths differently
+            assert differ_n < 0.01 * inked_n  # 1 %: Chromium smooths short and long paths differently
             assert inked_n > 1000
         await tab.value("boards[0].parts.record.click()")
         await tab.until("boards[0].state.recording")
@@ -164,7 +165,7 @@ def test_page_draws_contact_zeroes_and_records(tmp_path, monkeypatch):
         while not zeroed:
             await asyncio.sleep(0.02)
         await tab.until("boards[0].state.zeroed")
-        assert await tab.value("boards[0].parts.adapt.disabled")  # a network cannot adapt
+        assert await tab.value("boards[0].parts.adapt.disabled")  # only the universal model can adapt
 
     with plugged_in(make_script(pokes_n=4), loop=True) as name:
         serve(name, [read_network(write_model(tmp_path))], in_browser(tmp_path, act))
@@ -189,11 +190,13 @@ def test_page_adapts_to_presses_and_draws_the_ellipse(tmp_path, random_pokes):  
 
 def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):  # noqa: F811
     quiet = make_poke_script(guided_pokes)
-    late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)  # time to press the button before the first place
+    # pause before the first place, in which the test presses the button
+    late_s = np.where(np.arange(len(quiet)) < 400, 0.0, 3.0)
     script = replace(quiet, t_s=quiet.t_s + late_s)
 
     async def act(tab: Tab) -> None:
-        no_contact = "rows.slice(-30).every(({high}) => high[0] === 0)"  # longer than the pause between two places
+        # 30 rows without contact: longer than the pause between two places
+        no_contact = "rows.slice(-30).every(({high}) => high[0] === 0)"
         await tab.until(
             f"(({{rows}}) => rows.length > 30 && rows.at(-1).n - rows.at(-30).n < 35 && {no_contact})(boards[0])"
         )
@@ -213,13 +216,13 @@ def test_page_adapts_to_guided_presses_and_shows_errors(tmp_path, guided_pokes):
 def test_page_draws_several_boards(tmp_path):
     async def act(tab: Tab) -> None:
         await tab.until("boards.length === 8 && boards.every(({state}) => state.zeroed)")
-        for i in range(1, 8):  # the model has five chips; the sleeve is drawn without a dot
+        for i in range(1, 8):  # the model has five chips, so the sleeve of forty chips has no estimate
             await tab.until(f"(({{last}}) => last && last.contact && !isNaN(last.x))(boards[{i}])")
         for i, rate_hz in enumerate(RATES_HZ[:UNPLUGGED_I]):
             await tab.until(f"((hz) => 0 < hz && hz < 1.4 * {rate_hz})(parseFloat(boards[{i}].parts.rate.innerText))")
         await asyncio.to_thread(unplugged.close)
         await tab.until("boards[7].state.silent && boards[7].parts.rate.innerText === '–'")
-        lost = ",".join(["0"] * UNPLUGGED_I + ["NaN"])  # a silent board shows no rate and no further loss
+        lost = ",".join(["0"] * UNPLUGGED_I + ["NaN"])  # a board without data shows no rate and no further loss
         await tab.until("boards.map(({parts}) => parseFloat(parts.lost.innerText)).join()", lost.__eq__)
         assert "unplugged" in str(await tab.value("boards[7].state.alarms.join()"))
         assert await tab.value("boards.slice(0, 7).every(({state}) => !state.alarms.join().includes('unplugged'))")

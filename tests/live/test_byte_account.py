@@ -1,4 +1,4 @@
-"""Tests, with random faults, that every byte of a board is in a frame or counted as lost for the right reason."""
+"""Tests with random faults: every byte sent by a board is in a frame or counted as lost, with the right reason."""
 
 from collections import Counter
 from dataclasses import replace
@@ -11,7 +11,8 @@ from reskin.live.emulator import BYTE_FAULTS, VALUE_FAULTS, Fault, Script, encod
 from reskin.seeds import rng_for
 from tests.board.signals import TEXT_WIRES, WIRES, make_frames
 
-SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0  # one fault per slot; the last slot has none
+# a script has 8 slots of 12 frames at 400 Hz; one fault per slot, none in the last slot
+SLOTS_N, SLOT_FRAMES_N, RATE_HZ = 8, 12, 400.0
 NOT_FINITE_SHARE = 0.02
 SEEDS_N = 200
 REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_finite_bytes_n", "skipped_resync_bytes_n",
@@ -19,20 +20,20 @@ REASONS = ("frames_n", "frame_bytes_n", "not_finite_frames_n", "skipped_not_fini
 
 
 def draw(seed: int) -> tuple[Script, list[bytes], list[bool], np.random.Generator]:
-    """Draw a stream with faults in most slots; return also its undamaged frames and which of them are finite."""
+    """Return a random script with faults, its undamaged frames, which of these are finite, and the generator."""
     rng = rng_for(seed, "byte account")
     wire, chips_n = str(rng.choice(WIRES)), int(rng.integers(1, 6))
     frames = make_frames(SLOTS_N * SLOT_FRAMES_N, chips_n, seed)
     faults = [str(name) for name in rng.choice([*VALUE_FAULTS, *BYTE_FAULTS, "none"], SLOTS_N - 1)]
-    # After damage, the decoder takes an implausible frame for the rest of a damaged one and skips it.
+    # Frames near damage must be finite: after damage, the decoder takes a non-finite frame for a damaged one.
     finite = rng.random(len(frames)) >= NOT_FINITE_SHARE
     finite |= np.repeat([name in BYTE_FAULTS for name in [*faults, "none"]], SLOT_FRAMES_N)
     script = Script("recorded", wire, frames, encode_pieces(frames, wire), np.arange(len(frames)) / RATE_HZ)
-    for slot_i, name in enumerate(faults):  # first faults of chips, then faults of the wire
+    for slot_i, name in enumerate(faults):  # faults of chips come first; faults of the wire are injected below
         if name in VALUE_FAULTS and (name != "clock-jump" or wire == "binary-clock"):
             script = inject(script, make_fault(name, slot_i, rng))
     pieces = list(script.pieces)
-    # Frames with a terminator in the payload are decoded only if their values are plausible.
+    # Frames with a terminator in the payload must be finite: otherwise, the decoder does not recognise them as frames.
     finite |= np.array([b"\r\n" in piece[:-2] for piece in pieces])
     for i in np.flatnonzero(~finite):
         pieces[i] = with_nan(pieces[i], wire)
@@ -56,10 +57,10 @@ def with_nan(piece: bytes, wire: str) -> bytes:
 
 
 def expected_account(script: Script, clean: list[bytes], finite: list[bool]) -> Counter[str]:
-    """Return the expected account, from the faults applied to each frame and not from its bytes.
+    """Return the expected counts of frames and bytes, derived from the injected faults instead of the bytes.
 
-    After a damaged frame, the next frame is lost too, because the decoder cannot know where it starts. Exception: a
-    damaged text frame that still ends with a line feed.
+    The frame after a damaged frame is lost too, because the decoder cannot know where it starts, unless the damaged
+    frame is text and still ends with a line feed.
     """
     count: Counter[str] = Counter()
     in_step = True
@@ -88,7 +89,7 @@ def test_every_byte_is_in_a_frame_or_counted_by_reason():
     for seed in range(SEEDS_N):
         script, clean, finite, rng = draw(seed)
         count, data = expected_account(script, clean, finite), b"".join(script.pieces)
-        if seed % 2 and finite[-1]:  # unplugged inside the last frame
+        if seed % 2 and finite[-1]:  # the board is unplugged within the last frame
             left_n = len(clean[-1]) - int(rng.integers(3, len(clean[-1])))
             data = data[: len(data) - len(clean[-1]) + left_n]
             count.update(frames_n=-1, frame_bytes_n=-len(clean[-1]), skipped_truncated_bytes_n=left_n)

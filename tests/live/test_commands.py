@@ -1,4 +1,4 @@
-"""Tests that commands without options find the boards that are plugged in."""
+"""Tests that `reskin record` and `reskin live` without options find the boards that are plugged in."""
 
 import time
 from types import SimpleNamespace
@@ -18,7 +18,7 @@ RATE_BYTES_S = 82 * 400
 
 @pytest.fixture(autouse=True)
 def clock(tmp_path, monkeypatch):
-    """Advance the recorder's clock as bytes arrive, so that a busy machine records as much as a quiet one."""
+    """Replace the recorder's clock by one that advances with received bytes, independent of the machine's load."""
 
     def monotonic() -> float:
         return sum(stream.stat().st_size for stream in tmp_path.rglob(STREAM_FILE)) / RATE_BYTES_S

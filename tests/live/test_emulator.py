@@ -1,4 +1,4 @@
-"""Tests of emulated boards: their scripts, when bytes arrive, and injected faults."""
+"""Tests of emulated boards: scripts, the times at which bytes are sent, and injected faults."""
 
 import math
 import threading
@@ -24,7 +24,7 @@ SCRIPT, POKED = make_script(pokes_n=0), make_script(pokes_n=1)
 
 
 class SimulatedClock:
-    """A clock that only advances by waiting, and a stop event that is never set."""
+    """A clock whose time advances only by waiting; also serves as a stop event that is never set."""
 
     def __init__(self):
         self.s = 0.0
@@ -36,11 +36,11 @@ class SimulatedClock:
         return False
 
     def wait(self, seconds):
-        self.s += max(seconds, 1e-9)  # a smaller step would be lost to rounding
+        self.s += max(seconds, 1e-9)  # a smaller step would vanish by rounding
 
 
 class FakeReader:
-    """A reader that notes the arrival of each frame and is late once, by `late_s` at frame `late_i`."""
+    """A reader that records the arrival time of each frame; once, at frame `late_i`, it is late by `late_s`."""
 
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []
@@ -67,9 +67,9 @@ def test_no_byte_is_lost_while_nobody_reads(port):
     sent = b"".join(SCRIPT.pieces)
     end, stop, sent_bytes_n = make_port(port), threading.Event(), []
     player = threading.Thread(target=lambda: sent_bytes_n.append(play(SCRIPT, end, stop, speed=math.inf)))
-    with open_port(end.name, 115200) as device:  # opening a port discards waiting bytes
+    with open_port(end.name, 115200) as device:  # opening a port discards bytes that wait there
         player.start()
-        time.sleep(0.5)  # nobody reads
+        time.sleep(0.5)  # nobody reads from the port meanwhile
         data = b""
         while len(data) < len(sent):
             data += read_waiting(device)
@@ -80,8 +80,8 @@ def test_no_byte_is_lost_while_nobody_reads(port):
 
 
 @pytest.mark.parametrize("port", ["pty", "tcp"])
-def test_loop_starts_again_when_the_port_is_opened_again(port):
-    # Opening a port discards waiting bytes, so some of the first frames may be missing.
+def test_script_restarts_when_the_port_is_reopened(port):
+    # Opening a port discards bytes that wait there, so some of the first frames may be missing.
     script = make_script(pokes_n=2)
     end, stop, early = make_port(port), threading.Event(), b"".join(script.pieces[200:250])
     player = threading.Thread(target=play, args=[script, end, stop], kwargs={"loop": True})
@@ -90,7 +90,7 @@ def test_loop_starts_again_when_the_port_is_opened_again(port):
     for _ in range(2):
         with open_port(end.name, 115200) as device:
             data = b""
-            while len(data) < 8 * len(early):  # a stream that is not restarted would differ
+            while len(data) < 8 * len(early):  # long enough to differ from a stream that is not restarted
                 data += read_waiting(device)
         restarted.append(early in data)
     stop.set()
@@ -107,7 +107,7 @@ def test_speed_multiplies_the_rate_of_the_script(times, speed):
     np.testing.assert_allclose(reader.arrival_s, SCRIPT.t_s / speed, atol=1e-8)
 
 
-def test_a_late_reader_gets_at_most_a_tenth_of_a_second_at_once(times):
+def test_late_reader_gets_at_most_a_tenth_of_a_second_at_once(times):
     reader = FakeReader(times, late_i=100, late_s=2.0)
     play(SCRIPT, reader, times)
     late_s = np.array(reader.arrival_s) - SCRIPT.t_s
@@ -116,7 +116,7 @@ def test_a_late_reader_gets_at_most_a_tenth_of_a_second_at_once(times):
     assert max(Counter(reader.arrival_s).values()) <= LATE_MAX_S * RATE_HZ + 1
 
 
-def test_link_keeps_its_name_over_unplugging(tmp_path):
+def test_link_has_the_same_name_after_unplugging(tmp_path):
     link, stop = tmp_path / "board", threading.Event()
     end = make_port(str(link))
     player = threading.Thread(target=play, args=[inject(SCRIPT, parse_fault("unplug@0.5+99")), end, stop])
@@ -126,13 +126,13 @@ def test_link_keeps_its_name_over_unplugging(tmp_path):
             read_waiting(device)
     assert not link.is_symlink()
     assert not link.exists()
-    stop.set()  # ends the unplugged period
+    stop.set()  # ends the time for which the board is unplugged
     player.join()
     assert link.is_symlink()
     end.unplug()
 
 
-def test_link_in_use_is_refused_and_kept(tmp_path):
+def test_link_in_use_is_an_error_and_is_not_removed(tmp_path):
     link = tmp_path / "board"
     first = make_port(str(link))
     leads_to = link.readlink()
@@ -141,20 +141,20 @@ def test_link_in_use_is_refused_and_kept(tmp_path):
     assert link.readlink() == leads_to
     first.unplug()
     assert not link.is_symlink()
-    link.symlink_to(leads_to.with_name("999999"))  # of an emulator that was killed
+    link.symlink_to(leads_to.with_name("999999"))  # a link left by an emulator that was killed
     second = make_port(str(link))
     assert link.exists()
     second.unplug()
 
 
-def test_link_taken_while_unplugged_is_kept(tmp_path):
+def test_link_taken_by_another_emulator_is_not_removed(tmp_path):
     link = tmp_path / "board"
     first = make_port(str(link))
     first.unplug()
     second = make_port(str(link))
     with pytest.raises(ParamsError, match="which is in use"):
         first.plug_in()
-    first.unplug()  # as the command does at its end
+    first.unplug()  # as `reskin emulate` does at its end
     assert link.exists()
     second.unplug()
     assert not link.is_symlink()
@@ -173,7 +173,7 @@ def test_invalid_ports_raise(tmp_path):
 
 
 class TestFaults:
-    def test_value_faults_change_only_the_frames_inside(self):
+    def test_value_faults_change_only_frames_within_their_time(self):
         for name in ("failed-read", "chip-reset", "stuck", "saturated", "int16-wrap", "magnet", "too-hot", "crlf"):
             changed = inject(SCRIPT, parse_fault(f"{name}@0.5+0.25"))
             inside = (SCRIPT.t_s >= 0.5) & (SCRIPT.t_s < 0.75)
@@ -190,10 +190,10 @@ class TestFaults:
 
         assert frames_n("dropped") == len(SCRIPT) - 50
         assert frames_n("repeated") == len(SCRIPT) + 100
-        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # a torn frame also loses the start of the next
+        assert frames_n("torn") == len(SCRIPT) - 2 * 10  # a torn frame also costs the next frame
 
     def test_clock_jump_needs_frames_with_a_clock(self):
-        with pytest.raises(ParamsError, match="Use a binary-clock capture"):
+        with pytest.raises(ParamsError, match="needs a capture with a clock"):
             inject(
                 replace(SCRIPT, frames=replace(SCRIPT.frames, device_s=SCRIPT.frames.device_s * np.nan)),
                 parse_fault("clock-jump@0.5"),
@@ -222,7 +222,7 @@ def test_script_of_an_sd_card_log_has_its_frames(tmp_path):
     header = make_header(capture="c0", layout="sd-card", clock=Clock(kind="recording", rate_hz=None, marks=()))
     write_capture(tmp_path / "c0", header, {LOG_FILE: log.encode()})
     script = read_script(str(tmp_path / "c0"))
-    np.testing.assert_allclose(script.frames.b_uT, frames.b_uT, atol=0.006)  # two decimals
+    np.testing.assert_allclose(script.frames.b_uT, frames.b_uT, atol=0.006)  # the log has two decimals
     np.testing.assert_allclose(script.t_s, POKED.t_s, atol=1e-4)
 
 
@@ -231,11 +231,11 @@ def test_script_of_a_simulation_has_contacts(source):
     script = read_script(source)
     assert script.frames.b_uT.shape == (len(script), 15)
     assert np.all(np.diff(script.t_s) >= 0)
-    assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # uT
+    assert np.ptp(script.frames.b_uT, axis=0).max() > 100  # contacts change the field by more than 100 uT
 
 
 def test_invalid_sources_raise(tmp_path):
     for source in (str(tmp_path), "nowhere", str(ROOT / "pipeline/scenes/lab.yaml"), "../scenes/quick"):
-        with pytest.raises(ReskinError, match="not the folder of a capture|not a simulated scene") as error:
+        with pytest.raises(ReskinError, match="must be the folder of a capture|not a simulated scene") as error:
             read_script(source)
         assert "Traceback" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Tests of the estimators of a live board, their calibration on the page, and unknown skins."""
+"""Tests of the models of a live board: estimates, calibration from the page, unknown skins."""
 
 import re
 import time
@@ -21,14 +21,14 @@ QUIET_N, POKED_N = 600, 100
 
 @pytest.fixture(scope="module")
 def random_pokes():
-    """Return the no-load readings of a simulated skin, and fields, places and forces of pokes all over it."""
+    """Return no-load readings of a simulated skin, and fields, places (mm) and forces (N) of pokes at random places."""
     places = np.column_stack([rng_for(0, "places").uniform(3, 13, (PRESSES_N, 2)), np.full(PRESSES_N, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=3), places, seed=3)
     return noload_uT, b_uT, places[:, :2], force_N
 
 
 def make_poke_script(pokes, rotated_n: int = 0):
-    """Make a script with a quiet start and all pokes with pauses; `rotated_n` rotates the order of the chips."""
+    """Return a script of all pokes with pauses, after a start without contact; the chips are rotated by `rotated_n`."""
     noload_uT, b_uT, _, _ = pokes
     script = make_script(pokes_n=0, quiet_s=(QUIET_N + 2 * POKED_N * len(b_uT)) / 400)
     poke_i, since_n = np.divmod(np.arange(len(script)) - QUIET_N, 2 * POKED_N)
@@ -40,8 +40,8 @@ def make_poke_script(pokes, rotated_n: int = 0):
 
 def test_universal_model_estimates_places_and_their_standard_deviation(random_pokes):
     skin, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
-    estimates = np.concatenate([each.target[each.contact] for each in readings])
-    sd_mm = np.concatenate([each.sd_mm[each.contact] for each in readings])
+    estimates = np.concatenate([batch.target[batch.contact] for batch in readings])
+    sd_mm = np.concatenate([batch.sd_mm[batch.contact] for batch in readings])
     true = np.repeat(random_pokes[2], POKED_N, axis=0)
     assert len(estimates) == pytest.approx(len(true), abs=20)
     error_mm = np.abs(estimates[: len(true), :2] - true[: len(estimates)])
@@ -50,29 +50,29 @@ def test_universal_model_estimates_places_and_their_standard_deviation(random_po
     assert skin.health.alarms == {}
 
 
-def test_chips_in_another_order_are_an_unknown_skin(random_pokes):
+def test_board_with_swapped_chips_raises_the_alarm_unknown_skin(random_pokes):
     skin, _ = play_to_skin(make_poke_script(random_pokes, rotated_n=1), load_universal())
     assert skin.health.alarms[UNKNOWN_SKIN].count_n > 0.5 * POKED_N * PRESSES_N
 
 
-def test_presses_are_collected_and_adapted_to(random_pokes):
+def test_model_adapts_to_collected_presses(random_pokes):
     _, readings = play_to_skin(make_poke_script(random_pokes), load_universal())
     pokes = Presses()
-    for each in readings:
-        pokes.add(each)
+    for batch in readings:
+        pokes.add(batch)
     assert pokes.complete
     change_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
-    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # maximum noise of 200 readings with 3 uT
+    np.testing.assert_allclose(pokes.db_uT, change_uT, atol=30)  # tolerance in uT: readings have noise of 3 uT
     estimator = UniversalEstimator(load_universal())
     estimator.set_noload(random_pokes[0])
     assert "adapted to 12 presses: standard deviation of a place" in estimator.adapt(pokes.db_uT)
     before = estimator(pokes.db_uT.astype(np.float32))
-    estimator.set_noload(random_pokes[0])  # the adaptation is kept
+    estimator.set_noload(random_pokes[0])  # a new no-load reading keeps the adaptation
     np.testing.assert_allclose(estimator(pokes.db_uT.astype(np.float32)).target, before.target, rtol=1e-6)
 
 
 class PressedWhileAdapting(UniversalEstimator):
-    """An estimator whose user presses the button Adapt while it adapts."""
+    """An estimator that is adapted again, by the button Adapt, while an adaptation runs."""
 
     session: Session
     times_n: int
@@ -84,7 +84,7 @@ class PressedWhileAdapting(UniversalEstimator):
 
 
 @pytest.mark.parametrize(("times_n", "instruction"), [(0, ""), (1, ""), (2, f"press 1 of {PRESSES_N}, anywhere")])
-def test_presses_asked_for_during_adaptation_are_kept(random_pokes, times_n, instruction):
+def test_button_during_adaptation_keeps_the_presses(random_pokes, times_n, instruction):
     session = Session("played", load_universal(), "a board")
     session.skin.reader = reader = ScriptReader(make_poke_script(random_pokes))
     session.skin.estimator = estimator = PressedWhileAdapting(load_universal())
@@ -100,7 +100,7 @@ def test_presses_asked_for_during_adaptation_are_kept(random_pokes, times_n, ins
     assert state["alarms"] == []
 
 
-def test_presses_within_the_noise_are_refused_and_change_nothing(random_pokes):
+def test_presses_within_the_noise_are_refused(random_pokes):
     noload_uT, b_uT, _, _ = random_pokes
     db_uT = b_uT - noload_uT.mean(axis=0)
     estimator = UniversalEstimator(load_universal())
@@ -113,7 +113,7 @@ def test_presses_within_the_noise_are_refused_and_change_nothing(random_pokes):
     np.testing.assert_array_equal(estimator(db_uT.astype(np.float32)).target, before)
 
 
-def test_new_presses_replace_wrong_ones(random_pokes):
+def test_new_presses_replace_earlier_ones(random_pokes):
     db_uT = random_pokes[1] - random_pokes[0].mean(axis=0)
     corrected, adapted_once = UniversalEstimator(load_universal()), UniversalEstimator(load_universal())
     for estimator in (corrected, adapted_once):
@@ -129,7 +129,7 @@ def test_new_presses_replace_wrong_ones(random_pokes):
 
 @pytest.fixture(scope="module")
 def guided_pokes():
-    """Return the same for a skin that is pressed at the places that the page shows, in that order."""
+    """Like `random_pokes`, for pokes at the places that the page shows, in the order of the page."""
     places = np.column_stack([GuidedPresses().place_mm, np.full(GuidedPresses().presses_n, 1.0)])
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(seed=5), places, seed=5)
     return noload_uT, b_uT, places[:, :2], force_N
@@ -138,9 +138,9 @@ def guided_pokes():
 def test_guided_presses_calibrate_and_test_the_model(guided_pokes):
     _, readings = play_to_skin(make_poke_script(guided_pokes), load_universal())
     pokes, crosses = GuidedPresses(), []
-    for each in readings:
+    for batch in readings:
         crosses += [pokes.next_mm] if pokes.next_mm not in [None, *crosses] else []
-        pokes.add(each)
+        pokes.add(batch)
     np.testing.assert_allclose(crosses, guided_pokes[2])
     assert len(np.unique(pokes.place_mm, axis=0)) == len(pokes) == 2 * pokes.held_out.sum()
     assert pokes.next_mm is None
@@ -152,7 +152,7 @@ def test_guided_presses_calibrate_and_test_the_model(guided_pokes):
     held_out_mm = np.linalg.norm(found - guided_pokes[2][pokes.held_out], axis=1)
     assert after_mm == pytest.approx(np.median(held_out_mm), abs=0.006)
     assert after_mm < before_mm
-    estimator.set_noload(guided_pokes[0])  # the calibration is kept
+    estimator.set_noload(guided_pokes[0])  # a new no-load reading keeps the calibration
     np.testing.assert_allclose(
         estimator(pokes.db_uT[pokes.held_out].astype(np.float32)).target[:, :2], found, rtol=1e-6
     )
@@ -162,7 +162,7 @@ def test_guided_presses_add_to_the_labels_of_a_calibration(guided_pokes):
     noload_uT, b_uT, place_mm, force_N = guided_pokes
     kept, rest_uT = GuidedPresses().held_out, noload_uT.mean(axis=0)
     calibrated = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
-    # The guided presses have no measured force.
+    # Presses at places shown by the page have no measured force.
     all_force_N = np.where(kept, force_N, calibrated.estimate(b_uT).force_N)
     expected = load_universal().zero(noload_uT).label(place_mm, all_force_N, b_uT).predict(b_uT)
     estimator = UniversalEstimator(calibrated)
@@ -183,31 +183,32 @@ def test_universal_model_is_refused_for_other_chips():
     skin, readings = play_to_skin(make_script(pokes_n=1, chips_n=4), load_universal())
     assert skin.estimator is None
     assert "no place or force: the universal model is for five chips. Use a model for this board." in skin.alarms()
-    assert all(np.isnan(each.target).all() for each in readings)
+    assert all(np.isnan(batch.target).all() for batch in readings)
 
 
-def test_opening_a_board_keeps_the_calibration(random_pokes, tmp_path):
+def test_opened_board_uses_the_saved_calibration(random_pokes, tmp_path):
     noload_uT, b_uT, place_mm, force_N = random_pokes
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
     calibrated.save(tmp_path / "s3.safetensors")
     before, mean = calibrated.predict(b_uT), calibrated.skin.mean
-    (tmp_path / "s3.json").write_text("{}")  # a user's file of that name is not taken for a network card
+    (tmp_path / "s3.json").write_text("{}")  # not the card of the model s3: a user's file with that name
     for models in (calibrated, read_models([tmp_path / "s3.safetensors"])):
         _, readings = play_to_skin(make_poke_script(random_pokes), models)
-        estimates = np.concatenate([each.target[each.contact] for each in readings])
+        estimates = np.concatenate([batch.target[batch.contact] for batch in readings])
         true_mm = np.repeat(place_mm, POKED_N, axis=0)[: len(estimates)]
         uncalibrated = np.concatenate(
-            [each.target[each.contact] for each in play_to_skin(make_poke_script(random_pokes), load_universal())[1]]
+            [batch.target[batch.contact] for batch in play_to_skin(make_poke_script(random_pokes), load_universal())[1]]
         )
         assert np.abs(estimates[:, :2] - true_mm).mean() < 0.6 * np.abs(uncalibrated[:, :2] - true_mm).mean()
-    np.testing.assert_array_equal(calibrated.predict(b_uT), before)  # the user's model is unchanged
+    # opening a board does not change the model passed by the user
+    np.testing.assert_array_equal(calibrated.predict(b_uT), before)
     np.testing.assert_array_equal(calibrated.skin.mean, mean)
 
 
 def test_calibration_is_refused_for_several_boards(random_pokes, tmp_path):
     noload_uT, b_uT, place_mm, force_N = random_pokes
     calibrated = load_universal().zero(noload_uT).label(place_mm, force_N, b_uT)
-    with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) cannot estimate for 2 boards"):
+    with pytest.raises(ParamsError, match=r"to one skin \(12 presses\) and cannot be used for 2 boards"):
         reskin.open(["/dev/a", "/dev/b"], model=calibrated)
     calibrated.save(tmp_path / "s3.safetensors")
     with pytest.raises(ParamsError, match="is a calibration of the universal model, load it with reskin.load_univ"):

@@ -1,4 +1,4 @@
-"""Tests that the examples of docs/live.md and docs/add-a-skin.md run, with fakes for third-party packages."""
+"""Tests that the examples in docs/live.md and docs/add-a-skin.md run, with fakes of third-party packages."""
 
 import re
 import sys
@@ -16,7 +16,7 @@ EXAMPLES = dict(re.findall(r"```python (\w+)\n(.*?)```", PAGES, re.DOTALL))
 
 
 class OneContact:
-    """A skin that is touched once."""
+    """Fake of an opened board that yields one contact."""
 
     def __init__(self, port: str) -> None:
         self.port = port

@@ -5,13 +5,13 @@ import numpy as np
 from reskin.seeds import rng_for
 from tests.live.gripper import AIM_N, PERIOD_S, RATE_HZ, SETTLED_S, Finger, fit, grip
 
-SEEDS = range(3)  # one skin and network each
+SEEDS = range(3)  # seeds; each draws a skin and trains a network
 
 
 def test_controller_holds_half_a_newton():
-    """Over 12 seeds (mean and standard deviation), the estimate is held at 0.512 +- 0.002 N.
+    """Measured over 12 seeds (mean +- standard deviation): the estimated force is held at 0.512 +- 0.002 N.
 
-    The true force differs from the aim by 15 +- 9 %, its mean over three seeds by 15 +- 5 %; its maximum is 0.7 N.
+    The true force differs from the aim by 15 +- 9 %, the mean of three seeds by 15 +- 5 %; the maximum force is 0.7 N.
     """
     errors = []
     for seed in SEEDS:

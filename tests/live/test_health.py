@@ -1,4 +1,4 @@
-"""Tests that every fault raises an alarm that names the chip, and that a healthy board raises none."""
+"""Tests that every fault raises an alarm with the number of the chip, and that a healthy board raises no alarm."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ ALARMS = {
 
 
 def feed(script, frames_n=7):
-    """Feed a script's frames in small batches, as they arrive."""
+    """Feed the frames of a script in batches of `frames_n`; return the health monitor."""
     health, frames = Health(script.frames.temperature_degC.shape[1]), script.frames
     for first in range(0, len(frames), frames_n):
         rows = (np.arange(len(frames)) >= first) & (np.arange(len(frames)) < first + frames_n)
@@ -33,11 +33,11 @@ def feed(script, frames_n=7):
 
 
 def inject_fault(name, wire="binary"):
-    """Return a script with a fault; its frames are decoded from the damaged bytes."""
+    """Return a script with a fault at 1.5 s; its frames are decoded from the damaged bytes."""
     from reskin.board.stream import decode_all
     from reskin.live.emulator import Script
 
-    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset chip stays reset
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset lasts until the end
     script = inject(make_script(pokes_n=2, wire=wire), parse_fault(f"{name}@1.5+{duration_s}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     t_s = script.t_s if len(frames) == len(script) else np.linspace(0, script.duration_s, len(frames))
@@ -55,7 +55,7 @@ def test_fault_is_named_and_counted(name):
     health = feed(inject_fault(name))
     assert set(health.alarms) == {ALARMS[name]}
     alarm = health.alarms[ALARMS[name]]
-    duration_s = 4.0 if name == "chip-reset" else 1.5  # finding the LSB takes 400 frames
+    duration_s = 4.0 if name == "chip-reset" else 1.5  # a reset is found only after 400 frames
     assert 1.4 <= alarm.first_s <= 1.5 + duration_s
     assert alarm.last_s <= 1.6 + duration_s
     assert alarm.count_n >= 100
@@ -64,7 +64,7 @@ def test_fault_is_named_and_counted(name):
 
 
 def fail_reads_of_chip_0(script, every_n):
-    """Return the script with a failed read of chip 0 in every `every_n`-th frame."""
+    """Return the script with failed reads of chip 0, one in `every_n` frames."""
     b_uT, temperature_degC = script.frames.b_uT.copy(), script.frames.temperature_degC.copy()
     b_uT[every_n - 1 :: every_n, :3], temperature_degC[every_n - 1 :: every_n, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     return replace(script, frames=replace(script.frames, b_uT=b_uT, temperature_degC=temperature_degC))
@@ -78,12 +78,12 @@ def test_failed_reads_of_another_chip_do_not_hide_a_fault(name, every_n):
 
 
 @pytest.mark.parametrize("every_n", [3, 30, BATCH_FRAMES_N])
-def test_stuck_chip_stays_invalid_beside_failed_reads(every_n):
-    script = fail_reads_of_chip_0(inject_fault("stuck"), every_n)  # stuck from 1.5 to 3.0 s
+def test_stuck_chip_is_invalid_despite_failed_reads(every_n):
+    script = fail_reads_of_chip_0(inject_fault("stuck"), every_n)  # chip 1 is stuck from 1.5 to 3.0 s
     health, used = Health(5), np.zeros(len(script), bool)
     for i in range(len(script)):
         used[i : i + 1] = health.feed(script.frames.where(np.arange(len(script)) == i), float(script.t_s[i]))
-    # Detection needs two batches of frames without failed reads; up to a third of the frames fail.
+    # A stuck chip is detected within two batches of frames without failed reads; up to a third of the frames have one.
     found_s = 1.5 + 2 * BATCH_FRAMES_N * 1.5 / 400
     assert not used[(script.t_s > found_s) & (script.t_s < 2.95)].any()
     assert used[script.t_s < 1.5].any()
@@ -91,7 +91,7 @@ def test_stuck_chip_stays_invalid_beside_failed_reads(every_n):
 
 def test_reset_is_found_on_a_quiet_board():
     rng, step_uT = np.random.default_rng(0), np.tile([0.15, 0.15, 0.242], 5)
-    step_uT[3:6] = RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT  # chip 1 is back at its power-on settings
+    step_uT[3:6] = RESET_LSB_XY_uT, RESET_LSB_XY_uT, RESET_LSB_Z_uT  # steps of chip 1 at its power-on settings
     b_uT = np.round(rng.normal(0, 1.0, (1200, 15)) / step_uT) * step_uT
     script = make_script(pokes_n=2)
     frames = replace(script.frames.where(np.arange(len(script)) < 1200), b_uT=b_uT.astype(np.float32))
@@ -99,19 +99,19 @@ def test_reset_is_found_on_a_quiet_board():
     assert ALARMS["chip-reset"] in alarms
 
 
-def test_zeros_are_named_on_every_chip():
+def test_chip_that_reads_zeros_is_named():
     health = feed(inject_fault("zeros"))
     assert {name: alarm.count_n for name, alarm in health.alarms.items()} == {
         f"chip {chip_i}: zeros in place of a reading": 600 for chip_i in range(5)
     }
 
 
-def test_repeated_frames_and_clock_jump():
+def test_repeated_frames_and_clock_jumps_raise_alarms():
     assert "frames repeat" in feed(inject_fault("repeated")).alarms
     assert "the board's clock jumps" in feed(inject_fault("clock-jump", "binary-clock")).alarms
 
 
-def test_missing_frames_make_a_board_slower():
+def test_missing_frames_raise_the_alarm_slower_than_before():
     half = (np.arange(len(SCRIPT)) < 1000) | (np.arange(len(SCRIPT)) % 2 == 0)
     health = Health(5)
     for i in np.flatnonzero(half):
@@ -120,7 +120,7 @@ def test_missing_frames_make_a_board_slower():
     assert health.rate_hz == pytest.approx(200, rel=0.1)
 
 
-def test_faulty_frames_are_invalid():
+def test_frames_with_a_fault_are_invalid():
     frames = SCRIPT.frames.where(np.arange(len(SCRIPT)) < BATCH_FRAMES_N)
     for name in ("failed-read", "zeros", "saturated", "too-hot"):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
@@ -140,17 +140,17 @@ def feed_once(frames: Frames):
     return Health(5).feed(frames, 1.0)
 
 
-def test_common_field_is_an_outside_field():
+def test_equal_change_on_all_chips_is_an_outside_field():
     turn = np.tile(np.eye(3), (5, 1, 1))
     health = Health(5)
-    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # too weak to decide
+    health.feed_change(np.tile([0.0, 0.0, 20.0], 5), turn, 0.0)  # too weak to be judged
     health.feed_change(np.array([200.0, 0, 0, -100, 50, 0, 0, 0, 100, 0, -50, 0, 30, 0, 0]), turn, 0.0)
     assert health.alarms == {}
     health.feed_change(np.tile([0.0, 0.0, 400.0], 5), turn, 0.0)
     assert [name.split(":")[0] for name in health.alarms] == ["external field"]
 
 
-def test_fault_policy_setting():
+def test_fault_policy_decides_which_frames_are_valid():
     for name, fault in (("failed-read", "failed_read"), ("saturated", "saturated"), ("too-hot", "too_hot")):
         script = inject(SCRIPT, parse_fault(f"{name}@0+0.05"))
         frames = changed_frames(script, BATCH_FRAMES_N)

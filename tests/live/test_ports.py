@@ -1,4 +1,4 @@
-"""Tests that a board is recognised from its bytes, and that other devices are not taken for boards."""
+"""Tests that boards are recognised by the bytes that they send, and that other devices are not."""
 
 from dataclasses import replace
 
@@ -13,11 +13,11 @@ from reskin.live.emulator import inject, parse_fault
 from reskin.seeds import rng_for
 from tests.live.boards import make_script, plugged_in
 
-CHUNK_N = 3  # frames per chunk; chunks do not start at frames
+CHUNK_N = 3  # frames per chunk; chunks start in the middle of a frame
 
 
 def chunks_of(script, cut_n=31):
-    """Return the script's bytes as read from a port that is opened in the middle of a frame."""
+    """Return the script's bytes in chunks, without the first `cut_n` bytes (the port is opened within a frame)."""
     data = b"".join(script.pieces)[cut_n:]
     size = CHUNK_N * len(script.pieces[0])
     every_s = CHUNK_N * script.duration_s / len(script)
@@ -31,7 +31,7 @@ def test_wire_chips_rate_and_lsb_are_detected(wire, chips_n, rate_hz):
     found = find.recognise("port", chunks_of(script))
     assert (found.problem, found.wire, found.chips_n) == (None, wire, chips_n)
     assert found.rate_hz == pytest.approx(rate_hz, rel=0.03)
-    np.testing.assert_allclose(found.lsb_uT, (0.15, 0.242), rtol=0.06)  # text has two decimals
+    np.testing.assert_allclose(found.lsb_uT, (0.15, 0.242), rtol=0.06)  # text frames have two decimals
     assert found.gain_sel == 7
     assert f"{chips_n} chips" in str(found)
 
@@ -45,7 +45,7 @@ def test_other_devices_are_not_boards():
 
 
 @given(st.binary(max_size=3000), st.integers(1, 700))
-def test_any_bytes_are_described(data, size):
+def test_arbitrary_bytes_are_described_without_error(data, size):
     chunks = [(data[first : first + size], 0.01 * first) for first in range(0, len(data), size)]
     assert str(find.recognise("port", chunks)).startswith("port: ")
 
@@ -59,10 +59,10 @@ def test_frames_of_random_values_are_described(seed, chips_n):
     assert str(find.recognise("port", [(data, 0.0), (data, 1.0)])).startswith("port: ")
 
 
-def test_noiseless_chips_show_no_lsb():
+def test_chips_without_noise_have_no_lsb():
     script = make_script(pokes_n=0)
-    still = replace(script, pieces=[script.pieces[0]] * len(script))
-    assert "steps not known yet" in str(find.recognise("port", chunks_of(still)))
+    without_noise = replace(script, pieces=[script.pieces[0]] * len(script))
+    assert "steps not known yet" in str(find.recognise("port", chunks_of(without_noise)))
 
 
 def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
@@ -78,7 +78,7 @@ def test_only_board_is_found_and_two_are_ambiguous(tmp_path):
 
 class TestReplugging:
     def find(self, *port_lists):
-        """Look for the replugged port, with one list of ports per poll; the last list stays."""
+        """Find the port of a replugged board; each poll sees the next list of ports, and later polls the last list."""
         polls, printed = iter(port_lists), []
         last = [set(port_lists[-1])]
 
@@ -90,9 +90,9 @@ class TestReplugging:
 
     def test_replugged_port_is_found(self):
         found, printed = self.find("ab", "ab", "ab", "b", "b", "b", "bc")
-        assert found == "c"  # it may come back under another name
+        assert found == "c"  # a replugged board may have another port
         assert printed == ["Unplug the board.", "a disappeared. Plug it in again."]
 
-    def test_waiting_for_replugging_ends(self):
+    def test_waiting_for_replugging_ends_at_the_time_limit(self):
         with pytest.raises(CaptureError, match="no port disappeared within 1 s"):
             self.find("ab")

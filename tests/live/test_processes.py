@@ -1,4 +1,4 @@
-"""Tests of commands in separate processes with an emulated board: emulate, ports, record, decode, live."""
+"""Tests of the commands emulate, ports, record, decode and live, each in a process, with an emulated board."""
 
 import asyncio
 import os
@@ -26,17 +26,17 @@ from tests.live.boards import PLACES, make_script, write_model, write_script
 from tests.live.test_server import until
 from tests.stages.checkout import ROOT
 
-LONG_S = 120.0  # enough for a process that imports torch on a busy machine
+LONG_S = 120.0  # time limit: enough to import PyTorch on a busy machine
 pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo-terminals"), pytest.mark.timeout(900)]
 
 
 def restore_ctrl_c() -> None:
-    """Undo the shell's setting that processes in the background ignore Ctrl-C."""
+    """Let Ctrl-C end this process, even if a shell started the tests in the background, where Ctrl-C is ignored."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class Shell:
-    """Run `reskin` in a folder; `close` stops all processes that are left."""
+    """Runs `reskin` commands in a folder; `close` stops those that still run."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.running = folder, []
@@ -76,7 +76,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.05)
 
 
-def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
+def test_commands_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
     capture, link = write_script(make_script(pokes_n=4), tmp_path / "c0"), tmp_path / "board"
     board = shell.start("emulate", capture, "--port", link, "--loop", "--fault", "crlf@1+1")
     wait_until(link.is_symlink)
@@ -105,7 +105,7 @@ def test_emulate_ports_record_decode_and_live_work_together(shell, tmp_path):
 
 
 async def watch_page(address: str) -> None:
-    """Wait for contacts at their places and for the alarms of the board."""
+    """Wait until the page has received contacts at the right places and the expected alarms."""
     async with aiohttp.ClientSession() as client, connect(client, address) as page:
         await until(page, lambda message: message.get("zeroed") is True)
         alarms, near_n = "", 0
@@ -121,7 +121,7 @@ async def watch_page(address: str) -> None:
 
 
 class connect:
-    """A websocket to a server that may still be starting."""
+    """Context manager: a websocket to a server, which may still be starting."""
 
     def __init__(self, client: aiohttp.ClientSession, address: str) -> None:
         self._client, self._address = client, address
@@ -170,7 +170,7 @@ def test_invalid_options_print_one_sentence(shell):
     assert "use only one of --port, --replay" in errors
     assert "Traceback" not in errors
     for arguments, message in (
-        (["nothing"], "not the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
+        (["nothing"], "must be the folder of a capture .*, nominal, or the YAML file of a simulated scene"),
         (["nothing", "--fault", "melted"], r"is not NAME\[@START_S\[\+DURATION_S\]\] with one of failed-read"),
     ):
         with pytest.raises(ReskinError, match=message):

@@ -1,4 +1,4 @@
-"""Tests that labelled recordings can be added to a scene, in whichever way they end."""
+"""Tests that labelled recordings can be added to a scene, however the recording ends."""
 
 import os
 import signal
@@ -36,7 +36,7 @@ def frames_written_n(part):
 
 @pytest.fixture
 def hold_until_frames(monkeypatch, tmp_path):
-    """Hold each label until enough frames have arrived, also on a busy machine."""
+    """Make every label last until enough frames have been recorded, instead of a fixed time."""
 
     def hold(self, label, dwell_s):
         start_s, before_n = self.unix_s(), frames_written_n(tmp_path / "run1.part")
@@ -55,7 +55,7 @@ def pokes():
 
 
 def read(folder):
-    """Read a capture as `reskin add` does, with its own files and header."""
+    """Read a capture folder as `reskin add` does."""
     from reskin.recordings.header import write_capture
 
     header, files = native(folder, CaptureNames("b0", "s0", None), None, ())
@@ -87,9 +87,10 @@ def test_program_labels_a_recording(tmp_path, hold_until_frames, capsys):
     assert account["frames_contact_n"] == pytest.approx(arrived_n, abs=2)
 
 
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")  # Python 3.12 warns because of threads
+# Python 3.12 warns about forks of programs with threads
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_killed_recording_keeps_its_labels(tmp_path):
-    """The recorder is a child of this process, so that no interpreter has to start."""
+    """The recorder runs in a fork, which starts faster than a new interpreter."""
     robot = tmp_path / "robot.csv"
     with plugged_in(make_script(pokes_n=1), loop=True) as port:
         source = label_source(str(robot), None, None, dwell_s=1.0, say=print)
@@ -106,13 +107,13 @@ def test_killed_recording_keeps_its_labels(tmp_path):
 
 
 def write_robot_log(robot, part):
-    """Touch (4, 8) repeatedly until the recorder has written two touches; hold each until frames have arrived."""
+    """Write a robot's log of touches at (4, 8) mm until two are recorded; each touch lasts until frames arrive."""
     end_s = time.monotonic() + LONG_S
     with robot.open("w", buffering=1) as stream:
         stream.write("unix_s,phase,x_mm,y_mm,Fz_N\n")
         for phase in cycle(["noload", "contact"]):
             before_n, holds = frames_written_n(part), True
-            while holds:  # the last row is written after the frames have arrived
+            while holds:  # the row that ends a phase is written after the frames have arrived
                 holds = frames_written_n(part) < before_n + DWELL_FRAMES_N
                 stream.write(f"{time.time():.4f},{phase},4,8,0.5\n")
                 time.sleep(0.02)
@@ -130,11 +131,12 @@ def test_recording_on_a_full_disk_can_be_added(tmp_path, monkeypatch, hold_until
 
     def append(file, data):
         taken.append(data)
-        if len(taken) > 2:  # the log's header and one touch
+        if len(taken) > 2:  # the disk is full after the log's header and one touch
             raise OSError(ENOSPC, "No space left on device")
         file.write(data)
 
-    monkeypatch.setattr(labels, "io", SimpleNamespace(append=append))  # for the labels, not for the stream
+    # only for the labels; the stream is still written
+    monkeypatch.setattr(labels, "io", SimpleNamespace(append=append))
     with plugged_in(make_script(pokes_n=1), loop=True) as port, pytest.raises(OSError, match="No space left"):
         reskin.record(pokes(), port=port, out=tmp_path / "run1", dwell_s=0.2)
     assert not (tmp_path / "run1").exists()
@@ -153,7 +155,7 @@ def test_invalid_label_sources_raise(labels, gauge, scan, message):
         label_source(labels, gauge, scan, dwell_s=1.0, say=print)
 
 
-def test_prompts_are_random_by_default():
+def test_prompted_places_are_in_random_order_by_default():
     assert label_source("grid:2x2:4", None, None, dwell_s=1.0, say=print).scan == "random"
     assert label_source("line:5:2", "/dev/x@9600", "snake", dwell_s=1.0, say=print).scan == "snake"
     assert label_source(None, "/dev/x", None, dwell_s=1.0, say=print).name == "gauge"

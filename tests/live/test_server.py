@@ -1,4 +1,4 @@
-"""Tests of the page and its websocket: estimates, buttons, access and limits."""
+"""Tests of the server of the live page: estimates, buttons, access control, limits."""
 
 import asyncio
 import json
@@ -24,13 +24,13 @@ from reskin.recordings.header import HEADER_FILE, parse
 from tests.live.boards import PLACES, RATE_HZ, make_script, plugged_in, write_model, zero_requests
 
 LONG_S = 120.0
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # sockets of refused clients
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")  # warnings about unclosed sockets of refused clients
 
 
 def serve(
     ports: str | list[str], models: Models, act: Callable[[str, aiohttp.ClientSession], Awaitable[None]], token=""
 ):
-    """Serve a page of one or several boards, let a client act, and stop."""
+    """Serve a page of one or several boards, run `act` with a client, and stop the server."""
 
     async def run() -> None:
         boards = open_sessions([ports] if isinstance(ports, str) else ports, models, "a board")
@@ -53,7 +53,7 @@ def serve(
 
 
 def unpack(data: bytes) -> dict:
-    """Read a binary message as the page does."""
+    """Decode a binary message as the page does."""
     number, chips_n, bins_n, t_s = HEAD.unpack_from(data)
     values = np.frombuffer(data, "<f4", offset=HEAD.size)
     first = NUMBERS_N + 3 * chips_n
@@ -64,17 +64,18 @@ def unpack(data: bytes) -> dict:
 
 
 async def until(socket, wanted: Callable[[dict], bool]) -> dict:
-    """Receive messages until `wanted` accepts one, and return it."""
+    """Receive messages until `wanted` accepts one; return this message."""
     end_s = time.monotonic() + LONG_S
     while time.monotonic() < end_s:
-        received = await asyncio.wait_for(socket.receive(), LONG_S)  # aiohttp's timeout restarts with every ping
+        # not aiohttp's time limit, which restarts with every ping
+        received = await asyncio.wait_for(socket.receive(), LONG_S)
         message = unpack(received.data) if received.type == aiohttp.WSMsgType.BINARY else json.loads(received.data)
         if wanted(message):
             return message
     raise AssertionError("the message was never received")
 
 
-def test_page_gets_estimates_and_buttons_zero_and_record(tmp_path, monkeypatch):
+def test_page_receives_estimates_and_its_buttons_zero_and_record(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     zeroed = zero_requests(monkeypatch)
     models = [read_network(write_model(tmp_path))]
@@ -111,13 +112,13 @@ def test_page_gets_estimates_and_buttons_zero_and_record(tmp_path, monkeypatch):
         serve(name, models, act)
 
 
-def test_address_that_cannot_be_used_is_an_error_and_not_printed():
+def test_unusable_address_is_an_error_and_is_not_printed():
     printed: list[str] = []
     with socketlib.create_server(("127.0.0.1", 0)) as busy:
         number = busy.getsockname()[1]
         for host, message in {
             "127.0.0.1": f"--http-port: cannot listen on {number}: another program uses it",
-            "192.0.2.1": "--host: 192.0.2.1 is not an address of this machine",  # reserved for documentation
+            "192.0.2.1": "--host: 192.0.2.1 is not an address of this machine",  # an address reserved for documentation
             "no such host": "--host: no such host is not an address of this machine",
         }.items():
             with pytest.raises(ParamsError, match=message):
@@ -125,7 +126,7 @@ def test_address_that_cannot_be_used_is_an_error_and_not_printed():
     assert printed == []
 
 
-def test_page_is_announced_once_it_is_served(monkeypatch):
+def test_address_is_printed_when_the_page_is_served(monkeypatch):
     printed: list[str] = []
 
     def run_app(app, *, host, port, print, handle_signals) -> None:
@@ -137,7 +138,7 @@ def test_page_is_announced_once_it_is_served(monkeypatch):
     assert re.search(r"open http://0.0.0.0:8765/\?token=.+; press Ctrl-C", printed[0])
 
 
-def test_file_as_port_is_an_error(tmp_path):
+def test_file_instead_of_a_port_is_an_error(tmp_path):
     (tmp_path / "log.csv").touch()
     with pytest.raises(CaptureError, match="log.csv: cannot open the port: it is a file"):
         open_sessions([str(tmp_path / "log.csv")], [], "a board")
@@ -158,19 +159,20 @@ def test_page_waits_for_a_missing_board(tmp_path):
                 assert page.status == 200
                 assert kind in page.headers["Content-Type"]
                 assert "default-src 'self'" in page.headers["Content-Security-Policy"]
-                assert "://" not in (await page.text()).replace("http://www.w3.org", "")  # no external resource
+                # the page loads no external resource
+                assert "://" not in (await page.text()).replace("http://www.w3.org", "")
 
     serve(str(tmp_path / "none"), [], act)
 
 
-def test_requests_of_other_hosts_and_sites_are_forbidden(tmp_path):
+def test_requests_from_other_hosts_and_sites_are_forbidden(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
-        own = address.removeprefix("http://")
+        host = address.removeprefix("http://")
         for headers, status in (
             ({"Host": "evil.example"}, 403), ({"Host": "127.0.0.1.evil.example"}, 403), ({"Host": "[::1"}, 403),
             ({"Host": "lohost[::1]::8786"}, 403),
-            ({"Host": "localhost:9000"}, 200),  # through an SSH tunnel
-            ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{own}"}, 200),
+            ({"Host": "localhost:9000"}, 200),  # a request through an SSH tunnel
+            ({"Origin": "http://evil.example"}, 403), ({"Origin": "null"}, 403), ({"Origin": f"http://{host}"}, 200),
         ):  # fmt: skip
             async with client.get(f"{address}/", headers=headers) as page:
                 assert page.status == status, headers
@@ -183,7 +185,7 @@ def test_requests_of_other_hosts_and_sites_are_forbidden(tmp_path):
     serve(str(tmp_path / "none"), [], act)
 
 
-def test_other_machines_need_the_token(tmp_path):
+def test_requests_from_other_machines_need_the_token(tmp_path):
     async def act(address: str, client: aiohttp.ClientSession) -> None:
         for query, status in (("", 403), ("?token=guess", 403), ("?token=\u00e9", 403), ("?token=secret", 200)):
             async with client.get(f"{address}/{query}", headers={"Host": "lab-pc:8765"}) as page:
@@ -196,7 +198,7 @@ def test_other_machines_need_the_token(tmp_path):
     serve(str(tmp_path / "none"), [], act, token="secret")
 
 
-def test_junk_is_ignored_and_floods_are_refused(tmp_path, monkeypatch):
+def test_invalid_messages_are_ignored_and_too_many_are_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     async def act(address: str, client: aiohttp.ClientSession) -> None:

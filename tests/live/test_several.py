@@ -1,4 +1,4 @@
-"""Tests of eight boards on eight ports: one is a sleeve of forty chips, another one is unplugged."""
+"""Tests of eight boards on eight ports, of which one has forty chips (a sleeve) and one is unplugged."""
 
 import asyncio
 import math
@@ -31,7 +31,7 @@ pytestmark = [
 
 
 def plug_in_all(stack: ExitStack, unplugged: ExitStack, folder, boards) -> list[str]:
-    """Play boards in threads; closing `unplugged` unplugs the last of eight, closing `stack` the others."""
+    """Emulate eight boards in threads; closing `unplugged` unplugs the last board, closing `stack` the others."""
     names = []
     for i in boards:
         script = make_script(pokes_n=3, chips_n=CHIPS_N[i], rate_hz=RATES_HZ[i])
@@ -50,7 +50,7 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
             poke = await until(
                 page, lambda message: message.get("contact") == 1 and 0 < message["rate_hz"] < 1.3 * RATES_HZ[i]
             )
-            # The model has five chips; other boards have no estimate.
+            # The model is for five chips: boards with another number of chips have no estimate.
             assert math.isfinite(poke["x_mm"]) == (CHIPS_N[i] == 5)
             assert len(poke["change_uT"]) == 3 * CHIPS_N[i]
             assert np.abs(poke["change_uT"]).max() > 100
@@ -71,7 +71,7 @@ def test_page_of_eight_boards_shows_which_is_unplugged(tmp_path):
         for page in pages:
             await page.close()
 
-    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # maximum number of bins: memory is bounded
+    assert PAGES_MAX_N * BOARDS_MAX_N * BINS_N < 1e5  # memory for bins has an upper bound
     assert LATENCIES_N < 1e4
     with ExitStack() as stack, ExitStack() as unplugged:
         serve(plug_in_all(stack, unplugged, tmp_path, range(len(CHIPS_N))), load_universal(), act)
@@ -81,13 +81,14 @@ def test_unplugged_board_does_not_delay_the_others(tmp_path):
     with ExitStack() as stack, ExitStack() as unplugged:
         names = plug_in_all(stack, unplugged, tmp_path, (1, 2, UNPLUGGED_I))
         with reskin.open(names, model=write_model(tmp_path)) as skins:
-            updates, found = Counter(), []  # how often the others were read during each update of the last board
+            # number of readings of each other board during each update of the last board
+            updates, found = Counter(), []
             for *others, last in skins:
-                found += [each[1:4] for each in others if each.F_N > 0]
+                found += [contact[1:4] for contact in others if contact.F_N > 0]
                 if len(found) > 20:
                     unplugged.close()
                 if math.isnan(last.F_N) and any("unplugged" in alarm for alarm in last.alarms):
-                    assert not any("unplugged" in alarm for each in others for alarm in each.alarms)
+                    assert not any("unplugged" in alarm for contact in others for alarm in contact.alarms)
                     updates[last.t_s] += 1
                 if len(updates) >= 5 and max(updates.values()) >= 5:
                     break

@@ -1,4 +1,4 @@
-"""Tests of `LiveSkin`: estimates, no-load reading, alarms, and the account of bytes."""
+"""Tests of `LiveSkin`: estimates, no-load reading, alarms, counts of bytes."""
 
 import itertools
 import math
@@ -31,12 +31,12 @@ from tests.live.boards import (
 )
 
 SCRIPT = make_script(pokes_n=2)
-LATE = {"no data", "slower than before: frames are missing"}  # possible alarms of a healthy board on a busy machine
+LATE = {"no data", "slower than before: frames are missing"}  # alarms that a healthy board may raise on a busy machine
 
 
 def test_every_reading_has_time_place_and_force(tmp_path):
     script = make_script(pokes_n=3, quiet_s=QUIET_S + 2.5)
-    unread_n = 1000  # opening the pseudo-terminal late discards at most so many frames
+    unread_n = 1000  # at most this many frames are discarded if the pseudo-terminal is opened late
     with plugged_in(script) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
         wanted_n = len(script) - unread_n
         contacts = list(itertools.takewhile(lambda _: skin.account["frames_n"] < wanted_n, skin.every()))
@@ -44,7 +44,7 @@ def test_every_reading_has_time_place_and_force(tmp_path):
     found = np.array([contact[1:4] for contact in contacts if contact.F_N > 0])
     nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
     assert set(nearest) == {0, 1}
-    np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)  # noise of 3 uT in fifteen channels
+    np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)  # error by noise of 3 uT in fifteen channels
     assert all(math.isnan(contact.x_mm) for contact in contacts if contact.F_N == 0)
     assert 300 < len(found) < len(contacts)
     assert {alarm for contact in contacts for alarm in contact.alarms} <= LATE
@@ -57,7 +57,8 @@ def test_several_models_give_mean_and_standard_deviation(tmp_path):
     models = [write_model(tmp_path, f"m{i}", off_mm=i) for i in range(2)]
     with plugged_in(SCRIPT, loop=True) as name, reskin.open(name, model=models) as skin:
         touched = next(contact for contact in skin if contact.F_N > 0)
-    off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)  # on a busy machine the first poke may be missed
+    # either poke: on a busy machine, the first may be missed
+    off = np.abs(touched[1:4] - (PLACES + (0.5, 0, 0))).max(axis=1)
     assert off.min() < 0.5
     np.testing.assert_allclose(touched.sd_mm, (math.sqrt(0.5), 0.0), atol=0.01)
 
@@ -70,18 +71,20 @@ def test_slow_caller_gets_the_latest_reading(tmp_path):
         plugged_in(SCRIPT, loop=True) as name,
         reskin.open(name, model=reskin.load_model(write_model(tmp_path))) as skin,
     ):
-        readings = (contact for contact in skin if np.isfinite(contact.b_uT).all())  # skips "no data" on a busy machine
+        # without "no data", which a busy machine may cause
+        readings = (contact for contact in skin if np.isfinite(contact.b_uT).all())
         before, before_n = next(readings), skin.account["frames_n"]
-        while skin.reader.waiting_bytes_n < 300 * 82:  # a slow controller
+        while skin.reader.waiting_bytes_n < 300 * 82:  # the caller is slow
             time.sleep(0.01)
         late = next(readings)
-        came_n = skin.account["frames_n"] - before_n
-        assert came_n >= 300
-        assert (frame_i(late) - frame_i(before) - came_n) % len(SCRIPT) == 0  # the latest frame; no frame is missing
+        received_n = skin.account["frames_n"] - before_n
+        assert received_n >= 300
+        # `late` is the latest frame, and no frame was lost
+        assert (frame_i(late) - frame_i(before) - received_n) % len(SCRIPT) == 0
         assert skin.reader.missed_bytes_n == skin.lost_bytes_n == 0
 
 
-def test_stalls_and_unplugging_are_alarms_and_it_continues(tmp_path):
+def test_stall_and_unplugging_raise_alarms_and_readings_continue(tmp_path):
     script = inject(inject(make_script(pokes_n=3), parse_fault("stall@2.5+1")), parse_fault("unplug@4.5+1"))
     link, seen = str(tmp_path / "board"), []
     with plugged_in(script, link, loop=True) as name, reskin.open(name, model=write_model(tmp_path)) as skin:
@@ -94,11 +97,11 @@ def test_stalls_and_unplugging_are_alarms_and_it_continues(tmp_path):
     assert "unplugged" in alarms_text
 
 
-def test_failed_reads_have_no_estimate(tmp_path):
+def test_frames_with_failed_reads_have_no_estimate(tmp_path):
     skin, readings = play_to_skin(
         inject(SCRIPT, parse_fault("failed-read@1.7+0.5")), [read_network(write_model(tmp_path))]
     )
-    failed = [row for each in readings for row in each.target[each.b_uT[:, 3] == np.float32(8028.16)]]
+    failed = [row for batch in readings for row in batch.target[batch.b_uT[:, 3] == np.float32(8028.16)]]
     assert len(failed) == 200
     assert np.isnan(failed).all()
     assert skin.health.alarms["chip 1: failed I2C reads"].count_n == 200
@@ -106,7 +109,7 @@ def test_failed_reads_have_no_estimate(tmp_path):
 
 def test_opening_a_port_mid_frame_loses_no_frame():
     whole = make_script(pokes_n=0)
-    # After a lone line feed, the next frame is skipped too.
+    # If the stream begins with a line feed, the next frame is skipped too.
     for cut_i, left_n, skipped_n in ((0, 52, 52), (0, 1, 1 + 82), (400, 52, 52)):
         pieces = [piece[-left_n:] if i == cut_i else piece for i, piece in enumerate(whole.pieces)]
         skin, _ = play_to_skin(replace(whole, pieces=pieces))
@@ -131,18 +134,19 @@ def test_magnet_raises_only_the_outside_field_alarm(tmp_path):
     assert {word.split(":")[0] for word in skin.health.alarms} == {"external field"}
 
 
-def test_no_load_reading_waits_for_a_still_skin():
+def test_no_load_reading_waits_until_the_skin_is_not_touched():
     script = inject(make_script(pokes_n=0, quiet_s=4.0), parse_fault("magnet@0.35+0.7"))
     skin, _ = play_to_skin(script)
     rest_uT = script.frames.b_uT[:100].mean(axis=0)
-    np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))  # noise of 3 uT
+    # four standard errors of a mean of 100 readings with 3 uT noise
+    np.testing.assert_allclose(skin.noload_uT, rest_uT, atol=4 * 3 / np.sqrt(100))
     moving = inject(make_script(pokes_n=0, quiet_s=2.0), parse_fault("magnet@0.35+0.7"))
     assert not play_to_skin(moving)[0].zeroed
 
 
 def test_zero_from_another_thread_restarts_the_no_load_reading():
     class ZeroingList(list):
-        def append(self, frames):  # interrupts the polling thread between two statements
+        def append(self, frames):  # runs between two statements of the polling thread
             super().append(frames)
             skin.zero()
 
@@ -180,7 +184,7 @@ def test_every_byte_is_in_a_frame_or_counted_as_lost():
         - sum(count for name, count in account.items() if name.startswith("skipped_"))
     )
     assert account["bytes_n"] + account["missed_bytes_n"] == sum(sent)
-    assert 0 <= waiting_n < 3 * 82  # the end of the stream is undecided
+    assert 0 <= waiting_n < 3 * 82  # the last bytes are neither in a frame nor lost yet
     assert account["frames_n"] * 82 == account["frame_bytes_n"]
     assert account["skipped_resync_bytes_n"] > 1000
     print(f"\n{sum(sent)} bytes sent: {dict(account)}, {waiting_n} bytes wait for more")
@@ -191,14 +195,14 @@ def test_sleeve_of_forty_chips_has_layout_and_estimates(tmp_path):
     skin, readings = play_to_skin(make_script(pokes_n=2, chips_n=40, rate_hz=133.0), [model])
     assert skin.layout.known
     assert skin.detected.chips_n == 40
-    found = np.concatenate([each.target[each.contact] for each in readings])
+    found = np.concatenate([batch.target[batch.contact] for batch in readings])
     nearest = np.abs(found[:, None] - PLACES).sum(axis=2).argmin(axis=1)
     assert set(nearest) == {0, 1}
     np.testing.assert_allclose(found, PLACES[nearest], atol=0.5)
     assert skin.health.alarms == {}
 
 
-def test_eight_boards_at_once():
+def test_eight_boards_are_read_at_once():
     chips_n = range(1, 9)
 
     def look(name: str) -> int:
@@ -215,7 +219,7 @@ def test_eight_boards_at_once():
 
 def test_other_chip_count_and_missing_port_raise(tmp_path):
     with plugged_in(make_script(pokes_n=1, chips_n=4)) as name:
-        with pytest.raises(ReskinError, match="the board has 12 channels, but the model 15"):
+        with pytest.raises(ReskinError, match="the board has 12 channels, but the model has 15"):
             reskin.open(name, model=write_model(tmp_path)).__enter__()
     with pytest.raises(ReskinError, match="cannot open the port"), reskin.open("/dev/none"):
         pass
@@ -226,7 +230,7 @@ def test_port_held_by_another_program_is_not_open():
         skin = LiveSkin(name)
         skin.reader.start(must_exist=False)
         try:
-            while not skin.reader.problem:  # the suite's time limit ends an endless loop
+            while not skin.reader.problem:  # (if there is no problem, the time limit of the suite ends the loop)
                 time.sleep(0.01)
             assert skin.alarms()[0].startswith(f"not open: {name}: cannot open the port")
         finally:

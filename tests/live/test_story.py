@@ -1,4 +1,4 @@
-"""Test of the whole path from an emulated board to live estimates: emulate, record, add, dvc repro."""
+"""Test of the whole path from an emulated board to live estimates: emulate, record, add, `dvc repro`, open."""
 
 import json
 import os
@@ -33,7 +33,7 @@ pytestmark = [pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseud
 
 
 def make_poke_script() -> tuple[Script, ProbeLog]:
-    """Poke places of a grid with varying pauses; return the script and a robot's log, whose clock is 100 s ahead."""
+    """Return a script of pokes on a grid with varying pauses, and the robot's log, whose clock is 100 s ahead."""
     rng = rng_for(0, "poked")
     starts_s = QUIET_S + np.cumsum(DWELL_S + rng.uniform(0.1, 0.25, POKES_N))
     place_mm, force_N = 4.0 * rng.integers(1, 4, (POKES_N, 2)), rng.uniform(0.5, 2.0, POKES_N)
@@ -61,13 +61,13 @@ def make_poke_script() -> tuple[Script, ProbeLog]:
 
 
 def write_punctual_arrivals(folder: Path, sent: Script) -> None:
-    """Replace the arrival times by those of a machine that is never late."""
+    """Replace the recorded arrival times by those of a machine without delays."""
     data, header = (folder / STREAM_FILE).read_bytes(), parse((folder / HEADER_FILE).read_text(), "header")
     first = b"".join(sent.pieces).find(data)
-    assert first >= 0  # the recording is a suffix of the sent bytes
+    assert first >= 0  # the recording is the end of the sent bytes
     ends = np.cumsum([len(piece) for piece in sent.pieces]) - first
-    came = (ends > 0) & (ends <= len(data))
-    times = clocks.Arrivals(ends[came], 1e9 + sent.t_s[came])
+    received = (ends > 0) & (ends <= len(data))
+    times = clocks.Arrivals(ends[received], 1e9 + sent.t_s[received])
     (folder / ARRIVALS_FILE).write_text(clocks.render(times))
     seal(folder, header)
 
@@ -82,7 +82,7 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     with closing(Shell(root)) as shell:
         shell.start("emulate", write_script(script, tmp_path / "c0"), "--port", link, "--fault", CRLF)
         wait_until(link.is_symlink)
-        assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # at the end of the script
+        assert "(unplugged after" in shell.run("record", "--port", link, "--out", "run1")  # the script has ended
         write_punctual_arrivals(root / "run1", inject(script, parse_fault(CRLF)))
         shell.run("add", "run1", "--layout", "capture", "--probe", "robot.csv", *LABELS)
     run(root, "dvc", "repro", "report@pressed")
@@ -91,12 +91,13 @@ def test_from_a_recorded_board_to_a_model_that_estimates_live(tmp_path):
     assert numbers["provenance"]["source"] == "recorded"
     assert numbers["capture"]["logged_indentations_n"] == POKES_N
     assert numbers["capture"]["frames_n"] * 82 == numbers["capture"]["frame_bytes_n"]
-    assert numbers["capture"]["frames_n"] > 0.7 * len(script)  # opening and closing a terminal discard waiting bytes
+    assert numbers["capture"]["frames_n"] > 0.7 * len(script)  # opening and closing a terminal discards bytes
     model = min((root / "data/models/pressed/train_single").glob("*.safetensors"))
     _, readings = play_to_skin(script, [read_network(model)])
-    t_s = np.concatenate([each.t_s[each.contact] for each in readings])
-    found = np.concatenate([each.target[each.contact] for each in readings])
+    t_s = np.concatenate([batch.t_s[batch.contact] for batch in readings])
+    found = np.concatenate([batch.target[batch.contact] for batch in readings])
     assert len(found) > 0.8 * POKES_N * DWELL_S * RATE_HZ
     pressed = log.contact.nonzero()[0][np.searchsorted(log.t_start_s[log.contact] - 100, t_s + 0.1) - 1]
     true = np.column_stack([log.x_mm, log.y_mm, log.Fz_N])[pressed]
-    assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()  # mm and N; mostly training data
+    # mm, mm, N; small, because most presses are training data
+    assert (np.median(np.abs(found - true), axis=0) < (1, 1, 0.2)).all()

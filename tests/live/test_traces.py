@@ -1,4 +1,4 @@
-"""Tests that messages to a page have a limited size and keep peaks."""
+"""Tests that messages to the live page have a limited size and contain the peaks of the force."""
 
 import numpy as np
 
@@ -13,14 +13,14 @@ def readings(t_s, force_N):
 
 
 def forces(data):
-    """Return the bins of a message: their starts, and the minimum and maximum of the force."""
+    """Return the start, minimum force and maximum force of each time bin in a message."""
     _, chips_n, bins_n, t_s = HEAD.unpack_from(data)
     rest = np.frombuffer(data, "<f4", offset=HEAD.size)[NUMBERS_N + 3 * chips_n :]
     start_s, traces = t_s + rest[:bins_n].astype(float), rest[bins_n:].reshape(2, bins_n, 1 + chips_n)
     return start_s, traces[0, :, 0], traces[1, :, 0]
 
 
-def test_bins_keep_peaks_and_only_ten_seconds():
+def test_bins_contain_peaks_and_the_last_ten_seconds():
     traces, peak_s = Traces(layout_of(5), 0.0), 115.0
     for first in range(0, 48_000, 40):  # two minutes at 400 Hz
         t_s = (first + np.arange(40)) / 400
@@ -34,7 +34,7 @@ def test_bins_keep_peaks_and_only_ten_seconds():
     assert len(traces.message(traces.newest_bin, rate_hz=400.0, lost_bytes_n=0)) < 300
 
 
-def test_messages_skip_gaps_and_known_bins():
+def test_messages_omit_gaps_and_bins_sent_before():
     traces = Traces(layout_of(5), 0.0)
     for t_s in (np.arange(0, 1, 0.01), np.arange(5, 6, 0.01)):
         traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
@@ -44,7 +44,7 @@ def test_messages_skip_gaps_and_known_bins():
     np.testing.assert_allclose(later_s, start_s[start_s >= 5.5 - 1e-6], atol=1e-5)
 
 
-def test_bin_times_stay_precise_after_two_weeks():
+def test_bin_times_are_precise_after_two_weeks():
     traces, t_s = Traces(layout_of(5), 0.0), 14 * 86_400 + np.arange(0, 2, 0.005)
     traces.add(readings(t_s, np.ones(len(t_s))), t_s[-1])
     start_s, _, _ = forces(traces.message(0, rate_hz=200.0, lost_bytes_n=0))
@@ -55,7 +55,7 @@ def test_display_latency_of_the_confirmed_message():
     traces = Traces(layout_of(5), 0.0)
     traces.add(readings(np.array([1.0]), np.ones(1)), 1.002)
     number = HEAD.unpack_from(traces.message(0, rate_hz=1.0, lost_bytes_n=0))[0]
-    for seen in (number, number + 1, -1):  # unknown numbers have no latency
+    for seen in (number, number + 1, -1):  # a number that is confirmed again or unknown has no latency
         traces.confirm(seen, 1.03)
     np.testing.assert_allclose(traces.to_screen_s, [0.03])
     np.testing.assert_allclose(traces.to_estimate_s, [0.002])

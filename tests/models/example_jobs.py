@@ -1,7 +1,7 @@
 """Small recipes, training data and jobs for tests.
 
-`some_job` prepares a network whose targets are a smooth function of its inputs. The other jobs use a scene of four
-skins: two are training skins and the last one is new.
+`some_job` prepares a network whose targets are a smooth function of the inputs. The other jobs use `example_data`, a
+scene of four skins: the first two are training skins, the last one is the new skin.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ from reskin.models.network import draw_weights, paper_layers
 from reskin.models.recipe import AdaptationRecipe, FineTuningRecipe, Recipe
 from reskin.seeds import rng_for
 
-ROWS_N = 48  # twelve per skin
+ROWS_N = 48  # twelve rows on each of four skins
 TRAIN, TEST, POKED, OWN = np.arange(24), np.arange(42, 48), np.arange(36, 42), np.arange(36, 39)
 SETTINGS = {"steps_n": 4, "batch_n": 16, "rate_max": 3e-3, "gradient_norm_max": 1.0, "weight_decay": 0.0}
 
@@ -47,7 +47,7 @@ def some_rows(n: int, *names: str | int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: str | int = "draws") -> PreparedJob:
-    """A fresh job, equal for equal names; with `terms`, it has the data for all loss terms."""
+    """Return a new prepared job, equal for equal arguments; with `terms`, the job has the data for all loss terms."""
     inputs, targets = some_rows(n, name)
     start, rng = some_weights(name), rng_for(0, draws, name)
     if not terms:
@@ -55,11 +55,11 @@ def some_job(name: str | int = 0, *, n: int = 32, terms: bool = False, draws: st
     places = rng_for(0, "places", name).integers(0, 5, (n, 2)).astype(np.float64)
     labelled = LabelledRows(inputs, targets, triplet_points(places, np.arange(n) % 2))
     poked, _ = some_rows(20, name, "poked")
-    row = np.concatenate([np.arange(20), np.arange(10)])  # the first ten rows are on two lines
+    row = np.concatenate([np.arange(20), np.arange(10)])  # the first ten rows are on two lines each
     line_i = np.repeat([0, 1, 2], 10)
     order = triplet_points(np.tile(np.arange(10) // 2, 3)[:, None].astype(np.float64), line_i)
-    own = LabelledRows(*some_rows(6, name, "own"), None)
-    return PreparedJob(start, rng, labelled, UnlabelledRows(poked, order, row), own)
+    few_labels = LabelledRows(*some_rows(6, name, "own"), None)
+    return PreparedJob(start, rng, labelled, UnlabelledRows(poked, order, row), few_labels)
 
 
 def example_data() -> TrainingData:
@@ -69,11 +69,11 @@ def example_data() -> TrainingData:
     return TrainingData(db_uT, target, np.repeat(["b0_s0", "b0_s1", "b1_s0", "b1_s1"], 12))
 
 
-def with_values(rows: TrainingData, part: str, at: np.ndarray, to: object) -> TrainingData:
-    """The same scene with other values in some rows."""
-    values = getattr(rows, part).copy()
-    values[at] = to
-    return replace(rows, **{part: values})
+def with_values(data: TrainingData, part: str, row: np.ndarray, value: object) -> TrainingData:
+    """Return the data with `value` in the given rows of the array `part`."""
+    values = getattr(data, part).copy()
+    values[row] = value
+    return replace(data, **{part: values})
 
 
 def pooled(**changes: object) -> TrainingJob:
@@ -85,7 +85,7 @@ def without_triplets() -> TrainingJob:
 
 
 def lines(row: np.ndarray = POKED) -> Lines:
-    """Pokes by hand along one line of places with two visits each, over the given rows."""
+    """Return one line of hand pokes at the given rows, two pokes per place."""
     one = hand_lines(np.zeros(len(row), np.int32), np.repeat(np.arange(len(row) // 2), 2).astype(np.int32))
     return replace(one, row=row[one.row])
 

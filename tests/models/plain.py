@@ -1,4 +1,4 @@
-"""Reference for stacked networks: the paper's network and its training loop in plain PyTorch, one at a time."""
+"""Reference for stacks of networks: the paper's network and training loop in plain PyTorch, for a single network."""
 
 from collections.abc import Callable, Iterable, Mapping
 
@@ -11,14 +11,15 @@ from reskin.models.job import LossWeights
 from reskin.models.recipe import Schedule
 
 UNLABELLED = ("unlabelled", "unlabelled_positive", "unlabelled_negative")
-# paper section 4: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) -> xyF(3)
+# Layers in section 4 of the paper: B(15) -> MLP+ReLU(200) -> MLP(200) -> MLP(40) -> MLP+ReLU(200) -> MLP+ReLU(200) ->
+# xyF(3)
 PAPER = ("15-200", "ReLU", "200-200", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3")
 RELEASED = ("15-200", "ReLU", "200-200", "ReLU", "200-40", "40-200", "ReLU", "200-200", "ReLU", "200-3", "ReLU")
 PRINTED = {"paper": PAPER, "released": RELEASED}
 
 
 def plain_net(architecture: str, weights: Mapping[str, np.ndarray]) -> nn.Sequential:
-    """A plain network with these weights in its linear layers."""
+    """Return a plain PyTorch network with these weights."""
     parts: list[nn.Module] = []
     layer_n = 0
     for word in PRINTED[architecture]:
@@ -33,13 +34,13 @@ def plain_net(architecture: str, weights: Mapping[str, np.ndarray]) -> nn.Sequen
 
 
 def features_of(net: nn.Sequential) -> nn.Sequential:
-    """The part of a plain network up to its 40 features."""
+    """Return the first layers of a plain network, up to the 40 features."""
     forty = next(i for i, part in enumerate(net) if isinstance(part, nn.Linear) and part.out_features == 40)
     return net[: forty + 1]
 
 
 def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarray]:
-    """The weights of a plain network, or their gradients, with the names that models use."""
+    """Return the weights (or their gradients) of a plain network, under the names in saved models."""
     linear = [part for part in net if isinstance(part, nn.Linear)]
     return {
         f"layer{i}.{name}": (values.grad if gradient else values.detach()).numpy().copy()
@@ -51,7 +52,7 @@ def weights_of(net: nn.Sequential, gradient: bool = False) -> dict[str, np.ndarr
 def plain_train(
     start: Mapping[str, np.ndarray], batches: Iterable[Batch], schedule: Schedule, terms: LossWeights
 ) -> dict[str, np.ndarray]:
-    """Train one network by autograd in a plain loop, on the batches of a stack of one."""
+    """Train a network in a plain loop, on the batches that a stack of one network would get."""
     net = plain_net("paper", start)
     features = features_of(net)
     optimizer = torch.optim.AdamW(net.parameters(), lr=schedule.rate_max, weight_decay=schedule.weight_decay)
@@ -77,7 +78,7 @@ def plain_train(
 def hinge(
     features: Callable[[torch.Tensor], torch.Tensor], anchor: torch.Tensor, near: torch.Tensor, far: torch.Tensor
 ) -> torch.Tensor:
-    """Mean over a batch of the printed triplet loss, row by row."""
+    """Return the triplet loss as printed in the paper, computed row by row; mean over the batch."""
     a, p, n = features(anchor), features(near), features(far)
     rows = [torch.clamp((a[i] - p[i]).dot(a[i] - p[i]) - (a[i] - n[i]).dot(a[i] - n[i]), min=0) for i in range(len(a))]
     return torch.stack(rows).mean()

@@ -1,4 +1,4 @@
-"""Alignment methods compared with SciPy's matrix roots, a known map and leave-one-out errors."""
+"""Tests of alignment methods against SciPy's matrix square roots, a known linear map, and leave-one-out errors."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from reskin.seeds import rng_for
 
 
 def draw_inputs(name: str, n: int = 80, c: int = 4) -> np.ndarray:
-    """Inputs of a skin: correlated channels with different scales and means."""
+    """Return random inputs of a skin: correlated channels with different scales and means."""
     rng = rng_for(0, "alignment", name)
     return rng.standard_normal((n, c)) @ rng.standard_normal((c, c)) * rng.uniform(1, 30, c) + rng.normal(0, 20, c)
 
@@ -23,7 +23,7 @@ def test_matched_channels_have_the_means_and_deviations():
     np.testing.assert_allclose(moved.std(axis=0, ddof=1), TO.std(axis=0, ddof=1))
 
 
-def test_gains_and_offsets_are_undone():
+def test_gains_and_offsets_are_removed():
     gains, offsets = np.array([0.5, 2.0, 1.3, 0.9]), np.array([3.0, -7.0, 0.0, 40.0])
     np.testing.assert_allclose(match_channels(OF, OF * gains + offsets)(OF), OF * gains + offsets)
 
@@ -36,8 +36,8 @@ def test_coral_matches_the_covariance():
 
 def test_coral_uses_square_roots_of_covariances():
     scale = OF.std(axis=0, ddof=1)
-    of, to = (np.cov(side / scale, rowvar=False) + np.eye(4) for side in (OF, TO))
-    expected = (OF - OF.mean(axis=0)) / scale @ np.linalg.inv(sqrtm(of)) @ sqrtm(to) * scale + TO.mean(axis=0)
+    source, target = (np.cov(side / scale, rowvar=False) + np.eye(4) for side in (OF, TO))
+    expected = (OF - OF.mean(axis=0)) / scale @ np.linalg.inv(sqrtm(source)) @ sqrtm(target) * scale + TO.mean(axis=0)
     np.testing.assert_allclose(coral(OF, TO)(OF), expected)
 
 
@@ -47,9 +47,9 @@ def test_alignment_with_itself_is_the_identity(align):
 
 
 def test_constant_channel_is_moved_but_not_scaled():
-    of, to = OF.copy(), TO.copy()
-    of[:, 1], to[:, 1] = 3.0, 5.0
-    np.testing.assert_allclose(match_channels(of, to)(of)[:, 1], 5.0)
+    source, target = OF.copy(), TO.copy()
+    source[:, 1], target[:, 1] = 3.0, 5.0
+    np.testing.assert_allclose(match_channels(source, target)(source)[:, 1], 5.0)
 
 
 def test_direct_standardisation_recovers_a_linear_map():
@@ -58,7 +58,7 @@ def test_direct_standardisation_recovers_a_linear_map():
     np.testing.assert_allclose(direct(OF, OF @ known, 1e12).matrix, np.eye(4), atol=1e-6)
 
 
-def test_undetermined_directions_stay():
+def test_undetermined_directions_are_unchanged():
     pairs = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     found = direct(pairs, 3 * pairs, 1e-9)
     np.testing.assert_allclose(found(np.eye(4)), np.diag([3.0, 3.0, 1.0, 1.0]), atol=1e-6)
@@ -66,16 +66,18 @@ def test_undetermined_directions_stay():
 
 @pytest.mark.parametrize("noise", [0.01, 30.0])
 def test_ridge_minimises_the_leave_one_out_error(noise):
-    of = draw_inputs("pairs", n=9)
-    to = of @ np.diag([1.5, 0.5, 1.0, 1.2]) + noise * rng_for(0, "noise").standard_normal(of.shape)
+    source = draw_inputs("pairs", n=9)
+    to = source @ np.diag([1.5, 0.5, 1.0, 1.2]) + noise * rng_for(0, "noise").standard_normal(source.shape)
 
     def error(ridge: float) -> float:
         total = 0.0
-        for i in range(len(of)):
-            rest = np.delete(np.arange(len(of)), i)
-            held = ridge * (of**2).sum() / of.shape[1]  # relative to all pairs
-            gain = np.linalg.solve(of[rest].T @ of[rest] + held * np.eye(4), of[rest].T @ (to - of)[rest])
-            total += float((((to - of)[i] - of[i] @ gain) ** 2).sum())
+        for i in range(len(source)):
+            rest = np.delete(np.arange(len(source)), i)
+            held = ridge * (source**2).sum() / source.shape[1]  # the penalty is proportional to the number of pairs
+            gain = np.linalg.solve(
+                source[rest].T @ source[rest] + held * np.eye(4), source[rest].T @ (to - source)[rest]
+            )
+            total += float((((to - source)[i] - source[i] @ gain) ** 2).sum())
         return total
 
-    assert choose_ridge(of, to) == min(RIDGES, key=error)
+    assert choose_ridge(source, to) == min(RIDGES, key=error)

@@ -36,7 +36,7 @@ def test_weights_depend_on_the_generator_only():
     assert all((one[name] != third[name]).any() for name in one)
 
 
-def test_layers_do_not_share_draws():
+def test_layers_have_different_initial_weights():
     weights = draw_weights(paper_layers(15), rng_for(0, "net"))
     assert not np.isin(weights["layer2.weight"].ravel()[:50], weights["layer5.weight"]).any()
 
@@ -47,12 +47,12 @@ def test_initial_weights_follow_pytorch(i):
     weights = draw_weights(paper_layers(15), rng_for(0, "net"))
     theirs = nn.Linear(layer.in_n, layer.out_n)
     for part in ("weight", "bias"):
-        ours, own = weights[f"layer{i}.{part}"], getattr(theirs, part).detach().numpy()
-        assert ours.shape == own.shape
-        assert ours.dtype == own.dtype == np.float32
+        ours, pytorch = weights[f"layer{i}.{part}"], getattr(theirs, part).detach().numpy()
+        assert ours.shape == pytorch.shape
+        assert ours.dtype == pytorch.dtype == np.float32
         limit = np.float32(layer.in_n**-0.5)
-        assert max(np.abs(ours).max(), np.abs(own).max()) <= limit
-    # uniform: sd of limit / sqrt(3), mean of 0; six standard errors of a mean of squares and of a mean
+        assert max(np.abs(ours).max(), np.abs(pytorch).max()) <= limit
+    # Uniform in +-limit: mean 0, standard deviation limit / sqrt(3). Tolerances: six standard errors.
     values, n = weights[f"layer{i}.weight"].astype(float), weights[f"layer{i}.weight"].size
     assert (values**2).mean() == pytest.approx(limit**2 / 3, rel=6 * (4 / 5) ** 0.5 / n**0.5)
     assert abs(values.mean()) < 6 * limit / (3 * n) ** 0.5

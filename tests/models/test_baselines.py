@@ -28,7 +28,7 @@ NONE = np.zeros(0, np.int64)
 
 
 class PicklingExecutor(Executor):
-    """Run a call on a copy that went through pickle, as another process does."""
+    """Executor that pickles and unpickles a call and runs it here; another process would get the same copy."""
 
     def submit(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         done: Future[Any] = Future()
@@ -62,7 +62,7 @@ def results_of(*tasks: ClassicalJob, rows: TrainingData = ROWS) -> list[Classica
 
 @pytest.fixture
 def fits(monkeypatch) -> list[dict[str, Any]]:
-    """The arguments of every fit, in order."""
+    """Return a list to which every call of `fit` appends its arguments."""
     seen: list[dict[str, Any]] = []
 
     def recording_fit(one, inputs, target, rng, *, weight):
@@ -87,7 +87,7 @@ def test_job_equals_direct_call(name, inputs):
     (got,) = results_of(task(one))
     train, test = (expected_inputs(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
     by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
-    # Inputs of 1 uT to 200 uT may differ in the last bit of a float32; the targets then change by at most 1e-5
+    # Inputs of 1 uT to 200 uT may differ in the last bit of float32; predictions then differ by at most 1e-5.
     np.testing.assert_allclose(got.predicted, by_hand.predict(test), atol=1e-5)
     assert got.rows_n == 30
     assert got.seconds > 0
@@ -99,10 +99,10 @@ def test_labels_of_a_new_skin_weigh_as_much_as_all_others():
     train = np.concatenate([TRAIN, OWN])
     mean, sd = ROWS.db_uT[train].mean(axis=0, dtype=float), ROWS.db_uT[train].std(axis=0, dtype=float)
     middle, spread = ROWS.target[train].mean(axis=0, dtype=float), ROWS.target[train].std(axis=0, dtype=float)
-    weight = [1.0] * 30 + [5.0] * 6  # 6 rows of weight 5 equal 30 others
+    weight = [1.0] * 30 + [5.0] * 6  # 6 rows of weight 5 weigh as much as 30 rows
     plane = Ridge(1.0).fit((ROWS.db_uT[train] - mean) / sd, (ROWS.target[train] - middle) / spread, weight)
     wanted = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
-    np.testing.assert_allclose(got.predicted, wanted, atol=1e-5)  # float32 rounding
+    np.testing.assert_allclose(got.predicted, wanted, atol=1e-5)  # rounding to float32
     assert got.rows_n == 36
     assert np.abs(got.predicted - results_of(task())[0].predicted).max() > 1e-3
 
@@ -120,10 +120,10 @@ def test_weights_of_both_groups_have_the_same_sum(own_n, rows_max_n):
         patch.setattr(classical, "fit", recording_fit)
         results_of(task(few_labels=np.arange(60, 60 + own_n), rows_max_n=rows_max_n))
     (weight,) = weights
-    others, own = weight[:-own_n], weight[-own_n:]
+    others, labelled = weight[:-own_n], weight[-own_n:]
     assert len(others) == min(30, rows_max_n)
     assert (others == 1).all()
-    assert own.sum() == pytest.approx(len(others), rel=1e-6)  # sums of float32
+    assert labelled.sum() == pytest.approx(len(others), rel=1e-6)  # float32 sums
 
 
 def test_rows_are_unweighted_without_labels_of_a_new_skin(fits):
@@ -132,7 +132,7 @@ def test_rows_are_unweighted_without_labels_of_a_new_skin(fits):
 
 
 def rows_of(fits: list[dict[str, Any]]) -> list[list[int]]:
-    """The row numbers passed to each fit, identified by their fields."""
+    """Return the row numbers passed to each fit; rows are identified by their fields."""
     return [[int(np.flatnonzero((ROWS.db_uT == row).all(axis=1))[0]) for row in one["inputs"]] for one in fits]
 
 
@@ -141,7 +141,7 @@ def test_thinning_keeps_the_given_number_of_rows(fits):
     thinned, with_own, whole = rows_of(fits)
     assert len(set(thinned)) == len(thinned) == 12
     assert set(thinned) < set(TRAIN)
-    assert with_own == [*thinned, *OWN]  # labels of a new skin are never thinned
+    assert with_own == [*thinned, *OWN]  # labelled rows of a new skin are never dropped
     assert whole == TRAIN.tolist()
     assert [one.rows_n for one in done] == [12, 18, 30]
     for one, numbers in zip(fits, (thinned, with_own, whole), strict=True):
@@ -157,7 +157,7 @@ def test_thinning_depends_on_seed_and_name_only(fits):
     assert all(numbers != first for numbers in different)
 
 
-def test_results_are_in_order_and_reported():
+def test_results_are_in_the_order_of_jobs_and_logged():
     lines: list[str] = []
     names = {"first": TEST, "second": TEST[:5], "third": TEST[5:]}
     tasks = [task(name=name, test=test) for name, test in names.items()]
@@ -167,7 +167,7 @@ def test_results_are_in_order_and_reported():
 
 
 @pytest.mark.parametrize("name", SETTINGS)
-def test_other_targets_do_not_matter(name):
+def test_targets_of_test_rows_do_not_matter(name):
     used = np.concatenate([TRAIN, OWN])
     others = ROWS.target.copy()
     others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6

@@ -14,13 +14,13 @@ def batches(jobs: list[PreparedJob], steps_n: int = STEPS_N, batch_n: int = BATC
 
 
 def rows_of(batch: torch.Tensor, rows: np.ndarray) -> list[int]:
-    """The row numbers of one network's batch (all rows differ)."""
+    """Return the row numbers in a network's batch (no two rows are equal)."""
     (found,) = [np.argmax((rows[None] == batch.numpy()[:, None]).all(axis=2), axis=1)]
     assert (rows[found] == batch.numpy()).all()
     return found.tolist()
 
 
-def test_every_step_has_all_batches():
+def test_every_step_has_a_batch_for_each_term():
     steps = batches([some_job(i, terms=True) for i in range(3)])
     assert len(steps) == STEPS_N
     for step in steps:
@@ -40,8 +40,8 @@ def test_targets_belong_to_their_rows():
         for i, job in enumerate(jobs):
             chosen = rows_of(step["inputs"][i], job.labelled.inputs)
             assert (step["targets"][i].numpy() == job.labelled.targets[chosen]).all()
-            own = rows_of(step["few_labels"][i], job.few_labels.inputs)
-            assert (step["few_labels_targets"][i].numpy() == job.few_labels.targets[own]).all()
+            labelled_rows = rows_of(step["few_labels"][i], job.few_labels.inputs)
+            assert (step["few_labels_targets"][i].numpy() == job.few_labels.targets[labelled_rows]).all()
             rows_of(step["unlabelled"][i], job.unlabelled.inputs)
 
 
@@ -74,10 +74,11 @@ def test_poke_triplets_are_ordered_along_one_line():
     assert met == {0, 1, 2}
 
 
-def test_rows_are_drawn_equally_often():
+def test_rows_are_drawn_with_equal_probability():
     job, n = some_job(n=8), 400 * BATCH_N
-    drawn = np.concatenate([rows_of(step["inputs"][0], job.labelled.inputs) for step in batches([job], 400)])
-    assert (np.abs(np.bincount(drawn, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()  # six binomial sd
+    rows = np.concatenate([rows_of(step["inputs"][0], job.labelled.inputs) for step in batches([job], 400)])
+    # six binomial standard deviations
+    assert (np.abs(np.bincount(rows, minlength=8) - n / 8) < 6 * (n * 7 / 64) ** 0.5).all()
 
 
 def test_batches_do_not_depend_on_the_stack():
@@ -88,8 +89,8 @@ def test_batches_do_not_depend_on_the_stack():
         assert all(torch.equal(one[name][0], other[name][1]) for name in one)
 
 
-def test_additional_term_keeps_other_batches():
-    """Methods are compared on equal batches, in every block and not only in the first."""
+def test_additional_loss_term_does_not_change_other_batches():
+    """Methods are compared on equal batches; this must hold in every block of steps."""
     full = some_job(terms=True)
     without = {
         "triplet": PreparedJob(

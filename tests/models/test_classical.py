@@ -21,7 +21,7 @@ SETTINGS = {
 }
 every_method = pytest.mark.parametrize("method", SETTINGS)
 
-# Inputs (some 30 uT), targets (16 mm) and predictions are float32, with a relative error of 6e-8 per operation.
+# Tolerance: inputs (about 30 uT), targets (up to 16 mm) and predictions are float32, with relative rounding of 6e-8.
 PREDICTION_ATOL_MM = 1e-4
 
 
@@ -30,7 +30,7 @@ def settings_of(method: str, **changes: object) -> Classical:
 
 
 def rows(seed: int = 0, n: int = 200, ch: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Places and forces, and a smooth field change of one skin with 1 uT of noise."""
+    """Return field changes and targets of a skin: the field is smooth in place and force, plus 1 uT of noise."""
     rng, skin = rng_for(seed, "rows"), rng_for(0, "skin")
     target = rng.uniform(0, 16, (n, 3))
     db_uT = 30 * np.tanh(target @ skin.normal(0, 0.1, (3, ch)) + skin.normal(0, 1, ch)) + rng.normal(0, 1, (n, ch))
@@ -46,7 +46,7 @@ def fit_to(
 def standardise(
     db_uT: np.ndarray, target: np.ndarray, query_uT: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, targets and queries as a method sees them, standardised by the rows alone."""
+    """Return inputs, targets and queries standardised by the mean and deviation of the training rows."""
     mean, sd = db_uT.mean(axis=0, dtype=float), db_uT.std(axis=0, dtype=float)
     wanted = (target - target.mean(axis=0, dtype=float)) / target.std(axis=0, dtype=float)
     return (db_uT - mean) / sd, wanted, (query_uT - mean) / sd
@@ -71,7 +71,7 @@ def test_ridge_equals_closed_form(weighted):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_knn_weighs_by_distance(weighted):
+def test_knn_weights_neighbours_by_inverse_distance(weighted):
     db_uT, target = rows()
     weight = rng_for(0, "weight").uniform(1, 20, len(db_uT)).astype(np.float32) if weighted else None
     query_uT, _ = rows(1, n=20)
@@ -87,7 +87,7 @@ def test_knn_weighs_by_distance(weighted):
 
 
 @every_method
-def test_blocks_do_not_matter(method):
+def test_prediction_does_not_depend_on_blocks(method):
     db_uT, target = rows()
     fitted = fit_to(method, db_uT, target)
     query_uT, _ = rows(1, n=BLOCK_ROWS_N + 2)
@@ -96,7 +96,7 @@ def test_blocks_do_not_matter(method):
         np.testing.assert_allclose(got[i : i + 1], fitted.predict(query_uT[i : i + 1]), atol=PREDICTION_ATOL_MM)
 
 
-def test_knn_at_distance_0():
+def test_knn_returns_the_target_at_distance_0():
     db_uT, target = rows()
     weight = np.where(np.arange(len(db_uT)) < 5, 50, 1).astype(np.float32)
     np.testing.assert_allclose(fit_to("knn", db_uT, target, weight).predict(db_uT), target, atol=PREDICTION_ATOL_MM)
@@ -130,7 +130,7 @@ def test_cubic_ridge_equals_scikit_learn(weighted):
     np.testing.assert_allclose(got, unstandardise(wanted, target), atol=PREDICTION_ATOL_MM)
 
 
-def test_cubic_is_recovered():
+def test_cubic_function_is_recovered():
     rng = rng_for(0, "cubic")
     db_uT = rng.uniform(-30, 30, (400, 4)).astype(np.float32)
 
@@ -140,7 +140,8 @@ def test_cubic_is_recovered():
 
     query_uT = rng.uniform(-30, 30, (50, 4)).astype(np.float32)
     got = fit_to("cubic_ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
-    np.testing.assert_allclose(got, cubic(query_uT), atol=1e-4)  # of up to 54, in float32 (6e-8 of it)
+    # predictions up to 54, in float32 (relative rounding 6e-8)
+    np.testing.assert_allclose(got, cubic(query_uT), atol=1e-4)
     plane = fit_to("ridge", db_uT, cubic(db_uT), alpha=1e-9).predict(query_uT)
     assert np.abs(plane - cubic(query_uT)).max() > 1
 
@@ -154,7 +155,7 @@ def test_boosting_is_deterministic():
 
 
 @every_method
-def test_predictions_beat_the_mean(method):
+def test_predictions_are_better_than_the_mean_target(method):
     db_uT, target = rows(n=600)
     got = fit_to(method, db_uT[:400], target[:400]).predict(db_uT[400:])
     error, spread = ((got - target[400:]) ** 2).mean(axis=0), target[400:].var(axis=0)
@@ -162,10 +163,10 @@ def test_predictions_beat_the_mean(method):
 
 
 @every_method
-@settings(max_examples=10, deadline=None)  # each fits twice
+@settings(max_examples=10, deadline=None)  # an example fits two models
 @given(st.integers(0, 10_000), st.integers(-20, 20))
-def test_targets_in_other_units(method, seed, power):
-    """A factor of 1e-6 to 1e6 that is a power of 2 rounds nothing, so trees split at the same places."""
+def test_other_units_of_targets_scale_the_predictions(method, seed, power):
+    """The factor (1e-6 to 1e6) is a power of 2: no value is rounded, so trees split at the same values."""
     db_uT, target = rows(seed, n=60)
     query_uT, _ = rows(seed + 1, n=20)
     factor = np.float32(2.0**power)
@@ -176,13 +177,13 @@ def test_targets_in_other_units(method, seed, power):
 
 @every_method
 @pytest.mark.parametrize("shift_mm", [-500.0, 3.0, 40.0])
-def test_places_from_another_origin(method, shift_mm):
+def test_shifted_places_shift_the_predictions(method, shift_mm):
     db_uT, target = rows()
     query_uT, _ = rows(1)
-    target = np.round(target * 64) / 64  # exact after the shift
+    target = np.round(target * 64) / 64  # so that the shift causes no rounding
     got = fit_to(method, db_uT, target).predict(query_uT)
     other = fit_to(method, db_uT, target + np.float32(shift_mm)).predict(query_uT)
-    # the shifted predictions are float32: 6e-8 of 500 mm, in addition
+    # additional tolerance: shifted predictions of up to 500 mm are rounded to float32 (6e-8)
     np.testing.assert_allclose(other - shift_mm, got, atol=PREDICTION_ATOL_MM + 6e-8 * abs(shift_mm))
 
 
@@ -190,8 +191,8 @@ def test_places_from_another_origin(method, shift_mm):
 def test_constant_channel_is_ignored(method):
     db_uT, target = rows()
     query_uT, _ = rows(1)
-    still = np.full((len(db_uT), 1), 0.1, np.float32)
-    got = fit_to(method, np.hstack([db_uT, still]), target).predict(np.hstack([query_uT, still + 5]))
+    constant = np.full((len(db_uT), 1), 0.1, np.float32)
+    got = fit_to(method, np.hstack([db_uT, constant]), target).predict(np.hstack([query_uT, constant + 5]))
     np.testing.assert_allclose(got, fit_to(method, db_uT, target).predict(query_uT), atol=PREDICTION_ATOL_MM)
 
 
@@ -209,8 +210,8 @@ def test_unknown_force_leaves_places_unchanged(method):
 
 
 @every_method
-def test_partly_known_force_is_learned(method):
-    """Inputs with known force repeat those without, so that both standardise alike."""
+def test_force_that_is_known_for_some_rows_is_learned(method):
+    """Rows without force repeat the inputs of rows with force, so both sets have equal means and deviations."""
     db_uT, target = rows(n=80)
     query_uT, _ = rows(1)
     both = np.vstack([target, target])
@@ -220,13 +221,13 @@ def test_partly_known_force_is_learned(method):
         got[:, 2], fit_to(method, db_uT, target).predict(query_uT)[:, 2], atol=PREDICTION_ATOL_MM
     )
     whole = fit_to(method, np.vstack([db_uT, db_uT]), np.vstack([target, target])).predict(query_uT)
-    if method != "rbf_ridge":  # rbf_ridge draws 100 of the 160 rows
+    if method != "rbf_ridge":  # excluded, because rbf_ridge uses a random 100 of the 160 rows
         np.testing.assert_allclose(got[:, :2], whole[:, :2], atol=PREDICTION_ATOL_MM)
 
 
 @every_method
-def test_weighted_rows_dominate(method):
-    """A tenth of the rows is 8 mm further along x; it weighs twice as much as all others, or hardly anything."""
+def test_rows_of_large_weight_dominate_the_prediction(method):
+    """A tenth of the labels is shifted 8 mm along x; these rows have twice the weight of all others, or almost none."""
     db_uT, target = rows(n=400)
     further = np.arange(400) < 40
     target[further, 0] += 8
@@ -237,7 +238,7 @@ def test_weighted_rows_dominate(method):
         weight = np.where(further, weight_of_one, 1).astype(np.float32)
         predicted = fit_to(method, db_uT, target, weight, **most).predict(query_uT)
         errors_mm.append((predicted[:, 0] - wanted[:, 0] - 8).mean())
-    assert errors_mm[0] == pytest.approx(-8, abs=1)  # the others have a third of the weight
+    assert errors_mm[0] == pytest.approx(-8, abs=1)  # the other rows have a third of the total weight
     assert errors_mm[1] > -6
 
 
@@ -252,12 +253,12 @@ def test_rbf_draws_rows_at_random():
 
 
 def test_rbf_keeps_rows_of_greater_weight():
-    """Only the kept rows are pressed elsewhere: a prediction there depends on them alone."""
+    """The rows of greater weight are at places of their own, where predictions depend only on these rows."""
     db_uT, target = rows(n=300)
     db_uT[:5] += 1e5 * np.arange(1, 6)[:, None]
-    weight = np.where(np.arange(300) < 5, 59, 1).astype(np.float32)  # half of all that the others weigh
+    weight = np.where(np.arange(300) < 5, 59, 1).astype(np.float32)  # together, half the weight of the others
     got = fit_to("rbf_ridge", db_uT, target, weight, gamma=300.0, rows_max_n=64).predict(db_uT[:5])
-    lowered = 59 * 59 / 295  # of 295 others 59 stay
+    lowered = 59 * 59 / 295  # 59 of the 295 other rows are kept, each standing for five
     mean = target.mean(axis=0, dtype=float)
     wanted = mean + (target[:5] - mean) / (1 + 0.1 / lowered)
     np.testing.assert_allclose(got, wanted, atol=PREDICTION_ATOL_MM)

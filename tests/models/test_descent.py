@@ -32,7 +32,7 @@ def test_steps_equal_torch_bit_for_bit(steps_n, weight_decay):
 
 
 def test_training_imports_no_compiler():
-    """Importing torch's compiler costs two seconds per process, and nothing here is compiled."""
+    """Importing PyTorch's compiler would cost two seconds per process, and this project compiles no network."""
     code = (
         "import sys\nfrom reskin.models.train import train\nfrom reskin.models.job import LossWeights\n"
         "from tests.models.example_jobs import some_job\nfrom tests.models.example_jobs import recipe\n"

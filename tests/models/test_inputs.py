@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from reskin.models.inputs import VIEW, DB_FLOOR_uT
 from reskin.seeds import rng_for
 
-SHAPE_ATOL = 1e-6  # components up to 1, rounded to float32 (6e-8) a few times
-LOG_ATOL = 1e-5  # logs up to 17, rounded to float32 a few times
+SHAPE_ATOL = 1e-6  # components of at most 1, after a few float32 roundings of 6e-8
+LOG_ATOL = 1e-5  # logarithms of at most 17, after a few float32 roundings
 
 
 def rows(seed: int = 0, n: int = 20, ch: int = 15) -> np.ndarray:
-    """Changes of about 120 uT, far above the floor."""
+    """Return field changes of about 120 uT, far above the floor of the length."""
     return rng_for(seed, "rows").normal(3, 30, (n, ch)).astype(np.float32)
 
 
@@ -51,7 +51,7 @@ def test_shape_has_unit_length(seed, times):
     assert (length[~above] < 1).all()
 
 
-def test_zero_change():
+def test_shape_of_a_zero_change_is_finite():
     seen = VIEW["shape"](np.zeros((2, 15), np.float32))
     assert (seen[:, :-1] == 0).all()
     assert (seen[:, -1] == math.log(DB_FLOOR_uT)).all()

@@ -37,13 +37,13 @@ def train_job(job: TrainingJob, rows: TrainingData) -> TrainingResult:
 
 
 def equal_results(one: TrainingResult, other: TrainingResult) -> bool:
-    """Return whether weights, scaler and curve are equal bit for bit."""
+    """Return whether weights, scaler and loss curve are equal bit for bit."""
     weights = all((one.weights[name] == other.weights[name]).all() for name in one.weights)
     scaler, again = one.scaler.arrays(), other.scaler.arrays()
     return weights and one.curve == other.curve and all((scaler[name] == again[name]).all() for name in scaler)
 
 
-# Data that adaptation may use
+# Which data an adaptation may use
 
 
 @pytest.mark.parametrize("new", [np.nan, 1e3, -7.0], ids=str)
@@ -76,7 +76,7 @@ def test_lines_have_no_place_and_no_force():
     assert [field.name for field in fields(Lines)] == ["row", "line_i", "order_i"]
 
 
-def test_pokes_use_the_scaler_of_the_start():
+def test_pokes_use_the_scaler_of_the_pretrained_network():
     line_i, order_i = np.array([[0, 0, 0, 1, 1, 1], [0, 1, 2, 0, 2, 3]], np.int32)
     along = Lines(np.array([40, 36, 38, 40, 36, 41]), line_i, order_i)
     scaler = replace(start().scaler, input_shift=np.arange(15, dtype=np.float32))
@@ -94,7 +94,7 @@ def test_pokes_use_the_scaler_of_the_start():
 
 
 @pytest.mark.parametrize("at", [POKED, NEW], ids=["poked", "all"])
-def test_control_uses_nothing_of_the_new_skin(at):
+def test_control_uses_no_data_of_the_new_skin(at):
     control = adaptation(unlabelled_weight=0.0)
     once = train_job(control, example_data())
     for part, new in (("db_uT", 1e4), ("target", np.nan)):
@@ -102,7 +102,7 @@ def test_control_uses_nothing_of_the_new_skin(at):
     assert not equal_results(once, train_job(adaptation(), example_data()))
 
 
-def test_fine_tuning_uses_its_labels_only():
+def test_fine_tuning_uses_only_the_given_labels_of_the_new_skin():
     once = train_job(fine_tuning(), example_data())
     others = np.setdiff1d(NEW, OWN)
     assert equal_results(once, train_job(fine_tuning(), with_values(example_data(), "target", others, np.nan)))
@@ -110,12 +110,12 @@ def test_fine_tuning_uses_its_labels_only():
     assert not equal_results(once, train_job(fine_tuning(own_weight=0.0), example_data()))
 
 
-# Held-out data
+# Held-out data must not influence the result
 
 
 @pytest.mark.parametrize("scaling", ["standard", "released"])
 @pytest.mark.parametrize("view", ["raw", "shape"])
-def test_no_test_row_reaches_the_model(scaling, view):
+def test_test_rows_do_not_influence_the_model(scaling, view):
     job = pooled(scaling=scaling, inputs=view)
     once = train_job(job, example_data())
     planted = with_values(with_values(example_data(), "db_uT", TEST, 1e4), "target", TEST, -1e4)
@@ -125,13 +125,13 @@ def test_no_test_row_reaches_the_model(scaling, view):
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_scaler_uses_training_rows(kind):
+def test_scaler_is_fitted_to_training_rows(kind):
     _, scaler = prepare(KINDS[kind](), with_values(example_data(), "db_uT", NEW, 1e6))
     np.testing.assert_allclose(scaler.input_shift, example_data().db_uT[TRAIN].mean(axis=0, dtype=float), rtol=1e-6)
     np.testing.assert_allclose(scaler.target_scale, example_data().target[TRAIN].std(axis=0, dtype=float), rtol=1e-6)
 
 
-def test_labelled_triplets_are_by_place_on_each_skin_in_mm():
+def test_labelled_triplets_are_formed_by_distance_in_mm_on_each_skin():
     rows = example_data()
     prepared, _ = prepare(pooled(), rows)
     assert (prepared.labelled.points.place == rows.target[TRAIN, :2]).all()
@@ -152,7 +152,7 @@ def test_loss_weights_follow_the_recipe():
     assert pooled().schedule == pooled().recipe
 
 
-# Paired comparisons
+# Methods are compared in pairs, with equal batches
 
 
 def first_batches(job: TrainingJob) -> list[np.ndarray]:
@@ -169,19 +169,19 @@ def first_batches(job: TrainingJob) -> list[np.ndarray]:
     ],
     ids=["another name", "another schedule", "no triplets"],
 )
-def test_recipes_share_start_and_batches(other):
+def test_recipes_have_equal_initial_weights_and_batches(other):
     one, two = (prepare(job, example_data())[0].initial_weights for job in (pooled(), other))
     assert all((one[name] == two[name]).all() for name in one)
     assert all((a == b).all() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
-def test_adaptation_and_control_share_batches():
+def test_adaptation_and_control_have_equal_batches():
     pairs = zip(first_batches(adaptation()), first_batches(adaptation(unlabelled_weight=0.0)), strict=True)
     assert all((a == b).all() for a, b in pairs)
 
 
 @pytest.mark.parametrize("changes", [{"seed": 8}, {"seed_i": 1}, {"fold": "b0"}], ids=str)
-def test_folds_and_seeds_differ(changes):
+def test_folds_and_seeds_have_different_batches(changes):
     other = replace(pooled(), **changes)
     assert (
         prepare(pooled(), example_data())[0].initial_weights["layer1.weight"]
@@ -190,7 +190,7 @@ def test_folds_and_seeds_differ(changes):
     assert any((a != b).any() for a, b in zip(first_batches(pooled()), first_batches(other), strict=True))
 
 
-# Cache keys
+# Keys of the cache of training results
 
 
 def key(job: TrainingJob, rows: TrainingData | None = None) -> str:
@@ -261,7 +261,7 @@ def test_different_settings_have_different_keys():
     assert len({key(job) for job in jobs}) == len(jobs)
 
 
-def test_restart_after_collapse_differs():
+def test_restart_after_collapse_has_other_weights_and_batches():
     again = replace(pooled(), attempt_i=1)
     assert key(again) != key(pooled())
     (one, _), (other, _) = prepare(pooled(), example_data()), prepare(again, example_data())
@@ -276,7 +276,7 @@ def test_last_bias_starts_at_the_mean_target(scaling):
     prepared, scaler = prepare(job, with_values(rows, "target", (slice(None), 2), np.nan))
     predicted = scaler.decode(prepared.initial_weights["layer6.bias"][None])[0]
     np.testing.assert_allclose(predicted[:2], rows.target[TRAIN[3:], :2].mean(axis=0), rtol=1e-5)
-    assert prepared.initial_weights["layer6.bias"][2] == 0  # an unknown target
+    assert prepared.initial_weights["layer6.bias"][2] == 0  # no force is known
 
 
 WITHOUT_INFLUENCE = {
@@ -294,7 +294,7 @@ WITHOUT_INFLUENCE = {
 }
 
 
-def test_key_covers_the_code_of_training():
+def test_key_includes_the_code_of_training():
     graph = grimp.build_graph("reskin", cache_dir=None)
     modules = {"reskin.models.train", *graph.find_upstream_modules("reskin.models.train")}
     imported = {module for module in modules if not graph.find_children(module)}
@@ -341,21 +341,21 @@ def test_augmented_copies_keep_targets_and_are_new_skins():
     plain = pooled()
     recipe = AugmentedRecipe.model_validate(plain.recipe.model_dump() | {"augmentation": settings})
     (one, _), (more, _) = (prepare(job, example_data()) for job in (plain, replace(plain, recipe=recipe)))
-    # Boards without spread: the same rows three times, with the same targets.
+    # With boards without spread, the rows appear three times, with equal fields and targets.
     np.testing.assert_array_equal(more.labelled.inputs, np.tile(one.labelled.inputs, (3, 1)))
     np.testing.assert_array_equal(more.labelled.targets, np.tile(one.labelled.targets, (3, 1)))
     assert more.labelled.points.group.tolist() == np.repeat(range(6), 12).tolist()
 
 
-def test_augmentation_is_drawn_per_fold_and_seed():
+def test_augmentation_depends_on_fold_and_seed():
     settings = {"copies_n": 1, "gain_sd": 0.1, "lean_sd_deg": 5.0, "noise_uT": 1.0}
     recipe = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings})
     other = AugmentedRecipe.model_validate(pooled().recipe.model_dump() | {"augmentation": settings | {"gain_sd": 0.2}})
     job = replace(pooled(), recipe=recipe)
-    drawn = [
+    augmented = [
         prepare(one, example_data())[0].labelled.inputs
         for one in (job, job, replace(job, fold="b9"), replace(job, seed_i=5))
     ]
-    assert (drawn[0] == drawn[1]).all()
-    assert not any((drawn[0] == one).all() for one in drawn[2:])
+    assert (augmented[0] == augmented[1]).all()
+    assert not any((augmented[0] == one).all() for one in augmented[2:])
     assert key(job) != key(replace(job, recipe=other)) != key(pooled())

@@ -11,7 +11,7 @@ from reskin.models.losses import squared_error, triplet_loss
 from reskin.seeds import rng_for
 
 M, B, D = 3, 7, 40
-SUM_RTOL = 1e-5  # float32 sums of up to 280 terms
+SUM_RTOL = 1e-5  # rounding of float32 sums of up to 280 terms
 
 
 def predictions(*names: str | int) -> torch.Tensor:
@@ -27,7 +27,7 @@ def three(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def looped_triplet(anchor: torch.Tensor, positive: torch.Tensor, negative: torch.Tensor) -> list[float]:
-    """Max(0, |a - p|^2 - |a - n|^2) in float64, by three nested loops."""
+    """Reference: max(0, |a - p|^2 - |a - n|^2) in float64, by three nested loops."""
     losses = []
     for member_i in range(len(anchor)):
         total = 0.0
@@ -74,7 +74,7 @@ def test_gradient_points_to_the_target():
 @given(st.floats(-100, 100))
 def test_shift_invariance_of_l2(shift):
     predicted, truth = predictions("answer"), predictions("truth")
-    # float32 numbers up to 100 carry about 1e-5 of absolute rounding
+    # rounding error of float32 numbers up to 100 is about 1e-5
     torch.testing.assert_close(
         squared_error(predicted + shift, truth + shift), squared_error(predicted, truth), rtol=1e-3, atol=0
     )
@@ -89,15 +89,15 @@ def test_triplet_loss_equals_nested_loops(seed):
     )
 
 
-def test_satisfied_triplet_costs_nothing():
+def test_satisfied_triplet_has_no_loss():
     anchor = torch.zeros(1, 1, 2)
     positive, negative = torch.tensor([[[1.0, 0.0]]]), torch.tensor([[[0.0, 1.0 + 1e-6]]])
-    assert float(triplet_loss(anchor, positive, negative)) == 0  # no margin
+    assert float(triplet_loss(anchor, positive, negative)) == 0  # the loss has no margin
     assert float(triplet_loss(anchor, negative, positive)) > 0
 
 
 def test_gradient_of_a_violated_triplet():
-    # loss 2^2 - 1^2: d/dp = -2 (a - p), d/dn = 2 (a - n), d/da = 2 (a - p) - 2 (a - n)
+    # loss = |a - p|^2 - |a - n|^2 = 2^2 - 1^2: d/dp = -2 (a - p), d/dn = 2 (a - n), d/da = 2 (a - p) - 2 (a - n)
     a, p, n = (torch.tensor([[[x]]], requires_grad=True) for x in (0.0, 2.0, 1.0))
     loss = triplet_loss(a, p, n)
     loss.sum().backward()
@@ -112,7 +112,7 @@ def test_identical_points_have_no_gradient():
     assert all((one.grad == 0).all() for one in points)
 
 
-def test_networks_of_a_stack_have_their_own_losses():
+def test_networks_of_a_stack_have_separate_losses():
     anchor, positive, negative = three()
     before = triplet_loss(anchor, positive, negative)
     positive[1] += 10
@@ -121,10 +121,10 @@ def test_networks_of_a_stack_have_their_own_losses():
 
 
 @given(st.integers(0, 1000), st.floats(-5, 5))
-def test_invariance_under_rotation_and_shift(seed, shift):
+def test_triplet_loss_is_invariant_under_rotation_and_shift(seed, shift):
     turn = torch.from_numpy(special_ortho_group.rvs(D, random_state=rng_for(seed, "turn")).astype(np.float32))
     moved = [one @ turn + shift for one in three()]
-    # differences of sums of about 80, in float32 numbers of up to 10
+    # tolerance: differences of sums of about 80, from float32 numbers of up to 10
     torch.testing.assert_close(triplet_loss(*moved), triplet_loss(*three()), rtol=1e-4, atol=1e-4)
 
 
@@ -133,7 +133,7 @@ def test_triplet_loss_scales_with_the_square(k):
     stretched = [one * k for one in three()]
     torch.testing.assert_close(
         triplet_loss(*stretched), triplet_loss(*three()) * k**2, rtol=1e-4, atol=0
-    )  # float32 rounding
+    )  # tolerance of float32
 
 
 @given(st.integers(0, 1000))
@@ -141,4 +141,4 @@ def test_swapping_positive_and_negative_changes_the_sign(seed):
     anchor, positive, negative = three(seed)
     both = triplet_loss(anchor, positive, negative) - triplet_loss(anchor, negative, positive)
     mean = ((anchor - positive) ** 2).sum(-1).mean(-1) - ((anchor - negative) ** 2).sum(-1).mean(-1)
-    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # float32 sums of about 80
+    torch.testing.assert_close(both, mean, rtol=1e-4, atol=1e-4)  # tolerance: float32 sums of about 80

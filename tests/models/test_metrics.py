@@ -9,7 +9,7 @@ from reskin.metrics import METRICS, register, score, score_groups
 TRUE = np.array([[2.0, 2.0, 1.0], [4.0, 6.0, 2.0], [8.0, 8.0, 3.0], [16.0, 0.0, 0.5]])
 
 
-def test_perfect_prediction():
+def test_scores_of_a_perfect_prediction():
     found = score(TRUE, TRUE)
     assert {name: found[name] for name in METRICS} == {
         "accuracy_pct": 100.0, "mse_xy_mm2": 0.0, "mse_f_N2": 0.0, "r2_f": 1.0,
@@ -41,7 +41,7 @@ def test_place_error_equals_naive_loop():
     for i in range(len(TRUE)):
         for axis in (0, 1):
             total += (predicted[i, axis] - TRUE[i, axis]) ** 2
-    # the same sum in another order: rounding only
+    # tolerance: rounding of the same sum in another order
     assert score(TRUE, predicted)["mse_xy_mm2"] == pytest.approx(total / (2 * len(TRUE)), rel=1e-12)
 
 
@@ -56,7 +56,7 @@ def test_unknown_force_is_ignored():
 @given(st.floats(-5, 5), st.floats(-5, 5))
 def test_constant_offset_is_removed_by_registration(dx_mm, dy_mm):
     shifted = TRUE + [dx_mm, dy_mm, 0.0]
-    # exact except for rounding of means of numbers below 32
+    # tolerance: rounding of means of numbers below 32
     assert score(TRUE, register(TRUE, shifted))["mse_xy_mm2"] == pytest.approx(0.0, abs=1e-24)
 
 
@@ -64,7 +64,7 @@ def test_constant_offset_is_removed_by_registration(dx_mm, dy_mm):
 def test_force_error_scales_with_the_square_of_the_unit(scale):
     predicted = TRUE + 0.25
     scaled = score(TRUE * [1, 1, scale], predicted * [1, 1, scale])
-    # two roundings per row
+    # tolerance: two roundings per row
     assert scaled["mse_f_N2"] == pytest.approx(scale**2 * score(TRUE, predicted)["mse_f_N2"], rel=1e-9)
 
 

@@ -8,7 +8,7 @@ from reskin.models.network import LAYERS, Predictor, Stack, draw_weights
 from reskin.seeds import rng_for
 from tests.models.plain import features_of, plain_net, weights_of
 
-# float32 sums of up to 200 terms, in another order, six layers deep; numbers near 1
+# Tolerance: six layers of float32 sums of up to 200 terms near 1, in another order.
 CLOSE = {"rtol": 1e-4, "atol": 1e-6}
 
 
@@ -43,7 +43,7 @@ def test_stacked_networks_equal_plain_networks(architecture, members_n):
         torch.testing.assert_close(net.features(inputs)[i], features, **CLOSE)
         gradients = _with_gradients_for_weights(net).weights_of(i)
         for name, values in weights_of(alone, gradient=True).items():
-            # gradients are sums over the batch, too
+            # larger tolerance, because gradients are also summed over the batch
             np.testing.assert_allclose(gradients[name], values, rtol=1e-3, atol=1e-5, err_msg=name)
 
 
@@ -65,7 +65,7 @@ def test_stacked_networks_are_independent():
         assert all(torch.equal(a[i], b[i]) == same for a, b in zip(again_gradients, gradients, strict=True))
 
 
-def test_nan_stays_in_its_network():
+def test_nan_input_affects_its_network_only():
     inputs = batch(3)
     _, gradients = descend(stack(3), inputs)
     inputs[1] = torch.nan
@@ -102,11 +102,11 @@ def test_output_depends_on_forty_features():
     net, inputs = stack(2), batch(2)
     features = net.features(inputs)
     assert features.shape == (2, 16, 40)
-    assert (features < 0).any()  # no ReLU after the bottleneck
+    assert (features < 0).any()  # there is no ReLU after the feature layer
     assert torch.equal(net.head(features), net(inputs))
 
 
-def test_released_network_is_nonnegative():
+def test_outputs_of_the_released_network_are_not_negative():
     outputs, plain = stack(1, "released")(batch(1)), stack(1)(batch(1))
     assert (outputs >= 0).all()
     assert (plain < 0).any()

@@ -19,11 +19,11 @@ from reskin.models.train import CHECKED_STEPS_N, train_stack
 from tests.models.example_jobs import TRAIN, adaptation, example_data, fine_tuning, pooled, recipe, without_triplets
 
 SIZE_N = STACK_N["cpu"]
-STACKED_ATOL = 1e-3  # mm, N: float32 rounding between stacks (test_train.py)
+STACKED_ATOL = 1e-3  # mm and N: rounding differences between stacks (see test_train.py)
 
 
 class InlineExecutor(Executor):
-    """Run each call immediately in this process and count calls; workers are dead from call `die_after` on."""
+    """Executor that runs and counts calls in this process; after `die_after` calls, its workers count as dead."""
 
     def __init__(self, die_after: int = 10**9, error: type[Exception] = BrokenProcessPool) -> None:
         self.calls_n = 0
@@ -44,7 +44,7 @@ class InlineExecutor(Executor):
 
 
 def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
-    """Return jobs of folds that each hold out some rows of two skins."""
+    """Return jobs of `folds_n` folds; each fold holds out some rows of two skins."""
     everyone = np.arange(24)
     held = [np.array([i, i + 12]) for i in range(folds_n)]
     one = replace(pooled(**changes), experiment="lobo")
@@ -52,16 +52,16 @@ def jobs(folds_n: int = 3, **changes: object) -> list[TrainingJob]:
 
 
 def run(
-    some: list[TrainingJob], cache: Path, executor: Executor | None = None, log: list[str] | None = None
+    selected: list[TrainingJob], cache: Path, executor: Executor | None = None, log: list[str] | None = None
 ) -> list[TrainingResult]:
     tell = (lambda line: None) if log is None else log.append
-    return run_jobs(some, example_data(), executor=executor or InlineExecutor(), cache=cache, log=tell)
+    return run_jobs(selected, example_data(), executor=executor or InlineExecutor(), cache=cache, log=tell)
 
 
-def trainings_n(some: list[TrainingJob], cache: Path) -> int:
-    """Return the number of stacks that are trained."""
+def trainings_n(selected: list[TrainingJob], cache: Path) -> int:
+    """Run jobs; return the number of stacks that are trained (not taken from the cache)."""
     executor = InlineExecutor()
-    run(some, cache, executor)
+    run(selected, cache, executor)
     return executor.calls_n
 
 
@@ -77,19 +77,19 @@ def test_result_reports_whether_it_was_cached(tmp_path):
     assert [one.reused for one in both] == [True, True, False, False]
     assert [one.seconds for one in both[:2]] == pytest.approx(
         [one.seconds for one in first]
-    )  # seconds of the training, not of reading the cache
+    )  # the seconds are those of the training, not of reading the cache
 
 
 def test_results_are_in_the_order_of_jobs(tmp_path):
-    some = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adaptation(), fine_tuning()]
-    done = run(some, tmp_path)
-    assert len({one.key for one in done}) == len(some)
-    assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in some]
+    selected = [*jobs(2), pooled(), *jobs(5, steps_n=3), without_triplets(), adaptation(), fine_tuning()]
+    done = run(selected, tmp_path)
+    assert len({one.key for one in done}) == len(selected)
+    assert [one.predicted.shape for one in done] == [(len(job.test), 3) for job in selected]
 
 
-def test_result_does_not_depend_on_the_stack(tmp_path):
-    some = [*jobs(2), pooled(), adaptation(), jobs(3)[2]]
-    for job, one in zip(some, run(some, tmp_path), strict=True):
+def test_result_does_not_depend_on_other_jobs_of_the_stack(tmp_path):
+    selected = [*jobs(2), pooled(), adaptation(), jobs(3)[2]]
+    for job, one in zip(selected, run(selected, tmp_path), strict=True):
         (alone,) = train_stack([job], example_data())
         np.testing.assert_allclose(one.predicted, alone.predicted, rtol=0, atol=STACKED_ATOL)
         assert (one.scaler.input_shift == alone.scaler.input_shift).all()
@@ -106,24 +106,24 @@ def test_call_sends_each_set_of_rows_once(tmp_path, monkeypatch):
     )
     run([replace(job, seed_i=seed_i) for job in jobs(2) for seed_i in (0, 1)], tmp_path, here)
     assert {job.train.size + job.test.size for _, stack, _ in sent for job, *_ in stack} == {0}
-    assert len(written[0]) == 3 + 4  # fields, targets and skins; training and test rows of two folds
+    assert len(written[0]) == 3 + 4  # 3: fields, targets and skins; 4: training and test rows of two folds
 
 
 def test_killed_run_keeps_finished_jobs(tmp_path):
-    some = jobs(2 * SIZE_N + 1)
+    selected = jobs(2 * SIZE_N + 1)
     with pytest.raises(BrokenProcessPool):
-        run(some, tmp_path / "killed", InlineExecutor(die_after=1))
-    assert trainings_n(some, tmp_path / "killed") == 2  # of three stacks
-    done, fresh = run(some, tmp_path / "killed"), run(some, tmp_path / "fresh")
+        run(selected, tmp_path / "killed", InlineExecutor(die_after=1))
+    assert trainings_n(selected, tmp_path / "killed") == 2  # two of three stacks
+    done, fresh = run(selected, tmp_path / "killed"), run(selected, tmp_path / "fresh")
     assert all(equal_results(a, b) for a, b in zip(done, fresh, strict=True))
 
 
 def test_stack_killed_during_writing_is_retrained(tmp_path):
-    # Batches of 1 and many steps amplify differences in the last bits between places in a stack.
-    some = jobs(SIZE_N, steps_n=60, batch_n=1)
-    done = run(some, tmp_path)
+    # Many steps with batches of one row amplify differences in the last bits, which depend on the position in a stack.
+    selected = jobs(SIZE_N, steps_n=60, batch_n=1)
+    done = run(selected, tmp_path)
     (tmp_path / f"{done[1].key}.safetensors").unlink()
-    assert all(equal_results(a, b) for a, b in zip(done, run(some, tmp_path), strict=True))
+    assert all(equal_results(a, b) for a, b in zip(done, run(selected, tmp_path), strict=True))
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "bit"])
@@ -131,7 +131,7 @@ def test_damaged_result_is_reported_and_retrained(tmp_path, damage):
     first, log = run(jobs(), tmp_path), []
     file = tmp_path / f"{first[1].key}.safetensors"
     content = bytearray(file.read_bytes())
-    content[-5] ^= 1  # one bit of a weight, which the file format does not detect
+    content[-5] ^= 1  # changes one bit of a weight, which the file format does not detect
     file.write_bytes({"cut": content[: len(content) // 2], "empty": b"", "bit": content}[damage])
     again = run(jobs(), tmp_path, log=log)
     assert [line.startswith("warning: a cached result is damaged") for line in log[:2]] == [True, False]
@@ -168,31 +168,31 @@ def test_finished_jobs_are_not_trained_again(tmp_path):
         (replace(jobs(1)[0], seed_i=1), 1),
         (jobs(1, steps_n=5)[0], 1),
         (replace(jobs(1)[0], recipe=without_triplets().recipe), 1),
-        (jobs(3)[2], 3),  # another fold joins the stack
+        (jobs(3)[2], 3),  # a job of another fold, which changes the stack
     ],
     ids=["seed", "schedule", "terms", "fold"],
 )
-def test_additional_job_trains_one_stack(tmp_path, more, trained_n):
+def test_additional_job_trains_only_its_stack(tmp_path, more, trained_n):
     run(jobs(2), tmp_path)
     assert trainings_n([*jobs(2), more], tmp_path) == 1
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 + trained_n
 
 
-def test_renamed_training_is_cached(tmp_path):
+def test_renamed_job_is_read_from_the_cache(tmp_path):
     run(jobs(1), tmp_path)
     renamed = replace(jobs(1)[0], experiment="sensors", recipe_name="twin", what="multi")
     assert trainings_n([renamed], tmp_path) == 0
 
 
-def test_equal_trainings_run_once(tmp_path):
+def test_equal_jobs_are_trained_once(tmp_path):
     one = jobs(1)[0]
-    some = [one, replace(one, recipe_name="twin"), one]
-    done = run(some, tmp_path)
+    selected = [one, replace(one, recipe_name="twin"), one]
+    done = run(selected, tmp_path)
     assert len(list(tmp_path.glob("*.safetensors"))) == 1
     assert all(equal_results(done[0], other) for other in done[1:])
 
 
-def test_different_trainings_of_one_name_are_distinct(tmp_path):
+def test_different_jobs_of_one_name_are_both_trained(tmp_path):
     one, other = jobs(1)[0], jobs(1, steps_n=3)[0]
     assert one.name == other.name
     done = run([one, other], tmp_path)
@@ -200,7 +200,7 @@ def test_different_trainings_of_one_name_are_distinct(tmp_path):
     assert [training.curve for training in done] == [run([job], tmp_path)[0].curve for job in (one, other)]
 
 
-def test_cache_holds_no_rows(tmp_path):
+def test_cache_contains_no_rows(tmp_path):
     run(jobs(), tmp_path)
     assert [one for one in tmp_path.rglob("*.safetensors") if one.parent != tmp_path] == []
 
@@ -230,11 +230,11 @@ def test_diverged_network_keeps_its_last_finite_weights(tmp_path):
         assert all(np.isfinite(one.predicted).all() for one in done)
 
 
-DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # constant output, and no gradient through a ReLU of 0
+DEAD = {"layer1.weight": 0, "layer1.bias": 0}  # output is constant and has no gradient, because the ReLUs are 0
 
 
 def prepare_dead(attempts: set[int]) -> object:
-    """Return a `prepare` that gives these attempts of fold b0 dead weights."""
+    """Return a substitute for `prepare`: in these attempts, fold b0 starts with dead weights."""
 
     def make(job: TrainingJob, rows: object) -> object:
         prepared, scaler = prepare(job, rows)
@@ -250,9 +250,9 @@ def prepare_dead(attempts: set[int]) -> object:
 @pytest.mark.parametrize(("dead", "before_n", "collapsed"), [(set(), 0, 0), ({0}, 1, 0), ({0, 1, 2}, 2, 1)])
 def test_collapsed_training_is_repeated_at_most_twice(tmp_path, monkeypatch, dead, before_n, collapsed):
     monkeypatch.setattr(train, "prepare", prepare_dead(dead))
-    some, log = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
-    for _ in range(2):  # the second time from the cache
-        first, second = run(some, tmp_path, log=log)
+    selected, log = jobs(2, steps_n=CHECKED_STEPS_N, rate_max=1e-2), []
+    for _ in range(2):  # the second time, results are from the cache
+        first, second = run(selected, tmp_path, log=log)
         assert (first.collapsed_before_n, first.collapsed) == (before_n, bool(collapsed))
         assert (second.collapsed_before_n, second.collapsed) == (0, False)
         assert second.explained_min > 0.5
@@ -279,17 +279,17 @@ def test_constant_or_unknown_target_is_not_a_collapse(tmp_path):
 
 def test_worker_process_gives_the_same_result(tmp_path, monkeypatch):
     monkeypatch.setenv("RESKIN_EXECUTOR", "processes:1")
-    some = [adaptation(), fine_tuning()]
+    selected = [adaptation(), fine_tuning()]
     with make_executor(imports="reskin.models.train") as executor:
-        apart = run(some, tmp_path / "apart", executor)
-    assert all(equal_results(a, b) for a, b in zip(apart, run(some, tmp_path / "here"), strict=True))
+        in_worker = run(selected, tmp_path / "apart", executor)
+    assert all(equal_results(a, b) for a, b in zip(in_worker, run(selected, tmp_path / "here"), strict=True))
 
 
-def by_key(some: list[TrainingJob]) -> dict[str, TrainingJob]:
-    return {f"key{i}": job for i, job in enumerate(some)}
+def by_key(selected: list[TrainingJob]) -> dict[str, TrainingJob]:
+    return {f"key{i}": job for i, job in enumerate(selected)}
 
 
-def test_equal_recipes_share_a_stack():
+def test_jobs_with_equal_recipes_share_a_stack():
     twin = [replace(job, recipe_name="twin") for job in jobs(1)]
     assert [len(stack) for stack in make_stacks(by_key([*jobs(2), *twin]), 3)] == [3]
     released = replace(adaptation(), recipe=pooled(architecture="released").recipe)
@@ -299,25 +299,25 @@ def test_equal_recipes_share_a_stack():
 
 
 @given(st.lists(st.integers(0, 4), max_size=20), st.integers(1, 5))
-def test_stacks_cover_every_job_once(kinds, size_n):
+def test_every_job_is_in_one_stack(kinds, size_n):
     settings = [{"steps_n": 3}, {"steps_n": 4}, {"rate_max": 1e-3}, {"architecture": "released"}, {"batch_n": 8}]
-    some = by_key([pooled(**settings[kind]) for kind in kinds])
-    found = make_stacks(some, size_n)
-    assert sorted(key for one in found for key in one) == sorted(some)
+    selected = by_key([pooled(**settings[kind]) for kind in kinds])
+    found = make_stacks(selected, size_n)
+    assert sorted(key for one in found for key in one) == sorted(selected)
     for one in found:
         assert 1 <= len(one) <= size_n
         assert len({kinds[int(key.removeprefix("key"))] for key in one}) == 1
     counts = [kinds.count(kind) for kind in set(kinds)]
-    assert len(found) == sum(-(-count // size_n) for count in counts)  # the fewest possible stacks
+    assert len(found) == sum(-(-count // size_n) for count in counts)  # as few stacks as possible
 
 
 def test_five_targets_are_learned():
-    own = example_data()
-    shear_N = own.target[:, 2:] * np.array([0.5, -0.25], np.float32)
-    five = replace(own, target=np.hstack([own.target, shear_N]))
+    data = example_data()
+    shear_N = data.target[:, 2:] * np.array([0.5, -0.25], np.float32)
+    five = replace(data, target=np.hstack([data.target, shear_N]))
     many = replace(without_triplets(), recipe=recipe(steps_n=400))
     (one,) = train_stack([replace(many, test=many.train)], five)
     assert one.predicted.shape == (len(many.train), 5)
-    # training data, overfitted: shear is a fixed share of the third target
+    # predictions for training data, which the network overfits; shear is proportional to the third target
     rms_N = np.sqrt(((one.predicted - five.target[many.train]) ** 2).mean(axis=0))
     assert (rms_N < 0.5 * five.target.std(axis=0)).all()

@@ -14,7 +14,7 @@ def rows(n: int = 50, ch: int = 6) -> tuple[np.ndarray, np.ndarray]:
 def test_inputs_have_zero_mean_and_unit_deviation():
     db_uT, target = rows()
     scaled = fit_standard(db_uT, target).encode(db_uT).astype(float)
-    # float32 rounding of numbers of about 3 sd
+    # tolerance: rounding of numbers of about 3 standard deviations to float32
     np.testing.assert_allclose(scaled.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(scaled.std(axis=0), 1, atol=1e-5)
 
@@ -23,7 +23,7 @@ def test_scaler_uses_training_rows_only():
     db_uT, target = rows()
     train = np.arange(30)
     fitted = fit_standard(db_uT[train], target[train])
-    db_uT[30:] += 1e6  # test rows
+    db_uT[30:] += 1e6  # rows 30 and later are test rows
     target[30:] -= 1e6
     again = fit_standard(db_uT[train], target[train])
     assert all((a == b).all() for a, b in zip(fitted.arrays().values(), again.arrays().values(), strict=True))
@@ -45,10 +45,10 @@ def test_unknown_force_leaves_places_unchanged():
     assert np.isfinite(scaler.decode(np.zeros((1, 3), np.float32))).all()
 
 
-def test_released_scaling():
+def test_scaling_of_the_released_code():
     db_uT, target = rows()
     scaler = fit_released(db_uT, target)
-    # float32 against float64
+    # tolerance: float32 compared with float64
     np.testing.assert_allclose(scaler.input_scale, 5 * db_uT.std(axis=0, dtype=float), rtol=1e-6)
     assert (scaler.input_shift == 0).all()
     assert scaler.encode_target(np.array([[16, 8, 3]], np.float32)).tolist() == [[1.0, 0.5, 1.0]]
@@ -60,7 +60,7 @@ def test_decode_inverts_encode(seed):
     db_uT, target = rows()
     scaler = fit_standard(db_uT, target)
     wanted = rng.uniform(-20, 20, (5, 3)).astype(np.float32)
-    # two float32 roundings
+    # tolerance: two float32 roundings
     np.testing.assert_allclose(scaler.decode(scaler.encode_target(wanted)), wanted, atol=1e-4)
 
 

@@ -17,9 +17,9 @@ from tests.models.plain import plain_net, plain_train
 
 ALL_TERMS = LossWeights(0.5, unlabelled=0.7, few_labels=0.3)
 NO_TERMS = LossWeights(0.0)
-# Sums in another order, on another processor or with another memory alignment differ by 6e-8 of a term. AdamW divides
-# a gradient by its own size, so if rounding opens a ReLU for one row, all weights of its unit move by a whole step.
-# One unit of 200 is at most 7 % of the distance from the start; a missing loss term changes more than that.
+# Tolerances. Sums differ by 6e-8 of a term if the order, the processor or the memory alignment changes. AdamW divides a
+# gradient by its size: if rounding makes a ReLU positive for one row, all weights of this unit move by a whole step.
+# One unit of 200 changes the distance from the start by at most 7 %; a missing loss term changes it by more.
 WAY = 2e-2
 
 
@@ -40,8 +40,8 @@ def test_gradients_are_clipped_per_network():
     net = Stack(paper_layers(15), [some_weights(i) for i in range(3)])
     lengths = torch.tensor([0.0, 0.5, 70.0])
     for parameter in net.parameters():
-        drawn = torch.from_numpy(rng_for(0, "gradient", str(tuple(parameter.shape))).normal(size=parameter.shape))
-        parameter.grad = drawn.float()
+        gradient = torch.from_numpy(rng_for(0, "gradient", str(tuple(parameter.shape))).normal(size=parameter.shape))
+        parameter.grad = gradient.float()
     whole = torch.cat([one.grad.flatten(1) for one in net.parameters()], dim=1).norm(dim=1)
     for parameter in net.parameters():
         parameter.grad *= (lengths / whole)[:, None, None]
@@ -53,7 +53,7 @@ def test_gradients_are_clipped_per_network():
 
 
 def test_clipping_prevents_dead_networks():
-    """Without clipping, at four times the usual rate, all ReLUs of a layer die in most networks on simulated skins."""
+    """Without clipping, at four times the usual rate, all ReLUs of a layer become 0 in most networks."""
     jobs = [some_job(i, n=400) for i in range(3)]
     schedule = recipe(steps_n=400, batch_n=64, rate_max=2.4e-2)
     free, cut = (run(jobs_of(jobs), schedule.model_copy(update={"gradient_norm_max": one})) for one in (1e9, 1.0))
@@ -93,7 +93,7 @@ def test_stack_equals_single_training(terms, batch_n):
         np.testing.assert_allclose(together[i].curve, alone.curve, rtol=1e-3)
 
 
-@pytest.mark.parametrize(  # weight decay does not depend on the loss terms
+@pytest.mark.parametrize(  # a single case with weight decay, which does not depend on the loss terms
     ("terms", "decay"),
     [
         (NO_TERMS, 0.0),
@@ -114,9 +114,11 @@ def test_stack_equals_plain_pytorch_loop(terms, decay):
 
 
 def relative_distance(weights: Weights, truth: Weights, start: Weights) -> float:
-    """Distance of all weights from the truth, relative to the distance of the start."""
-    off, way = (np.concatenate([(truth[name] - other[name]).ravel() for name in truth]) for other in (weights, start))
-    return float(np.linalg.norm(off) / np.linalg.norm(way))
+    """Return the distance of the weights from `truth`, relative to the distance of the initial weights from `truth`."""
+    off, start_off = (
+        np.concatenate([(truth[name] - other[name]).ravel() for name in truth]) for other in (weights, start)
+    )
+    return float(np.linalg.norm(off) / np.linalg.norm(start_off))
 
 
 @pytest.mark.parametrize("name", ["triplet", "unlabelled", "few_labels"])
@@ -133,7 +135,7 @@ def test_each_term_changes_the_weights(name):
 
 
 @pytest.mark.parametrize("name", ["unlabelled", "few_labels"])
-def test_data_of_each_term_decides_the_weights(name):
+def test_data_of_each_loss_term_changes_the_weights(name):
     schedule, terms = recipe(steps_n=10), replace(NO_TERMS, **{name: 0.5})
     one, other = some_job(terms=True), some_job(terms=True)
     swapped = replace(other, **{name: replace(getattr(other, name), inputs=getattr(other, name).inputs[::-1].copy())})
@@ -141,7 +143,7 @@ def test_data_of_each_term_decides_the_weights(name):
 
 
 def test_unlabelled_pokes_train_the_feature_layers_only():
-    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # clipping would scale all layers
+    far = recipe(steps_n=1, rate_max=1e-2, gradient_norm_max=1e12)  # no clipping, which would scale all layers
     (outcome,) = run([some_job(terms=True)], far, LossWeights(0.0, unlabelled=1e6))
     (plain,) = run([some_job(terms=True)], far)
     for i in range(1, 7):
@@ -151,14 +153,14 @@ def test_unlabelled_pokes_train_the_feature_layers_only():
 
 @pytest.mark.parametrize("steps_n", [1, 2, 49, 50, 51, 120])
 def test_curve_is_the_mean_loss_of_each_block(steps_n):
-    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # the weights hardly move
+    schedule = recipe(steps_n=steps_n, rate_max=1e-12)  # so that the weights hardly change
     job = some_job()
     (outcome,) = run([job], schedule)
     feed, net, blocks = BatchSampler([some_job()], schedule.batch_n, "cpu"), plain_net("paper", job.initial_weights), []
     for n in block_sizes(steps_n):
         losses = [nn.functional.mse_loss(net(b["inputs"][0]), b["targets"][0]).item() for b in feed.sample(n)]
         blocks.append(sum(losses) / n)
-    assert outcome.curve == pytest.approx(blocks, rel=1e-5)  # float32 sums
+    assert outcome.curve == pytest.approx(blocks, rel=1e-5)  # rounding of float32 sums
 
 
 @pytest.mark.parametrize(("n", "batch_n"), [(1, 1), (1, 16), (3, 16), (17, 1), (32, 100)])
@@ -186,7 +188,7 @@ def scale_inputs(job: PreparedJob, times: float) -> PreparedJob:
 
 
 def test_nan_weights_of_the_last_step_are_detected():
-    """Pokes of 1e30 break the triplet term after the L2 loss of the same step was finite."""
+    """Pokes of 1e30 uT make the triplet term infinite, although the L2 loss of the same step is finite."""
     job = some_job(terms=True)
     job.unlabelled.inputs[:] *= 1e30
     (outcome,) = run([job], recipe(steps_n=1), LossWeights(0.0, unlabelled=1.0))
@@ -196,13 +198,13 @@ def test_nan_weights_of_the_last_step_are_detected():
 
 def test_infinite_loss_with_finite_weights_is_detected():
     job = some_job()
-    job.labelled.targets[:] *= 1e20  # squares overflow float32, gradients do not
+    job.labelled.targets[:] *= 1e20  # squares overflow in float32, gradients do not
     (outcome,) = run([job], recipe(steps_n=1))
     assert (outcome.stopped_step, outcome.curve) == (1, [])
 
 
-def test_late_stop_restores_the_previous_block(monkeypatch):
-    """Row 0 breaks the network and is first drawn in the second block."""
+def test_divergence_restores_the_weights_of_the_previous_block(monkeypatch):
+    """Row 0 makes the network diverge; it is first drawn in the second block of steps."""
     n, schedule = 60, recipe(steps_n=170, batch_n=1)
     seed = next(seed for seed in range(1000) if first_step_of_row_0(n, seed) // BLOCK_STEPS_N == 1)
     broken, sound = some_job(n=n, draws=seed), some_job(n=n, draws=seed)
@@ -213,7 +215,7 @@ def test_late_stop_restores_the_previous_block(monkeypatch):
     )
     (whole,) = run([sound], schedule)
     (outcome,) = run([broken], schedule)
-    assert len(checks) == len(block_sizes(170)) + 2  # nothing is left to train after the second check
+    assert len(checks) == len(block_sizes(170)) + 2  # no network is left to train after the second check
     assert outcome.stopped_step == 2 * BLOCK_STEPS_N
     assert outcome.curve == whole.curve[:1]
     assert all((outcome.weights[name] == checks[0][name]).all() for name in checks[0])
@@ -224,11 +226,13 @@ def first_step_of_row_0(n: int, seed: int) -> int:
     job = some_job(n=n, draws=seed)
     feed = BatchSampler([job], 1, "cpu")
     steps = chain.from_iterable(feed.sample(BLOCK_STEPS_N) for _ in range(2))
-    drawn = [i for i, step in enumerate(steps) if (step["inputs"][0, 0].numpy() == job.labelled.inputs[0]).all()]
-    return drawn[0] if drawn else -1
+    steps_with_row_0 = [
+        i for i, step in enumerate(steps) if (step["inputs"][0, 0].numpy() == job.labelled.inputs[0]).all()
+    ]
+    return steps_with_row_0[0] if steps_with_row_0 else -1
 
 
-def test_neighbours_of_a_diverging_network_are_unaffected():
+def test_diverging_network_does_not_affect_others_of_the_stack():
     schedule = recipe(steps_n=120)
     well = run([some_job(i, terms=True) for i in range(3)], schedule, ALL_TERMS)
     jobs = [some_job(i, terms=True) for i in range(3)]
@@ -240,7 +244,7 @@ def test_neighbours_of_a_diverging_network_are_unaffected():
     assert len(first.curve) == 3
 
 
-def test_starts_and_rows_are_not_modified():
+def test_initial_weights_and_rows_are_not_modified():
     job, untouched = some_job(terms=True), some_job(terms=True)
     run([job], recipe(), ALL_TERMS)
     assert all((job.initial_weights[name] == untouched.initial_weights[name]).all() for name in job.initial_weights)

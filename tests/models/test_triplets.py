@@ -8,7 +8,7 @@ from reskin.models.losses import TripletPoints, draw_triplets, triplet_points
 from reskin.seeds import rng_for
 
 DRAWN_N = 400
-ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, at their indices
+ROW = np.arange(5, dtype=np.float64)[:, None]  # five pokes of a line, whose places are the indices 0 to 4
 
 
 def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -16,13 +16,13 @@ def draw(points: TripletPoints, anchor: np.ndarray, seed: int = 0) -> tuple[np.n
 
 
 def distances(place: np.ndarray, anchor: int) -> list[float]:
-    """The squared distances of all points from one, by a loop."""
+    """Return the squared distances of all points from the anchor, by a loop."""
     return [sum((float(a) - float(b)) ** 2 for a, b in zip(one, place[anchor], strict=True)) for one in place]
 
 
 @st.composite
 def placed_points(draw_one: st.DrawFn) -> tuple[np.ndarray, np.ndarray, int]:
-    """TripletPoints in up to four groups, on few integer places (many ties); each place has at least two visits."""
+    """Draw points in up to four groups, at few integer places (many equal distances), each visited twice or more."""
     axes_n = draw_one(st.sampled_from([1, 2]))
     place, group = [], []
     for name in draw_one(st.lists(st.integers(0, 99), min_size=1, max_size=4, unique=True)):
@@ -49,7 +49,7 @@ def test_positive_is_strictly_nearer_in_the_same_group(case):
 
 
 @given(placed_points(), st.floats(-100, 100), st.sampled_from([0.25, 2.0, 8.0]))
-def test_invariance_under_shift_and_scale(case, shift, times):
+def test_triplets_are_invariant_under_shift_and_scale(case, shift, times):
     place, group, seed = case
     anchor = rng_for(seed, "anchors").integers(len(group), size=32)
     one = draw(triplet_points(place, group), anchor, seed)
@@ -58,7 +58,7 @@ def test_invariance_under_shift_and_scale(case, shift, times):
 
 
 @given(placed_points())
-def test_names_of_groups_do_not_matter(case):
+def test_triplets_do_not_depend_on_group_names(case):
     place, group, seed = case
     anchor = np.arange(len(group))
     one = draw(triplet_points(place, group), anchor, seed)
@@ -67,17 +67,17 @@ def test_names_of_groups_do_not_matter(case):
 
 
 def test_places_in_mm_use_both_axes():
-    # from the corner: 3 mm along x is nearer than 2 mm and 3 mm along both
+    # from the corner, the point 3 mm along x is nearer than the point 2 mm along x and 3 mm along y
     place = np.array([[0, 0], [3, 0], [2, 3]], np.float32)
     positive, negative = draw(triplet_points(place, np.zeros(3, int)), np.zeros(DRAWN_N, int))
     assert set(positive) == {1}
     assert set(negative) == {2}
 
 
-def test_two_places_suffice_with_two_visits_each():
+def test_two_places_with_two_visits_each_suffice():
     points = triplet_points(np.array([[0.0], [0.0], [1.0], [1.0]]), np.zeros(4, int))
     positive, negative = draw(points, np.tile(np.arange(4), 50))
-    assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # the other visit to the anchor's place
+    assert (positive == np.tile([1, 0, 3, 2], 50)).all()  # the positive is the other visit to the anchor's place
     assert all(set(negative[i::4]) == ({2, 3} if i < 2 else {0, 1}) for i in range(4))
 
 
@@ -123,12 +123,12 @@ def test_draws_follow_the_generator():
 
 
 def test_every_ordered_pair_is_equally_likely():
-    # from index 0 of five, all distances differ: six pairs of the four others
+    # from index 0, the distances of the four other points differ: they form six ordered pairs
     n = 6000
     positive, negative = draw(triplet_points(ROW, np.zeros(5, int)), np.zeros(n, int))
     pairs, times = np.unique(np.stack([positive, negative]), axis=1, return_counts=True)
     assert pairs.T.tolist() == [[1, 2], [1, 3], [1, 4], [2, 3], [2, 4], [3, 4]]
-    assert (np.abs(times - n / 6) < 6 * (n * 5 / 36) ** 0.5).all()  # six binomial sd
+    assert (np.abs(times - n / 6) < 6 * (n * 5 / 36) ** 0.5).all()  # six binomial standard deviations
 
 
 @given(placed_points())
@@ -139,7 +139,7 @@ def test_every_other_point_is_drawn(case):
     others = mates[mates != 0]
     away = np.array(distances(place, 0))[others]
     positive, negative = draw(triplet_points(place, group), np.zeros(3000, int), seed)
-    # worst case, one point in eleven ordered against one other only: (1 - 2 / 121)^3000 = 1e-22
+    # worst case, a point of eleven that forms a pair with one other point only: missed with (1 - 2 / 121)^3000 = 1e-22
     assert set(positive) == set(others[away < away.max()])
     assert set(negative) == set(others[away > away.min()])
 

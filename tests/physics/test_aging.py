@@ -1,4 +1,4 @@
-"""Relaxation, hysteresis, wear and temperature compared with closed forms, 50-digit arithmetic and publications."""
+"""Tests of relaxation, hysteresis, wear and temperature against closed forms, 50-digit arithmetic, published values."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ from reskin.physics.aging import (
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-14  # a few dozen operations in double precision
+ROUNDING = 1e-14  # relative error of a few dozen operations in double precision
 times_s = st.floats(0, 1e5)
 changes = st.floats(-10, 10)
 
@@ -40,7 +40,7 @@ def test_pokes_relax_as_the_relaxation_function():
     assert not broken(signals.check_relaxation())
 
 
-def test_no_time_and_no_change_keep_the_state():
+def test_without_time_or_change_the_state_is_kept():
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     assert advance(state, 0.0, 0.0, SKIN_RELAXATION).tobytes() == state.tobytes()
 
@@ -68,7 +68,7 @@ def test_force_is_linear_in_the_elastic_force(dt_s, change, factor):
     )
 
 
-def test_held_skin_relaxes_to_the_remaining_share():
+def test_force_at_constant_depth_relaxes_to_the_remaining_share():
     relaxed = relax(np.linspace(0, 1e6, 1000), np.ones(1000), SKIN_RELAXATION)
     assert (np.diff(relaxed) <= ROUNDING).all()
     assert relaxed[0] == pytest.approx(1, abs=ROUNDING)
@@ -89,11 +89,11 @@ def test_invalid_relaxation_is_refused(tau_s, share):
         Prony(np.array([tau_s]), np.array([share]))
 
 
-def test_reading_follows_approach_and_hold():
+def test_force_at_a_reading_follows_approach_and_hold():
     jump, slow = Relaxation(approach_s=0.0, hold_s=5.0), Relaxation(approach_s=5.0, hold_s=0.0)
     truth = 1 - (SKIN_RELAXATION.share * -np.expm1(-5.0 / SKIN_RELAXATION.tau_s)).sum()
     assert relaxed_share(jump) == pytest.approx(truth, rel=1e-12)
-    # Parts of the force that build up during the approach relax for a shorter time: the decay is averaged over it.
+    # Force that builds up during the approach relaxes for a shorter time: the decay is averaged over the approach.
     x = 5.0 / SKIN_RELAXATION.tau_s
     assert relaxed_share(slow) == pytest.approx(1 - (SKIN_RELAXATION.share * (1 + np.expm1(-x) / x)).sum(), rel=1e-12)
 
@@ -117,7 +117,7 @@ def test_field_memory_equals_integration_in_small_steps():
                 np.testing.assert_allclose(added_T[i, -1], (q_T - first_T).sum(axis=0), atol=1e-8)
 
 
-def test_residual_of_a_press_is_5_to_8_percent():
+def test_memory_of_a_press_is_5_to_8_percent():
     once_T = np.zeros((5, 1, 1, 3))
     once_T[0] = 1e-3
     before_T, _ = field_memory(once_T, REMEMBERED)
@@ -129,11 +129,11 @@ def test_residual_of_a_press_is_5_to_8_percent():
 
 def test_hovering_tip_leaves_no_memory():
     stops_T = np.zeros((2, 4, 1, 3))
-    stops_T[:, 2] = 1e-3  # hover twice, press, lift off
+    stops_T[:, 2] = 1e-3  # field changes at the stops: none, none, a press, none
     _, added_T = field_memory(stops_T, REMEMBERED)
     assert not added_T[0, :2].any()
     assert (added_T[0, 2:] > 0).all()
-    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)  # a press with the same mean
+    one_T = np.full((1, 1, 1, 3), 1e-3 / 4)  # a press with the same mean field change
     np.testing.assert_allclose(added_T[0, -1], field_memory(one_T, REMEMBERED)[1][0, 0])
 
 
@@ -148,7 +148,7 @@ def test_memory_is_linear_and_needs_time(factor):
     assert not any(part.any() for part in field_memory(change_T, at_once))
 
 
-def test_shares_without_times_are_refused():
+def test_memory_shares_without_time_constants_are_refused():
     with pytest.raises(ValueError, match="one time for each share"):
         Memory(share=(0.1,), tau_s=(1.0, 2.0), contact_s=1.0, rest_s=1.0)
 
@@ -163,18 +163,18 @@ def test_fresh_skin_is_unchanged():
 
 
 def test_softening_is_settling_plus_ageing():
-    # by hand: 0.1 (1 - e^-1) = 0.0632121, 0.01 log10(1.3) = 0.0011394; after 999,000 contacts 0.1 + 0.01 * 3
+    # Expected: 0.1 (1 - e^-1) = 0.0632121 and 0.01 log10(1.3) = 0.0011394; after 999,000 contacts, 0.1 + 0.01 * 3.
     np.testing.assert_allclose(softening(np.array([300, 999_000]), **DESIGN), [0.9356485, 0.87], atol=1e-7)
 
 
 def test_early_softening_matches_the_specification():
-    # A scene may neglect it for a cycled skin: from contact 1000 to 1030 it is far below 1 %.
+    # A scene may neglect softening of a cycled skin: from contact 1000 to 1030, it is far below 1 %.
     cycled = softening(np.array([1000, 1030]), **DESIGN)
     assert 0 < 1 - cycled[1] / cycled[0] < 0.01
 
 
 @given(counts)
-def test_use_never_stiffens_a_skin(contacts_n):
+def test_stiffness_never_increases_with_contacts(contacts_n):
     left = softening(contacts_n, **DESIGN)
     assert (np.diff(left) <= 0).all()
     assert ((left > 0) & (left <= 1)).all()
@@ -186,15 +186,16 @@ def test_fading_is_half_a_percent_per_decade():
 
 def test_baseline_walks_with_the_square_root_of_contacts():
     walks_T = baseline_walk(np.array([100, 10_000]), 20_000, step_T=0.2e-6, rng=rng_for(0, "wear"))
-    # 2 %: four times the sampling error 1 / sqrt(2 n)
+    # 2 %: four standard errors 1 / sqrt(2 n)
     np.testing.assert_allclose(walks_T.std(axis=1), [2e-6, 20e-6], rtol=0.02)
-    np.testing.assert_allclose(np.corrcoef(walks_T)[0, 1], 0.1, atol=0.03)  # the later value contains the earlier one
+    # the walk to the later contact includes the walk to the earlier one
+    np.testing.assert_allclose(np.corrcoef(walks_T)[0, 1], 0.1, atol=0.03)
 
 
 def test_walk_follows_the_generator():
     first, again = (baseline_walk(np.arange(50), 15, step_T=1e-7, rng=rng_for(0, "wear")) for _ in range(2))
     assert first.tobytes() == again.tobytes()
-    assert not first[0].any()  # before the first contact
+    assert not first[0].any()  # no walk before the first contact
 
 
 @pytest.mark.parametrize(
@@ -231,10 +232,10 @@ def test_board_warms_up_exponentially():
 @given(st.floats(0, 1e5))
 def test_room_temperature_oscillates_about_the_warming(time_s):
     room = HOW.model_copy(update={"swing_K": 2.0})
-    assert temperature_rise_K(np.zeros(1), room) == 0  # temperatures are relative to the start
+    assert temperature_rise_K(np.zeros(1), room) == 0  # rises are relative to the start
     # The oscillation starts with a rise.
     assert temperature_rise_K(np.array([150.0]), room) > temperature_rise_K(np.array([150.0]), HOW)
-    time = np.array([time_s, time_s + 300.0])  # half a period apart
+    time = np.array([time_s, time_s + 300.0])  # times that are half a period apart
     swing_K = temperature_rise_K(time, room) - temperature_rise_K(time, HOW)
     assert swing_K.sum() == pytest.approx(0.0, abs=1e-9)
     assert np.abs(swing_K).max() <= 2.0

@@ -1,4 +1,4 @@
-"""An iron ball compared with magpylib's sphere, the boundary conditions on its surface, and laws of induced fields."""
+"""Tests of the field of an iron ball against magpylib's sphere, boundary conditions and laws of magnetostatics."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from reskin.seeds import rng_for
 RADIUS_M = 5e-3
 CENTRE_M = np.array([1e-3, -2e-3, 12e-3])
 B_T = np.array([20e-6, 10e-6, -45e-6])
-ROUNDING = 1e-10  # places in mm, subtracted
+ROUNDING = 1e-10  # relative error of differences of places of a few mm
 MU_R = st.floats(1.0, 1e5)
 NEAR = np.array([[3e-3, 1e-3, 2e-3], [-4e-3, -1e-3, 4e-3]]), np.array([[0.0, 1e-3, 5e-3], [2e-3, 0.0, -1e-3]])
 
@@ -43,7 +43,8 @@ def test_field_outside_equals_magpylib_sphere(mu_r):
     theirs_T = magnet_sphere_Bfield(
         observers=observers_m - CENTRE_M, diameters=diameters_m, polarizations=polarisation_T
     )
-    np.testing.assert_allclose(field(observers_m, mu_r=mu_r), theirs_T, rtol=1e-9, atol=1e-18)  # rounding, 50 uT
+    # tolerance: rounding of fields of 50 uT
+    np.testing.assert_allclose(field(observers_m, mu_r=mu_r), theirs_T, rtol=1e-9, atol=1e-18)
 
 
 @given(MU_R)
@@ -57,7 +58,7 @@ def test_boundary_conditions_on_the_surface(mu_r):
 
 
 @given(st.floats(-3, 3), st.floats(1.5, 20))
-def test_linearity_and_decay_with_r3(factor, times):
+def test_induced_field_is_linear_and_falls_with_the_third_power(factor, times):
     near_m, far_m = on_sphere(1.5 * RADIUS_M), on_sphere(1.5 * times * RADIUS_M)
     np.testing.assert_allclose(field(near_m, factor * B_T), factor * field(near_m), rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(field(far_m) * times**3, field(near_m), rtol=1e-9, atol=1e-16)
@@ -67,17 +68,18 @@ def test_ball_of_air_has_no_field():
     assert not field(on_sphere(2 * RADIUS_M), mu_r=1.0).any()
 
 
-def test_field_of_dipoles_and_images_is_normal_to_the_surface():
+def test_field_of_dipoles_near_iron_is_normal_to_its_surface():
     observers_m = on_sphere(RADIUS_M)
     together_T = magnet.field(*NEAR, observers_m) + images(observers_m)
     sideways_T = np.cross(together_T, outward(observers_m))
-    assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()  # rounding
+    assert np.abs(sideways_T).max() < 1e-9 * np.abs(together_T).max()  # zero, except for rounding
     without_T = np.cross(magnet.field(*NEAR, observers_m), outward(observers_m))
-    assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()  # the ball does change the direction
+    # the test is meaningful: without the ball, the field is not normal
+    assert np.abs(without_T).max() > 0.1 * np.abs(together_T).max()
 
 
 def test_flux_of_images_is_zero():
-    # Gauss's law, over a sphere of the ball's size and half as much again: exact for polynomials of 31st degree.
+    # Gauss's law on a sphere of 1.5 times the radius of the ball, integrated at 60 latitudes and 120 longitudes.
     cos, weights = np.polynomial.legendre.leggauss(60)
     angles = np.linspace(0, 2 * np.pi, 120, endpoint=False)
     sin = np.sqrt(1 - cos**2)
@@ -94,16 +96,18 @@ def test_images_of_a_far_dipole_equal_those_of_its_uniform_field():
     observers_m = on_sphere(2 * RADIUS_M)
     uniform_T = magnet.field(*far, CENTRE_M[None])[0]
     of_uniform_T = field(observers_m, uniform_T, mu_r=1e12)
-    np.testing.assert_allclose(  # over 5 mm the field of a dipole 1 m away varies by 3 * 5 mm / 1 m
+    np.testing.assert_allclose(  # tolerance: over 5 mm, the field of a dipole 1 m away varies by 3 * 5 mm / 1 m
         images(observers_m, far), of_uniform_T, rtol=0, atol=0.02 * np.abs(of_uniform_T).max()
     )
 
 
 def test_directions_are_uniform_unit_vectors():
-    drawn = random_directions(20_000, rng_for(0, "directions"))
-    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, rtol=1e-12)
-    np.testing.assert_allclose(drawn.mean(axis=0), 0, atol=5 / np.sqrt(3 * 20_000))  # five sd of a mean
-    np.testing.assert_allclose(drawn.T @ drawn / 20_000, np.eye(3) / 3, atol=0.012)  # five sd: 0.3 / sqrt(n)
+    directions = random_directions(20_000, rng_for(0, "directions"))
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, rtol=1e-12)
+    # five standard errors of the mean
+    np.testing.assert_allclose(directions.mean(axis=0), 0, atol=5 / np.sqrt(3 * 20_000))
+    # five standard errors of 0.3 / sqrt(n)
+    np.testing.assert_allclose(directions.T @ directions / 20_000, np.eye(3) / 3, atol=0.012)
 
 
 def test_earth_field_has_its_magnitude_and_dip():

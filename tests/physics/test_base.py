@@ -1,4 +1,4 @@
-"""The base of the skin, compared with finite elements: pressed layers, drags, rigid slides, finite friction."""
+"""Tests of the deformation of the skin against finite elements: pressed and dragged layers, sliding, friction."""
 
 import numpy as np
 import pytest
@@ -8,10 +8,12 @@ from reskin.physics import layer, shear, slide
 from tests.elements import Layer, along_x_strains, plate
 
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3
-DRAG_M, AS_ON_THE_SKIN = 0.9e-3, 0.75  # greatest depth of a drag in the scenes; contact radius over thickness
+# greatest depth of a drag in the scenes; contact radius / thickness of the layer in finite elements
+DRAG_M, AS_ON_THE_SKIN = 0.9e-3, 0.75
 TAKEN_M = np.array([4e-5, 7e-5])
 HELD = {
-    "slipping": {"held": {"axis": [0], "base": [1]}, "drag": {"far": lambda r: 2 / r}},  # beyond it u_r goes as 1 / r
+    # condition at the outer edge: u_r falls as 1 / r
+    "slipping": {"held": {"axis": [0], "base": [1]}, "drag": {"far": lambda r: 2 / r}},
     "bonded": {"held": {"axis": [0], "base": [0, 1], "far": [0]}, "drag": {}},
 }
 PARTS = ("r_m", "z_m", "r_r", "r_z", "z_r", "z_z")
@@ -25,16 +27,16 @@ def finite_elements(cells_n):
     return Layer(H_M, 3 * H_M, 8 * H_M, cells_n)
 
 
-def sum_of_waves(at, waves):
-    found = layer.displacement(at.r_m.ravel(), at.z_m.ravel(), waves)
-    return np.stack([getattr(found, name).reshape(at.r_m.shape) for name in PARTS])
+def sum_of_waves(motion, waves):
+    found = layer.displacement(motion.r_m.ravel(), motion.z_m.ravel(), waves)
+    return np.stack([getattr(found, name).reshape(motion.r_m.shape) for name in PARTS])
 
 
-def errors_of(at, truth):
-    """Root mean square error of displacement and of gradient, each relative to that of the truth."""
-    near, parts_n = at.r_m < 4 * H_M, len(at.parts_m)
-    found = np.concatenate([at.parts_m, at.gradient.reshape(-1, *at.r_m.shape)])[:, near]
-    miss, size = ((of**2).sum(axis=1) for of in (found - truth[:, near], truth[:, near]))
+def errors_of(motion, truth):
+    """Return the rms error of the displacement and of the gradient, each divided by the rms of the true values."""
+    near, parts_n = motion.r_m < 4 * H_M, len(motion.parts_m)
+    found = np.concatenate([motion.parts_m, motion.gradient.reshape(-1, *motion.r_m.shape)])[:, near]
+    miss, size = ((values**2).sum(axis=1) for values in (found - truth[:, near], truth[:, near]))
     return np.sqrt([miss[part].sum() / size[part].sum() for part in (slice(parts_n), slice(parts_n, None))])
 
 
@@ -44,17 +46,18 @@ def test_pressed_layer_converges_to_finite_elements(base):
     amplitude_m = WIDTH_M**2 * np.exp(-((k_per_m * WIDTH_M) ** 2) / 2) / 2 * layer.WAVES_W / H_M
     waves = layer.Waves(k_per_m, amplitude_m, H_M, base)
     solved = [finite_elements(cells_n).solve(1, gaussian, **HELD[base]) for cells_n in (4, 8)]
-    errors = np.array([errors_of(at.inside, sum_of_waves(at.inside, waves)) for at in solved])
-    assert (errors[1] < [1e-3, 2e-2]).all()  # at 8 cells: 3e-4 and 9e-3
-    assert (errors[0] / errors[1] > 2 ** np.array([2.7, 1.7])).all()  # Taylor & Hood: orders 3 and 2
+    errors = np.array([errors_of(solution.inside, sum_of_waves(solution.inside, waves)) for solution in solved])
+    assert (errors[1] < [1e-3, 2e-2]).all()  # with 8 cells, the errors are 3e-4 and 9e-3
+    # Taylor-Hood elements converge with orders 3 and 2
+    assert (errors[0] / errors[1] > 2 ** np.array([2.7, 1.7])).all()
     slip_m, truth_m = solved[1].base.parts_m[0], sum_of_waves(solved[1].base, waves)[0]
     np.testing.assert_allclose(slip_m, truth_m, atol=5e-4 * np.abs(truth_m).max())
 
 
 @pytest.mark.parametrize("base", ["slipping", "bonded"])
-def test_contact_pressure_puts_the_surface_on_the_tip(base):
+def test_contact_pressure_deforms_the_surface_to_the_tip(base):
     contact = layer.contact_of_depth(DEPTH_M, thickness_m=H_M, tip_radius_m=TIP_M, base=base)
-    # p^(k) / 2G = integral of chi cos(kx) dx: p(r) / 2G = -integral of chi'(x) / sqrt(x^2 - r^2); x^2 = r^2 + y^2
+    # p^(k) / 2G = integral of chi cos(kx) dx, so p(r) / 2G = -integral of chi'(x) / sqrt(x^2 - r^2) dx; x^2 = r^2 + y^2
     chi = Polynomial.fit(contact.x_m**2, contact.weights_m2 / (contact.radius_m * layer.CONTACT_W), 12)
 
     def load(r_m):
@@ -63,65 +66,65 @@ def test_contact_pressure_puts_the_surface_on_the_tip(base):
         return 4 * top_m * (chi.deriv()(x2_m2) @ layer.CONTACT_W)
 
     top = finite_elements(8).solve(1, load, **HELD[base]).top
-    r_m, up_m = (of[top.r_m < contact.radius_m] for of in (top.r_m, top.parts_m[1]))
-    # the edge of the pressure is inside a cell, where the error is 0.4 % and 0.7 % of the depth
+    r_m, up_m = (values[top.r_m < contact.radius_m] for values in (top.r_m, top.parts_m[1]))
+    # 1 %: the edge of the contact is inside a cell; measured errors are 0.4 % and 0.7 % of the depth
     np.testing.assert_allclose(up_m, TIP_M - np.sqrt(TIP_M**2 - r_m**2) - DEPTH_M, atol=1e-2 * DEPTH_M)
 
 
-def half_curl(at):
-    """D, E, S of `ShearMap` by the chain rule from A, B, C."""
-    ((a_r, a_z), (b_r, b_z), (c_r, _)), (_, b, c) = at.gradient, at.parts_m
-    in_line, across = (a_z + b_z - c_r) / 2, (a_z - b_z - c / at.r_m) / 2
-    return np.stack([(in_line + across) / 2, (in_line - across) / 2, b / at.r_m + (b_r - a_r) / 2])
+def half_curl(motion):
+    """Return D, E, S of `ShearMap`, derived from A, B, C and their gradients by the chain rule."""
+    ((a_r, a_z), (b_r, b_z), (c_r, _)), (_, b, c) = motion.gradient, motion.parts_m
+    in_line, across = (a_z + b_z - c_r) / 2, (a_z - b_z - c / motion.r_m) / 2
+    return np.stack([(in_line + across) / 2, (in_line - across) / 2, b / motion.r_m + (b_r - a_r) / 2])
 
 
-def test_deepest_drag_is_covered_by_finite_elements():
+def test_finite_elements_cover_the_deepest_drag():
     contact = layer.contact_of_depth(DRAG_M, thickness_m=H_M, tip_radius_m=TIP_M, base="slipping")
     assert 0.7 < contact.radius_m / H_M < AS_ON_THE_SKIN
 
 
-# A contact as on the skin, and one on a thin layer, which is wide relative to a cell: errors of 0.8 % and 0.05 %
+# A contact as on the skin, and one on a thin layer, which covers many cells. Measured errors: 0.8 % and 0.05 %.
 @pytest.mark.parametrize(("radius_h", "tolerance"), [(AS_ON_THE_SKIN, 0.012), (2.5, 1e-3)])
 def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
     radius_m, chi = radius_h * H_M, layer.CONTACT_W * (1 - layer.CONTACT_X**2) ** 2.5
     traction = shear.Traction(radius_m, radius_m * layer.CONTACT_X, chi / chi.sum())
 
-    def load(r_m):  # q = 3 Q / pi a^2 (1 - r^2 / a^2)^2; q cos f along r and -q sin f across it make 2 q A
+    def load(r_m):  # q = 3 Q / pi a^2 (1 - r^2 / a^2)^2; q cos f along r and -q sin f across r do the work 2 q A
         return 6 / np.pi / radius_m**2 * np.maximum(1 - (r_m / radius_m) ** 2, 0) ** 2
 
-    of = Layer(H_M, radius_m + H_M, radius_m + 8 * H_M, 6, along_x_strains)
-    solved = of.solve(0, load, {"axis": [1, 2], "base": [0, 1, 2], "far": [0, 1, 2]}, {})
-    at, table = solved.inside, shear.tabulate(traction, H_M)
-    (r_m, r_i), (z_m, z_i) = (np.unique(part.round(12), return_inverse=True) for part in (at.r_m, at.z_m))
+    elements = Layer(H_M, radius_m + H_M, radius_m + 8 * H_M, 6, along_x_strains)
+    solved = elements.solve(0, load, {"axis": [1, 2], "base": [0, 1, 2], "far": [0, 1, 2]}, {})
+    motion, table = solved.inside, shear.tabulate(traction, H_M)
+    (r_m, r_i), (z_m, z_i) = (np.unique(part.round(12), return_inverse=True) for part in (motion.r_m, motion.z_m))
     truth = np.moveaxis(shear.evaluate_map(traction, r_m, z_m, thickness_m=H_M), 2, 0)[:, r_i, z_i]
-    near = at.r_m < radius_m + 3 * H_M
-    found = [*at.parts_m[:, near], *half_curl(at)[:, near]]
+    near = motion.r_m < radius_m + 3 * H_M
+    found = [*motion.parts_m[:, near], *half_curl(motion)[:, near]]
     errors = [np.linalg.norm(f - t) / np.linalg.norm(t) for f, t in zip(found, truth[:, near], strict=True)]
     assert max(errors[:3]) < tolerance
-    assert max(errors[3:]) < 4 * tolerance  # gradients converge one order more slowly
+    assert max(errors[3:]) < 4 * tolerance  # gradients converge with one order less
     assert 1 / solved.under_load_m == pytest.approx(table.stiffness_m, rel=5e-4)
     d, e, s = half_curl(solved.top)
-    # beside the contact's edge: 4 % and 0.4 % lower
+    # 5 %: finite elements give 4 % and 0.4 % less beside the edge of the contact
     assert max(np.abs(d + e).max(), np.hypot(d - e, s).max()) == pytest.approx(table.steepest_per_m2, rel=0.05)
 
 
 @pytest.mark.parametrize("sides_m", [(20e-3, 20e-3), (20e-3, 50e-3)])
-def test_plate_under_even_drag_moves_rigidly(sides_m):
+def test_stiff_plate_under_uniform_drag_moves_rigidly(sides_m):
     misses_m = []
     for stiffness in (1e3, 1e4):
         middle_m, move_m, spin_rad = plate(sides_m, (6e-3, -3e-3), TAKEN_M, stiffness)
         rigid = slide.rigid_motion(middle_m[None], TAKEN_M[None], sides_m)
         misses_m.append(np.append(move_m - rigid.move_m[0], (spin_rad - rigid.spin_rad[0]) * sides_m[0] / 2))
     assert np.abs(misses_m[1]).max() < 1e-4 * TAKEN_M.max()
-    # the deformation is proportional to drag over stiffness
+    # the deviation from a rigid motion is inversely proportional to the stiffness
     np.testing.assert_allclose(misses_m[0], 10 * misses_m[1], atol=1e-5 * TAKEN_M.max())
 
 
 def test_base_friction_interpolates_between_slipping_and_bonded():
-    of = finite_elements(4)
-    slipping_m, bonded_m = (of.solve(1, gaussian, **HELD[base]).under_load_m for base in HELD)
-    between = [of.with_friction(gaussian, mu, **HELD["slipping"]) for mu in (1e-3, 0.5, 100.0)]
-    held = [(slipping_m - at.under_load_m) / (slipping_m - bonded_m) for at in between]
+    elements = finite_elements(4)
+    slipping_m, bonded_m = (elements.solve(1, gaussian, **HELD[base]).under_load_m for base in HELD)
+    between = [elements.with_friction(gaussian, mu, **HELD["slipping"]) for mu in (1e-3, 0.5, 100.0)]
+    held = [(slipping_m - solution.under_load_m) / (slipping_m - bonded_m) for solution in between]
     assert held[0] < 0.01
     assert (np.diff(held) > 0).all()
     assert 0.99 < held[-1] < 1

@@ -1,4 +1,4 @@
-"""Boards compared with their design: chip positions, rotations and draws by name."""
+"""Tests of boards: chip positions and rotations of the design, and random draws by name and seed."""
 
 import numpy as np
 import pytest
@@ -50,10 +50,11 @@ def same(one, other):
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
 
 
-def test_board_without_spreads_equals_cad_and_recordings():
+def test_board_without_spreads_equals_design_file_and_recordings():
     board = draw_board(design(), no_spread(), seed=1, name="b0")
     np.testing.assert_allclose(board.chips_m, 1e-3 * np.array([[*xy, -1.1] for xy in CROSS_MM]))
-    recorded = [  # lab boards 1 and 2 (tests/recordings/test_lab_frames.py); the board file swaps chips 2 and 4
+    # lab boards 1 and 2 (tests/recordings/test_lab_frames.py); the board's design file swaps chips 2 and 4
+    recorded = [
         np.eye(3),
         np.diag([-1, -1, 1]),
         [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
@@ -82,13 +83,14 @@ def test_boards_depend_on_name_and_seed():
 def test_draws_have_the_given_spreads():
     boards = [draw_board(design(), spreads(), seed=0, name=f"b{i}") for i in range(400)]
     gains = np.array([np.diagonal(board.sensitivity, axis1=1, axis2=2) for board in boards])
-    # 10 %: sampling error of a standard deviation is 1 / sqrt(2 n), 3.5 % for 400 boards and less for chips.
+    # 10 %: the standard error of a standard deviation is 1 / sqrt(2 n): 3.5 % for 400 boards, less for chips.
     assert np.std([board.chips_m[0, 2] for board in boards]) == pytest.approx(0.1e-3, rel=0.1)
     assert np.std([board.offset_T for board in boards]) == pytest.approx(200e-6, rel=0.1)
     assert np.std(np.log(gains)) == pytest.approx(0.025, rel=0.1)
     cross = np.array([board.sensitivity for board in boards])[:, :, ~np.eye(3, dtype=bool)]
     assert np.std(cross) == pytest.approx(0.01, rel=0.1)
-    tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])  # two axes of 2 degrees each
+    # angle of two tilts, about x and about y, of 2 degrees each
+    tilt_rad = np.arccos([board.turn[:, 2, 2] for board in boards])
     assert np.sqrt(np.mean(tilt_rad**2)) == pytest.approx(np.sqrt(2) * np.radians(2), rel=0.1)
 
 
@@ -101,9 +103,9 @@ def test_tiled_boards_have_forty_chips():
     centres_mm = [(x, y, 0.0) for y in (-38.1, -12.7, 12.7, 38.1) for x in (-12.7, 12.7)]
     assert board.chips_m.shape == (40, 3)
     for board_i, middle_mm in enumerate(centres_mm):
-        own = slice(5 * board_i, 5 * board_i + 5)
-        np.testing.assert_allclose(board.chips_m[own], one.chips_m + 1e-3 * np.array(middle_mm), atol=1e-15)
-        np.testing.assert_allclose(board.turn[own], one.turn)
+        chips_of_tile = slice(5 * board_i, 5 * board_i + 5)
+        np.testing.assert_allclose(board.chips_m[chips_of_tile], one.chips_m + 1e-3 * np.array(middle_mm), atol=1e-15)
+        np.testing.assert_allclose(board.turn[chips_of_tile], one.turn)
 
 
 @given(st.integers(1, 4), st.integers(1, 3), st.floats(1, 100))
@@ -129,12 +131,13 @@ def test_too_many_chips_are_refused():
         design(tiles={"columns_n": 1, "rows_n": 13, "pitch_mm": 25.4})
 
 
-def test_gaps_stay_positive_and_tilt_and_bow_need_one_board():
+def test_gaps_are_positive_and_tilt_and_bow_need_a_single_board():
     wide = spreads(board_gap=0.5, board_uneven=0.5)
     boards = [draw_board(design(gap_mm=0.1), wide, seed=seed, name="b0") for seed in range(100)]
     gaps_m = np.stack([-board.chips_m[:, 2] for board in boards])
     assert (gaps_m > 0).all()
-    # log gap = log(middle) + 0.5 (a x + b y + c r^2), r = 1 at the outer chips: two give the tilt, all give the bow.
+    # log gap = log(middle) + 0.5 (a x + b y + c r^2), with r = 1 at outer chips: opposite chips give the tilt, all the
+    # bow.
     log = np.log(gaps_m / gaps_m[:, :1])
     tilt, bow = (log[:, 1] - log[:, 3]) / 2, log[:, 1:].mean(axis=1)
     assert 0.35 < tilt.std() < 0.7
@@ -142,7 +145,7 @@ def test_gaps_stay_positive_and_tilt_and_bow_need_one_board():
     np.testing.assert_allclose(log[:, 1] + log[:, 3], log[:, 2] + log[:, 4], atol=1e-12)
 
 
-def test_chip_without_rotation_is_refused():
+def test_chip_without_a_rotation_is_refused():
     with pytest.raises(ParamsError, match="chips_turn_deg must have one rotation"):
         design(chips_turn_deg=[0.0])
 

@@ -1,4 +1,4 @@
-"""The compiled change of field, compared with a NumPy loop and magpylib; linearity and exact zeros."""
+"""Tests of the compiled change of field against a NumPy loop and magpylib; linearity; exact zeros."""
 
 import numpy as np
 import pytest
@@ -12,24 +12,24 @@ from reskin.physics.magnet import change_of_field
 from reskin.seeds import rng_for
 from tests.laws import broken
 
-ROUNDING = 1e-12  # a few thousand operations in float64, relative to the sum of magnitudes
+ROUNDING = 1e-12  # error of a few thousand float64 operations, relative to the sum of the magnitudes
 seeds = st.integers(0, 10**6)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def compiled():
-    """Compile before Hypothesis measures the time of an example."""
+    """Compile the kernel before Hypothesis measures the time of examples."""
     change_of_field(*scene(0))
 
 
 def naive(rest, moved, observers_m):
-    """Sum the field differences of all dipoles, as specified."""
+    """Reference: sum the field differences of all dipoles in a NumPy loop."""
     after_T = magnet.field_of_each(*moved, observers_m)
     return (after_T - magnet.field_of_each(*rest, observers_m)).sum(axis=1)
 
 
 def scene(seed, nodes_n=200):
-    """Return dipoles of a slab off the origin that move by 0.1 mm and whose moments change by a tenth."""
+    """Return dipoles before and after moving 0.1 mm (moments change by 10 %), and observers, all off the origin."""
     rng = rng_for(seed, "change")
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), size=(nodes_n, 3))
     moments = 1e-5 * rng.normal(size=(nodes_n, 3))
@@ -48,7 +48,7 @@ def test_compiled_sum_equals_naive_sum(seed):
 
 
 @given(seeds, st.floats(-5, 5).filter(lambda factor: abs(factor) > 1e-6))
-def test_linearity_and_magpylib(seed, factor):
+def test_change_is_linear_in_moments_and_equals_magpylib(seed, factor):
     assert not broken(dipoles(seed, factor))
 
 
@@ -64,7 +64,7 @@ def test_dipoles_without_moment_change_nothing():
     assert not change_of_field((nodes_m, nothing), (moved_m, nothing), observers_m).any()
 
 
-def test_no_dipoles():
+def test_no_dipoles_cause_no_change():
     nothing = (np.zeros((0, 3)), np.zeros((0, 3)))
     assert not change_of_field(nothing, nothing, np.ones((2, 3))).any()
 
@@ -77,20 +77,20 @@ def test_moving_there_and_back_changes_nothing(seed):
 
 
 def test_tiny_move_keeps_precision():
-    # Reference: the slope of the field along the move; one step of 1e-9 m changes the field by 1e-6 of itself.
+    # Reference: the derivative of the field along the move. A move of 1e-9 m changes the field by 1e-6 of its value.
     (nodes_m, moments), _, observers_m = scene(3)
     step_m = np.array([1e-9, 0.0, 0.0])
     found_T = change_of_field((nodes_m, moments), (nodes_m + step_m, moments), observers_m)
     wide_m = 1e3 * step_m
     ahead_T, behind_T = (magnet.field(nodes_m + side * wide_m, moments, observers_m) for side in (1, -1))
-    # rtol: next order, (1e-6 m / 3e-3 m)^2, and 1e-9 m / 3e-3 m
+    # rtol: terms of next order, (1e-6 m / 3e-3 m)^2 and 1e-9 m / 3e-3 m
     np.testing.assert_allclose(found_T, (ahead_T - behind_T) / 2e3, rtol=1e-4)
 
 
 @pytest.mark.parametrize("place", [0.0, np.nan])
 def test_observer_on_a_dipole_is_refused(place):
-    at, away, moment = np.full((1, 3), place), np.ones((1, 3)), np.ones((1, 3))
+    dipole_m, away, moment = np.full((1, 3), place), np.ones((1, 3)), np.ones((1, 3))
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
-        change_of_field((at, moment), (away, moment), np.zeros((1, 3)))
+        change_of_field((dipole_m, moment), (away, moment), np.zeros((1, 3)))
     with pytest.raises(ParamsError, match="distance to a chip must be above 0 m"):
-        change_of_field((away, moment), (at, moment), np.zeros((1, 3)))
+        change_of_field((away, moment), (dipole_m, moment), np.zeros((1, 3)))

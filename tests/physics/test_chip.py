@@ -1,4 +1,4 @@
-"""The chip model compared with the data sheet: gains, range, noise, temperature, conversion times."""
+"""Tests of the chip model against the data sheet: gains, range, noise, temperature, conversion times."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_lsb_and_wrap_follow_the_data_sheet(gain_sel, seed):
     assert not broken([*signals.steps(), *signals.conversion(gain_sel, seed)])
 
 
-def test_reading_within_range_counts_nothing():
+def test_readings_within_range_are_neither_wrapped_nor_clipped():
     b_uT, overruns = read([4e-3, -4e-3, 4e-3])
     assert b_uT.dtype == np.float32
     assert overruns == Overruns(clipped_n=0, wrapped_n=0)
@@ -58,20 +58,20 @@ def test_out_of_range_fields_wrap_or_clip(b_uT, wrapped_n, clipped_n):
     assert out_of_range(np.array([b_uT]), "", "", wrapped_n=wrapped_n, clipped_n=clipped_n).holds
 
 
-def test_rotated_chip():
+def test_rotated_chip_reads_the_field_in_its_axes():
     b_uT, _ = read([0, 300e-6, 0], board(turn=QUARTER))
-    np.testing.assert_allclose(b_uT, [[300, 0, 0]], atol=0.08)  # half a step
+    np.testing.assert_allclose(b_uT, [[300, 0, 0]], atol=0.08)  # tolerance: half a step
 
 
 def test_gain_and_offset_act_in_the_chips_frame():
     b_uT, _ = read([100e-6, 0, 0], board(gain=2.0, offset_T=30e-6))
-    np.testing.assert_allclose(b_uT, [[230, 30, 30]], atol=0.13)  # half a step of z
+    np.testing.assert_allclose(b_uT, [[230, 30, 30]], atol=0.13)  # tolerance: half a step of z
 
 
 def test_readings_are_multiples_of_the_lsb():
     b_uT, _ = read(rng_for(1, "sensor").uniform(-4e-3, 4e-3, size=(500, 3)), design=LOUD)
     counts = b_uT.astype(np.float64) / steps_uT(7)
-    np.testing.assert_allclose(counts, np.rint(counts), atol=2e-3)  # float32 of 4000 uT is off by 1e-3 steps
+    np.testing.assert_allclose(counts, np.rint(counts), atol=2e-3)  # float32 rounds 4000 uT by 1e-3 steps
 
 
 def test_clipping_ignores_the_offset():
@@ -83,7 +83,7 @@ def test_clipping_ignores_the_offset():
 def test_noise_and_temperature_resolution():
     assert not broken([*signals.noise(LOUD, 0), signals.temperature(0)])
     b_uT, _ = read(np.zeros((40_000, 3)), design=LOUD)
-    np.testing.assert_allclose(b_uT.mean(axis=0), 0, atol=0.1)  # four times 5 uT / sqrt(n)
+    np.testing.assert_allclose(b_uT.mean(axis=0), 0, atol=0.1)  # four standard errors 5 uT / sqrt(n)
     read_degC = read_temperature(np.full((10_000, 5), 25.0), LOUD, rng_for(2, "sensor"))
     assert read_degC.std() == pytest.approx(0.1, rel=0.05)
     assert read_degC.mean() == pytest.approx(25, abs=0.01)
@@ -104,12 +104,12 @@ def test_frame_has_the_last_finished_conversion(rate_hz, phase_s):
     age_s, _ = last_conversions(frame_s, np.array([phase_s]))
     ends_s = phase_s + CONVERSION_S * np.arange(-1, int(frame_s[-1] / CONVERSION_S) + 2)
     truth_s = [t - max(end for end in ends_s if end <= t + 1e-12) for t in frame_s]
-    # a conversion that ends exactly with the frame may belong to it or not
+    # a conversion that ends exactly at the time of the frame may or may not be included
     off_s = np.abs(age_s[:, 0] - truth_s)
     assert (np.minimum(off_s, CONVERSION_S - off_s) < 1e-9).all()
 
 
-def test_repeated_conversions_by_rate():
+def test_share_of_repeated_conversions_by_rate():
     for rate_hz, least, most in ((400, 0, 0), (1000, 0.44, 0.48)):  # 1 - 1 / (1.84 ms x 1 kHz) = 0.457
         _, source_i = last_conversions((1 + np.arange(2000)) / rate_hz, np.zeros(1))
         repeated = np.mean(source_i[:, 0] != np.arange(2000))
@@ -124,10 +124,10 @@ def test_chips_of_one_frame_are_not_simultaneous():
 
 
 @given(rates_hz)
-def test_reading_is_as_old_as_its_conversion(rate_hz):
+def test_reading_is_the_field_at_its_conversion(rate_hz):
     frame_s = (1 + np.arange(30)) / rate_hz
     age_s, _ = last_conversions(frame_s, np.array([0.3e-3]))
     value = np.repeat(frame_s[:, None, None], 3, axis=2)
     seen = sample_at_conversion(value, age_s, rate_hz)
-    late = frame_s - age_s[:, 0] >= frame_s[0]  # before the first frame, its value is used
+    late = frame_s - age_s[:, 0] >= frame_s[0]  # earlier conversions use the field of the first frame
     np.testing.assert_allclose(seen[late, 0, 0], (frame_s - age_s[:, 0])[late], atol=1e-9)

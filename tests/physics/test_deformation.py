@@ -1,4 +1,4 @@
-"""Finite deformation under a tip: laws of `verification` on both bases, linear limit, convergence of steps."""
+"""Tests of the finite deformation under a tip: the laws in `verification`, linear limit, convergence of the steps."""
 
 from itertools import pairwise
 
@@ -28,19 +28,19 @@ def linear_at(r_m, z_m, depth_m, base="bonded"):
     return layer.displacement(r_m, z_m, layer.waves(contact, H_M, base))
 
 
-def det_f(at):
-    return np.linalg.det(at.f) * at.hoop
+def det_f(deformed):
+    return np.linalg.det(deformed.f) * deformed.hoop
 
 
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize("depth_m", [0.2e-3, 0.6e-3, 1.2e-3])
 def test_surface_follows_the_tip(depth_m, base):
-    # If the material were not followed, the surface would miss the tip by 27 % of the depth at 1.2 mm.
+    # If the deformation was computed in one step, the surface would miss the tip by 27 % of the depth at 1.2 mm.
     assert not broken(mechanics.sunken_surface(layer.IndentedLayer(H_M, TIP_M, base), depth_m))
 
 
 @pytest.mark.parametrize("base", BASES)
-def test_volume_and_base_are_kept(base):
+def test_volume_is_conserved_and_the_base_does_not_move(base):
     assert not broken(mechanics.finite_deformation(layer.IndentedLayer(H_M, TIP_M, base), 1.2e-3))
 
 
@@ -50,19 +50,19 @@ def test_angle_equals_polar_decomposition():
     np.testing.assert_allclose((u @ vt)[:, 0, 1], np.sin(deformation.rotation_angle(f)), atol=1e-12)
 
 
-def test_one_linear_step_would_lose_volume():
+def test_single_linear_step_would_lose_volume():
     r_m, z_m = nodes()
     linear = linear_at(r_m, z_m, 1.2e-3)
     one_shot = ((1 + linear.r_r) * (1 + linear.z_z) - linear.r_z * linear.z_r) * (1 + linear.hoop)
     followed = det_f(follow(r_m, z_m))
-    assert one_shot.min() < 0.5  # 0.42 on the axis
+    assert one_shot.min() < 0.5  # 0.42 of the volume would remain on the axis
     assert np.mean(np.abs(followed - 1) < 0.01) > 0.97
 
 
-def test_slipping_base_conserves_flow():
+def test_material_under_the_dent_flows_outward_on_a_slipping_base():
     press = layer.IndentedLayer(H_M, TIP_M, "slipping")
     assert not broken(mechanics.far_field(press, 1.2e-3))
-    # The volume under the dent is between that of a cone and that of a cylinder.
+    # The volume of the dent is between the volumes of a cone and of a cylinder.
     grown_m2 = (follow(np.full(5, 9e-3), np.linspace(0, 1, 5) * H_M, base="slipping").r_m ** 2 - 9e-3**2).mean()
     assert (
         press.contact(1.2e-3).radius_m ** 2 * 1.2e-3 / 3 < grown_m2 * H_M < press.contact(1.2e-3).radius_m ** 2 * 1.2e-3
@@ -77,23 +77,24 @@ def test_steps_converge_quadratically(monkeypatch):
     for step in (0.1, 0.05, 0.025):
         ladder = np.array([0.0, step / 4, step / 2, *np.arange(step, 1.01, step)])
         monkeypatch.setattr(deformation, "LADDER", ladder)
-        found.append(follow(r_m, z_m, 0.6 * H_M * deformation.depth_scale(TIP_M / H_M)))  # a whole number of steps
-    loss = [np.abs(det_f(at) - 1).max() for at in found]
+        # a depth of a whole number of steps
+        found.append(follow(r_m, z_m, 0.6 * H_M * deformation.depth_scale(TIP_M / H_M)))
+    loss = [np.abs(det_f(deformed) - 1).max() for deformed in found]
     assert loss[1] < loss[0] / 2.5
     assert loss[2] < loss[1] / 2.5
     apart_m = [np.hypot(b.r_m - a.r_m, b.z_m - a.z_m).max() for a, b in pairwise(found)]
     assert apart_m[1] < apart_m[0] / 2
-    assert apart_m[1] < 0.03 * 1.2e-3  # difference between the default step and half of it
+    assert apart_m[1] < 0.03 * 1.2e-3  # difference between results with the default step and with half the step
 
 
 @pytest.mark.parametrize("base", BASES)
 def test_shallow_poke_is_linear(base):
     r_m, z_m = nodes(r_max_m=1e-3)
-    at, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
+    deformed, depth_m = follow(r_m, z_m, 30e-6, base), 30e-6
     linear = linear_at(r_m, z_m, depth_m, base)
-    # 5 % of the depth: the displacement of the material, and a contact (0.3 mm) no wider than the shortest wave
-    np.testing.assert_allclose(at.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
-    np.testing.assert_allclose(at.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
+    # 5 % of the depth, because the material moves and the contact (0.3 mm) is as small as the shortest wave
+    np.testing.assert_allclose(deformed.r_m - r_m, linear.r_m, atol=0.05 * depth_m)
+    np.testing.assert_allclose(deformed.z_m - z_m, linear.z_m, atol=0.05 * depth_m)
 
 
 @pytest.mark.parametrize("base", BASES)

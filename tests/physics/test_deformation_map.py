@@ -1,4 +1,4 @@
-"""The tabulated deformation compared with following each node; no contact, base, reach and rigid motion."""
+"""Tests of the tabulated deformation against following each node; cases without contact, base, reach, thin skins."""
 
 from functools import cache
 
@@ -17,7 +17,7 @@ depths_m = st.floats(1e-5, 1.2e-3)
 bases = st.sampled_from(BASES)
 
 
-@cache  # computed on demand, because every test worker repeats the collection
+@cache  # not computed at import, because every test worker imports this module
 def table(base="bonded"):
     return deformation.tabulate(H_M, TIP_M, 1.2e-3, heights=HEIGHTS, base=base)
 
@@ -43,17 +43,20 @@ def places(rng, places_n, half_m=10e-3):
 @pytest.mark.parametrize("base", BASES)
 @pytest.mark.parametrize(("rung_i", "share"), [(4, 2e-3), (-1, 2e-3), (None, 0.05)])
 def test_table_equals_following_nodes(rung_i, share, base):
-    # Interpolating in R/h and r costs 2e-3 of the depth. Between tabulated depths it is 5 %: the contact's edge jumps.
+    # Interpolation in R/h and r has an error of 2e-3 of the depth; between tabulated depths 5 %, because the contact's
+    # edge is at another radius.
     depth_m = 0.55e-3 if rung_i is None else table(base).depth_m[rung_i]
     start_m = places(np.random.default_rng(0), 150) * (1, 0, 1)
-    start_m = start_m[start_m[:, 2] < H_M]  # on the surface itself the angle jumps at the contact's edge
+    start_m = start_m[start_m[:, 2] < H_M]  # below the surface, on which the angle jumps at the contact edge
     moved = move(start_m, (0, 0, depth_m), base)
-    at = follow(np.abs(start_m[:, 0]), start_m[:, 2], depth_m, base)
+    followed = follow(np.abs(start_m[:, 0]), start_m[:, 2], depth_m, base)
     sign = np.sign(start_m[:, 0])
-    np.testing.assert_allclose(moved.after[0][:, 0], sign * at.r_m, atol=share * depth_m)
-    np.testing.assert_allclose(moved.after[0][:, 2], at.z_m, atol=share * depth_m)
+    np.testing.assert_allclose(moved.after[0][:, 0], sign * followed.r_m, atol=share * depth_m)
+    np.testing.assert_allclose(moved.after[0][:, 2], followed.z_m, atol=share * depth_m)
     if share < 0.01:
-        np.testing.assert_allclose(moved.after[1][:, 0], sign * np.sin(deformation.rotation_angle(at.f)), atol=3e-3)
+        np.testing.assert_allclose(
+            moved.after[1][:, 0], sign * np.sin(deformation.rotation_angle(followed.f)), atol=3e-3
+        )
 
 
 @given(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3), depths_m, bases)
@@ -72,7 +75,7 @@ def test_without_contact_no_node_moves(depth_m, base):
 
 
 @given(depths_m)
-def test_bonded_base_stays(depth_m):
+def test_bonded_base_does_not_move(depth_m):
     base_m = np.column_stack([np.linspace(0, 10e-3, 200), np.zeros(200), np.zeros(200)])
     np.testing.assert_array_equal(move(base_m, (0, 0, depth_m)).after[0], base_m)
 
@@ -84,7 +87,7 @@ def test_deeper_pokes_move_material_deeper(first_m, second_m, base):
     column_m = np.column_stack([np.zeros((7, 2)), H_M * np.array(HEIGHTS[1:])])
     shallow, deep = (move(column_m, (0, 0, depth), base).after[0][:, 2] for depth in (shallow_m, deep_m))
     assert (deep <= shallow + 1e-12).all()
-    assert (np.diff(deep) > 0).all()  # the order of layers is kept
+    assert (np.diff(deep) > 0).all()  # layers keep their order
 
 
 def test_displacement_beyond_the_reach_is_negligible():
@@ -103,7 +106,7 @@ def test_slipping_skin_moves_outward_beyond_the_reach(depth_m):
     grown_m2 = moved.after[0][:, 0] ** 2 - r_m**2
     np.testing.assert_allclose(
         grown_m2, grown_m2[-1], rtol=0.01
-    )  # at the table's edge the two solutions differ by exp(-5 pi), and by rounding of sums
+    )  # tolerance: at the edge of the table, the two solutions differ by exp(-5 pi) and by rounding of sums
     past = slice(len(HEIGHTS), None)
     np.testing.assert_array_equal(moved.after[0][past, 1:], rest_m[past, 1:])
     np.testing.assert_array_equal(moved.after[1][past], moved.before[1][past])
@@ -117,7 +120,7 @@ def test_slipping_base_keeps_its_height(depth_m):
     assert (after_m[:, 0] > base_m[:, 0]).all()
 
 
-def test_thin_skin():
+def test_table_of_a_thin_skin():
     thin = deformation.tabulate(0.2e-3, TIP_M, 0.058e-3, heights=(0.5, 1.0), base="bonded")
     assert deformation.at_depth(thin, 0.058e-3)[-1, 0, 1] * 0.2e-3 == pytest.approx(-0.058e-3, rel=0.02)
     with pytest.raises(ParamsError, match="depth must be such that"):

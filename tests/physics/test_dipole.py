@@ -1,4 +1,4 @@
-"""The dipole field compared with closed forms, a naive sum and magpylib; laws of magnetostatics."""
+"""Tests of the dipole field against closed forms, a naive sum, magpylib and laws of magnetostatics."""
 
 import numpy as np
 import pytest
@@ -11,35 +11,37 @@ from reskin.errors import ParamsError
 from reskin.physics.magnet import MU0_4PI, field, field_of_each
 from reskin.seeds import rng_for
 
-ROUNDING = 1e-12  # a few hundred operations in float64
+ROUNDING = 1e-12  # relative error of a few hundred float64 operations
 SIX_STEPS = (np.eye(3)[:, None] * np.array([1.0, -1.0])[:, None]).reshape(6, 3)
 
 coordinates = st.floats(-1, 1, allow_subnormal=False)
 triples = st.tuples(coordinates, coordinates, coordinates).map(np.array)
-# Sources off the origin and distant observers reveal a wrong sign of the separation.
+# Sources away from the origin and distant observers reveal a wrong sign of the separation vector.
 sources_m = triples.map(lambda v: v + np.array([3.0, -2.0, 1.0]))
 observers_m = triples.map(lambda v: v + np.array([-3.0, 4.0, 5.0]))
 
 
-def at(source_m, moment, observer_m):
+def field_at(source_m, moment, observer_m):
     return field(np.atleast_2d(source_m), np.atleast_2d(moment).astype(float), np.atleast_2d(observer_m))[0]
 
 
-def test_constant_is_that_of_codata():
+def test_constant_equals_codata():
     assert mu_0 / (4 * np.pi) == MU0_4PI
     assert 0 < abs(MU0_4PI / 1e-7 - 1) < 1e-9
 
 
 @given(sources_m, st.floats(0.1, 5))
 def test_field_on_axis_and_beside(source_m, r_m):
-    # rtol: (source + r) - source loses digits
+    # rtol: the separation (source + r) - source loses digits
     for direction, times in (((0, 0, r_m), 2), ((r_m, 0, 0), -1)):
         truth_T = (0, 0, times * 2.0 * MU0_4PI / r_m**3)
-        np.testing.assert_allclose(at(source_m, (0, 0, 2.0), source_m + direction), truth_T, rtol=1e-9, atol=1e-25)
+        np.testing.assert_allclose(
+            field_at(source_m, (0, 0, 2.0), source_m + direction), truth_T, rtol=1e-9, atol=1e-25
+        )
 
 
 def test_field_at_45_degrees():
-    b_T = at((1.0, 2.0, 3.0), (0, 0, 1), np.array([1.0, 2.0, 3.0]) + np.array([1, 0, 1]) / np.sqrt(2))
+    b_T = field_at((1.0, 2.0, 3.0), (0, 0, 1), np.array([1.0, 2.0, 3.0]) + np.array([1, 0, 1]) / np.sqrt(2))
     np.testing.assert_allclose(b_T, MU0_4PI * np.array([1.5, 0, 0.5]), rtol=ROUNDING, atol=1e-20)
 
 
@@ -63,9 +65,9 @@ def test_field_equals_magpylib(seed):
 
 @given(sources_m, triples, triples, observers_m, coordinates)
 def test_field_is_linear_in_the_moment(source_m, one, other, observer_m, share):
-    together = at(source_m, one + share * other, observer_m)
-    apart = at(source_m, one, observer_m) + share * at(source_m, other, observer_m)
-    np.testing.assert_allclose(together, apart, rtol=1e-9, atol=1e-20)  # atol: terms may cancel
+    together = field_at(source_m, one + share * other, observer_m)
+    summed = field_at(source_m, one, observer_m) + share * field_at(source_m, other, observer_m)
+    np.testing.assert_allclose(together, summed, rtol=1e-9, atol=1e-20)  # atol: the fields may cancel
 
 
 @given(sources_m, triples, observers_m)
@@ -74,7 +76,7 @@ def test_divergence_and_curl_are_zero(source_m, moment, observer_m):
     b_T = field(source_m[None], moment[None], observer_m + step_m * SIX_STEPS).reshape(3, 2, 3)
     jacobian = (b_T[:, 0] - b_T[:, 1]) / (2 * step_m)
     size = MU0_4PI * (np.linalg.norm(moment) + 1e-3) / np.linalg.norm(observer_m - source_m) ** 4
-    assert abs(np.trace(jacobian)) < 1e-5 * size  # central differences: (step / r)^2
+    assert abs(np.trace(jacobian)) < 1e-5 * size  # error of central differences: (step / r)^2
     assert np.abs(jacobian - jacobian.T).max() < 1e-5 * size
 
 
@@ -82,8 +84,8 @@ def test_divergence_and_curl_are_zero(source_m, moment, observer_m):
 def test_rotation_by_90_degrees(source_m, moment, observer_m):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     np.testing.assert_allclose(
-        at(turn @ source_m, turn @ moment, turn @ observer_m),
-        turn @ at(source_m, moment, observer_m),
+        field_at(turn @ source_m, turn @ moment, turn @ observer_m),
+        turn @ field_at(source_m, moment, observer_m),
         rtol=1e-9,
         atol=1e-22,
     )
@@ -95,5 +97,5 @@ def test_observer_on_a_dipole_is_refused(place):
         field(np.full((1, 3), place), np.ones((1, 3)), np.zeros((1, 3)))
 
 
-def test_no_dipoles():
+def test_no_dipoles_have_no_field():
     assert not field(np.zeros((0, 3)), np.zeros((0, 3)), np.ones((2, 3))).any()

@@ -1,4 +1,4 @@
-"""Friction: Q = min(k s, mu F), energy and Coulomb's disc; subdivision, rotation and lifting of paths."""
+"""Tests of friction under a dragged tip: Q = min(k s, mu F), energy, Coulomb's limit, subdivided and rotated paths."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from pipeline.experiments.verification.mechanics import straight_drag
 from reskin.errors import ParamsError
 from reskin.physics.shear import drag_force
 
-ROUNDING = 1e-12  # some hundred steps in double precision
-K = 1000.0  # N/m, the skin's order of magnitude
+ROUNDING = 1e-12  # relative error of some hundred steps in double precision
+K = 1000.0  # N/m, of the order of the skin's stiffness
 paths_m = st.integers(2, 40).flatmap(lambda t: arrays(float, (t, 2), elements=st.floats(-1e-2, 1e-2)))
 frictions = st.floats(0, 2)
 
@@ -29,7 +29,7 @@ def slipped_m(path_m, found):
 
 
 @given(st.floats(1e-6, 1e-2), st.floats(1e-3, 5), st.floats(1e-3, 2), st.floats(0, 5e3), st.integers(1, 50))
-def test_straight_drag_is_spring_or_friction(end_m, normal_N, mu, stiffness, steps_n):
+def test_force_of_a_straight_drag_is_that_of_spring_or_friction(end_m, normal_N, mu, stiffness, steps_n):
     path_m = np.linspace(0, end_m, steps_n + 1)
     assert straight_drag(path_m, mu * normal_N, stiffness_N_per_m=stiffness, coefficient=mu).holds
 
@@ -75,7 +75,8 @@ def test_subdividing_a_straight_path_changes_nothing(cuts, end_m, mu):
 
 def test_loop_dissipates_friction_times_length():
     reach_m, mu, steps_n = 3e-3, 0.8, 300
-    stuck_m = mu * 1.0 / K  # 0.8 mm: with steps of 10 um, each change between sticking and sliding is at a stop
+    # 0.8 mm is a whole number of steps of 10 um, so sticking and sliding change exactly at a stop
+    stuck_m = mu * 1.0 / K
     along_m = np.concatenate(
         [np.linspace(a, b, n + 1)[:-1] * reach_m for a, b, n in ((0, 1, steps_n), *[(1, -1, 600), (-1, 1, 600)] * 2)]
     )
@@ -83,11 +84,12 @@ def test_loop_dissipates_friction_times_length():
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=mu)
     work_J = ((found.force_N[1:] + found.force_N[:-1]) / 2 * np.diff(path_m, axis=0)).sum(axis=1)
     loop_J = work_J[-1200:].sum()
-    # In a loop the spring reverses twice, by twice its length each time; the tip slides over the rest of the 4 reaches.
-    assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)  # sums of 1200 straight pieces
+    # In a loop of length 4 reaches, the spring reverses twice, over twice its length each; elsewhere the tip slides.
+    # rounding of sums over 1200 straight pieces
+    assert loop_J == pytest.approx(mu * 1.0 * (4 * reach_m - 4 * stuck_m), rel=1e-9)
     slid_m = np.hypot(*slipped_m(path_m, found)[-1200:].T).sum()
     assert slid_m == pytest.approx(4 * reach_m - 4 * stuck_m, rel=1e-9)
-    # From rest: the work is dissipated or still stored in the spring.
+    # From rest, the work equals the dissipated energy plus the energy stored in the spring.
     all_slid_m = np.hypot(*slipped_m(path_m, found).T).sum()
     assert work_J.sum() == pytest.approx(mu * 1.0 * all_slid_m + K * stuck_m**2 / 2, rel=1e-9)
 
@@ -102,24 +104,26 @@ def test_friction_opposes_slip(path_m, mu):
 
 
 @given(paths_m, frictions, st.floats(-np.pi, np.pi))
-def test_rotation_of_the_path(path_m, mu, angle_rad):
+def test_rotating_the_path_rotates_the_force(path_m, mu, angle_rad):
     turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
-    still, turned = (
+    unrotated, turned = (
         drag_force(p, normals(p), stiffness_N_per_m=K, friction=mu).force_N for p in (path_m, path_m @ turn.T)
     )
-    np.testing.assert_allclose(turned, still @ turn.T, atol=1e-10)  # 40 steps of up to 30 N before they are cut
+    # rounding of 40 steps of up to 30 N (before limiting by friction)
+    np.testing.assert_allclose(turned, unrotated @ turn.T, atol=1e-10)
 
 
 def test_force_turns_within_a_few_spring_lengths():
     path_m = np.vstack([straight(4e-3, 400, 0.0), straight(8e-3, 800, np.pi / 2)[1:] + [4e-3, 0]])
     found = drag_force(path_m, normals(path_m), stiffness_N_per_m=K, friction=0.8)
     sideways_N, past_m = found.force_N[401:, 0], path_m[401:, 1]
-    # The spring trails behind (a tractrix): its angle f from the new line is tan(f / 2) = exp(-way / length)
+    # The spring follows a tractrix: its angle f to the new line obeys tan(f / 2) = exp(-distance / length).
     angle_rad = 2 * np.arctan(np.exp(-past_m / 0.8e-3))
-    np.testing.assert_allclose(sideways_N, 0.8 * np.sin(angle_rad), atol=0.8 * 10e-6 / 0.8e-3)  # one step's turn
+    # tolerance: rotation within a step
+    np.testing.assert_allclose(sideways_N, 0.8 * np.sin(angle_rad), atol=0.8 * 10e-6 / 0.8e-3)
 
 
-def test_spring_slackens_under_lighter_force():
+def test_tangential_force_falls_with_the_normal_force():
     path_m = np.array([[0.0, 0.0], [2e-3, 0.0], [2e-3, 0.0], [2e-3, 0.0]])
     found = drag_force(path_m, np.array([1.0, 1.0, 0.25, 1.0]), stiffness_N_per_m=K, friction=0.8)
     np.testing.assert_allclose(found.force_N[:, 0], [0, 0.8, 0.2, 0.2], rtol=ROUNDING)

@@ -1,4 +1,4 @@
-"""The bonded layer compared with limits, 50-digit arithmetic and the laws of `verification`; invalid input."""
+"""Tests of the bonded layer against limits, 50-digit arithmetic and the laws in `verification`; invalid input."""
 
 from dataclasses import asdict
 
@@ -23,8 +23,8 @@ thicknesses_m = st.floats(1e-3, 5e-3)
 tips_m = st.floats(2e-3, 4e-3)
 
 
-def force(depth_m, modulus_Pa=190e3, **of):
-    return layer.force(np.atleast_1d(np.asarray(depth_m, dtype=float)), modulus_Pa=modulus_Pa, **(SKIN | of))
+def force(depth_m, modulus_Pa=190e3, **changes):
+    return layer.force(np.atleast_1d(np.asarray(depth_m, dtype=float)), modulus_Pa=modulus_Pa, **(SKIN | changes))
 
 
 def field(r_m, z_m, depth_m=1.2e-3):
@@ -41,12 +41,12 @@ def test_compliance_limits():
         layer.bonded_compliance(np.array([0.0, 1e-6, 1e-3])),
         layer.bonded_compliance(np.array([20.0, 1e4, 1e150])),
     )
-    np.testing.assert_allclose(long, [0, 2e-18 / 3, 2e-9 / 3], rtol=2e-6)  # 2 A^3 / 3, next term A^2 smaller
+    np.testing.assert_allclose(long, [0, 2e-18 / 3, 2e-9 / 3], rtol=2e-6)  # 2 A^3 / 3; the next term is smaller by A^2
     np.testing.assert_allclose(short, 1, rtol=1e-13)
 
 
 @given(st.floats(0.01, 30), st.floats(0, 1))
-def test_profile_over_depth(kh, share):
+def test_displacement_over_depth_equals_50_digits(kh, share):
     with mpmath.workdps(50):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh) * mpmath.mpf(share)
         ratio = (mpmath.cosh(a) + a * mpmath.sinh(a)) / (a * mpmath.cosh(a))
@@ -57,7 +57,8 @@ def test_profile_over_depth(kh, share):
         size = (mpmath.sinh(2 * a) - 2 * a) / (mpmath.cosh(2 * a) + 2 * a**2 + 1) / w(a)
         truth = [float(size * mpmath.diff(w, z, order)) for order in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]))
-    np.testing.assert_allclose([float(part[0, 0]) for part in found], truth, atol=1e-12)  # relative to a half-space's 1
+    # relative to 1 for a half-space
+    np.testing.assert_allclose([float(part[0, 0]) for part in found], truth, atol=1e-12)
 
 
 def test_base_is_fixed_and_surface_free_of_shear():
@@ -65,15 +66,15 @@ def test_base_is_fixed_and_surface_free_of_shear():
     base = layer.depth_profile(np.zeros((1, 40)), kh)
     top = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(base[:2], 0, atol=1e-15)
-    np.testing.assert_allclose(top[0] + top[2], 0, atol=1e-13)  # W'' + W = 0
+    np.testing.assert_allclose(top[0] + top[2], 0, atol=1e-13)  # no shear stress: W'' + W = 0
     assert np.isfinite(top).all()
 
 
-@settings(max_examples=30)  # a new layer takes 50 ms
+@settings(max_examples=30)  # an example takes 50 ms
 @given(thicknesses_m, tips_m, st.floats(0.05, 0.6))
 def test_force_equals_dimitriadis_for_small_tips(thickness_m, tip_radius_m, relative_depth):
-    # The series is too low from its term in chi^2 on: by 8 % at chi = sqrt(R d) / h = 0.5 and by 16 % at 1, as pressure
-    # rings confirm.
+    # The published series is too low from its term in chi^2 on: by 8 % at chi = sqrt(R d) / h = 0.5 and by 16 % at 1.
+    # The solution with pressure rings confirms that.
     depth_m = min(relative_depth * thickness_m, 0.2 * tip_radius_m, 0.25 * thickness_m**2 / tip_radius_m)
     assert mechanics.dimitriadis(np.array([depth_m]), IndentedLayer(thickness_m, tip_radius_m, "bonded")).holds
 
@@ -91,13 +92,13 @@ def test_pressure_rings_give_the_same_force(base):
     press = IndentedLayer(2e-3, 3e-3, base)
     assert mechanics.rings(1e-3, press).holds
     _, pressure = mechanics.ring_pressures(1e-3, press)
-    assert (pressure > 0).all()  # no tension: the contact radius is not too large
-    assert pressure[-1] < 0.25 * pressure[0]  # no peak at the edge: it is not too small
+    assert (pressure > 0).all()  # no tension, so the contact radius is not too large
+    assert pressure[-1] < 0.25 * pressure[0]  # no peak at the edge, so the contact radius is not too small
 
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.6e-3, 1.2e-3])
-def test_small_step_keeps_volume_and_base(base, depth_m):
+def test_small_step_conserves_volume_and_does_not_move_the_base(base, depth_m):
     assert not broken(mechanics.one_small_step(IndentedLayer(2e-3, 3e-3, base), depth_m))
 
 
@@ -108,7 +109,7 @@ def test_hoop_strain_on_the_axis():
 def test_forces_of_the_specification():
     np.testing.assert_allclose(
         force(DEPTHS_M), [0.09, 0.33, 0.74, 1.33, 2.08, 3.00], atol=0.006
-    )  # two printed decimals
+    )  # the specification has two decimals
 
 
 @settings(max_examples=15, deadline=None)

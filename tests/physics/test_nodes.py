@@ -1,4 +1,4 @@
-"""The quadrature of the skin: volume, polynomials and the seams of the magnets."""
+"""Tests of the quadrature nodes of the skin: total volume, exact polynomials, cells end at the seams of the magnets."""
 
 from itertools import pairwise, product
 
@@ -31,7 +31,7 @@ def test_cells_fill_the_skin(thickness_m, rule):
 
 
 @given(rules)
-def test_cells_respect_the_width_and_seams(rule):
+def test_cells_have_at_most_the_given_width_and_end_at_seams(rule):
     x_m = np.unique(place_nodes(THICKNESS_M, rule).nodes_m[:, 0])
     marks_m = np.array([-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2])
     for a_m, b_m in pairwise(marks_m):
@@ -46,7 +46,7 @@ def test_seams_are_those_of_the_magnet_array():
 
 
 @given(st.floats(1e-3, 60e-3), st.floats(1e-3, 60e-3), rules)
-def test_skins_of_any_size_are_filled(x_m, y_m, rule):
+def test_cells_fill_skins_of_any_size(x_m, y_m, rule):
     rest = place_nodes(THICKNESS_M, rule, sides_m=(x_m, y_m))
     np.testing.assert_allclose(rest.volumes_m3.sum(), x_m * y_m * THICKNESS_M, rtol=1e-12)
     for axis, side_m in enumerate((x_m, y_m)):
@@ -54,7 +54,7 @@ def test_skins_of_any_size_are_filled(x_m, y_m, rule):
         along_m = np.unique(rest.nodes_m[:, axis])
         for a_m, b_m in pairwise(marks_m):
             inside_m = along_m[(a_m < along_m) & (along_m < b_m)]
-            cells_n = round((b_m - a_m) / (2 * (inside_m[0] - a_m)))  # the first node is half a cell from the edge
+            cells_n = round((b_m - a_m) / (2 * (inside_m[0] - a_m)))  # the first node is half a cell away from the edge
             assert cells_n == len(inside_m)
             assert (b_m - a_m) / cells_n <= rule.cell_m * (1 + 1e-6)
 
@@ -68,7 +68,7 @@ def test_nodes_of_the_papers_skin_are_unchanged():
     np.testing.assert_array_equal(rest.nodes_m, naive_m)
 
 
-def test_six_layers_integrate_degree_eleven():
+def test_six_layers_integrate_polynomials_of_degree_eleven():
     rest = place_nodes(THICKNESS_M, DEFAULT_QUADRATURE)
     for power in range(12):
         mean = rest.volumes_m3 @ (rest.nodes_m[:, 2] / THICKNESS_M) ** power / rest.volumes_m3.sum()
@@ -83,12 +83,12 @@ def test_error_falls_with_the_square_of_the_cell():
         truth = 4 * np.sin(300 * half_m) / 300 * np.sin(200 * half_m) / 200 * THICKNESS_M
         return abs(rest.volumes_m3 @ wave / truth - 1)
 
-    # Powers of two of 6.35 mm and 3.65 mm, so that every cell is halved; 5 %: the next order of the midpoint rule
+    # Cell sizes are 6.35 mm and 3.65 mm divided by powers of two, so every cell is halved. 5 %: error of next order.
     coarse, fine = error(6.35e-3 / 8), error(6.35e-3 / 16)
     assert coarse / fine == pytest.approx(4, rel=0.05)
 
 
-def test_rotation_by_90_degrees():
+def test_nodes_are_symmetric_under_rotation_by_90_degrees():
     nodes_m = place_nodes(THICKNESS_M).nodes_m
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 

@@ -1,4 +1,4 @@
-"""Shear under a dragged tip compared with 50-digit arithmetic, a boundary value problem and published solutions."""
+"""Tests of shear under a dragged tip against 50-digit arithmetic, a boundary value problem, published solutions."""
 
 import mpmath
 import numpy as np
@@ -23,13 +23,13 @@ forces_N = st.tuples(st.floats(-3, 3), st.floats(-3, 3)).map(np.array)
 
 
 def of_shape(chi, radius_m):
-    """A traction whose transform is the integral of chi(x / a) cos(k x)."""
+    """Return a traction of radius a whose transform is the integral of chi(x / a) cos(k x) dx."""
     weights = layer.CONTACT_W * chi(layer.CONTACT_X)
     return Traction(radius_m, radius_m * layer.CONTACT_X, weights / weights.sum())
 
 
 def hertzian(radius_m=1.5e-3):
-    """q = 3 Q / (2 pi a^2) sqrt(1 - r^2 / a^2), whose transform is 3 (sin ka - ka cos ka) / (ka)^3."""
+    """Return q = 3 Q / (2 pi a^2) sqrt(1 - r^2 / a^2), whose transform is 3 (sin ka - ka cos ka) / (ka)^3."""
     return of_shape(lambda x: 1 - x**2, radius_m)
 
 
@@ -38,7 +38,7 @@ def sliding(depth_m=0.6e-3):
 
 
 def displacement_m(traction, places_m, thickness_m=H_M):
-    """The displacement as documented for `ShearMap`, per Q / G along x, without a table."""
+    """Return the displacement for a force along x, in units of Q / G, computed from the definition of `ShearMap`."""
     found = []
     for x, y, z in np.atleast_2d(places_m):
         r, f = np.hypot(x, y), np.arctan2(y, x)
@@ -48,7 +48,7 @@ def displacement_m(traction, places_m, thickness_m=H_M):
 
 
 def gradients(traction, places_m, step_m=2e-6):
-    """u_i,j by central differences; relative error 3e-4 for the field's shortest wavelength of 0.3 mm."""
+    """Return u_i,j by central differences; relative error of 3e-4 for the shortest wavelength, 0.3 mm."""
     steps = step_m * np.eye(3)
     pairs = [(displacement_m(traction, places_m + e) - displacement_m(traction, places_m - e)) for e in steps]
     return np.stack(pairs, axis=-1) / (2 * step_m)
@@ -60,14 +60,16 @@ def some_places_m(places_n=40, top=0.95):
     return np.stack([r_m * np.cos(f), r_m * np.sin(f), H_M * rng.uniform(0.05, top, places_n)], axis=1)
 
 
-def displace(force_N, nodes_m, of=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear_displacement):
-    of = shear.tabulate_depth(0.6e-3, **SKIN) if of is None else of
+def displace(
+    force_N, nodes_m, table=None, centre_m=(0.3e-3, -0.2e-3), modulus_Pa=YOUNG_PA, by=shear.shear_displacement
+):
+    table = shear.tabulate_depth(0.6e-3, **SKIN) if table is None else table
     force_N, centre_m = np.asarray(force_N, dtype=float), np.asarray(centre_m, dtype=float)
-    return by(of, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
+    return by(table, nodes_m, centre_m, force_N=force_N, modulus_Pa=modulus_Pa)
 
 
 @given(st.floats(0.01, 200), st.floats(0, 1))
-def test_response_equals_50_digits(kh, share):
+def test_response_of_the_layer_equals_50_digits(kh, share):
     with mpmath.workdps(250):
         a, z = mpmath.mpf(kh), mpmath.mpf(kh * share)
         size = mpmath.cosh(a) ** 2 + a**2
@@ -85,16 +87,16 @@ def test_response_equals_50_digits(kh, share):
         ]
     found = shear.wave_response(np.array([[kh * share]]), np.array([kh]))
     found = [found.w, found.w_slope, found.w_spin, found.v, found.v_slope]
-    # relative to tractions of 1; kz carries a rounding of 1e-16 kh into the exponents
+    # relative to a traction of 1; the rounding of kz adds 1e-16 kh to the exponents
     np.testing.assert_allclose([part[0, 0] for part in found], [float(part) for part in truth], atol=1e-13)
 
 
 @pytest.mark.parametrize("kh", [0.05, 0.5, 1.5, 4.0, 12.0])
 def test_response_solves_the_boundary_value_problem(kh):
-    """Equilibrium and Hooke's law at k = G = 1: two displacements and stresses in the wave's plane, one across it."""
+    """Reference: equilibrium and Hooke's law for k = G = 1, in the plane of the wave and across this plane."""
 
-    def slopes(_z, at):
-        along, up, shearing, normal, across, across_stress = at
+    def slopes(_z, state):
+        along, up, shearing, normal, across, across_stress = state
         return np.stack([shearing - up, along, normal + 4 * along, -shearing, across_stress, across])
 
     def ends(base, top):
@@ -113,26 +115,27 @@ def test_response_solves_the_boundary_value_problem(kh):
         "v_slope": across_stress,
     }
     for name, values in parts.items():
-        np.testing.assert_allclose(getattr(found, name)[:, 0], values, atol=1e-6, err_msg=name)  # 100 x tol
+        # 100 times the solver's tolerance
+        np.testing.assert_allclose(getattr(found, name)[:, 0], values, atol=1e-6, err_msg=name)
 
 
 def test_boundary_conditions_of_short_waves():
     kh = np.geomspace(1e-3, 500, 40)
     base, top = shear.wave_response(np.zeros((1, 40)), kh), shear.wave_response(kh[None], kh)
     np.testing.assert_allclose([base.w, base.w_slope, base.v], 0, atol=1e-15)
-    np.testing.assert_allclose(top.w_spin + 2 * top.w, 2, atol=1e-12)  # w'' + w = 2: stress T
+    np.testing.assert_allclose(top.w_spin + 2 * top.w, 2, atol=1e-12)  # w'' + w = 2 is the stress T at the surface
     np.testing.assert_allclose(top.v_slope, 1, atol=1e-14)
 
 
 def test_bettis_reciprocity_with_pressure():
-    """Betti: each load does equal work on the displacement of the other; `layer` solves the pressure."""
+    """Betti: each of two loads (pressure, traction) does the same work on the displacement by the other load."""
     kh = np.geomspace(1e-3, 100, 60)
     _, aside, _ = layer.depth_profile(kh[None], kh)
     np.testing.assert_allclose(shear.wave_response(kh[None], kh).w, aside, atol=1e-14)
 
 
 @pytest.mark.parametrize("radius_m", [0.6e-3, 1.5e-3])
-def test_surface_equals_johnson_minus_the_base(radius_m):
+def test_surface_equals_johnsons_half_space_minus_the_effect_of_the_base(radius_m):
     traction, r_m = hertzian(radius_m), np.linspace(0, radius_m, 12)
     found = shear.evaluate_map(traction, r_m, np.array([H_M]), thickness_m=H_M)[:, 0, :2].T
     # Johnson 1985, 3.91 at nu = 1/2: u_x = pi q0 / 32 G a (6 a^2 - 2.5 x^2 - 3.5 y^2), u_y = pi q0 / 32 G a x y
@@ -145,7 +148,7 @@ def test_surface_equals_johnson_minus_the_base(radius_m):
         return 3 * (np.sin(ka) - ka * np.cos(ka)) / ka**3 * missing * jv(order, k * r) / (8 * np.pi)
 
     base = [[quad(held, 1e-3, 25 / H_M, args=(r, order), limit=200)[0] for r in r_m] for order in (0, 2)]
-    # 1 % of the middle: the table has no waves below 0.3 mm
+    # 1 % of the displacement in the middle: waves shorter than 0.3 mm are missing
     np.testing.assert_allclose(found, free - np.array(base), atol=0.01 * found[0, 0])
 
 
@@ -160,33 +163,34 @@ def test_traction_is_the_only_shear_stress():
         for e in step_m * np.eye(3)[:2]
     ]
     q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
-    # 2 % of the peak: no waves shorter than 0.3 mm
+    # 2 % of the peak: waves shorter than 0.3 mm are missing
     np.testing.assert_allclose(along_z[:, 0] + slope[0], q_per_m2, atol=0.02 * q_per_m2[0])
     np.testing.assert_allclose(along_z[:, 1] + slope[1], 0, atol=0.02 * q_per_m2[0])
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(2e-3, H_M)])
-def test_every_level_carries_the_force(traction):
+def test_every_horizontal_plane_carries_the_force(traction):
     r_m, step_m = np.linspace(0, 12 * H_M, 1500), 1e-6
     for z_m in (0.0, 0.4 * H_M, 0.8 * H_M):
         z = np.array([z_m, z_m + step_m, z_m + 2 * step_m])
         along = shear.evaluate_map(traction, r_m, z, thickness_m=H_M)[..., 0]
         slope = (-3 * along[:, 0] + 4 * along[:, 1] - along[:, 2]) / (2 * step_m)
-        # u_x,z; the sum of u_z,x is zero. At a distance of 12 h shear has decayed to exp(-0.74 * 12), times the area.
+        # The integral of u_x,z; that of u_z,x is zero. At a distance of 12 h, shear has decayed to exp(-0.74 * 12)
+        # times the area.
         assert np.trapezoid(2 * np.pi * r_m * slope, r_m) == pytest.approx(1, abs=1e-3)
 
 
-def test_volume_is_kept_and_rotation_is_half_the_curl():
+def test_volume_is_conserved_and_rotation_is_half_the_curl():
     traction, places_m = sliding(), some_places_m()
     grad = gradients(traction, places_m)
     size = np.abs(grad).max()
-    np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)  # of differences
+    np.testing.assert_allclose(np.trace(grad, axis1=1, axis2=2), 0, atol=1e-5 * size)  # error of central differences
     truth = np.stack(
         [grad[:, 2, 1] - grad[:, 1, 2], grad[:, 0, 2] - grad[:, 2, 0], grad[:, 1, 0] - grad[:, 0, 1]], axis=1
     )
-    of = shear.tabulate(traction, H_M)
-    found = displace([YOUNG_PA / 3, 0], places_m, of, centre_m=(0, 0)).half_curl
-    np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # and of the table
+    table = shear.tabulate(traction, H_M)
+    found = displace([YOUNG_PA / 3, 0], places_m, table, centre_m=(0, 0)).half_curl
+    np.testing.assert_allclose(found, truth / 2, atol=2e-3 * size)  # error of central differences and of the table
 
 
 @pytest.mark.parametrize("force", [(1.0, 0.0), (-0.6, 0.8)])
@@ -195,29 +199,31 @@ def test_table_equals_direct_integration(force):
     found = displace(np.array(force) * YOUNG_PA / 3, places_m, shear.tabulate(traction, H_M), centre_m=(0, 0))
     turn = np.array([[force[0], -force[1], 0], [force[1], force[0], 0], [0, 0, 1]])
     truth_m = displacement_m(traction, places_m @ turn) @ turn.T
-    np.testing.assert_allclose(found.displacement_m, truth_m, atol=1e-3 * np.abs(truth_m).max())  # steps of 25 um
+    # the table has steps of 25 um
+    np.testing.assert_allclose(found.displacement_m, truth_m, atol=1e-3 * np.abs(truth_m).max())
 
 
 @pytest.mark.parametrize("radius_m", [0.05e-3, 0.3e-3])
-def test_stiffness_of_mindlin_on_thick_layers(radius_m):
+def test_stiffness_on_thick_layers_equals_mindlin(radius_m):
     assert not broken([mechanics.sticking(radius_m), mechanics.sliding(radius_m, TIP_M, "bonded")])
-    # mean of 6 a^2 - 3 r^2 over q ~ sqrt(a^2 - r^2) is 24/5 a^2: u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a
+    # The mean of 6 a^2 - 3 r^2, weighted by q ~ sqrt(a^2 - r^2), is 24/5 a^2: u = pi q0 a / 32 G * 24/5 = 9 Q / 40 G a.
     assert shear.tangential_stiffness_m(hertzian(radius_m), 100.0) == pytest.approx(40 / 9 * radius_m, rel=1e-4)
 
 
-def test_thin_layer_shears_like_a_block():
+def test_thin_layer_shears_uniformly():
     wide_m = np.array([4.0, 5.0, 6.0]) * H_M
     blocks_m = np.sqrt(
         [H_M / np.pi * shear.tangential_stiffness_m(shear.stick_traction(a_m, H_M), H_M) for a_m in wide_m]
     )
-    # k_t = pi G (a + seam)^2 / h with one seam for all radii, up to (h / a)^2
+    # k_t = pi G (a + seam)^2 / h, with the same seam for all radii, up to terms of (h / a)^2.
     np.testing.assert_allclose(np.diff(blocks_m), H_M, rtol=5e-3)
     seam = (blocks_m - wide_m) / H_M
     assert ((seam > 0.5) & (seam < 1)).all()
     middle_m = shear.evaluate_map(
         shear.stick_traction(3 * H_M, H_M), np.array([0.0]), np.linspace(0, H_M, 9), thickness_m=H_M
     )[0, :, 0]
-    np.testing.assert_allclose(middle_m / middle_m[-1], np.linspace(0, 1, 9), atol=0.01)  # u = q z / G, edges 3 h away
+    # u = q z / G; the edges are 3 h away
+    np.testing.assert_allclose(middle_m / middle_m[-1], np.linspace(0, 1, 9), atol=0.01)
 
 
 def test_sticking_contact_moves_rigidly():
@@ -227,24 +233,25 @@ def test_sticking_contact_moves_rigidly():
             :, 0, :2
         ].T
         mean_per_m = 1 / shear.tangential_stiffness_m(traction, H_M)
-        np.testing.assert_allclose(parts[0], mean_per_m, rtol=0.03)  # infinite traction at the edge, cut off at 0.3 mm
-        assert np.abs(parts[1]).max() < 0.05 * mean_per_m  # error of the axisymmetric shape
+        # the traction is infinite at the edge, which waves of 0.3 mm do not resolve
+        np.testing.assert_allclose(parts[0], mean_per_m, rtol=0.03)
+        assert np.abs(parts[1]).max() < 0.05 * mean_per_m  # error of assuming an axisymmetric traction
 
 
 @given(st.floats(0.05, 3), st.floats(-0.9, 5), st.floats(-0.9, 5))
-def test_sticking_is_the_stiffest_traction(a_h, square, fourth):
-    """Thomson: of all tractions with equal sum, that of the rigid motion stores the least energy."""
+def test_traction_of_a_sticking_contact_is_the_stiffest(a_h, square, fourth):
+    """Thomson: of all tractions with equal total force, that of a rigid contact stores the least energy."""
     other = of_shape(lambda x: 1 + square * x**2 + (1 + square) * fourth * x**4, a_h * H_M)
     best = shear.tangential_stiffness_m(shear.stick_traction(a_h * H_M, H_M), H_M)
     assert 0 < shear.tangential_stiffness_m(other, H_M) <= best * (1 + ROUNDING)
 
 
-def test_sum_of_limits_is_at_most_5_percent_too_stiff():
+def test_stiffness_formula_is_at_most_5_percent_too_stiff():
     a_m = np.geomspace(0.01, 6, 40) * H_M
     ratio = [shear.tangential_stiffness_m(shear.stick_traction(a, H_M), H_M) for a in a_m] / (
         16 / 3 * a_m + np.pi * a_m**2 / H_M
     )
-    # The formula is exact in both limits. Axisymmetric stick is at most as stiff as the true one.
+    # The formula is exact in both limits. The axisymmetric sticking contact is at most as stiff as the true one.
     assert ratio.max() < 1
     assert ratio.min() == pytest.approx(0.955, abs=0.005)
 
@@ -269,39 +276,39 @@ def test_displacement_is_linear(one_N, other_N, times):
 
 
 @given(forces_N, st.floats(-np.pi, np.pi))
-def test_rotation_of_force_and_nodes(force_N, angle_rad):
+def test_rotating_force_and_nodes_rotates_the_displacement(force_N, angle_rad):
     nodes_m, (c, s) = some_places_m(30), (np.cos(angle_rad), np.sin(angle_rad))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    still, turned = (
+    unrotated, turned = (
         displace(force_N, nodes_m, centre_m=(0, 0)),
         displace(turn[:2, :2] @ force_N, nodes_m @ turn.T, centre_m=(0, 0)),
     )
-    # a node at the edge of a table cell may be in the next cell, which has the same value
-    np.testing.assert_allclose(turned.displacement_m, still.displacement_m @ turn.T, atol=1e-10)
-    np.testing.assert_allclose(turned.half_curl, still.half_curl @ turn.T, atol=1e-9)
+    # rounding may move a node at the edge of a table cell to the next cell, which has the same value there
+    np.testing.assert_allclose(turned.displacement_m, unrotated.displacement_m @ turn.T, atol=1e-10)
+    np.testing.assert_allclose(turned.half_curl, unrotated.half_curl @ turn.T, atol=1e-9)
 
 
 def test_mirror_symmetry_along_the_force():
     nodes_m, mirror = some_places_m(), np.array([1, -1, 1])
-    here, there = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
-    np.testing.assert_allclose(there.displacement_m, here.displacement_m * mirror, atol=1e-18)
-    np.testing.assert_allclose(there.half_curl, -here.half_curl * mirror, atol=1e-15)  # an axial vector
+    here, mirrored = displace([0.5, 0], nodes_m, centre_m=(0, 0)), displace([0.5, 0], nodes_m * mirror, centre_m=(0, 0))
+    np.testing.assert_allclose(mirrored.displacement_m, here.displacement_m * mirror, atol=1e-18)
+    np.testing.assert_allclose(mirrored.half_curl, -here.half_curl * mirror, atol=1e-15)  # the curl is an axial vector
     back = displace([-0.5, 0], nodes_m * [-1, 1, 1], centre_m=(0, 0))
     np.testing.assert_allclose(back.displacement_m, here.displacement_m * [-1, 1, 1], atol=1e-18)
 
 
-def test_skin_follows_the_tip_and_leans_forward():
+def test_skin_moves_with_the_tip_and_rotates_forward():
     middle = displace([0.5, 0], np.array([[0.3e-3, -0.2e-3, H_M], [0.3e-3, -0.2e-3, H_M / 2]]))
     assert (middle.displacement_m[:, 0] > 0).all()
     assert not middle.displacement_m[:, 1:].any()
-    assert (middle.half_curl[:, 1] > 0).all()  # from z towards x
+    assert (middle.half_curl[:, 1] > 0).all()  # rotation from z towards x
     assert not middle.half_curl[:, [0, 2]].any()
 
 
 def test_base_and_far_nodes_do_not_move():
     base = displace([0.5, 0.3], some_places_m() * [1, 1, 0])
     assert not base.displacement_m.any()
-    assert base.half_curl.any()  # the material on the base shears and therefore rotates
+    assert base.half_curl.any()  # the material at the base shears and therefore rotates
     away = displace([0.5, 0.3], np.array([[0.0, 12.5e-3, 1e-3], [-30e-3, 0.0, 2e-3]]))
     assert not away.displacement_m.any()
     assert not away.half_curl.any()
@@ -309,28 +316,28 @@ def test_base_and_far_nodes_do_not_move():
 
 def test_displacement_beyond_the_reach_is_below_half_a_percent():
     for depth_m in DEPTHS_M:
-        of = shear.tabulate_depth(float(depth_m), **SKIN)
-        assert np.abs(of.parts[-1, :, :3]).max() < 0.005 * of.parts[..., 0].max()
+        table = shear.tabulate_depth(float(depth_m), **SKIN)
+        assert np.abs(table.parts[-1, :, :3]).max() < 0.005 * table.parts[..., 0].max()
 
 
-@settings(max_examples=10, deadline=None)  # a table takes 20 ms
+@settings(max_examples=10, deadline=None)  # each example computes a table in 20 ms
 @given(st.floats(0.1, 10), st.floats(0.1, 10))
-def test_scaling_of_size_and_stiffness(size, hardness):
+def test_displacement_scales_with_size_and_stiffness(size, hardness):
     nodes_m = some_places_m(30)
     large = shear.tabulate_depth(size * 0.6e-3, thickness_m=size * H_M, tip_radius_m=size * TIP_M, base="bonded")
     here = displace([0.5, 0.2], nodes_m, centre_m=(0, 0))
-    there = displace(
+    scaled = displace(
         [0.5 * hardness * size**2, 0.2 * hardness * size**2],
         size * nodes_m,
         large,
         (0, 0),
         modulus_Pa=hardness * YOUNG_PA,
     )
-    np.testing.assert_allclose(there.displacement_m, size * here.displacement_m, atol=1e-9 * size * 1e-3)
-    np.testing.assert_allclose(there.half_curl, here.half_curl, atol=1e-9)
+    np.testing.assert_allclose(scaled.displacement_m, size * here.displacement_m, atol=1e-9 * size * 1e-3)
+    np.testing.assert_allclose(scaled.half_curl, here.half_curl, atol=1e-9)
 
 
-# squares of numbers below 1e-150 lose digits
+# tolerance: squares of numbers below 1e-150 lose digits
 @given(st.floats(-20, 20).filter(lambda amount: amount == 0 or abs(amount) > 1e-150), st.floats(-np.pi, np.pi))
 def test_rotation_equals_polar_decomposition_in_simple_shear(amount, towards_rad):
     ahead = np.array([np.cos(towards_rad), np.sin(towards_rad), 0.0])
@@ -344,67 +351,69 @@ def test_rotation_equals_polar_decomposition_in_simple_shear(amount, towards_rad
     assert np.linalg.norm(axis) == pytest.approx(1)
 
 
-def test_traction_moves_by_force_over_stiffness():
+def test_mean_displacement_of_the_traction_is_force_over_stiffness():
     traction = hertzian()
-    of, r_m = shear.tabulate(traction, H_M), np.linspace(0, 1, 2000) * traction.radius_m
-    surface_per_m = np.interp(r_m, of.r_m, of.parts[:, -1, 0])
+    table, r_m = shear.tabulate(traction, H_M), np.linspace(0, 1, 2000) * traction.radius_m
+    surface_per_m = np.interp(r_m, table.r_m, table.parts[:, -1, 0])
     q_per_m2 = 1.5 / np.pi / traction.radius_m**2 * np.sqrt(1 - (r_m / traction.radius_m) ** 2)
     mean_per_m = np.trapezoid(2 * np.pi * r_m * q_per_m2 * surface_per_m, r_m)
-    assert mean_per_m == pytest.approx(1 / of.stiffness_m, rel=1e-3)  # no waves below 0.3 mm
+    # Tolerance: waves shorter than 0.3 mm are missing.
+    assert mean_per_m == pytest.approx(1 / table.stiffness_m, rel=1e-3)
 
 
-def shear_in_many_steps(force_N, nodes_m, of, steps_n):
-    """Apply the force in many small steps, updating nodes and traction; the centre rests at 0."""
-    at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / of.stiffness_m
+def shear_in_many_steps(force_N, nodes_m, table, steps_n):
+    """Reference: apply the force in many small steps; each step moves nodes and traction. The contact starts at 0."""
+    at_m, ahead_m = nodes_m, np.array(force_N) * 3 / YOUNG_PA / table.stiffness_m
     for step_i in range(steps_n):
         centre_m = ahead_m * (step_i + 0.5) / steps_n
-        half_m = at_m + displace(np.array(force_N) / steps_n, at_m, of, centre_m).displacement_m / 2
-        at_m = at_m + displace(np.array(force_N) / steps_n, half_m, of, centre_m).displacement_m
+        half_m = at_m + displace(np.array(force_N) / steps_n, at_m, table, centre_m).displacement_m / 2
+        at_m = at_m + displace(np.array(force_N) / steps_n, half_m, table, centre_m).displacement_m
     return at_m - nodes_m
 
 
 def test_midpoint_steps_equal_many_small_steps():
     nodes_m, over = [0.5, 0.5, 1] * some_places_m(200), []
-    for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):  # mu = 0.8, 0.4, 0.8; 1, 1, 2 steps
-        of = shear.tabulate_depth(depth_m, **SKIN)
-        truth_m = shear_in_many_steps([force_N, 0], nodes_m, of, 48)
+    # friction coefficients 0.8, 0.4, 0.8; the code takes 1, 1, 2 steps
+    for depth_m, force_N in ((0.6e-3, 0.59), (0.6e-3, 0.59 / 2), (1.2e-3, 2.40)):
+        table = shear.tabulate_depth(depth_m, **SKIN)
+        truth_m = shear_in_many_steps([force_N, 0], nodes_m, table, 48)
         found_m, one_shot_m = (
-            displace([force_N, 0], nodes_m, of, (0, 0), by=by).displacement_m
+            displace([force_N, 0], nodes_m, table, (0, 0), by=by).displacement_m
             for by in (shear.shear_in_steps, shear.shear_displacement)
         )
         over.append(np.abs(found_m - truth_m).max() / np.abs(truth_m).max())
         assert over[-1] < np.abs(one_shot_m - truth_m).max() / np.abs(truth_m).max() / 5
     assert over[0] < 0.02
     assert over[2] < 0.05
-    assert over[1] < over[0] / 3  # second order: 4, and the table's corners
+    assert over[1] < over[0] / 3  # second order would give a factor of 4; less, because of the corners of the table
 
 
-def test_small_force_needs_no_midpoint():
+def test_small_force_needs_no_midpoint_step():
     nodes_m = some_places_m()
     once, half_way = (
         displace([3e-5, -4e-5], nodes_m, by=by) for by in (shear.shear_displacement, shear.shear_in_steps)
     )
     size_m = np.abs(once.displacement_m).max()
-    # half of 0.1 um, in a field that varies over 1 mm
+    # tolerance: half of the displacement of 0.1 um, in a field that varies over 1 mm
     np.testing.assert_allclose(half_way.displacement_m, once.displacement_m, atol=2e-4 * size_m)
 
 
-def test_carried_nodes_rotate_with_the_force():
+def test_displacement_of_moved_nodes_rotates_with_the_force():
     nodes_m, turn = some_places_m(), np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
     here = displace([0.5, 0], nodes_m, centre_m=(0, 0), by=shear.shear_in_steps)
-    there = displace([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
-    np.testing.assert_allclose(there.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
-    np.testing.assert_allclose(there.half_curl, here.half_curl @ turn.T, atol=1e-12)
+    rotated = displace([0.3, 0.4], nodes_m @ turn.T, centre_m=(0, 0), by=shear.shear_in_steps)
+    np.testing.assert_allclose(rotated.displacement_m, here.displacement_m @ turn.T, atol=1e-15)
+    np.testing.assert_allclose(rotated.half_curl, here.half_curl @ turn.T, atol=1e-12)
     assert not displace([0.5, 0.3], nodes_m * [1, 1, 0], by=shear.shear_in_steps).displacement_m.any()
 
 
 @pytest.mark.parametrize("traction", [sliding(), shear.stick_traction(1.2 * H_M, H_M)])
-def test_steepest_place_of_the_table(traction):
-    of, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
-    r_m, f = (part.ravel() for part in np.meshgrid(of.r_m[:200], np.linspace(0, np.pi, 13)))
+def test_steepest_gradient_of_the_table(traction):
+    table, force_N = shear.tabulate(traction, H_M), np.array([YOUNG_PA / 3, 0.0])
+    r_m, f = (part.ravel() for part in np.meshgrid(table.r_m[:200], np.linspace(0, np.pi, 13)))
     places_m = np.stack([r_m * np.cos(f), r_m * np.sin(f), np.full_like(r_m, H_M)], axis=1)
-    largest = np.linalg.norm(displace(force_N, places_m, of, (0, 0)).half_curl, axis=1).max()
-    assert of.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: next to a place of the table
+    largest = np.linalg.norm(displace(force_N, places_m, table, (0, 0)).half_curl, axis=1).max()
+    assert table.steepest_per_m2 == pytest.approx(largest, rel=1e-6)  # rounding of places: next to a point of the table
 
 
 def test_nodes_above_the_surface_move_with_it():
@@ -416,19 +425,22 @@ def test_nodes_above_the_surface_move_with_it():
 @pytest.mark.parametrize(
     ("depth_m", "force_N", "loss"), [(0.6e-3, 0.5, 0.03), (0.6e-3, 0.59, 0.05), (0.8e-3, 1.0, 0.08)]
 )
-def test_midpoint_steps_keep_volume(depth_m, force_N, loss):
-    of, step_m = shear.tabulate_depth(depth_m, **SKIN), 20e-6
+def test_midpoint_steps_conserve_volume(depth_m, force_N, loss):
+    table, step_m = shear.tabulate_depth(depth_m, **SKIN), 20e-6
     sides_m = np.linspace(-3.5e-3, 3.5e-3, 36), np.linspace(0, 2.5e-3, 8), np.linspace(0.05, 0.95, 10) * H_M
     places_m = np.stack(np.meshgrid(*sides_m), axis=-1).reshape(-1, 3)
     losses = []
     for by in (shear.shear_displacement, shear.shear_in_steps):
         ends = [
-            [displace([force_N, 0], places_m + sign * e, of, (0, 0), by=by).displacement_m for e in step_m * np.eye(3)]
+            [
+                displace([force_N, 0], places_m + sign * e, table, (0, 0), by=by).displacement_m
+                for e in step_m * np.eye(3)
+            ]
             for sign in (1, -1)
         ]
         grad = np.moveaxis(np.array(ends[0]) - np.array(ends[1]), 0, -1) / (2 * step_m)
         losses.append(np.abs(np.linalg.det(np.eye(3) + grad) - 1))
-    assert losses[1].max() < loss  # grows with steepness; midpoint steps are second order
+    assert losses[1].max() < loss  # the loss grows with the gradient; midpoint steps are of second order
     assert losses[0].max() > 4 * losses[1].max()
     assert losses[0].mean() > 4 * losses[1].mean()
 

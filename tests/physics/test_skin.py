@@ -1,4 +1,4 @@
-"""The change of field under a poke, compared with a naive loop; quadrature, symmetries, no contact, amplitude."""
+"""Tests of the field change by a poke against a naive loop; quadrature, symmetries, no contact, amplitude, sliding."""
 
 import numpy as np
 import pytest
@@ -19,11 +19,12 @@ from tests.physics.test_board import draw_board, no_spread, spreads
 EXACT, UNEVEN = no_spread(), spreads()
 SEATED = no_spread(skin_seat_mm=0.35)
 BOARD = draw_board(board_design(), EXACT, seed=0, name="b0")
-PEAK_T = 1e-3  # size of the fields; tolerances are rounding relative to it
-COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)  # COARSE for laws that hold for any rule, SPARSE for draws
-DEPTH_M = 0.6e-3  # these laws hold at any depth, and a single depth needs only one table
+PEAK_T = 1e-3  # magnitude of the fields; tolerances for rounding are relative to this value
+# COARSE for laws that hold for any quadrature, SPARSE for random draws
+COARSE, SPARSE = Quadrature(1e-3, 3), Quadrature(5e-3, 1)
+DEPTH_M = 0.6e-3  # the tested laws hold at any depth; a single depth needs only one table
 places_m = st.floats(-8e-3, 8e-3)
-# No deadline: the first example computes the tables for all others.
+# No deadline: the first example computes the tables of all examples.
 patient = settings(max_examples=20, deadline=None)
 
 
@@ -61,7 +62,7 @@ def table_of(one, rest, depth_m):
 
 
 def change_by_loop(one, board, poke_m):
-    """Sum the field difference of each moving node, as specified."""
+    """Reference: sum the field differences of all moving nodes in a loop."""
     moved, total_T = move_dipoles(one, poke_m), np.zeros_like(board.chips_m)
     for i, place, after in zip(moved.i, *moved.after, strict=True):
         for chip_i, chip in enumerate(board.chips_m):
@@ -83,8 +84,8 @@ def test_poke_equals_loop_over_rotated_dipoles(base):
     np.testing.assert_allclose(change(poke_m, one), truth_T, atol=1e-12 * PEAK_T)
 
 
-def test_material_leans_towards_the_dent():
-    # Beside the tip the surface slopes down towards the axis, so an arrow that points up leans inwards over the dent.
+def test_moments_beside_the_tip_rotate_towards_the_dent():
+    # Beside the tip, the surface slopes down towards the axis, so a moment that points up rotates towards the axis.
     one = skin()
     moved = move_dipoles(one, (0.0, 0.0, DEPTH_M))
     start_m, _ = moved.before
@@ -100,9 +101,10 @@ def test_material_leans_towards_the_dent():
 
 @pytest.mark.parametrize("base", ["bonded", "slipping"])
 @pytest.mark.parametrize("depth_m", [0.2e-3, 1.0e-3])
-def test_quadrature_error(depth_m, base):
-    # Compares dB, not the field at rest; the pattern is shifted, so that no symmetry hides errors. For a shallow
-    # indentation over a seam 2 % is below the resolution of a chip: there the bound is a tenth of its noise, 3.3 uT.
+def test_error_of_the_quadrature_in_use(depth_m, base):
+    # Compares field changes, not fields at rest. The magnet pattern is shifted, so that no symmetry hides errors. For a
+    # shallow indentation over a seam, 2 % would be below the resolution of a chip: there the limit is a tenth of the
+    # chip's noise of 3.3 uT.
     rules = (
         DEFAULT_QUADRATURE,
         Quadrature(DEFAULT_QUADRATURE.cell_m / 2, DEFAULT_QUADRATURE.layers_n),
@@ -113,8 +115,8 @@ def test_quadrature_error(depth_m, base):
     assert not broken(mechanics.quadrature(BOARD, used, tuple(fine), rules=rules, pokes_m=pokes_m, unseen_uT=0.33))
 
 
-def test_rotation_of_moments_matters():
-    # 156-242 % over indentations of the grid: moments are rotated, R.M, not only moved
+def test_field_change_without_rotation_of_moments_is_wrong():
+    # Without rotation (R.M) of the moments, dB is wrong by 156-242 % for indentations on the grid.
     one, wrong, size = skin(SEATED, rule=DEFAULT_QUADRATURE), [], []
     for place in ((0.0, 0.0), (4e-3, 0.0), (-4e-3, 4e-3), (2e-3, -6e-3)):
         moved = move_dipoles(one, (*place, DEPTH_M))
@@ -152,7 +154,7 @@ def test_extreme_skins_and_pokes(base):
         *stability.amplitude(BOARD, usual, bare, strong), stability.same_seed(usual, again, renamed),
     ]  # fmt: skip
     assert not broken(cases)
-    assert not change((1e-3, 2e-3, -usual.depth_zero_m), usual).any()  # the tip just touches
+    assert not change((1e-3, 2e-3, -usual.depth_zero_m), usual).any()  # the tip touches without indenting
 
 
 @patient
@@ -174,8 +176,8 @@ def test_high_tip_makes_no_contact():
     assert not change((0.0, 0.0, 0.05e-3), high).any()
 
 
-def test_offsets_of_skin_and_poke():
-    # Shifting the skin is equivalent to shifting poke and sensors the other way.
+def test_shifting_skin_or_poke_and_board_is_equivalent():
+    # Shifting the skin is equivalent to shifting poke and chips in the opposite direction.
     exact, seated = skin(), skin(SEATED)
     assert np.abs(seated.seat_m).min() > 0
     there_m = np.append(seated.seat_m, 0.0)
@@ -187,15 +189,16 @@ def test_offsets_of_skin_and_poke():
 
 
 def test_wider_skin_changes_nothing_far_from_its_edges():
-    # 8 and 12 cubes are both even, so the same poles are over the chips, which are at least 25 mm from the edges.
+    # 8 and 12 magnets are both even numbers, so the same poles are over the chips, which are 25 mm or more from the
+    # edges.
     wide, wider = (
         draw_skin(design(), EXACT, seed=0, name="s0", rule=COARSE, sides_m=(side_m, side_m))
         for side_m in (50.8e-3, 76.2e-3)
     )
     poke_m = (1.3e-3, -2.1e-3, DEPTH_M)
     once_T, again_T = change(poke_m, wide), change(poke_m, wider)
-    # Only the magnets beyond the edge differ there; they alternate, so their fields nearly cancel. On the authors'
-    # skin of 20 mm, whose outer chips are 3 mm from an edge, the same poke differs from one on an infinite skin.
+    # The two skins differ only by alternating magnets beyond the edge, whose fields nearly cancel. On the authors' skin
+    # of 20 mm, whose outer chips are 3 mm from an edge, the same poke gives another dB than on an infinite skin.
     assert np.linalg.norm(once_T - again_T) < 1e-4 * np.linalg.norm(again_T)
     assert np.linalg.norm(change(poke_m) - again_T) > 3e-3 * np.linalg.norm(again_T)
 
@@ -215,7 +218,7 @@ def test_many_pokes_equal_single_pokes():
         np.testing.assert_array_equal(of_many, change(poke_m))
 
 
-@pytest.mark.parametrize(  # each pair of a base, a thickness and a kind of depth once
+@pytest.mark.parametrize(  # covers each pair of base, thickness and kind of depth once
     ("base", "thickness_mm", "at", "error"),
     [
         ("bonded", 1.82, 0.0, 0.003),
@@ -225,8 +228,9 @@ def test_many_pokes_equal_single_pokes():
     ],
 )
 def test_tables_equal_following_nodes(thickness_mm, at, error, base):
-    # 1.82 mm is halfway between two tables. At the tables' depths this is the error of interpolation in R/h and r.
-    # Between these depths it is 0.6 %: following ends with half a step, which changes dB as much (flow.STEP).
+    # A thickness of 1.82 mm is halfway between two tables. At tabulated depths, this is the error of interpolation in
+    # R/h and r. Between them, the error is 0.6 %: following a node ends with half a step, which changes dB as much
+    # (flow.STEP).
     one = skin(SEATED, thickness_mm=thickness_mm, base=base)
     ladder_m = one.thickness_m * deformation.depth_scale(one.tip_radius_m / one.thickness_m) * deformation.LADDER
     for rung_i in (6, 16, 22):
@@ -235,7 +239,7 @@ def test_tables_equal_following_nodes(thickness_mm, at, error, base):
             (float(poke_m[2]),), layer.IndentedLayer(one.thickness_m, one.tip_radius_m, base)
         )
         truth = mechanics.follow_dipoles(one, poke_m[:2], depths_m)
-        # On a bonded base nothing moves past the table's reach.
+        # On a bonded base, nothing moves beyond the reach of the table.
         near = np.linalg.norm(
             one.nodes_m[:, :2] - poke_m[:2], axis=1, keepdims=True
         ) < one.thickness_m * deformation.reach(one.tip_radius_m / one.thickness_m, base)
@@ -247,7 +251,7 @@ def test_tables_equal_following_nodes(thickness_mm, at, error, base):
 
 def test_draws_have_the_given_spreads():
     skins = [skin(UNEVEN, f"s{i}", SPARSE) for i in range(100)]
-    # 25 %: three and a half times the sampling error 1 / sqrt(2 n) of 100 skins
+    # 25 %: three and a half standard errors 1 / sqrt(2 n) for 100 skins
     assert np.std([one.seat_m for one in skins]) == pytest.approx(0.25e-3, rel=0.25)
     np.testing.assert_allclose([one.nodes_m[:, :2].mean(axis=0) for one in skins], [one.seat_m for one in skins])
     assert np.std([one.depth_zero_m for one in skins]) == pytest.approx(0.05e-3, rel=0.25)
@@ -256,17 +260,17 @@ def test_draws_have_the_given_spreads():
 
 
 def test_filler_and_amplitude_scale_the_moments():
-    # The nodes of a single layer are at half height, where the field vanishes at seam crossings but not at nodes.
+    # Nodes of a single layer are at half height, where the field is zero at crossings of seams but not at nodes.
     exact = np.linalg.norm(skin(rule=SPARSE).moments_A_m2, axis=1)
     for spread, within in ((no_spread(skin_amplitude=0.1), False), (no_spread(skin_filler=0.1), True)):
-        drawn = [np.linalg.norm(skin(spread, f"s{i}", SPARSE).moments_A_m2, axis=1) for i in range(60)]
-        factors = np.log(np.array(drawn) / exact)
-        assert np.std(factors) == pytest.approx(0.1, rel=0.3)  # three times the sampling error of 60 skins
+        moments = [np.linalg.norm(skin(spread, f"s{i}", SPARSE).moments_A_m2, axis=1) for i in range(60)]
+        factors = np.log(np.array(moments) / exact)
+        assert np.std(factors) == pytest.approx(0.1, rel=0.3)  # three standard errors for 60 skins
         assert (np.std(factors, axis=1).min() > 0.01) == within
 
 
-def test_field_at_rest_has_the_recorded_magnitude():
-    # Recorded B0 in-plane up to 3.6 mT; a factor of two, since the amplitude is one number for all skins.
+def test_field_at_rest_has_the_magnitude_of_recordings():
+    # Recorded in-plane fields at rest are up to 3.6 mT. Factor of two, because all skins have the same amplitude.
     rest_T, _ = changes_of_field(BOARD, skin(rule=DEFAULT_QUADRATURE), np.zeros((0, 3)))
     assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3
@@ -274,13 +278,14 @@ def test_field_at_rest_has_the_recorded_magnitude():
 
 def test_slipping_skin_is_softer_and_reaches_farther():
     bonded, slipping = skin(), skin(base="slipping")
-    assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))  # 1.8 times at 1.2 mm
+    # at 1.2 mm, the bonded skin is 1.8 times as stiff
+    assert forces(slipping, np.array([1e-3])) < 0.7 * forces(bonded, np.array([1e-3]))
     far = [np.linalg.norm(change((-8e-3, 0.0, 1e-3), one)[3]) for one in (bonded, slipping)]  # chip 3, 15 mm away
     assert far[1] > 10 * far[0]
 
 
-def test_force_of_the_specification():
-    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)  # known to two digits
+def test_force_equals_the_specification():
+    assert forces(skin(), np.array([1.2e-3])) == pytest.approx(3.0, rel=0.05)  # the specification has two digits
 
 
 @pytest.mark.parametrize("place_m", [(10.1e-3, 0.0), (0.0, -12e-3), (np.nan, 0.0)])
@@ -289,7 +294,7 @@ def test_poke_beside_the_skin_is_refused(place_m):
         change((*place_m, DEPTH_M))
 
 
-def test_edge_is_that_of_the_skin():
+def test_edge_for_pokes_is_the_edge_of_the_skin():
     one = skin(SEATED)
     corner_m = np.append(one.seat_m + np.sign(one.seat_m) * 9.99e-3, 0.0)
     assert np.abs(corner_m).max() > 10e-3
@@ -307,7 +312,7 @@ def test_invalid_depth_is_refused(depth_m):
 def test_unverified_depths_are_counted():
     one = skin()
     high, low = (type(one)(**{**one.__dict__, "depth_zero_m": zero_m}) for zero_m in (-0.1e-3, 0.1e-3))
-    depths_m = np.array([0.6, 1.15, 1.25]) * 1e-3  # verified to 1.2 mm of true depth
+    depths_m = np.array([0.6, 1.15, 1.25]) * 1e-3  # the model is verified up to a true depth of 1.2 mm
     assert [count_beyond_verified(skin_, depths_m) for skin_ in (high, one, low)] == [0, 1, 2]
 
 
@@ -327,7 +332,8 @@ def test_held_skin_slides_rigidly():
     assert np.abs(apart_m[:, 2]).max() == 0
     distance_m = np.linalg.norm(held_m[0][:50, None] - held_m[0][50:100], axis=2)
     np.testing.assert_allclose(distance_m, np.linalg.norm(free_m[0][:50, None] - free_m[0][50:100], axis=2), rtol=1e-9)
-    # The skin at the poke moves by give - away (1 - load) p, with p from the middle, limited by friction.
+    # At the poke, the skin moves by give - away (1 - load) p, where p is the place relative to the middle; friction
+    # limits the move.
     away_m, depth_m = poke_m[0, :2] - one.seat_m, poke_m[0, 2:]
     (normal_N,) = forces(one, depth_m)
     taken_m = (48e-6, 7e-6) - 6e-3 * (1 - normal_N / one.modulus_Pa / 40e-6) * away_m
@@ -336,11 +342,11 @@ def test_held_skin_slides_rigidly():
     assert 0.2 < share < 0.9
     nearest = np.argmin(np.linalg.norm(free_m[0][:, :2] - poke_m[0, :2], axis=1))
     np.testing.assert_allclose(apart_m[nearest, :2], share * taken_m, atol=2e-6)
-    still = held_skin(give_um=(0.0, 0.0), away_um_mm=0.0)
-    np.testing.assert_array_equal(change(poke_m[0], still), change(poke_m[0], free))
+    without_slide = held_skin(give_um=(0.0, 0.0), away_um_mm=0.0)
+    np.testing.assert_array_equal(change(poke_m[0], without_slide), change(poke_m[0], free))
 
 
-def test_force_on_a_held_skin():
+def test_force_needed_on_a_skin_held_by_springs():
     one, free = held_skin(EXACT), skin(base="slipping")
     depth_m = np.array([0.4e-3, 1.0e-3])
     stiffer = (1 - depth_m / one.thickness_m) ** -1.5

@@ -1,4 +1,4 @@
-"""The slide of a finite skin: least drag over pieces, closed forms on a square, no slide without a force."""
+"""Tests of the sliding of a finite skin: least drag over pieces, closed forms on a square, no sliding without force."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def one(place_m, taken_m, sides_m=SQUARE) -> tuple[np.ndarray, float]:
 
 
 def drag_matrix(pieces_n, sides_m):
-    """Reference: the matrix of the drag of a motion (f_x, f_y, theta), summed over pieces."""
+    """Reference: return the matrix of the quadratic drag of a rigid motion (f_x, f_y, theta), summed over pieces."""
     drag = np.zeros((3, 3))
     for i in range(pieces_n):
         for j in range(pieces_n):
@@ -36,8 +36,8 @@ def drag_matrix(pieces_n, sides_m):
 @pytest.mark.parametrize("sides_m", [SQUARE, (20e-3, 50e-3)])
 def test_motion_minimises_the_drag(sides_m):
     place_m, taken_m = np.array([6e-3, -3e-3]), np.array([4e-5, 7e-5])
-    # Least drag for a given displacement of the place, by Lagrange's equations. With 80 pieces per side, rho^2 is off
-    # by 1/80^2.
+    # Reference: least drag for a given displacement at the place, by Lagrange multipliers. With 80 pieces per side,
+    # rho^2 has a relative error of 1/80^2.
     held = np.array([[1, 0, -place_m[1]], [0, 1, place_m[0]]])
     equations = np.block([[drag_matrix(80, sides_m), held.T], [held, np.zeros((2, 2))]])
     *expected, spin_rad = np.linalg.solve(equations, np.append(np.zeros(3), taken_m))[:3]
@@ -61,7 +61,7 @@ def test_place_moves_by_the_given_displacement(place_m, taken_m):
 
 
 @given(place, taken)
-def test_quarter_turn_and_radial_pull(place_m, taken_m):
+def test_slide_under_quarter_turns_and_radial_pulls(place_m, taken_m):
     (move_m, spin_rad), quarter = one(place_m, taken_m), np.array([[0, -1], [1, 0]])
     turned_m, turned_rad = one(quarter @ place_m, quarter @ taken_m)
     np.testing.assert_allclose(turned_m, quarter @ move_m, atol=1e-18, rtol=1e-12)
@@ -72,13 +72,14 @@ def test_quarter_turn_and_radial_pull(place_m, taken_m):
 def test_displacement_follows_force_and_distance():
     places_m = np.array([[4e-3, 0.0]] * 3)
     found_m = slide.press_displacement_m(places_m, np.array([0.0, 0.5, 1.0]), give_m=(5e-5, 1e-5), away=7e-3)
-    # 7 um/mm 4 mm from the middle is 28 um, half of it at half of the load that lets go.
+    # 7 um/mm at 4 mm from the middle is 28 um at zero force, and half of that at half the force at which this slide
+    # vanishes.
     np.testing.assert_allclose(found_m, [[2.2e-5, 1e-5], [3.6e-5, 1e-5], [5e-5, 1e-5]], atol=1e-18)
 
 
 @given(place, st.floats(1e3, 1e5))
-def test_force_and_motion_agree(place_m, springs_N_per_m):
-    # Evenly spread springs: the force moves the skin by f / springs and rotates it by its moment over springs rho^2.
+def test_motion_equals_force_over_springs(place_m, springs_N_per_m):
+    # Uniform springs of stiffness k: a force moves the skin by f / k and rotates the skin by moment / (k rho^2).
     force_N, (x, y) = np.array([0.7, -0.4]), place_m
     taken_m = slide.compliance_m_per_N(np.array([place_m]), SQUARE, springs_N_per_m)[0] @ force_N
     move_m, spin_rad = one(place_m, taken_m)
@@ -88,7 +89,7 @@ def test_force_and_motion_agree(place_m, springs_N_per_m):
 
 
 @given(place, taken, st.floats(1e-6, 20.0))
-@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # dividing a force by it overflows
+@example((0.0, 0.0), (0.0, 2.2e-313), 1.0)  # dividing a force by this displacement overflows
 def test_friction_bounds_the_slide(place_m, taken_m, force_N):
     hold = slide.HoldDesign(**HELD).in_si()
     whole = slide.rigid_motion(np.array([place_m]), np.array([taken_m]), SQUARE)
@@ -97,14 +98,14 @@ def test_friction_bounds_the_slide(place_m, taken_m, force_N):
     assert sideways_N <= min(0.8 * force_N, hold.springs_N_per_m * np.hypot(*whole.move_m[0])) * (1 + 1e-12)
     moves, (x, y), (whole_x, whole_y) = whole.move_m.any(), found.move_m[0], whole.move_m[0]
     assert x * whole_y == pytest.approx(y * whole_x, rel=1e-12, abs=1e-24)
-    if moves:  # motion and spin are limited by the same factor, 1 - exp(-mu F / k u)
+    if moves:  # displacement and rotation are limited by the same factor, 1 - exp(-mu F / k u)
         with np.errstate(over="ignore"):
             share = 1 - np.exp(-0.8 * force_N / (7e3 * np.hypot(whole_x, whole_y)))
         np.testing.assert_allclose(found.move_m, share * whole.move_m, rtol=1e-9, atol=1e-20)
         np.testing.assert_allclose(found.spin_rad, share * whole.spin_rad, rtol=1e-9, atol=1e-20)
 
 
-def test_firm_press_takes_the_whole_slide():
+def test_firm_press_moves_the_skin_by_the_full_slide():
     whole = slide.RigidMotion(np.array([[5e-5, 0.0], [0.0, 0.0]]), np.array([1e-3, 0.0]))
     for force_N, share in ((0.0, 0.0), (1e3, 1.0)):
         found = slide.limit_by_friction(whole, np.full(2, force_N), 8750.0)
@@ -112,7 +113,7 @@ def test_firm_press_takes_the_whole_slide():
         np.testing.assert_array_equal(found.spin_rad, share * whole.spin_rad)
 
 
-def test_zero_slide_keeps_the_slipping_flow():
+def test_zero_slide_leaves_the_flow_on_a_slipping_base():
     rng = np.random.default_rng(0)
     heights = (0.2, 0.8)
     nodes_m = np.column_stack([rng.uniform(-8e-3, 8e-3, (60, 2)), H_M * rng.choice(heights, 60)])
@@ -120,8 +121,8 @@ def test_zero_slide_keeps_the_slipping_flow():
     table = deformation.tabulate(H_M, 2e-3, 0.8e-3, heights=rest.heights, base="slipping")
     moved = deformation.move_dipoles(table, rest, np.array([3e-3, -2e-3, 0.8e-3]))
     place_m = np.array([[3e-3, -2e-3]])
-    still = slide.rigid_motion(place_m, slide.press_displacement_m(place_m, np.array([0.2]), **STILL), SQUARE)
-    after = slide.apply(still, 0, moved.after)
+    without_slide = slide.rigid_motion(place_m, slide.press_displacement_m(place_m, np.array([0.2]), **STILL), SQUARE)
+    after = slide.apply(without_slide, 0, moved.after)
     for found, expected in zip(after, moved.after, strict=True):
         assert np.array_equal(found, expected)
     chips_m = np.array([[0.0, 0.0, -1e-3]])
@@ -150,30 +151,34 @@ TIP = {"thickness_m": H_M, "tip_radius_m": 2e-3}
 
 @given(st.floats(0, 0.71 * H_M), st.floats(1e5, 1e7))
 def test_depth_inverts_force(depth_m, modulus_Pa):
-    of = TIP | {"modulus_Pa": modulus_Pa}
-    found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **of), **of)
+    layer_settings = TIP | {"modulus_Pa": modulus_Pa}
+    found_m = slide.depth_at(slide.force_at(np.array([depth_m]), **layer_settings), **layer_settings)
     assert abs(found_m[0] - depth_m) < 1e-6 * H_M
 
 
 def test_force_limits():
-    of = TIP | {"modulus_Pa": 2e5}
+    layer_settings = TIP | {"modulus_Pa": 2e5}
     np.testing.assert_allclose(  # incompressible: 4/3 E / (1 - 1/4) sqrt(R) d^(3/2)
-        slide.force_at(np.array([0.0, 1e-9]), **of), [0, 16 / 9 * 2e5 * np.sqrt(2e-3) * 1e-9**1.5], rtol=2e-3
+        slide.force_at(np.array([0.0, 1e-9]), **layer_settings),
+        [0, 16 / 9 * 2e5 * np.sqrt(2e-3) * 1e-9**1.5],
+        rtol=2e-3,
     )
     at_m = np.array([0.75 * H_M])
-    assert slide.force_at(at_m, **of)[0] == pytest.approx(8 * layer.force(at_m, **of, base="slipping")[0])
-    assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(slide.DEEPEST * H_M)
-    assert slide.count_clipped(np.array([1.0, 1e6]), **of) == 1
-    assert slide.force_at(np.array([-1e-6]), **of)[0] == 0  # above the skin
+    assert slide.force_at(at_m, **layer_settings)[0] == pytest.approx(
+        8 * layer.force(at_m, **layer_settings, base="slipping")[0]
+    )
+    assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(slide.DEEPEST * H_M)
+    assert slide.count_clipped(np.array([1.0, 1e6]), **layer_settings) == 1
+    assert slide.force_at(np.array([-1e-6]), **layer_settings)[0] == 0  # the tip is above the skin
     for wrong_m in (H_M, np.nan):
         with pytest.raises(ParamsError, match="poke: depth must be finite and below"):
-            slide.force_at(np.array([wrong_m]), **of)
+            slide.force_at(np.array([wrong_m]), **layer_settings)
     with pytest.raises(ParamsError, match="modulus must be above"):
-        slide.depth_at(np.array([1.0]), **(of | {"modulus_Pa": 0.0}))
+        slide.depth_at(np.array([1.0]), **(layer_settings | {"modulus_Pa": 0.0}))
 
 
 def test_sharp_tip_is_limited_by_its_radius():
-    of = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
-    assert slide.depth_at(np.array([0.1]), **of)[0] < 0.5e-3
-    assert slide.depth_at(np.array([1e6]), **of)[0] == pytest.approx(0.999 * 0.5e-3)
-    assert slide.count_clipped(np.array([1e-3, 1e6]), **of) == 1
+    layer_settings = {"thickness_m": H_M, "tip_radius_m": 0.5e-3, "modulus_Pa": 2e5}
+    assert slide.depth_at(np.array([0.1]), **layer_settings)[0] < 0.5e-3
+    assert slide.depth_at(np.array([1e6]), **layer_settings)[0] == pytest.approx(0.999 * 0.5e-3)
+    assert slide.count_clipped(np.array([1e-3, 1e6]), **layer_settings) == 1

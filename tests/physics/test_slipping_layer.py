@@ -1,4 +1,4 @@
-"""The slipping layer compared with a dense 50-digit solution, its limits and the bonded layer."""
+"""Tests of the slipping layer against a dense 50-digit solution, limits, and the bonded layer."""
 
 import mpmath
 import numpy as np
@@ -20,7 +20,7 @@ def test_profile_and_compliance_equal_dense_solve(kh, share):
         w, z = mechanics.dense_profile(mpmath.mpf(kh)), mpmath.mpf(kh) * mpmath.mpf(share)
         truth = [float(mpmath.diff(w, z, n)) for n in range(3)]
     found = layer.depth_profile(np.array([[kh * share]]), np.array([kh]), "slipping")
-    # 1e-10: for long waves the profile is a difference of numbers larger by 1 / (kh)^2
+    # 1e-10: for long waves, the profile is a difference of numbers that are larger by 1 / (kh)^2
     np.testing.assert_allclose([part.item() for part in found], truth, atol=1e-10 * np.abs(truth).max())
     assert mechanics.sliding_compliance(np.array([kh])).holds
 
@@ -35,7 +35,7 @@ def test_base_and_surface_are_free_of_shear(kh):
 
 def test_compliance_limits():
     found = layer.slipping_compliance(np.array([0.0, 1e-6, 1e-3, 20.0, 1e4, 1e150]))
-    # next term: (kh)^3 / 6 and smaller
+    # tolerance: the next term is (kh)^3 / 6 or smaller
     np.testing.assert_allclose(found, [0, 5e-7, 5e-4, 1, 1, 1], rtol=1e-6)
 
 
@@ -44,31 +44,32 @@ def test_far_motion_of_slipping_and_bonded_skins():
     r_m, z_m = np.repeat([8e-3, 12e-3], 3), np.tile([0.0, 1e-3, 2e-3], 2)
     far = layer.displacement(r_m, z_m, layer.waves(under, SKIN["thickness_m"], "slipping"))
     volume_m3 = 2 * np.pi * r_m * SKIN["thickness_m"] * far.r_m
-    # Volume is conserved: the displaced volume passes every circle, evenly over the thickness.
-    np.testing.assert_allclose(volume_m3, volume_m3.mean(), rtol=0.01)  # 0.01: remaining waves of exp(-pi r / h) at 4 h
+    # Volume is conserved: the displaced volume flows through every circle, uniformly over the thickness.
+    # 0.01: waves that have decayed to exp(-pi r / h) at 4 h
+    np.testing.assert_allclose(volume_m3, volume_m3.mean(), rtol=0.01)
     assert volume_m3.mean() > 0
     bonded = layer.contact_of_depth(0.2e-3, **SKIN, base="bonded")
     held = layer.displacement(r_m, z_m, layer.waves(bonded, SKIN["thickness_m"], "bonded"))
-    # At 1.5 times the distance the surface of a slipping skin moves 2/3 as far, that of a bonded one less than 1/4.
+    # At 1.5 times the distance, the surface of a slipping skin moves 2/3 as much, that of a bonded skin less than 1/4.
     assert far.r_m[5] == pytest.approx(far.r_m[2] * 2 / 3, rel=0.01)
     assert held.r_m[5] < held.r_m[2] / 4
 
 
-def test_base_does_not_matter_on_a_thick_layer():
+def test_thick_layers_on_both_bases_have_equal_forces():
     depth_m = np.array([0.1e-3])
     deep = {"thickness_m": 0.5, "tip_radius_m": 3e-3, "modulus_Pa": 190e3}
     sliding, held = (layer.force(depth_m, **deep, base=base) for base in ("slipping", "bonded"))
-    np.testing.assert_allclose(sliding, held, rtol=0.005)  # chi = sqrt(R d) / h = 1e-3, times 1.1
+    np.testing.assert_allclose(sliding, held, rtol=0.005)  # tolerance: 1.1 chi, with chi = sqrt(R d) / h = 1e-3
 
 
 def test_slipping_base_is_1_8_times_softer():
-    at = {**SKIN, "modulus_Pa": 190e3}
-    held, sliding = (layer.force(np.array([1.2e-3]), **at, base=base) for base in ("bonded", "slipping"))
-    assert held / sliding == pytest.approx(1.8, abs=0.05)  # a factor of 1.8, known to two digits
+    press = {**SKIN, "modulus_Pa": 190e3}
+    held, sliding = (layer.force(np.array([1.2e-3]), **press, base=base) for base in ("bonded", "slipping"))
+    assert held / sliding == pytest.approx(1.8, abs=0.05)  # the factor 1.8 is known to two digits
 
 
 @given(st.floats(0.05, 0.55))
 @settings(max_examples=20, deadline=None)
-def test_bonded_base_is_always_harder(relative_depth):
-    depth_m, at = np.array([relative_depth * 2e-3]), {**SKIN, "modulus_Pa": 190e3}
-    assert layer.force(depth_m, **at, base="bonded") > layer.force(depth_m, **at, base="slipping")
+def test_skin_on_a_bonded_base_is_always_stiffer(relative_depth):
+    depth_m, press = np.array([relative_depth * 2e-3]), {**SKIN, "modulus_Pa": 190e3}
+    assert layer.force(depth_m, **press, base="bonded") > layer.force(depth_m, **press, base="slipping")

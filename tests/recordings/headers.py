@@ -1,4 +1,4 @@
-"""Capture headers and the default fault policy for tests."""
+"""Helpers for tests: capture headers and the default fault policy."""
 
 from pathlib import Path
 from typing import Any
@@ -14,5 +14,5 @@ DEFAULT_POLICY = parse(FaultPolicy, PARAMS["faults"], "params.yaml: faults")
 
 
 def make_header(**changed: Any) -> Header:
-    """Make the header of a recorded lab capture with five chips; `changed` fields are validated like the rest."""
+    """Return the header of a recorded lab capture with five chips; `changed` replaces and validates fields."""
     return header.make_header("test", **({"capture": "a_capture"} | LAB | changed))

@@ -1,4 +1,4 @@
-"""Tests that a frame's time is between the arrival times of the chunks around its last byte."""
+"""Tests of the times of frames, interpolated between the arrival times of chunks of bytes."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,7 @@ def arrivals_of(steps: Steps, first: tuple[int, float]) -> Arrivals:
 
 
 def naive_time_s(end_byte: int, table: Arrivals) -> float:
-    """Walk the chunks one by one, as documented for `times_of`."""
+    """Reference: go through the chunks one by one, as documented for `times_of`."""
     rows = list(zip(table.byte_end.tolist(), table.t_s.tolist(), strict=True))
     if end_byte <= rows[0][0]:
         return rows[0][1] - (rows[0][0] - end_byte) * (rows[-1][1] - rows[0][1]) / (rows[-1][0] - rows[0][0])
@@ -38,7 +38,7 @@ def test_frame_times_equal_naive_loop(steps: Steps, first: tuple[int, float]) ->
     table = arrivals_of(steps, first)
     end_byte = np.linspace(1, table.byte_end[-1] + 50, 40).astype(np.int64)
     expected_s = [naive_time_s(int(byte), table) for byte in end_byte]
-    # Sums of up to 31 doubles of size 1e3 to 1e4.
+    # Tolerance: sums of up to 31 doubles between 1e3 and 1e4.
     np.testing.assert_allclose(clocks.times_of(end_byte, table), expected_s, rtol=1e-12, atol=1e-9)
 
 
@@ -53,7 +53,7 @@ def test_times_never_decrease(steps: Steps, first: tuple[int, float]) -> None:
     assert (t_s >= table.t_s[chunk_i - 1] - 1e-9).all()
 
 
-def test_frame_past_last_chunk_has_no_time() -> None:
+def test_frame_after_the_last_chunk_has_no_time() -> None:
     t_s = clocks.times_of(np.array([82, 400, 401], np.int64), clocks.parse(GOOD, "arrivals.csv"))
     np.testing.assert_array_equal(t_s, [10 + 0.5 * 0.82, 11.5, np.nan])
 

@@ -1,4 +1,4 @@
-"""Tests of synchronising the stream's clock with the probe's, from marks or from contacts."""
+"""Tests of synchronising the clock of the stream with that of the probe, by marks or by contacts."""
 
 import numpy as np
 import pytest
@@ -11,14 +11,14 @@ from reskin.recordings.probe import LABELS, ProbeLog
 from reskin.seeds import rng_for
 
 FRAME_S = 1 / 400
-NOISE_UT = 4.0  # typical of real boards
-DRIFT_UT_PER_S = 10 / 60  # a board that warms up
+NOISE_UT = 4.0  # typical noise of real boards
+DRIFT_UT_PER_S = 10 / 60  # no-load drift of a board that warms up
 UNIX_S = 1.7e9
 JITTER_S = (0.2, 0.5)
 
 
 def log_of(indentations_n: int, dwell_s: float, travel_s: tuple[float, float] = JITTER_S) -> ProbeLog:
-    """Return a log whose robot travels for a random time between dwells; equal bounds make it periodic."""
+    """Return a probe log with random travel times between dwells; equal bounds of `travel_s` make the log periodic."""
     gap_s = rng_for(0, "travel").uniform(*travel_s, 2 * indentations_n)
     start_s = np.cumsum(gap_s + dwell_s)
     d = np.arange(2 * indentations_n, dtype=np.int32)
@@ -31,10 +31,10 @@ def clock_map(offset_s: float, rate: float = 1.0) -> ClockMap:
 
 
 def stream_of(log: ProbeLog, truth: ClockMap, margin_s: float = 1.0, faint: float = 0.0) -> Block:
-    """Return readings of 15 channels that go from a drifting no-load field to a random contact and back.
+    """Return times and fields (15 channels) of a skin that is touched at the log's contacts; the no-load field drifts.
 
-    The skin is touched from 60 ms before each contact dwell until 60 ms after it; a share `faint` of the contacts does
-    not change the field.
+    A touch lasts from 60 ms before each contact dwell until 60 ms after the dwell. A fraction `faint` of the contacts
+    does not change the field.
     """
     rng = rng_for(1, "stream")
     probe_s = np.arange(log.t_start_s[0] - margin_s, log.t_end_s[-1] + margin_s, FRAME_S * truth.rate)
@@ -60,9 +60,9 @@ def worst_s(found: ClockMap, truth: ClockMap, stream_s: np.ndarray) -> float:
     begin_s=st.sampled_from([0.0, UNIX_S]),
     marks_n=st.integers(2, 6),
 )
-def test_exact_marks_recover_the_line(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
+def test_exact_marks_recover_offset_and_rate(offset_s: float, drift_ppm: float, begin_s: float, marks_n: int) -> None:
     stream_s = begin_s + np.linspace(3, 3600, marks_n)
-    # A double holds Unix time to 2e-7 s; the clock_map is evaluated between its marks.
+    # Tolerance: a double has a resolution of 2e-7 s at Unix times. The map is evaluated between its marks.
     truth = clock_map(offset_s, 1 + drift_ppm * 1e-6)
     found = from_marks(np.stack([stream_s, truth.probe_s(stream_s)], axis=1), "header.json")
     assert worst_s(found, truth, stream_s) < 3e-6
@@ -78,7 +78,7 @@ def test_noisy_marks_give_the_least_squares_line() -> None:
     stream_s = np.linspace(0, 600, 12)
     probe_s = 5 + (1 + 50e-6) * stream_s + rng_for(0, "marks").normal(0, 2e-3, 12)
     found = from_marks(np.stack([stream_s, probe_s], axis=1), "header.json")
-    slope, offset_s = np.polyfit(stream_s, probe_s, 1)  # an independent solver with another parametrisation
+    slope, offset_s = np.polyfit(stream_s, probe_s, 1)  # reference: another solver with another parametrisation
     assert found.rate == pytest.approx(slope, abs=1e-12)
     assert found.offset_s == pytest.approx(offset_s, abs=1e-9)
     assert found.residual_s == pytest.approx(np.abs(probe_s - offset_s - slope * stream_s).max(), abs=1e-9)
@@ -113,7 +113,7 @@ def test_contacts_give_the_offset(offset_s: float, dwell_s: float) -> None:
     t_s, b_uT = stream_of(log, truth)
     found = from_contacts([(t_s, b_uT)], log, "c")
     assert worst_s(found, truth, t_s) < dwell_s / 4
-    assert worst_s(found, truth, t_s) < FRAME_S  # unbiased: pressing and lifting are symmetric
+    assert worst_s(found, truth, t_s) < FRAME_S  # no bias, because pressing and lifting are symmetric
     assert found.explained > 0.8
 
 
@@ -122,7 +122,7 @@ def test_contacts_follow_drifting_clocks() -> None:
     t_s, b_uT = stream_of(log, truth)
     blocks = [(t_s[i : i + 20_000], b_uT[i : i + 20_000]) for i in range(0, len(t_s), 20_000)]
     found = from_contacts(blocks, log, "c")
-    assert 200e-6 * np.ptp(t_s) > 0.1  # with an offset alone, the end would be wrong by a dwell
+    assert 200e-6 * np.ptp(t_s) > 0.1  # without a rate, the end would be wrong by more than a dwell
     assert worst_s(found, truth, t_s) < 0.1 / 4
 
 
@@ -132,7 +132,7 @@ def test_contacts_longer_than_pauses_give_the_offset() -> None:
     assert worst_s(from_contacts([(t_s, b_uT)], log, "c"), truth, t_s) < 0.5 / 4
 
 
-def test_part_of_the_stream_suffices_with_irregular_travel() -> None:
+def test_incomplete_stream_suffices_if_travel_times_are_irregular() -> None:
     log, truth = log_of(100, 0.2), clock_map(3.0)
     t_s, b_uT = stream_of(log, truth)
     part = slice(np.searchsorted(truth.probe_s(t_s), log.t_start_s[60]), None)
@@ -141,7 +141,7 @@ def test_part_of_the_stream_suffices_with_irregular_travel() -> None:
 
 
 @pytest.mark.parametrize("part", [slice(None), slice(5000, 15000)], ids=["whole", "piece"])
-def test_ambiguous_periodic_protocol_is_refused(part: slice) -> None:
+def test_incomplete_stream_of_a_periodic_protocol_is_refused(part: slice) -> None:
     log = log_of(40, 0.25, (0.25, 0.25))
     t_s, b_uT = stream_of(log, clock_map(7.0), margin_s=3.0)
     with pytest.raises(CaptureError, match="at two times almost equally well, .* Add sync marks: .*--mark"):
@@ -160,7 +160,7 @@ def test_offset_is_right_or_refused(
 ) -> None:
     log, truth = log_of(indentations_n, 0.25, travel_s), clock_map(7.0)
     t_s, b_uT = stream_of(log, truth, margin_s, faint)
-    # The stream begins with the robot lifted, wherever it is cut.
+    # The cut stream still begins while the robot is lifted.
     begin_i = np.searchsorted(truth.probe_s(t_s), log.t_start_s[2 * int(lost * indentations_n)])
     try:
         found = from_contacts([(t_s[begin_i:], b_uT[begin_i:])], log, "c")

@@ -1,4 +1,4 @@
-"""Test with a real recording that fresh no-load readings keep a network accurate in later passes."""
+"""Test with a real recording that no-load readings before each contact keep a network accurate in later passes."""
 
 from pathlib import Path
 
@@ -12,13 +12,13 @@ from reskin.recordings.readers import eflesh
 from tests.recordings.test_recordings import SPATIAL, ingest
 
 ROOT = Path(__file__).resolve().parents[2]
-# Accuracies in % of another network, trained on pass 1 and tested on passes 2 to 5.
+# Reference accuracies in % of another network, trained on pass 1 and tested on passes 2 to 5.
 FRESH_PCT, INITIAL_PCT = (89, 88, 86, 84), (55, 19, 13, 10)
-# Tolerance in percentage points per pass: network and number of training steps differ.
+# Tolerance in percentage points for each pass: network and number of training steps differ.
 TOLERANCE_PCT = 15
 
 
-def test_fresh_no_load_readings_keep_eflesh_accurate(shared_data, tmp_path, monkeypatch):
+def test_no_load_readings_before_each_contact_keep_eflesh_accurate(shared_data, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     (tmp_path / "capture").mkdir()
@@ -40,5 +40,5 @@ def test_fresh_no_load_readings_keep_eflesh_accurate(shared_data, tmp_path, monk
     assert "late" not in numbers
     assert [one["verdict"] for one in numbers["findings"]] == ["not judged (fewer than 4 boards)"] * 2
     of_trainings = [one["of_trainings"] for one in numbers["findings"]]
-    assert of_trainings == ["supported", "supported"]  # of three networks under each policy
-    assert numbers["contact_every_s"] > 1  # a real rig
+    assert of_trainings == ["supported", "supported"]  # verdicts over three networks per policy
+    assert numbers["contact_every_s"] > 1  # of a real rig

@@ -1,4 +1,4 @@
-"""Tests that faults are counted with their time span, and that the policy drops, flags or refuses them."""
+"""Tests that faults are counted with their time span, and that the policy drops, flags or refuses faulty frames."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -22,7 +22,7 @@ from tests.recordings.headers import DEFAULT_POLICY
 
 SCRIPTS = {wire: make_script(pokes_n=1, wire=wire) for wire in ("binary", "binary-clock", "text-txyz")}
 FROM_S, LASTS_S = 2.0, 0.5
-# Injected fault, wire, name in the log, number of faulty frames (None: bytes are counted instead).
+# Injected fault, wire format, name of the fault in the log, number of faulty frames (None: counted in bytes).
 FAULTS = [
     ("failed-read", "binary", "failed_read", 200), ("zeros", "binary", "zeros", 200), ("stuck", "binary", "stuck", 181),
     ("saturated", "binary", "saturated", 200), ("too-hot", "binary", "too_hot", 200),
@@ -33,7 +33,7 @@ FAULTS = [
 
 
 def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy, wire: str = "binary"):
-    """Feed frames in chunks that end at `ends`, as ingestion does; return the log and the mask of kept frames."""
+    """Feed frames in chunks that end at `ends`, as stage ingest does; return fault log and mask of kept frames."""
     frame_bytes_n = None if wire.startswith("text") else record_type(wire, 5).itemsize
     detector = FaultDetector(frames.temperature_degC.shape[1], frame_bytes_n=frame_bytes_n)
     log, kept = FaultLog(policy, "stream.bin", "ms"), []
@@ -45,7 +45,7 @@ def record(frames: Frames, t_s: np.ndarray, ends: list[int], policy: FaultPolicy
 
 
 def record_fault(name: str, wire: str, policy: FaultPolicy = DEFAULT_POLICY):
-    """Record a stream with a fault, in two chunks."""
+    """Decode a stream with a fault, in two chunks; return the fault log and the mask of kept frames."""
     script = SCRIPTS[wire] if name == "none" else inject(SCRIPTS[wire], parse_fault(f"{name}@{FROM_S}+{LASTS_S}"))
     frames, _ = decode_all(b"".join(script.pieces), wire, 5, name)
     sent_byte = np.cumsum([len(piece) for piece in script.pieces])
@@ -75,11 +75,11 @@ def test_faults_are_found_and_the_policy_applied(name, wire, fault, frames_n):
         assert found.count_n == pytest.approx(frames_n, rel=0.1) if frames_n else found.count_n > 500
         assert FROM_S - 0.01 <= found.first <= FROM_S + LASTS_S + 0.05
         assert found.last <= FROM_S + LASTS_S + 0.1
-        dropped = action == "drop" and fault not in ("torn", "wrong_baud")  # there are no frames to drop
+        dropped = action == "drop" and fault not in ("torn", "wrong_baud")  # these faults leave no frames to drop
         assert (~kept).sum() == (found.count_n if dropped else 0)
 
 
-def test_silence_of_more_than_a_second_is_an_unplugging():
+def test_silence_of_more_than_a_second_is_recorded_as_unplugging():
     script = SCRIPTS["binary"]
     frames = replace(script.frames, end_byte=82 * (1 + np.arange(len(script))))
     log, _ = record(frames, script.t_s + 1.5 * (script.t_s > 1.0), [], DEFAULT_POLICY)
@@ -144,7 +144,7 @@ CONSTANT = r"Bz of chip 0 \(.*\), Bz of chip 1 \(0 uT\) never changed in the who
 
 
 def constant_z(b_uT: np.ndarray) -> np.ndarray:
-    """Set z of chip 0 to a constant, and z of chip 1 to 0."""
+    """Return fields in which z of chip 0 is constant and z of chip 1 is 0."""
     changed = b_uT.copy()
     changed[:, 2], changed[:, 5] = b_uT[0, 2], 0.0
     return changed
@@ -173,7 +173,7 @@ def test_constant_channels_are_found_in_any_chunks(ends):
     assert log.account()["fault_constant_channel_last_ms"] > 0
 
 
-def test_still_chips_and_boards_have_no_constant_channel():
+def test_stuck_chips_and_unchanging_boards_have_no_constant_channel():
     channels = ConstantChannels(2)
     channels.feed(np.zeros((50, 6)))
     assert channels.describe() == []
@@ -188,7 +188,7 @@ CHIPS_N = 5
 
 
 def noisy_fields_uT(rows_n: int) -> np.ndarray:
-    """Return fields as five chips at GAIN_SEL 7 send them: 5 uT of noise about 300 uT, on the grid of their LSB."""
+    """Return fields of five chips at GAIN_SEL 7: 300 uT with 5 uT of noise, rounded to multiples of the LSB."""
     lsb_uT = np.tile([0.15, 0.15, 0.242], CHIPS_N)
     b_uT = 300 + 5 * seeds.rng_for(2021, "fields").standard_normal((rows_n, 3 * CHIPS_N))
     return np.round(b_uT / lsb_uT) * lsb_uT
@@ -225,7 +225,7 @@ def test_chip_with_another_lsb_is_named(chip_i: int) -> None:
 
 
 def test_fields_without_grid_are_accepted() -> None:
-    # For example from a recorder that averages; there is no LSB to compare.
+    # For example, fields from a recorder that averages: there is no LSB to compare.
     b_uT = 300 + 5 * seeds.rng_for(2021, "averaged").standard_normal((GRID_ROWS_N, 3 * CHIPS_N))
     unknown_degC = np.full((GRID_ROWS_N, CHIPS_N), np.nan)
     assert check_rows(b_uT, unknown_degC, None, where="here", policy=DEFAULT_POLICY).keep.all()

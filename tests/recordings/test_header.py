@@ -1,4 +1,4 @@
-"""Tests of capture headers, and of opening captures with the reader of their layout."""
+"""Tests of capture headers, and of opening a capture with the reader of its layout."""
 
 import hashlib
 import json
@@ -60,7 +60,7 @@ def test_renamed_folder_is_refused():
         check_same_capture(make_header(), "other")
 
 
-def test_header_has_checksums_of_written_and_copied_files(tmp_path):
+def test_header_has_checksums_of_all_files(tmp_path):
     (tmp_path / "source.csv").write_bytes(b"copied")
     header = write_capture(tmp_path / "c0", make_header(), {"a.bin": b"bytes", "b.csv": tmp_path / "source.csv"})
     assert header.files == {

@@ -1,4 +1,4 @@
-"""Tests of matching frames with dwells, in any blocks, against a double loop; every frame is accounted for."""
+"""Tests of matching frames with dwells, against a double loop: any block size, and every frame is counted."""
 
 import dataclasses
 import tracemalloc
@@ -20,12 +20,12 @@ from tests.recordings.headers import make_header
 CHIPS_N = 2
 CLOCK = ClockMap(offset_s=-5.0, rate=1.25, residual_s=0.0, explained=1.0)
 HEADER = make_header(chips_n=CHIPS_N, contacts_before_n=100)
-# The dwells of one indentation as (gap before, length) in half frames, so that some frames fall on edges.
+# Dwells of an indentation: (gap before, length) in halves of a frame period, so that some frames are on edges.
 DWELLS = st.lists(st.tuples(st.integers(0, 3), st.integers(1, 9)), min_size=1, max_size=3)
 
 
 def log_of(indentations: list[list[tuple[int, int]]]) -> ProbeLog:
-    """Return a log of these dwells; the first of each indentation is lifted, the others are in contact."""
+    """Return a probe log of these dwells; the first of each indentation is without contact, the others in contact."""
     rows = [
         (number, dwell_i > 0, *dwell) for number, one in enumerate(indentations) for dwell_i, dwell in enumerate(one)
     ]
@@ -37,7 +37,7 @@ def log_of(indentations: list[list[tuple[int, int]]]) -> ProbeLog:
 
 
 def timed_of(frames_n: int, faults: dict[int, str] | None = None) -> TimedFrames:
-    """Return frames one probe second apart, starting before the log; some of them are faulty."""
+    """Return frames at intervals of 1 s (probe time), from 2 s before the log; `faults` maps frames to their fault."""
     rng = rng_for(0, "frames", frames_n)
     b_uT = rng.normal(0, 100, (frames_n, 3 * CHIPS_N)).astype(np.float32)
     temperature_degC = rng.normal(25, 1, (frames_n, CHIPS_N)).astype(np.float32)
@@ -64,7 +64,7 @@ def cut(whole: TimedFrames, ends: list[int]) -> list[TimedFrames]:
 
 
 def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Concatenate the readings of all blocks by column."""
+    """Join all blocks with the log; return the readings as concatenated columns, and the account of frames."""
     account: dict[str, int] = {}
     parts = list(join(blocks, log, CLOCK, HEADER, account))
     empty = Joiner(log, CLOCK, HEADER).close()
@@ -75,7 +75,7 @@ def join_blocks(blocks: list[TimedFrames], log: ProbeLog) -> tuple[dict[str, np.
 
 
 def join_naively(timed: TimedFrames, log: ProbeLog) -> list[dict[str, object]]:
-    """Compare every frame with every dwell; the later dwell takes a frame on a common edge."""
+    """Reference: compare every frame with every dwell; a frame on a common edge belongs to the later dwell."""
     noload: dict[int, list[np.ndarray]] = {}
     contact: list[tuple[int, int]] = []
     for frame_i, t_s in enumerate(timed.t_s.tolist()):
@@ -122,7 +122,7 @@ def test_readings_equal_double_loop(
     assert len(actual["indentation"]) == len(expected)
     for row_i, row in enumerate(expected):
         for name, value in row.items():
-            # the mean is computed in float64; everything else is copied
+            # tolerance: the mean is computed in float64; all other values are copied
             np.testing.assert_allclose(
                 actual[name][row_i], value, rtol=1e-6 if name == "noload_uT" else 0, err_msg=name
             )
@@ -134,7 +134,7 @@ def test_readings_equal_double_loop(
     faults=FAULTS,
     ends=st.lists(st.integers(0, 60), max_size=60),
 )
-def test_blocks_do_not_matter(
+def test_readings_do_not_depend_on_blocks(
     indentations: list[list[tuple[int, int]]], frames_n: int, faults: dict[int, str], ends: list[int]
 ) -> None:
     log, timed = log_of(indentations), timed_of(frames_n, faults)
@@ -167,7 +167,7 @@ def test_frames_and_indentations_are_accounted_for(
 
 
 def test_losses_are_counted_by_reason() -> None:
-    # Frames at -2, -1, 0, ... s of probe time; dwells at 0-2, 3-4 | 5-6, 7-8 | 9-9.5 s, and after the stream.
+    # Frames are at -2, -1, 0, ... s of probe time; dwells are at 0-2, 3-4 | 5-6, 7-8 | 9-9.5 s, and after the stream.
     log = log_of([[(0, 4), (2, 2)], [(2, 2), (2, 2)], [(2, 1), (1, 1)], [(60, 2), (2, 2)]])
     timed = timed_of(13, {2: "failed", 3: "field", 7: "field", 8: "failed"})
     timed.t_s[12:] = np.nan
@@ -181,7 +181,7 @@ def test_losses_are_counted_by_reason() -> None:
         "dropped_failed_read_frames_n": 2,
         "dropped_stuck_chip_frames_n": 0,
         "dropped_between_dwells_frames_n": 2,  # at -2 and -1 s
-        "dropped_no_noload_frames_n": 2,  # at 7 and 8 s; their no-load dwell has no valid frame
+        "dropped_no_noload_frames_n": 2,  # at 7 and 8 s: the no-load dwell of this indentation has no valid frame
         "dropped_no_contact_frames_n": 1,  # at 9 s
         "indentations_n": 1,
         "dropped_no_noload_indentations_n": 1,
@@ -197,7 +197,7 @@ def test_readings_are_released_when_the_next_indentation_begins() -> None:
     timed = timed_of(400)
     joiner = Joiner(log, CLOCK, HEADER)
     rows_n = [len(joiner.feed(block)) for block in cut(timed, list(range(400)))]
-    assert max(rows_n) == 4  # a dwell of 3 s has frames on both edges
+    assert max(rows_n) == 4  # a dwell of 3 s has four frames, one on each edge
     assert len(joiner.close()) <= 4
 
 
@@ -214,4 +214,4 @@ def test_memory_does_not_grow_with_the_stream() -> None:
         tracemalloc.stop()
         return peak
 
-    assert peak_bytes_n(30) < 1.1 * peak_bytes_n(3)  # 10 % for counters and the allocator
+    assert peak_bytes_n(30) < 1.1 * peak_bytes_n(3)  # 10 %: counters and the allocator

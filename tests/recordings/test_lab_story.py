@@ -1,4 +1,4 @@
-"""Tests of real recordings, from `reskin add` to a leave-one-board-out table, and of adding and removing a board."""
+"""Tests of real recordings, from `reskin add` to leave-one-board-out scores; a board is added and removed."""
 
 import json
 import re
@@ -25,7 +25,7 @@ def lab(tmp_path_factory, shared_data) -> Iterator[Path]:
     settings = YAML(typ="safe").load(scene.read_text())
     settings["train_multi"]["seeds_n"] = 1
     settings["train_multi"] |= {"steps_n": 100, "variants": {}}
-    settings |= {"experiments": ["lobo"], "split": {}}  # scene ci tests the other experiments
+    settings |= {"experiments": ["lobo"], "split": {}}  # only one experiment: scene ci tests the others
     for section in ("few_labels", "audit", "compare", "universal", "reference_methods"):
         del settings[section]
     with scene.open("w") as stream:
@@ -53,18 +53,18 @@ def test_two_boards_give_two_folds(lab):
         assert set(parts["as_labelled"]) == {"accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f"}
 
 
-def test_stages_run_in_the_listed_order(lab):
+def test_stages_run_in_the_order_of_the_list(lab):
     order = json.loads((lab / ".reskin/order.json").read_text())["stages"]
     assert re.findall("^Running stage '(.*)':", (lab / REPRO_LOG).read_text(), re.MULTILINE) == order
 
 
 def test_adding_and_removing_a_board(lab, shared_data):
-    file = str(shared_data / "lab/board1_depth1.csv")  # serves as a third board
+    file = str(shared_data / "lab/board1_depth1.csv")  # used as the recording of a third board
     run(lab, "reskin", "add", file, "--layout", "lab", "--board", "board3", "--skin", "skin3", "--scene", "lab")
     output = run(lab, "dvc", "repro", "report@lab").stdout
     assert sorted(by_board(lab)) == ["board1", "board2", "board3"]
     assert "Stage 'ingest@lab-board1_skin1_board1_depth2' didn't change, skipping" in output
     run(lab, "reskin", "remove", "lab", "board3_skin3_board1_depth1")
-    run(lab, "dvc", "repro", "split@lab")  # the first stage that combines boards
+    run(lab, "dvc", "repro", "split@lab")  # stage split is the first that combines boards
     folds = json.loads((lab / "data/models/lab/folds.json").read_text())["folds"]
     assert {board for fold in folds for board in fold["test_boards"]} == {"board1", "board2"}

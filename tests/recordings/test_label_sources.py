@@ -1,4 +1,4 @@
-"""Tests that each label source writes a probe log, without a board, a robot or a person."""
+"""Tests that each label source (program, prompts, gauge, robot's table) writes a probe log."""
 
 import re
 import threading
@@ -27,7 +27,7 @@ from reskin.recordings.labels import Label, ProbeLogWriter
 from reskin.seeds import rng_for
 
 DWELL_s = 0.002
-LONG_S = 120.0  # timeout that a passing test never reaches
+LONG_S = 120.0  # time limit in s that a passing test never reaches
 
 
 @pytest.fixture
@@ -83,14 +83,14 @@ def test_invalid_label_and_failing_robot_end_the_labels(context):
         from_program(["lifted"], DWELL_s).run(LabelContext(context.writer, time.time, threading.Event(), context.mark))
 
 
-def test_hanging_program_is_not_waited_for(context):
+def test_recording_does_not_wait_for_a_hanging_program(context):
     hung = threading.Event()
     label_thread = LabelThread(LabelSource("hangs", None, lambda _: str(hung.wait(30))), context)
     assert label_thread.end(0.05) == "0 touches labelled"
     hung.set()
 
 
-def test_places_are_shuffled_in_each_pass(context, tmp_path):
+def test_prompted_places_are_shuffled_in_each_pass(context, tmp_path):
     prompter, printed = prompts([""] * 24 + ["q"])
     prompter.run(context)
     log = log_of(tmp_path)
@@ -128,7 +128,7 @@ def test_force_is_never_split_into_place_and_force(context, tmp_path, line, x_mm
     assert len([line for line in printed if "is neither a place" in line]) == 5
 
 
-def test_snake_order_and_invalid_places():
+def test_prompts_in_snake_order_and_invalid_places():
     assert parse_places("grid:3x2:4").order("snake", rng_for(0, "x")) == [0, 1, 2, 5, 4, 3]
     assert parse_places("robot.csv") is None
     for wrong in ("grid:0x2:4", "line:5:0", "grid:9999x9999:1"):
@@ -144,7 +144,7 @@ def wait_until(condition):
 
 
 class FakeGauge:
-    """The serial port of a force gauge that sends the given chunks and is then unplugged."""
+    """Fake serial port of a force gauge that sends these chunks and is then unplugged."""
 
     def __init__(self, chunks):
         self.chunks, self.sent_n, self.gone = iter(chunks), 0, False
@@ -176,7 +176,7 @@ def fake_gauge(monkeypatch):
 
 
 class GaugeContext(LabelContext):
-    """A context that holds each label until the gauge has sent data or is unplugged, also on a busy machine."""
+    """Label context in which a label lasts until the gauge has sent data or is unplugged, instead of a fixed time."""
 
     gauge: FakeGauge
 
@@ -206,7 +206,7 @@ def test_touches_without_gauge_data_are_counted(context, fake_gauge):
     assert prompter.run(context) == "2 touches without a force: the gauge at gauge sent none during them"
 
 
-def test_labels_continue_without_unplugged_gauge(context, fake_gauge):
+def test_labels_continue_after_the_gauge_is_unplugged(context, fake_gauge):
     gauge = fake_gauge([b"0.5\n"])
     prompter, _ = prompts(["", "", "", "0.8N", "q"], forces=ForceGauge("gauge", 9600))
     assert "gauge: lost the force gauge" in (message := prompter.run(with_gauge(context, gauge)))
@@ -216,7 +216,8 @@ def test_labels_continue_without_unplugged_gauge(context, fake_gauge):
 
 def test_gauge_alone_detects_touches(context, tmp_path, fake_gauge):
     fake_gauge([b"0.00\n"] * 40 + [b"0.50\n"] * 40 + [b"oops\n"])
-    ticks = count()  # a simulated clock: on a stalled machine, a touch of 0.5 s would become several touches
+    # simulated clock: with a real clock, a stalled machine would split a touch of 0.5 s into several touches
+    ticks = count()
     context = replace(context, unix_s=lambda: 1e9 + 0.002 * next(ticks))
     label_thread = LabelThread(from_gauge("gauge", 9600), context)
     label_thread._thread.join()
@@ -230,7 +231,7 @@ def test_gauge_alone_detects_touches(context, tmp_path, fake_gauge):
 
 
 class PollCounter(threading.Event):
-    """Stop event that counts how often the follower of a table has polled (it waits on this event each time)."""
+    """Stop event that counts waits: the follower of a table waits on this event once per poll."""
 
     def __init__(self):
         super().__init__()
@@ -253,7 +254,8 @@ def test_growing_table_is_followed(context, tmp_path, exists):
     with file.open("a") as stream:
         stream.write(rows if exists else old + rows)
     before_n = poll_counter.polls_n
-    wait_until(lambda: poll_counter.polls_n > before_n + 1)  # the first poll may have begun before the append
+    # two polls, because the first may have begun before the append
+    wait_until(lambda: poll_counter.polls_n > before_n + 1)
     assert label_thread.end(LONG_S) == "1 touches labelled"
     log = log_of(tmp_path)
     assert log.t_start_s.tolist() == pytest.approx([7.0, 7.3])
@@ -273,7 +275,7 @@ def test_interrupted_table_ends_the_labels(context, tmp_path, how, problem):
         with file.open("a") as stream:
             stream.write("".join(f"{begin_s}.{i},{'contact' if i > 4 else 'noload'}\n" for i in range(9)))
         time.sleep(0.02)
-        if context.marks:  # existing rows are skipped
+        if context.marks:  # the source is ready: it has skipped existing rows
             break
     if how == "replaced":
         (tmp_path / "new.csv").write_text(header)

@@ -1,4 +1,4 @@
-"""Tests that labels become the same dwells in any chunks, and that the probe log is valid at any time."""
+"""Tests that labels become the same dwells in any chunks, and that the probe log is always valid."""
 
 import math
 
@@ -28,12 +28,12 @@ DWELL = st.builds(lambda label, start_s, lasts_s: Dwell(label, start_s, start_s 
 
 def test_touch_is_written_after_its_noload_dwell(tmp_path):
     writer = ProbeLogWriter(tmp_path)
-    writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # without a no-load dwell before it
+    writer.write(Dwell(Label(True, 1.0, 2.0), 0.0, 1.0))  # skipped: no no-load dwell before it
     writer.write(Dwell(Label(False), 1.0, 2.0))
     assert len((tmp_path / PROBE_FILE).read_text().splitlines()) == 1
     writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.5, pass_i=1), 3.0, 4.0))
-    writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.7, pass_i=1), 4.0, 5.0))  # the touch goes on
-    writer.write(Dwell(Label(False), 4.5, 5.5))  # before the touch has ended
+    writer.write(Dwell(Label(True, 4.0, 8.0, Fz_N=0.7, pass_i=1), 4.0, 5.0))  # a longer dwell of the same touch
+    writer.write(Dwell(Label(False), 4.5, 5.5))  # skipped: begins before the touch has ended
     log = probe.parse(tmp_path / PROBE_FILE, "log")
     assert log.indentation.tolist() == [0, 0, 0]
     assert log.contact.tolist() == [False, True, True]
@@ -42,7 +42,7 @@ def test_touch_is_written_after_its_noload_dwell(tmp_path):
     assert math.isnan(log.x_mm[0])
     assert (writer.touches_n, writer.without_noload_n, writer.out_of_order_n) == (1, 1, 1)
     writer.close()
-    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # a late label of a program that hangs
+    writer.write(Dwell(Label(True, 1.0, 1.0), 8.0, 9.0))  # skipped: a late label from a program that hangs
 
 
 def test_touch_that_moves_without_lift_is_skipped(tmp_path):
@@ -104,7 +104,7 @@ def test_one_dwell_per_phase():
     assert touch.label.Fz_N == 0.5
 
 
-def test_long_touch_and_new_place_start_new_dwells():
+def test_long_touch_or_new_place_starts_a_new_dwell():
     text = HEAD + "".join(rows("contact", i, 10, 3, 0.1 * (i + 1)) for i in range(3)) + rows("contact", 3, 3, 4)
     found, _ = dwells_of(text)
     assert all(dwell.t_end_s - dwell.t_start_s <= DWELL_MAX_s + 0.11 for dwell in found)
@@ -118,7 +118,7 @@ def test_long_touch_and_new_place_start_new_dwells():
 def test_chunks_do_not_matter(chunk_n):
     text = HEAD + rows("noload", 0, 9, 1) + "noise\n\n1,2\n" + rows("contact", 4, 9, 3, 0.5)
     whole, parts = dwells_of(text), dwells_of(text, chunk_n)
-    assert repr(whole[0]) == repr(parts[0])  # repr: NaN != NaN
+    assert repr(whole[0]) == repr(parts[0])  # compared as text, because NaN != NaN
     assert whole[1].bad_n == parts[1].bad_n == 2
     assert parts[1].first_bad == "noise"
 
@@ -146,7 +146,7 @@ def test_gauge_lines_have_one_or_three_numbers():
     assert (gauge.bad_n, gauge.first_bad) == (2, "1,2")
 
 
-def test_endless_line_is_not_kept():
+def test_endless_line_is_dropped():
     lines = LineBuffer()
     for _ in range(1000):
         lines.feed(b"9" * 100)
@@ -159,7 +159,7 @@ def test_too_short_touches_are_counted():
     list(dwells.feed(table.feed(changes.encode())))
     assert dwells.short_n == 2
     assert dwells.summary().startswith("2 touches left out: a touch needs 0.05 s")
-    long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))  # 0.52 s: a dwell, and 0.01 s
+    long = "".join(f"{5 + 0.01 * i:.2f},contact,4,8\n" for i in range(53))  # 0.52 s: one dwell, and a rest of 0.01 s
     assert len(list(dwells.feed(table.feed((long + "6,noload,4,8\n").encode())))) == 1
     assert dwells.short_n == 2
     list(dwells.feed(table.feed(b"7,contact,4,8\n8,noload,4,8\n")))

@@ -1,4 +1,4 @@
-"""Tests that native captures become the right indentations, and that every byte and frame is accounted for."""
+"""Tests of native captures: indentations are recovered, and every byte and frame is in a reading or counted as lost."""
 
 import dataclasses
 from pathlib import Path
@@ -21,14 +21,14 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 RATE_HZ = 100.0
-OFFSET_S = 40.0  # probe minus stream
+OFFSET_S = 40.0  # probe time minus stream time
 INDENTATIONS_N = 60
-NOLOAD_N, MOVE_N, CONTACT_N = 4, 3, 5  # frames of one indentation: lifted, down, pressed, up
+NOLOAD_N, MOVE_N, CONTACT_N = 4, 3, 5  # frames per phase of an indentation: no load, moving (down and up), contact
 CHIPS_N = 5
 
 
 def simulate_presses() -> tuple[Frames, ProbeLog]:
-    """Simulate random presses: frames at `RATE_HZ`, rounded to 0.01 uT, and the probe log."""
+    """Return the frames of random presses at `RATE_HZ`, rounded to 0.01 uT, and the probe log."""
     rng = rng_for(0, "press")
     move_n = rng.integers(MOVE_N, 3 * MOVE_N, (INDENTATIONS_N, 2))
     parts, rows, begin = [], [], 10
@@ -45,7 +45,7 @@ def simulate_presses() -> tuple[Frames, ProbeLog]:
         )
         parts.append(share[:, None] * rng.normal(0, 200, 15))
         pressed = begin + NOLOAD_N + down_n
-        # Dwells reach half a frame past their frames; a frame i ends at (i + 1) / RATE_HZ.
+        # Frame i ends at (i + 1) / RATE_HZ; dwells extend half a frame beyond their first and last frame.
         rows.append((number, False, begin + 0.5, begin + NOLOAD_N + 0.5))
         rows.append((number, True, pressed + 0.5, pressed + CONTACT_N + 0.5))
         begin += len(share)
@@ -72,7 +72,7 @@ def header_of(wire: Wire, kind: str = "arrivals", marks: tuple[tuple[float, floa
 
 
 def write(folder: Path, wire: Wire, frames: Frames = FRAMES, **files: bytes) -> Path:
-    """Write a capture's files; chunks of 1 to 7 frames arrive when their last frame has ended."""
+    """Write the files of a capture; bytes arrive in chunks of 1 to 7 frames, at the end of the chunk's last frame."""
     whole = encode(frames, wire)
     rows = np.arange(len(frames))
     ends = np.cumsum([len(encode(frames.where(rows == row_i), wire)) for row_i in rows])
@@ -97,7 +97,7 @@ def read(folder: Path, header: Header) -> tuple[dict[str, np.ndarray], dict[str,
 
 
 def expected_readings() -> dict[str, np.ndarray]:
-    """Expected readings, from a loop over dwells and the frames before encoding."""
+    """Return the expected readings, by a loop over dwells and the frames before encoding."""
     columns: dict[str, list[Any]] = {
         name: [] for name in ("indentation", "reading_i", "x_mm", "b_uT", "noload_uT", "t_s")
     }
@@ -124,7 +124,8 @@ def test_indentations_are_recovered(
 ) -> None:
     got, account = read(write(tmp_path, wire), header_of(wire, kind, marks))
     for name, column in expected_readings().items():
-        # Exact except the mean (float32) and the time (text lines differ in length within a chunk: half a frame).
+        # Tolerances: the mean is float32; times of text frames are off by up to half a frame, because lines differ in
+        # length.
         atol = {"t_s": 0.5 / RATE_HZ, "noload_uT": 1e-3}.get(name, 0)
         np.testing.assert_allclose(got[name], column, rtol=0, atol=atol, err_msg=name)
     assert account["indentations_n"] == account["logged_indentations_n"] == INDENTATIONS_N
@@ -185,8 +186,8 @@ def test_stream_in_another_unit_is_refused(tmp_path: Path, factor: float) -> Non
 
 
 @pytest.mark.parametrize(("sent", "declared"), [("text-xyzt", "text-txyz"), ("text-txyz", "text-xyzt")])
-@pytest.mark.parametrize("scale", [1.0, 0.05])  # also fields as weak as temperatures
-def test_other_column_order_is_refused(tmp_path: Path, sent: Wire, declared: Wire, scale: float) -> None:
+@pytest.mark.parametrize("scale", [1.0, 0.05])  # with 0.05, fields are as weak as temperatures
+def test_wrong_column_order_is_refused(tmp_path: Path, sent: Wire, declared: Wire, scale: float) -> None:
     frames = dataclasses.replace(FRAMES, b_uT=FRAMES.b_uT * np.float32(scale))
     with pytest.raises(CaptureError, match=rf"stream.bin: temperatures of {declared} .* Is the wire format {sent}\?"):
         read(write(tmp_path, sent, frames), header_of(declared))
@@ -194,11 +195,11 @@ def test_other_column_order_is_refused(tmp_path: Path, sent: Wire, declared: Wir
 
 def test_probe_log_in_another_unit_is_refused(tmp_path: Path) -> None:
     folder = write(tmp_path, "binary", probe=probe.render(dataclasses.replace(LOG, x_mm=LOG.x_mm * 1000)).encode())
-    with pytest.raises(CaptureError, match="probe.csv: places must be one, or spread over 1 to 200 mm; got 5.9e"):
+    with pytest.raises(CaptureError, match="probe.csv: places must be equal, or spread over 1 to 200 mm; got 5.9e"):
         read(folder, header_of("binary"))
 
 
-def test_block_size_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readings_do_not_depend_on_the_block_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     header = header_of("binary")
     whole, whole_account = read(write(tmp_path, "binary"), header)
     monkeypatch.setattr(ingest, "BLOCK_BYTES_N", 1000)
@@ -210,7 +211,8 @@ def test_block_size_does_not_matter(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_frames_without_arrival_time_are_dropped(tmp_path: Path) -> None:
     b_uT, temperature_degC = FRAMES.b_uT.copy(), FRAMES.temperature_degC.copy()
-    b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC  # a fault in a frame without a time
+    # a failed read in a frame without a time
+    b_uT[-1, 3:6], temperature_degC[-1, 1] = FAILED_B_uT, FAILED_TEMPERATURE_degC
     frames = dataclasses.replace(FRAMES, b_uT=b_uT, temperature_degC=temperature_degC)
     folder = write(tmp_path, "binary", frames)
     rows = (folder / ARRIVALS_FILE).read_text().splitlines(keepends=True)

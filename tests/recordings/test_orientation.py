@@ -1,4 +1,4 @@
-"""Tests that swapped, mirrored and turned labels are detected by comparison with captures of other skins."""
+"""Tests that swapped, mirrored and rotated labels are detected by comparison with captures of other skins."""
 
 import shutil
 
@@ -15,7 +15,7 @@ DEPARTURES = [name for name in ORIENTATIONS if name != "as they are"]
 
 
 def board(name: str, presses_n: int = 60) -> Presses:
-    """Return noisy presses of a skin whose channels have random gains."""
+    """Return presses of a skin with noise and random gains of the channels."""
     rng = rng_for(0, "orientation", name)
     place_mm = rng.uniform(-8, 8, (presses_n, 2))
     db_uT = fields_uT(place_mm, rng.uniform(1, 5, presses_n)) * rng.normal(1, 0.1, 15)
@@ -33,11 +33,11 @@ def inverse_of(way: str) -> str:
 
 
 @pytest.mark.parametrize("way", DEPARTURES)
-def test_changed_labels_are_named_with_their_inverse(way):
+def test_departure_is_the_inverse_of_the_change_of_labels(way):
     assert other_orientation(relabel(board("one"), way), board("other")) == inverse_of(way)
 
 
-def test_no_false_alarm():
+def test_correct_or_uninformative_labels_raise_no_alarm():
     one, other = board("one"), board("other")
     assert other_orientation(one, other) is None
     assert other_orientation(relabel(board("few", 19), "with x mirrored"), other) is None
@@ -47,14 +47,14 @@ def test_no_false_alarm():
     assert other_orientation(relabel(one, "with x mirrored"), noise) is None
 
 
-def test_every_change_is_found_on_recorded_boards(shared_data, tmp_path):
-    """Of 18 pairs of files of two boards, one is inconclusive (board 2, depth 3, with board 1, depth 1)."""
+def test_every_change_of_labels_is_found_on_recorded_boards(shared_data, tmp_path):
+    """Both recordings are at depth 2. Of all 18 pairs, one is inconclusive: board 2 depth 3 with board 1 depth 1."""
     boards = {}
     for number in (1, 2):
         shutil.copy(shared_data / f"lab/board{number}_depth2.csv", tmp_path / lab.READINGS)
         readings, _ = lab.read(tmp_path, make_header(layout="lab", chips_n=5), DEFAULT_POLICY)
         boards[number] = presses_of([readings])
-    for own, other in ((1, 2), (2, 1)):
-        assert other_orientation(boards[own], boards[other]) is None
+    for new, other in ((1, 2), (2, 1)):
+        assert other_orientation(boards[new], boards[other]) is None
         for way in DEPARTURES:
-            assert other_orientation(relabel(boards[own], way), boards[other]) == inverse_of(way)
+            assert other_orientation(relabel(boards[new], way), boards[other]) == inverse_of(way)

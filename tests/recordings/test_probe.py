@@ -1,4 +1,4 @@
-"""Tests of the probe log as CSV; errors name the row."""
+"""Tests of reading and writing the probe log (CSV); errors name the row."""
 
 import dataclasses
 from pathlib import Path

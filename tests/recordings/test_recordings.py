@@ -1,6 +1,6 @@
-"""Tests that public recordings of real hardware have the contents that data/README.md describes.
+"""Tests that the public recordings contain what data/README.md describes.
 
-They are copied into a capture folder under the names that `collect` gives them, as `reskin add` does.
+Each recording is copied into a capture folder as `reskin add` does, and read by the reader of its layout.
 """
 
 import shutil
@@ -24,7 +24,7 @@ SCREW = "ini/b20_artillery_AFG_board2_50_screw.txt"
 
 
 def ingest(reader: ModuleType, recording: Path, folder: Path, **changed: object) -> tuple[Readings, dict[str, int]]:
-    """Copy a recording as `reskin add` does, and read it."""
+    """Copy a recording into a capture folder as `reskin add` does; return its readings and account."""
     files = reader.collect(recording)
     for name, source in files.items():
         shutil.copyfile(source, folder / name)
@@ -68,20 +68,20 @@ def test_lab_forces_reach_ten_newtons(shared_data: Path, tmp_path: Path) -> None
 
 @pytest.mark.parametrize("name", LAB)
 def test_lab_tip_pushes_the_skin_along_x(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # Experiment compare finds from fields alone that pokes move the skins of both boards by 48 um along the labels' +x.
+    # The tip pushes the skin: experiment compare finds, from fields alone, a move of 48 um along the labels' +x axis.
     readings, _ = ingest(lab, shared_data / "lab" / f"{name}.csv", tmp_path)
     assert 0.08 < readings.Fx_N.mean() < 0.6
 
 
 @pytest.mark.parametrize("name", LAB)
 def test_lab_noise_matches_the_data_sheet(shared_data: Path, name: str) -> None:
-    # Noise about the mean of each press: 65 x 9 degrees of freedom per channel, so 3 % error of the standard deviation.
+    # Noise about the mean of each press: 65 x 9 degrees of freedom per channel give a standard error of 3 %.
     trials = read_cells(shared_data / "lab" / f"{name}.csv", name, separator=",")
     names, rows = trials[0], [row for row in trials[1:] if row[1] == "noload"]
     columns = [names.index(f"B{axis}{chip}") for chip in range(5) for axis in "xyz"]
     b_uT = np.array([[float(row[i]) for i in columns] for row in rows]).reshape(65, 10, 15)
     sd_uT = np.sqrt(b_uT.var(axis=1, ddof=1).mean(axis=0)).reshape(5, 3)
-    # 3.0-3.3 and 4.4-5.0 uT over all files; single channels scatter by the 3 % above.
+    # All recordings have 3.0-3.3 uT (x, y) and 4.4-5.0 uT (z); single channels scatter by the standard error of 3 %.
     assert ((sd_uT[:, :2] > 2.9) & (sd_uT[:, :2] < 3.5)).all()
     assert ((sd_uT[:, 2] > 4.3) & (sd_uT[:, 2] < 5.3)).all()
 
@@ -95,7 +95,7 @@ def test_lab_skins_are_magnetised_to_millitesla(shared_data: Path, tmp_path: Pat
 def test_ini_recording_has_fifty_passes(shared_data: Path, tmp_path: Path) -> None:
     readings, account = ingest(ini, shared_data / SCREW, tmp_path)
     assert account["rows_read_n"] == 23_300
-    assert account["rows_n"] == 23_299  # the fields come one row late, which leaves one without a partner
+    assert account["rows_n"] == 23_299  # fields are one row late, which leaves one row without a partner
     assert account["passes_n"] == 50
     assert np.bincount(readings.pass_i).tolist() == [466] * 49 + [465]
     touching = np.isfinite(readings.x_mm)
@@ -106,7 +106,7 @@ def test_ini_recording_has_fifty_passes(shared_data: Path, tmp_path: Path) -> No
     assert readings.Fz_N.max() == np.float32(4.1)
 
 
-def test_ini_centre_is_a_place(shared_data: Path, tmp_path: Path) -> None:
+def test_ini_centre_is_one_of_the_places(shared_data: Path, tmp_path: Path) -> None:
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path)
     centre = (readings.x_mm == 10) & (readings.y_mm == 10)
     assert centre.sum() == 6 * 50
@@ -114,7 +114,7 @@ def test_ini_centre_is_a_place(shared_data: Path, tmp_path: Path) -> None:
 
 
 def test_ini_fields_are_one_row_late(shared_data: Path, tmp_path: Path) -> None:
-    # A known fault of existing recorders: a field follows the force of the previous row.
+    # Known fault of these recordings: the field of a row belongs to the force of the previous row.
     readings, _ = ingest(ini, shared_data / SCREW, tmp_path, options={"rows_late": "0"})
     change_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
     same_row = np.corrcoef(readings.Fz_N[:-1], change_uT[:-1])[0, 1]
@@ -155,13 +155,13 @@ def test_eflesh_gauge_recorded_ten_strokes(shared_data: Path, tmp_path: Path, na
     assert 0.48 < account["no_new_force_rows_n"] / account["rows_n"] < 0.49
     assert set(readings.x_mm) == set(readings.y_mm) == {0.0}
     assert 11.9 < readings.depth_mm.max() < 12.1
-    # 3.3 and 3.5 kg at the greatest depth
+    # gauge readings of 3.3 and 3.5 kg at the greatest depth
     assert 32 < np.nanmax(readings.Fz_N) < 34.5
 
 
 @pytest.mark.parametrize("name", [NORMAL, SHEAR])
 def test_each_eflesh_pass_is_one_stroke(shared_data: Path, tmp_path: Path, name: str) -> None:
-    # Passes are found by fresh baselines; the robot's z agrees and is not used to find them.
+    # Passes are found from new baselines; the robot's z, which the reader does not use for that, agrees.
     readings, account = ingest(eflesh, shared_data / name, tmp_path, options={"force_axis": "z"})
     assert account["passes_n"] == 10
     for pass_i in range(10):
@@ -193,7 +193,7 @@ def test_eflash7_places_are_numbered_and_zeros_dropped(
     np.testing.assert_allclose(readings.Fz_N.max(), force_max_N, atol=0.1)
 
 
-def test_eflash7_starts_untouched_with_a_residual_baseline(shared_data: Path, tmp_path: Path) -> None:
+def test_eflash7_starts_without_touch_with_a_changed_no_load_field(shared_data: Path, tmp_path: Path) -> None:
     files = sorted((shared_data / "eflash7").glob("*.csv"))
     assert len(files) == 19
     rest_uT, read_n = [], 0
@@ -204,4 +204,4 @@ def test_eflash7_starts_untouched_with_a_residual_baseline(shared_data: Path, tm
         rest_uT.append(np.linalg.norm(readings.noload_uT[0]))
         read_n += account["rows_read_n"]
     assert read_n == 7351
-    assert 270 < max(rest_uT) < 280  # the ninth single touch, 12 minutes after the first
+    assert 270 < max(rest_uT) < 280  # in the ninth single touch, 12 minutes after the first

@@ -1,4 +1,4 @@
-"""Tests of SD card logs: round trip, faults and errors."""
+"""Tests of reading and writing SD card logs; faults and errors."""
 
 import numpy as np
 import pytest
@@ -36,8 +36,8 @@ def test_log_round_trip(tmp_path_factory, chips_n):
     file = tmp_path_factory.mktemp("card") / "log.csv"
     file.write_text(render(t_s, b_uT, temperature_degC))
     read_s, read_uT, read_degC, account = read_log(file)
-    np.testing.assert_allclose(read_s, t_s, atol=5.1e-5)  # four decimals
-    np.testing.assert_allclose(read_uT, b_uT, atol=5.1e-3)  # two decimals
+    np.testing.assert_allclose(read_s, t_s, atol=5.1e-5)  # times have four decimals
+    np.testing.assert_allclose(read_uT, b_uT, atol=5.1e-3)  # fields have two decimals
     np.testing.assert_allclose(read_degC, temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == account["rows_read_n"] == 60
 
@@ -91,7 +91,7 @@ def test_missing_frames_are_counted(log):
 def test_failed_reads_and_stuck_chips_are_dropped(log):
     t_s, b_uT, temperature_degC = random_log()
     b_uT[3, :3], temperature_degC[3, 0] = FAILED_B_uT, FAILED_TEMPERATURE_degC
-    b_uT[30:, 3:] = b_uT[30, 3:]  # 30 equal frames: the last 11 are certainly stuck
+    b_uT[30:, 3:] = b_uT[30, 3:]  # 30 equal frames: from the 20th on, the chip counts as stuck
     log.write_text(render(t_s, b_uT, temperature_degC))
     read_s, _, _, account = read_log(log)
     assert account["dropped_failed_read_rows_n"] == 1

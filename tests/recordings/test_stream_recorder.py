@@ -1,4 +1,4 @@
-"""Tests of recording from a serial port, with a pseudo-terminal as the port."""
+"""Tests of the stream recorder, with a pseudo-terminal as the serial port."""
 
 import math
 import os
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs pseudo
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = make_frames(100, 5, 0)
-LONG_s = 120.0  # timeout that a passing test never reaches
+LONG_s = 120.0  # time limit in s that a passing test never reaches
 SETTINGS = PortSettings(
     baud=115200, wire="binary", chips_n=5, duration_s=LONG_s, bytes_max_n=None, silence_s=LONG_s, no_frame_s=LONG_s
 )
@@ -39,14 +39,14 @@ SETTINGS = PortSettings(
 
 @dataclass
 class Board:
-    """The board's end of a pseudo-terminal: what it sends can be read at `name`."""
+    """The board's end of a pseudo-terminal; the bytes that it sends arrive at the port `name`."""
 
     board_fd: int
     port_fd: int
     name: str
 
     def send(self, *chunks: bytes) -> None:
-        with suppress(OSError):  # nobody reads any more
+        with suppress(OSError):  # fails if the port is no longer open
             for chunk in chunks:
                 os.write(self.board_fd, chunk)
 
@@ -68,7 +68,7 @@ def board() -> Iterator[Board]:
 
 @dataclass
 class ManualClock:
-    """The recorder's clock, advanced only by the test, so that the load of the machine does not matter."""
+    """A clock for the recorder that only the test advances, independent of the load of the machine."""
 
     s: float = 0.0
 
@@ -81,7 +81,7 @@ def clock(monkeypatch) -> ManualClock:
 
 
 def record(board: Board, folder: Path, act: Callable[[threading.Event], None], **changed: object) -> Recording:
-    """Record from a board that starts to `act` once the recorder listens (earlier bytes are discarded)."""
+    """Record from a board; `act` runs in a thread as soon as the recorder has opened the port."""
 
     def begin() -> None:
         assert listening.wait(LONG_s)
@@ -149,7 +149,7 @@ def test_report_counts_frames(board, tmp_path):
     assert seen[-1] >= 1
 
 
-def test_pause_is_in_the_arrival_times(board, clock, tmp_path):
+def test_arrival_times_contain_a_pause(board, clock, tmp_path):
     data, pause_s = encode(FRAMES, "binary"), 0.4
 
     def act(_: threading.Event) -> None:
@@ -237,7 +237,7 @@ def test_signal_keeps_received_bytes(board, tmp_path, number):
     assert clocks.parse(tmp_path / ARRIVALS_FILE, "arrivals.csv").byte_end[-1] == len(data)
 
 
-def test_kill_loses_nothing_that_was_read(board, tmp_path):
+def test_kill_loses_no_byte_that_was_read(board, tmp_path):
     data = encode(FRAMES, "binary")
     with subprocess.Popen([sys.executable, "-c", RECORD, board.name, str(tmp_path)], cwd=ROOT) as process:
         written = tmp_path / STREAM_FILE
@@ -252,7 +252,7 @@ def test_waiting_uses_no_processor_time(board, tmp_path):
     before_s = time.process_time()
     with pytest.raises(CaptureError):
         record(board, tmp_path, lambda _: None, silence_s=1.0)
-    assert time.process_time() - before_s < 0.3  # a busy wait would take the whole second
+    assert time.process_time() - before_s < 0.3  # a busy wait would use the whole second
 
 
 def test_partial_first_line_is_dropped(board, clock, tmp_path):
@@ -275,7 +275,7 @@ def test_socket_is_recorded_like_a_port(tmp_path):
 
         def send() -> None:
             with server.accept()[0] as end:
-                wait_until((tmp_path / STREAM_FILE).exists)  # opening a port discards earlier bytes
+                wait_until((tmp_path / STREAM_FILE).exists)  # bytes sent before the port is opened are discarded
                 end.sendall(data)
 
         sender = threading.Thread(target=send)
@@ -294,11 +294,11 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))  # like a full disk
 
 
 def test_full_disk_keeps_a_readable_recording(board, tmp_path):
-    # -B: Python would leave truncated .pyc files.
+    # Option -B: otherwise, Python would write truncated .pyc files on the full disk.
     command = [sys.executable, "-B", "-c", FULL_DISK + RECORD, board.name, str(tmp_path)]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         wait_until((tmp_path / STREAM_FILE).exists)
-        os.set_blocking(board.board_fd, False)  # the recorder stops reading when it ends
+        os.set_blocking(board.board_fd, False)  # otherwise, writing would block after the recorder has ended
 
         def ended() -> bool:
             board.send(encode(FRAMES, "binary")[:820])
@@ -340,7 +340,7 @@ class TestErrors:
 
     def test_no_frame_suggests_wrong_baud_rate(self, board, tmp_path):
         noise = bytes(range(128)) * 4
-        os.set_blocking(board.board_fd, False)  # nobody reads while the error is built
+        os.set_blocking(board.board_fd, False)  # otherwise, writing would block while the error is prepared
 
         def act(stop: threading.Event) -> None:
             while not stop.wait(0.05) and board.board_fd >= 0:

@@ -59,12 +59,12 @@ def test_every_row_resolves_to_a_number(one):
     assert (one.paper is None) != (one.says is None)
 
 
-def test_every_number_of_the_paper_is_used():
+def test_every_number_of_the_paper_is_in_the_checklist():
     named = {name: value for name, value in vars(paper).items() if name.isupper()}
     printed = {leaf for name, value in named.items() for leaf in leaves(name, value)}
     used = {one.paper for one in ROWS} | {one.reach.paper for one in ROWS if one.reach}
     assert printed - used == set()
-    assert len(printed) > 30  # the loop found numbers
+    assert len(printed) > 30  # the set is not empty by mistake
 
 
 def test_every_figure_and_table_of_the_paper_has_a_row():
@@ -76,7 +76,7 @@ def test_every_figure_and_table_of_the_paper_has_a_row():
 
 
 def line(numbers: dict, name: str) -> dict[str, str]:
-    """Return the row of the checklist with the given id."""
+    """Return the row of the checklist for these numbers and this id."""
     (one,) = [one for one in ROWS if one.id == name]
     return checklist(numbers, [one]).to_dict("records")[0]
 
@@ -92,7 +92,7 @@ def test_missing_experiment_is_not_run():
 @given(
     mean=st.floats(1, 100), sd=st.floats(0.1, 50), ours=st.floats(0, 200), path=st.sampled_from(["accuracy_pct", "mse"])
 )
-def test_number_is_met_within_paper_sd_or_ten_percent(mean, sd, ours, path):
+def test_number_is_met_within_the_papers_sd_or_ten_percent(mean, sd, ours, path):
     judgement = judge_value(stat(ours), (mean, sd), ours=f"a.{path}")
     assert (judgement.criterion, judgement.met) == ("within the paper's sd", "yes" if abs(ours - mean) <= sd else "no")
     alone = judge_value(stat(ours), mean, ours=f"a.{path}")
@@ -110,12 +110,12 @@ def test_number_is_met_within_paper_sd_or_ten_percent(mean, sd, ours, path):
         ("positive", -0.1, None, "above 0", "no"),
     ],
 )  # fmt: skip
-def test_limits_are_met_by_the_mean(rule, ours, paper, criterion, met):
+def test_limits_are_compared_with_the_mean(rule, ours, paper, criterion, met):
     judgement = judge_value(ours, paper, rule=rule)
     assert (judgement.verdict, judgement.criterion, judgement.met) == (FEW_BOARDS, criterion, met)
 
 
-def test_finding_has_the_verdict_of_its_experiment():
+def test_finding_has_the_verdict_from_the_experiment():
     judgement = judge_value({"verdict": "undecided", "of_trainings": SUPPORTED}, rule="finding")
     assert (judgement.verdict, judgement.met) == ("undecided", "yes")
     assert judge_value(False).met == "no"
@@ -136,14 +136,14 @@ def test_claims_are_judged_by_interval_over_boards(rule, low, high, verdict):
 
 
 @given(low=st.floats(50, 99), width=st.floats(0.1, 20), limit=st.floats(60, 99))
-def test_lower_and_upper_limits_are_judged_alike(low, width, limit):
+def test_lower_and_upper_limits_are_judged_symmetrically(low, width, limit):
     ours = over_boards(low, low + width)
     least, most = (judge_value(ours, limit, rule=rule).verdict for rule in ("at_least", "at_most"))
     assert (least, most) in {(SUPPORTED, CONTRADICTED), (CONTRADICTED, SUPPORTED), (UNDECIDED, UNDECIDED)}
     assert (least == SUPPORTED) == (low > limit)
 
 
-def test_decrease_of_an_error_is_a_gain():
+def test_decrease_of_an_error_counts_as_gain():
     assert judge_value(over_boards(-0.3, -0.1), ours="paired.x.mse_xy_mm2", rule="gain").verdict == SUPPORTED
     assert judge_value(over_boards(0.1, 0.3), ours="paired.x.mse_xy_mm2", rule="gain").verdict == CONTRADICTED
 
@@ -157,17 +157,17 @@ def test_decrease_of_an_error_is_a_gain():
         (-4.0, 2.9, CONTRADICTED, False),
     ],
 )
-def test_sizeable_gain_is_half_of_the_papers(low, high, verdict, equivalent):
+def test_sizeable_gain_is_at_least_half_of_the_papers(low, high, verdict, equivalent):
     judgement = judge_value(over_boards(low, high), 5.97, rule="sizeable")
     assert (judgement.verdict, judgement.criterion) == (verdict, "gain above 2.98, half of the paper's")
     assert (EQUIVALENT in judgement.notes) == equivalent == (max(-low, high) < 5.97 / 2)
 
 
-def test_repeats_on_one_skin_have_too_few_boards():
+def test_repeats_on_one_skin_are_too_few_boards_for_a_verdict():
     assert judge_value(stat(96.3, 0.1, 5), 90.0, rule="at_least").verdict == FEW_BOARDS
 
 
-def test_each_rule_fails_if_one_count_fails():
+def test_rule_over_counts_fails_if_one_count_fails():
     sweep = [
         {"skins_n": n, "accuracy_pct": over_boards(*ends)} for n, ends in ((1, (1, 2)), (6, (-1, 2)), (15, (2, 3)))
     ]
@@ -178,7 +178,7 @@ def test_each_rule_fails_if_one_count_fails():
     assert judge_value(sweep, rule="each").verdict == CONTRADICTED
 
 
-def test_simulated_calibration_target_is_not_evidence():
+def test_value_to_which_the_simulation_is_calibrated_is_not_evidence():
     target = {"ours": "table2.single.accuracy_pct", "rule": "target"}
     assert judge_value(stat(25.0), (25.0, 10.0), **target).notes == (TARGET,)
     assert judge_value(stat(25.0), (25.0, 10.0), simulated=False, **target).notes == ()
@@ -195,7 +195,7 @@ def test_every_claim_has_a_verdict():
     assert set(table["verdict"]) <= {SUPPORTED, CONTRADICTED, UNDECIDED, FEW_BOARDS, "–"}
 
 
-def test_sweep_too_short_for_a_claim_is_not_reached():
+def test_claim_beyond_the_range_of_a_sweep_is_not_reached():
     numbers = all_experiments()
     del numbers["contrasts"]["pokes_plateau"]
     assert line(numbers, "plateau")["note"] == NOT_REACHED
@@ -203,13 +203,13 @@ def test_sweep_too_short_for_a_claim_is_not_reached():
     assert line(numbers, "plateau")["note"] == NOT_RUN
 
 
-def test_single_training_skin_is_not_compared_with_pooled():
+def test_single_training_skin_is_not_compared_with_pooled_training():
     item = {"ours": "table2.multi.accuracy_pct"}
     assert judge_value(stat(90.0), (85.0, 1.0), pooled=False, **item).notes == (ONE_SKIN,)
     assert judge_value(stat(90.0), (85.0, 1.0), **item).met == "no"
 
 
-def test_reason_is_shown_only_where_ours_differs():
+def test_reason_is_shown_only_if_our_number_differs():
     numbers = all_experiments()
     rows = [row(ours="single_random.accuracy_pct", why="Because.")]
     assert checklist(numbers, rows)["note"][0] == "Because."
@@ -242,7 +242,7 @@ def test_flexible_bias_is_judged_after_adaptation():
     assert line(numbers, "flexible-bias")["met"] == "no"
 
 
-def test_reasons_about_simulation_only_in_simulated_scenes():
+def test_reasons_about_simulation_are_only_in_simulated_scenes():
     simulation = ("simulat", "assumed", "a possible reason")
     for source in ("simulated", "recorded"):
         notes = checklist(all_experiments(source))["note"]
@@ -252,14 +252,15 @@ def test_reasons_about_simulation_only_in_simulated_scenes():
     assert not any(word in one.why for one in ROWS for word in simulation)
 
 
-def test_reason_fills_in_numbers():
+def test_reason_contains_numbers():
     assert "80 % nearer to the skin, ours 45 %" in line(all_experiments(), "flexible-accuracy_pct")["note"]
 
 
 @pytest.mark.parametrize(
     ("ours", "within"),
     [
-        (over_boards(95.0, 99.7), "yes"), (over_boards(95.0, 99.5), "no"), (stat(99.0, 6.0, 5), "–"),  # no boards
+        # without a summary over boards, there is no interval
+        (over_boards(95.0, 99.7), "yes"), (over_boards(95.0, 99.5), "no"), (stat(99.0, 6.0, 5), "–"),
         ({"mean": 99.0, "n": 1}, "–"),
     ],
 )  # fmt: skip
@@ -269,17 +270,17 @@ def test_papers_number_is_compared_with_our_interval(ours, within):
 
 
 def with_p(p: float, mean: float = 1.0) -> dict:
-    """Return a difference over boards with the two-sided p-value p."""
+    """Return a paired difference over boards with the two-sided p-value p."""
     se = mean / t.isf(p / 2, 5)
     return {"mean": mean, "sd": se * 6**0.5, "n": 6, "ci95": [mean - 2.571 * se, mean + 2.571 * se], "se": se, "df": 5}
 
 
-def test_family_of_claims_is_corrected_by_holm():
+def test_p_values_of_a_family_of_claims_are_corrected_by_holm():
     claim = {"what": "claim: x", "paper": None, "says": "claimed", "rule": "gain"}
     rows = [row(id=f"r{i}", ours=f"d{i}.accuracy_pct", family=i < 3, **claim) for i in range(4)]
     numbers = all_experiments() | {f"d{i}": {"accuracy_pct": with_p(p)} for i, p in enumerate((0.01, 0.03, 0.04, 0.04))}
     table = checklist(numbers, rows)
-    # Three claims: 0.01 becomes 0.03; 0.03 and 0.04 become 0.06: not significant although their intervals exclude 0.
+    # Three claims: 0.01 becomes 0.03; 0.03 and 0.04 become 0.06, not significant, although the intervals exclude 0.
     assert table["verdict"].tolist() == [SUPPORTED, UNDECIDED, UNDECIDED, SUPPORTED]
     assert table["p (Holm)"].tolist() == ["0.03", "0.06", "0.06", "–"]
 
@@ -312,6 +313,7 @@ def test_p_value_of_a_claim_of_several_parts():
         return [{"accuracy_pct": {"mean": mean, "se": se, "df": 5}} for mean, se in zip(means, (0.5, 1.0), strict=True)]
 
     alone = [claim_p_value(claim, None, one["accuracy_pct"]) for one in parts(-5.0, 0.2)]
-    assert claim_p_value(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])  # not the second part's 0.85
+    # the p-value of the first part; that of the second would be 0.85
+    assert claim_p_value(claim, None, parts(-5.0, 0.2)) == pytest.approx(2 * alone[0])
     assert claim_p_value(claim, None, parts(5.0, 0.2)) == pytest.approx(alone[1])
     assert claim_p_value(claim, None, []) is None

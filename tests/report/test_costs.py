@@ -1,4 +1,4 @@
-"""Tests of the figures and tables of error against run time."""
+"""Tests of figures and tables of error against run time."""
 
 import re
 from dataclasses import asdict
@@ -48,7 +48,7 @@ STIFF = [
 
 
 def with_times(rows: list[Precision]) -> list[dict]:
-    """Return the rows of a study with run times, except for failures and references."""
+    """Return the rows of a study with run times added, except for failed and reference rows."""
     done = [row for row in rows if row.error is not None and row.method != REFERENCE]
     times = {row.key: {"median_s": 1e-4 * (i + 1), "repeats_n": 5} for i, row in enumerate(done)}
     return [asdict(row) | times.get(row.key, {}) for row in rows]
@@ -104,7 +104,7 @@ def test_failures_are_grouped_by_method_and_kind():
 
 
 def test_failed_and_untimed_rows_are_not_drawn():
-    # Each point is one <use> of a marker.
+    # Each point is a <use> element that refers to a marker.
     done = [row for row in STIFF if row.failure is None]
     assert count_marks(draw_integrators()) == count_marks(draw_integrators(done))
     last = {key: value for key, value in with_times(SUMS)[-1].items() if key != "median_s"}
@@ -138,7 +138,7 @@ def test_figure_bytes_depend_only_on_rows():
 
 
 @given(st.lists(st.tuples(st.floats(1e-6, 1), st.floats(1e-16, 1)), max_size=12))
-def test_front_dominates_all_other_points(points):
+def test_points_on_the_front_dominate_all_others(points):
     kept = front(points)
     assert set(kept) <= set(points)
     times, errors = np.array(kept).reshape(-1, 2).T
@@ -159,8 +159,8 @@ def rows_of(places) -> list[dict]:
     ]
 
 
-def dominates(some, other) -> bool:
-    return some != other and all(a <= b for a, b in zip(some, other, strict=True))
+def dominates(one, other) -> bool:
+    return one != other and all(a <= b for a, b in zip(one, other, strict=True))
 
 
 PLACES = st.lists(st.tuples(st.integers(1, 9), st.integers(1, 9)), min_size=1, max_size=20)
@@ -181,7 +181,7 @@ def test_labelled_points_are_not_dominated(places):
 
 
 @given(PLACES)
-def test_labels_follow_the_front(places):
+def test_labels_are_in_the_order_of_the_front(places):
     members = [point for point in trade_off_points(rows_of(places), "train_s") if point.label]
     numbered = {int(point.label): point.position for point in members}
     assert sorted(numbered) == list(range(1, len(numbered) + 1))
@@ -198,7 +198,7 @@ def test_trade_off_figure_lists_every_method():
 
 
 def test_front_is_drawn_as_steps():
-    # The error is constant (a horizontal line) up to the time of the next method, then drops (a vertical line).
+    # The line is horizontal up to the time of the next method, then vertical down to its error.
     svg = trade_off(rows_of([(1, 3), (2, 2)]), "train_s", title="t", cost="c")
     (step,) = re.findall(r'<path d="([^"]+)"[^>]*stroke: #666666', svg.split('id="legend_1"')[0])
     first, corner, last = re.findall(r"[ML] (\S+) (\S+)", step)
@@ -214,7 +214,7 @@ def test_raw_and_other_inputs_differ_in_fill():
     assert shape["markerfacecolor"] == "white"
 
 
-def test_styles_of_49_methods_are_distinct():
+def test_49_methods_have_different_styles():
     assert len({(look_of(i)["color"], look_of(i)["marker"]) for i in range(49)}) == 49
 
 
@@ -276,7 +276,7 @@ def test_cost_figures_have_units_source_and_poke_counts():
 def test_each_point_adds_one_mark(costs):
     few, all_ = cost_pages({"learning": LEARNING[:3]}, "simulated")["training.svg"], costs["training.svg"]
     ticks = {name: len(re.findall('id="[xy]tick_', text)) for name, text in (("few", few), ("all", all_))}
-    # Each point has a mark in the panel and one in the legend. Each tick is a mark too.
+    # Each point has a mark in the panel and a mark in the legend; ticks are marks too.
     assert count_marks(all_) - ticks["all"] - (count_marks(few) - ticks["few"]) == 2
 
 
@@ -285,7 +285,7 @@ def test_cost_pages_are_reproducible(costs):
 
 
 def count_marks(svg: str) -> int:
-    """Return the number of marks: each is a <use> of a path."""
+    """Return the number of marks in a figure (SVG): <use> elements that refer to a path."""
     return len(re.findall("<use ", svg))
 
 

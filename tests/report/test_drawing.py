@@ -1,4 +1,4 @@
-"""Tests of the titles of marks in figures, which show their values."""
+"""Tests of the SVG titles of marks in figures, which browsers show as tooltips with the values."""
 
 import re
 import xml.etree.ElementTree as ET
@@ -15,7 +15,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def titles(text: str) -> list[list[str]]:
-    """Return the lines of each title, in order."""
+    """Return the lines of each title in a figure (SVG), in the order of the file."""
     return [unescape(title).split("\n") for title in re.findall(r"<title>(.*?)</title>", text, re.DOTALL)]
 
 
@@ -42,14 +42,15 @@ def test_titles_increase_with_position(points):
     text = draw(lambda axes: axes.plot(x, y, "s"), xlabel="x", ylabel="y")
     marks = [use for use in ET.fromstring(text).iter(f"{SVG}use") if use.find(f"{SVG}title") is not None]
     shown = [float(mark.find(f"{SVG}title").text.split("\n")[0].removeprefix("x = ")) for mark in marks]
-    at = [float(mark.get("x")) for mark in marks]
+    x_positions = [float(mark.get("x")) for mark in marks]
     assert shown == pytest.approx(x)
-    assert np.all(np.diff(np.array(at)[np.argsort(shown, kind="stable")]) >= -0.02)  # positions have two decimals
+    # tolerance: positions in the SVG have two decimals
+    assert np.all(np.diff(np.array(x_positions)[np.argsort(shown, kind="stable")]) >= -0.02)
 
 
-def test_title_of_a_bar_has_its_ends():
+def test_title_of_a_bar_has_both_ends():
     text = draw(lambda axes: axes.errorbar([1, 2], [5, 6], [[1, 0], [2, 0]], fmt="o", label="ours"))
-    assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 7", "y = 6"]  # the second bar has no length
+    assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 7", "y = 6"]  # the second bar has length 0
     text = draw(lambda axes: axes.errorbar([5, 6], [1, 2], xerr=[1, 2], fmt="o", capsize=3))
     assert [lines[-1] for lines in titles(text)] == ["bar from 4 to 6", "bar from 4 to 8"]
 
@@ -58,7 +59,7 @@ def test_errorbar_without_bars_has_titles():
     assert len(titles(draw(lambda axes: axes.errorbar([1, 2], [5, 6], None, fmt="o")))) == 2
 
 
-def test_named_ticks_are_used_in_titles():
+def test_titles_use_the_names_of_ticks():
     def plot(axes):
         axes.plot([3.1, 3.2], [0.9, 2.1], "o")
         axes.set_yticks([1, 2], ["one\nskin", "two skins"])
@@ -94,7 +95,7 @@ def test_line_without_marks_has_only_its_label():
     [np.arange(MARKS_MAX_N + 1.0), np.array([1.0, np.nan, 3.0])],
     ids=["too many", "one not drawn"],
 )
-def test_no_titles_for_too_many_or_missing_values(values):
+def test_too_many_or_missing_values_have_no_titles(values):
     assert titles(draw(lambda axes: axes.plot(values, values, "o"))) == []
     assert titles(draw(lambda axes: axes.scatter(values, values))) == []
 

@@ -1,4 +1,4 @@
-"""Tests of the report's figures: marks, units, source, the paper's numbers and reproducible bytes."""
+"""Tests of the report's figures: marks, units, source, numbers of the paper, reproducible files."""
 
 import io
 import json
@@ -42,13 +42,13 @@ def test_each_place_is_drawn_once():
 
 def test_skin_and_chips_are_drawn_only_on_the_papers_grid():
     elsewhere = error_grid(PLACES_MM - 20, PLACES_MM - 20, title="eflesh")
-    # Five chips, a skin and two legend entries; the axes lack two spines.
+    # More elements: five chips, a skin, two legend entries; fewer: two spines of the axes.
     assert draw_grid().count('id="patch_') - elsewhere.count('id="patch_') == 5 + 1 + 2 - 2
     assert "chip" in draw_grid()
     assert "chip" not in elsewhere
 
 
-def test_title_has_the_worst_place():
+def test_title_states_the_place_with_the_largest_error():
     errors_mm = np.zeros_like(PLACES_MM)
     errors_mm[PLACES_MM[:, 0] + PLACES_MM[:, 1] == 4, 0] = 3.0
     assert "worst 3.00 mm at x = 2, y = 2" in error_grid(PLACES_MM, PLACES_MM + errors_mm, title="t")
@@ -80,7 +80,7 @@ def test_error_grid_is_reproducible():
     assert draw_grid() != error_grid(PLACES_MM, PLACES_MM + np.arange(12)[:, None], title="lab (recorded), lobo")
 
 
-def test_layout_equals_matplotlibs_on_save():
+def test_layout_equals_that_of_matplotlib_on_save():
     def places(save) -> list[tuple[float, ...]]:
         with drawing(5.0, 3.0) as figure:
             for axes, scale in zip(figure.subplots(1, 2), ("linear", "log"), strict=True):
@@ -121,7 +121,7 @@ def test_sweep_sensors_has_a_line_for_each_method():
     assert "adapted" not in texts_of(sweep_sensors([one for one in SENSORS if one["method"] == "multi"], "recorded"))
 
 
-def test_bars_are_cut_to_possible_scores():
+def test_error_bars_end_at_possible_scores():
     accuracy = [row(95.0, sd=10.0, n=6), row(50.0, sd=10.0, n=6), row(5.0, sd=10.0, n=6)]
     means, lengths = bars(accuracy, "accuracy_pct")
     np.testing.assert_array_equal(means, [95.0, 50.0, 5.0])
@@ -152,7 +152,7 @@ def test_only_sweeps_with_numbers_are_drawn():
 @pytest.mark.parametrize("draw", [sweep_pokes, sweep_sensors])
 def test_sweeps_are_reproducible(draw):
     rows = POKES if draw is sweep_pokes else SENSORS
-    figure, again, other = (draw(some, "simulated") for some in (rows, rows, [*rows[:-1], rows[-1] | row(70.0)]))
+    figure, again, other = (draw(sweep, "simulated") for sweep in (rows, rows, [*rows[:-1], rows[-1] | row(70.0)]))
     assert figure == again != other
     ET.fromstring(figure)
 

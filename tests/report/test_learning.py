@@ -1,4 +1,4 @@
-"""Tests of the tables on training with many skins, and of the blocks of README and docs that show them."""
+"""Tests of the tables on training with many skins, and of the blocks in README and docs with these tables."""
 
 from itertools import pairwise
 
@@ -36,9 +36,9 @@ def paired(of: str, over: str, **scores) -> dict:
 
 def between(accuracy_pct: tuple[float, float], error: tuple[float, float]) -> dict:
     """Return paired differences with the given 95 % intervals over boards."""
-    own = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": error, "mse_f_N2": error}
-    by_board = {board: {name: ends[i] for name, ends in own.items()} for i, board in enumerate(("b0", "b1"))}
-    return {name: over_boards(*ends) for name, ends in own.items()} | {"by_board": by_board}
+    differences = {"accuracy_pct": accuracy_pct, "mse_xy_mm2": error, "mse_f_N2": error}
+    by_board = {board: {name: ends[i] for name, ends in differences.items()} for i, board in enumerate(("b0", "b1"))}
+    return {name: over_boards(*ends) for name, ends in differences.items()} | {"by_board": by_board}
 
 
 BOARDS = {f"b{i}": {"trained_on_skins_n": 15} for i in range(6)}
@@ -55,9 +55,9 @@ NUMBERS = {"table2": PAPER_AS_OURS, "lobo": {"by_board": BOARDS}, "paired": PAIR
 
 def test_paired_boards_table_lists_each_board():
     table = paired_boards_table(NUMBERS, "simulated")
-    own = table[table["difference"] == "adapted − multi-sensor + triplet"]
-    assert own["held-out board"].tolist() == ["b0", "b1"]
-    assert own["accuracy, %"].tolist() == ["+5", "+7"]
+    rows = table[table["difference"] == "adapted − multi-sensor + triplet"]
+    assert rows["held-out board"].tolist() == ["b0", "b1"]
+    assert rows["accuracy, %"].tolist() == ["+5", "+7"]
 
 
 def test_paired_table_has_the_papers_difference_of_means():
@@ -72,7 +72,7 @@ def test_paired_table_has_the_papers_difference_of_means():
         "+6 [5, 7]",
         "+0.1 [-2.9, 3.1]",
     ]
-    # 81.03 - 84.43 and 87.00 - 81.03 of the paper's table 2, which has no control.
+    # Differences of means in the paper's table 2: 81.03 - 84.43 and 87.00 - 81.03; the paper has no control.
     assert table["accuracy, % (paper: difference of means)"].tolist() == ["+59.19", "-3.4", "+5.97", "–"]
     assert table["MSE_xy, mm² (paper: difference of means)"].tolist() == ["-5.72", "+0.023", "-0.242", "–"]
     assert "95 % interval over n boards" in to_markdown(table)
@@ -216,7 +216,7 @@ def test_each_experiment_has_its_table_with_source():
     assert not expected & set(make_tables(nothing))
 
 
-def test_readme_has_claims_below_table_2():
+def test_readme_has_the_claims_below_table_2():
     described = {
         "grid": {"source": "simulated", "over_skins": {"step_z_uT": {"mean": 1.0, "least": 1.0, "most": 1.0, "n": 1}}}
     }

@@ -1,4 +1,4 @@
-"""Tests of the numbers and contrasts of the experiments on many skins, calculated by hand."""
+"""Tests of the numbers and contrasts of experiments on many skins, against values calculated by hand."""
 
 import json
 
@@ -15,17 +15,17 @@ from pipeline.statistics import tidy
 from tests.report import synthetic
 
 HELD_OUT = {"b0": ("s0", "s1"), "b1": ("s2", "s3")}
-BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # gain by adaptation on each skin, percentage points
+BETTER = {"s0": 2.0, "s1": 4.0, "s2": 6.0, "s3": 8.0}  # gain by adaptation on each skin, in percentage points
 
 
 BOARD_OF = {skin: board for board, skins in HELD_OUT.items() for skin in skins}
 
 
 def scores(by_skin: dict[str, float]) -> dict:
-    own = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
+    skin_scores = {skin: {"accuracy_pct": pct, "mse_xy_mm2": 1.0, "mse_f_N2": 0.5} for skin, pct in by_skin.items()}
     mean = {"accuracy_pct": sum(by_skin.values()) / len(by_skin), "mse_xy_mm2": 1.0, "mse_f_N2": 0.5}
-    return {"all": mean, "registered": mean, "by_skin": own, "rows_n": 10 * len(own)} | {
-        "board_of": {skin: BOARD_OF[skin] for skin in own}
+    return {"all": mean, "registered": mean, "by_skin": skin_scores, "rows_n": 10 * len(skin_scores)} | {
+        "board_of": {skin: BOARD_OF[skin] for skin in skin_scores}
     }
 
 
@@ -56,8 +56,8 @@ CARDS = [
 ]  # fmt: skip
 
 
-def numbers(made: list[dict] = CARDS, **points: list[dict]) -> dict:
-    return learning_numbers(tidy(made, points), headline="paper")
+def numbers(cards: list[dict] = CARDS, **points: list[dict]) -> dict:
+    return learning_numbers(tidy(cards, points), headline="paper")
 
 
 def paired(of: str, over: str) -> dict:
@@ -69,7 +69,7 @@ def test_table_2_pools_skins_by_board():
     table2 = numbers()["table2"]
     assert table2.keys() == {"multi", "triplet", "adapted"}
     assert table2["triplet"]["accuracy_pct"] == {"mean": 78.0, "n": 2, "sd": 0.0, "values": [78.0, 78.0]}
-    # board b0: 80 and 82; board b1: 84 and 86
+    # accuracies of the skins of b0: 80 and 82; of b1: 84 and 86
     assert table2["adapted"]["accuracy_pct"] == over(81.0, 85.0)
 
 
@@ -85,24 +85,24 @@ def over(*boards: float) -> dict:
 
 def test_paired_differences_by_board():
     assert [(one["of"], one["over"]) for one in numbers()["paired"]] == [one for one in PAIRS if "single" not in one]
-    # gains of 2 and 4 points on the skins of b0, of 6 and 8 on those of b1
+    # gains of 2 and 4 percentage points on the skins of b0, of 6 and 8 on the skins of b1
     assert paired("adapted", "triplet")["accuracy_pct"] == over(3.0, 7.0)
     by_board = paired("adapted", "triplet")["by_board"]
-    assert {board: own["accuracy_pct"] for board, own in by_board.items()} == {"b0": 3.0, "b1": 7.0}
+    assert {board: metrics["accuracy_pct"] for board, metrics in by_board.items()} == {"b0": 3.0, "b1": 7.0}
     assert paired("adapted", "control")["accuracy_pct"] == over(1.5, 3.5)
     assert paired("triplet", "multi")["accuracy_pct"] == {"mean": -2.0, "n": 2, "sd": 0.0, "values": [-2.0, -2.0]}
     assert paired("adapted", "multi")["accuracy_pct"]["mean"] == 3.0
     assert paired("control", "triplet")["accuracy_pct"]["mean"] == 2.5
 
 
-def test_multi_minus_single_uses_shared_skins():
+def test_multi_minus_single_uses_skins_of_both():
     single = [card("transfer", "s0", {"s2": 20.0, "s3": 30.0}), card("transfer", "s9", {"s2": 40.0, "s3": 30.0})]
     (one,) = [one for one in numbers([*CARDS, *single])["paired"] if one["over"] == "single"]
-    assert {board: own["accuracy_pct"] for board, own in one["by_board"].items()} == {"b1": 80.0 - 30.0}
+    assert {board: metrics["accuracy_pct"] for board, metrics in one["by_board"].items()} == {"b1": 80.0 - 30.0}
     assert one["accuracy_pct"] == {"mean": 50.0, "n": 1}
 
 
-def test_missing_experiment_is_absent():
+def test_missing_experiment_has_no_numbers():
     assert numbers([]) == {"variants": {}}
     assert numbers(board_cards("lobo", 80.0)).keys() == {"table2", "lobo", "variants"}
     without = numbers([*board_cards("lobo", 80.0), *board_cards("triplet", 78.0)])
@@ -110,11 +110,11 @@ def test_missing_experiment_is_absent():
     assert [(one["of"], one["over"]) for one in without["paired"]] == [("triplet", "multi")]
     alone = numbers(adapted_cards("paper", 78.0, 1.0))
     assert alone.keys() == {"table2", "adapt", "variants"}
-    assert alone["adapt"] == {"pokes_n": 390}  # with no control
+    assert alone["adapt"] == {"pokes_n": 390}  # there is no control
     assert "null" not in json.dumps(numbers())
 
 
-def test_other_recipes_appear_only_in_variants():
+def test_other_recipes_are_only_in_variants():
     alone = numbers([one for one in CARDS if one["recipe_name"] in ("paper", "control")])
     assert numbers() == alone | {"variants": numbers()["variants"]}
     assert numbers()["variants"].keys() == {"lobo", "triplet", "adapt"}
@@ -132,7 +132,7 @@ def test_sweep_over_pokes_is_sorted():
     assert sweep[0]["accuracy_pct"] == {"mean": 73.0, "n": 1, "sd_seeds": pytest.approx(8**0.5)}
 
 
-def test_sweep_over_sensors_by_method():
+def test_sweep_over_sensors_has_a_point_per_method_and_count():
     points = [
         point(by_skin, f"b1-{skins_n:02d}skins-draw{draw_i}", method=method, trained_on_skins_n=skins_n)
         for method, step_pct in (("multi", 0.0), ("triplet", 1.0), ("adapted", 2.0))
@@ -149,7 +149,7 @@ def test_sweep_over_sensors_by_method():
         ("multi", 1, 56.5), ("multi", 3, 58.5), ("triplet", 1, 57.5), ("triplet", 3, 59.5), ("adapted", 1, 58.5),
         ("adapted", 3, 60.5),
     ]  # fmt: skip
-    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)  # two draws for one board
+    assert all(one["accuracy_pct"]["n"] == 1 for one in sweep)  # one board, with two draws of skins
     assert all(one["accuracy_pct"]["sd_seeds"] == pytest.approx(0.5**0.5) for one in sweep)
 
 
@@ -170,7 +170,7 @@ def test_learning_times_are_medians():
         "adapt": [took("adapt.long.b0.s.390pokes.seed0", 5)],
     }
     timed = learning_times({"baselines": rows}, seconds)["learning"]
-    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # medians; the last method was not timed
+    assert [row.get("train_s") for row in timed] == [2, 100, 35, None]  # median times; the last method was not timed
     assert [row["inference_us"] for row in timed[:3]] == pytest.approx([2, 100, 5])
 
 
@@ -181,7 +181,7 @@ def test_adaptation_times_by_number_of_pokes():
 
 
 def points(key: str, by_count: dict[int, tuple[float, float]], **keys: str) -> list[dict]:
-    """Return the points of two boards, from their accuracies at each count."""
+    """Return points of two boards; `by_count` has the accuracies of both boards at each count."""
     return [
         point(dict.fromkeys(skins, float(pct)), board, **{key: count}, **keys)
         for count, both in by_count.items()
@@ -190,7 +190,7 @@ def points(key: str, by_count: dict[int, tuple[float, float]], **keys: str) -> l
 
 
 def gains(contrast: dict) -> dict[str, float]:
-    return {board: own["accuracy_pct"] for board, own in contrast["by_board"].items()}
+    return {board: metrics["accuracy_pct"] for board, metrics in contrast["by_board"].items()}
 
 
 def test_poke_contrasts_of_gain_and_plateau():
@@ -205,7 +205,7 @@ def test_poke_contrasts_of_gain_and_plateau():
     assert found["pokes_gain"]["accuracy_pct"]["values"] == pytest.approx([10.0, 4.0])
 
 
-def test_unreached_contrasts_are_absent():
+def test_contrasts_beyond_the_range_of_a_sweep_are_absent():
     found = contrasts_of_pokes(tidy([], {"pokes": points("pokes_n", {0: (70, 80), 65: (72, 81), 390: (75, 83)})}))
     assert found.keys() == {"pokes_first", "pokes_gain"}
     assert found["pokes_gain"]["to_pokes_n"] == 390
@@ -222,7 +222,7 @@ def test_sensor_contrasts_of_methods_and_gains():
         "multi": {1: (50, 60), 15: (80, 84)}, "triplet": {1: (48, 58), 15: (78, 82)},
         "adapted": {1: (58, 64), 15: (80, 83)},
     }  # fmt: skip
-    rows = [row for name, own in scores.items() for row in points("trained_on_skins_n", own, method=name)]
+    rows = [row for name, by_count in scores.items() for row in points("trained_on_skins_n", by_count, method=name)]
     found = contrasts_of_sensors(tidy([], {"sensors": rows}))
     assert gains(found["sensors_more_multi"]) == {"b0": 30.0, "b1": 24.0}
     over = found["sensors_adapted_over_triplet"]

@@ -1,4 +1,4 @@
-"""Tests of numbers.json, which is equal for equal runs, of provenance.json, and of the scores that DVC shows."""
+"""Tests of numbers.json (equal for equal runs), provenance.json, and the scores that `dvc metrics` shows."""
 
 import copy
 import json
@@ -18,7 +18,7 @@ STUDY = {"study": "field", "method": "Gauss in z", "setting": "1 mm x 5", "work_
 
 
 def run(seconds: float) -> dict:
-    """Return the numbers of a run with all kinds of times; one method is not timed."""
+    """Return the numbers of a run with every kind of run time; one method is not timed."""
     trainings = {
         "sweep_pokes": [{"name": f"pokes.paper.b0.{n}pokes.seed0", "train_s": seconds} for n in (0, 390)],
         "train_classical": [{"name": "ridge.b0", "train_s": seconds, "one_reading_s": seconds / 1e3}],
@@ -56,13 +56,13 @@ def test_split_and_join_are_inverse():
 
 
 @pytest.mark.parametrize("folder", sorted(file.parent for file in ROOT.glob("reports/*/numbers.json")), ids=str)
-def test_committed_reports_are_split(folder):
+def test_committed_numbers_and_provenance_are_separate(folder):
     numbers, provenance = (read_json(folder / name) for name in ("numbers.json", "provenance.json"))
     assert split(join(numbers, provenance)) == (numbers, provenance)
     assert {"git", "trained", "device", "seconds", "runtime"} <= set(provenance)
 
 
-def test_table_2_and_control_are_shown_by_their_means():
+def test_scores_include_the_means_of_table_2_and_control():
     numbers = {"provenance": {"source": "simulated"}, "table2": {"multi": scores()}, "adapt": {"control": scores()}}
     numbers["table2"]["multi"]["accuracy_pct"] = stat(82.2)
     assert headline_scores(numbers) == {
@@ -73,13 +73,13 @@ def test_table_2_and_control_are_shown_by_their_means():
     }
 
 
-def test_drift_is_shown_at_its_end():
+def test_scores_include_the_last_window_of_drift():
     windows = [{"contacts_n": n, "accuracy_pct": 100.0 - n, "mse_xy_mm2": 1.0} for n in (10, 20)]
     numbers = {"provenance": {"source": "recorded"}, "drift": {"each": windows, "findings": [{"finding": "x"}]}}
-    assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}  # without forces
+    assert headline_scores(numbers) == {"drift_end": {"each": {"accuracy_pct": 80.0}}}  # scores without forces
 
 
-def test_recorded_scenes_show_registered_scores_and_best_methods():
+def test_scores_of_recorded_scenes_are_registered_ones_and_best_methods():
     def row(method: str, labels_n: int, accuracy_pct: float) -> dict:
         fields = {"method": method, "inputs": "raw", "labels_n": labels_n, "registered": scores()}
         return fields | {"as_labelled": {"accuracy_pct": stat(accuracy_pct)}}
@@ -111,7 +111,7 @@ def test_empty_scene_has_no_scores():
 @pytest.mark.parametrize("without", ANALYSES)
 def test_missing_experiment_has_no_scores(without):
     numbers = all_experiments()
-    numbers.pop(without, None)  # compare is only run for recordings
+    numbers.pop(without, None)  # experiment compare is only in recorded scenes
     assert not any(name.startswith(without) for name in headline_scores(numbers))
 
 
@@ -124,4 +124,4 @@ def test_scores_of_committed_reports(file):
     for name, value in shown.items():
         if not name.endswith(".method"):
             assert value in known
-            assert name.endswith(("_pct", "_mm2", "_N2", ".r2_f"))  # R² has no unit
+            assert name.endswith(("_pct", "_mm2", "_N2", ".r2_f"))  # only R² has no unit

@@ -37,7 +37,7 @@ VOID = {"meta", "img", "br"}
 
 
 class Reader(HTMLParser):
-    """Parse a page into elements with attributes and ancestors; fail if tags do not nest."""
+    """Parse an HTML page into elements with attributes and ancestors; fail if tags are not nested correctly."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class Reader(HTMLParser):
 
 def render(numbers: dict | None = None, **more: pd.DataFrame) -> str:
     numbers = all_experiments() if numbers is None else numbers
-    # The synthetic numbers of experiments are too small for their tables.
+    # The synthetic numbers lack values that the tables of these experiments need.
     plain = {name: value for name, value in numbers.items() if name not in ANALYSES}
     drift = pd.DataFrame({"contacts": ["0"], "accuracy, %": ["90"]})
     tables = make_tables(plain) | {"checklist": checklist(numbers), "drift": drift} | more
@@ -98,7 +98,7 @@ def test_links_lead_to_unique_ids(read):
     links = {attributes["href"] for attributes, _ in read.all("a")}
     assert {link[1:] for link in links if link.startswith("#")} <= set(ids)
     assert [link for link in links if link.startswith("../../") and not (ROOT / link[6:]).exists()] == [
-        "../../pipeline/scenes/x.yaml"  # the synthetic scene has no file
+        "../../pipeline/scenes/x.yaml"  # no such file, because the scene is synthetic
     ]
     labels = {attributes["aria-labelledby"] for _, attributes, _ in read.elements if "aria-labelledby" in attributes}
     assert labels <= set(ids)
@@ -131,8 +131,8 @@ def test_smallest_width_of_a_figure_is_legible():
     letters = '<svg width="300.0pt" height="150.0pt"><g style="font-size: 10px"/><g style="font: 6px Arial"/></svg>'
     drawing = measure("figures/a.svg", letters)
     assert (drawing.width_px, drawing.height_px) == (400, 200)
-    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # the smallest letters are 6 pt high in a figure of 300 pt
-    assert drawing.scrolls  # on a phone
+    assert drawing.least_px == LEGIBLE_PX / 6 * 300  # the smallest text is 6 pt high in a figure 300 pt wide
+    assert drawing.scrolls  # scrolls on a phone
     assert not measure("figures/a.svg", letters.replace("6px", "9px")).scrolls
 
 
@@ -150,7 +150,7 @@ def test_figure_without_size_is_an_error():
         ("a ± b, [low, high]", "a ± b, [low, high]"),
     ],
 )
-def test_numbers_do_not_break_across_lines(text, kept):
+def test_numbers_are_not_broken_across_lines(text, kept):
     assert unbroken(text) == kept.replace("_", "\u00a0")
 
 
@@ -160,7 +160,7 @@ def test_summary_is_in_the_first_section():
     assert text.count(SUMMARY) == first.count(SUMMARY) == 1
 
 
-def test_about_lists_counts():
+def test_section_about_lists_counts():
     numbers = all_experiments()
     counts = next(iter(numbers["described"].values()))["counts"]
     counts.clear()
@@ -187,7 +187,7 @@ def test_incomparable_results_are_omitted():
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_badge_has_the_source(source):
+def test_badge_shows_the_source(source):
     text = render(all_experiments(source))
     assert f'<strong class="badge {source}">{source.upper()}</strong>' in text
     assert {"simulated": "RECORDED", "recorded": "SIMULATED"}[source] not in text
@@ -198,9 +198,9 @@ def test_page_starts_with_the_scene(read):
     assert place < read.words.index(read_sections()[0].title)
 
 
-def test_tables_without_a_section_are_shown(read):
+def test_tables_without_a_section_are_shown_as_text(read):
     assert "Surprise" in read.words
-    assert "<b>" in read.words  # as text, not as a tag
+    assert "<b>" in read.words  # shown as text, not interpreted as a tag
     assert "a & b" in read.words
     assert "Unheard of (simulated)" in read.words
 
@@ -253,7 +253,7 @@ def test_each_table_and_figure_has_one_section():
 
 
 def luminance(colour: str) -> float:
-    """Return the relative luminance (WCAG 2.2)."""
+    """Return the relative luminance of a colour (WCAG 2.2)."""
     parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
     return sum(weight * part for weight, part in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
@@ -295,11 +295,11 @@ def test_recorded_scenes_come_first():
     assert 'href="here/index.html"' in simulated
     assert "there/" not in simulated
     assert "here/" not in recorded.replace("there/", "")
-    assert "there/figures" not in text  # has no figure
+    assert "there/figures" not in text  # scene `there` has no figures
 
 
 def test_scenes_without_held_out_boards_come_last():
-    # "a" precedes "here" in the alphabet, but held out no board.
+    # Scene `a` comes before `here` in the alphabet, but has no held-out boards.
     alone = {name: value for name, value in scene_numbers("a", "simulated").items() if name != "table2"}
     both = index([alone, scene_numbers("here", "simulated")], {})
     assert both.index("Scene here") < both.index("Scene a")

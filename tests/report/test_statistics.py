@@ -1,4 +1,4 @@
-"""Tests of the statistics over boards against SciPy and naive loops, and of their symmetries."""
+"""Tests of the statistics over boards: against SciPy and naive loops, and symmetries."""
 
 import io
 
@@ -49,8 +49,8 @@ from reskin.seeds import rng_for
 from tests.data.test_splits import six_by_three_in_passes
 from tests.report.synthetic import SKINS, adapted_cards, card
 
-FEW = settings(max_examples=25, deadline=None)  # tables take milliseconds
-DOUBLE = 1e-9  # sums of doubles of tens
+FEW = settings(max_examples=25, deadline=None)  # few examples, because building tables takes milliseconds
+DOUBLE = 1e-9  # relative rounding error of sums of numbers of about 10
 VALUES = st.lists(st.floats(-50, 50), min_size=4, max_size=9).filter(lambda values: np.std(values) > 1e-3)
 PAIRS = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=4, max_size=9).filter(
     lambda pairs: np.std([a - b for a, b in pairs]) > 1e-3
@@ -69,7 +69,7 @@ def skin_scores(**changes: object) -> pd.DataFrame:
 
 
 def score_table(values: dict[str, list[list[float]]]) -> pd.DataFrame:
-    """Return a table of scores by board, skin and network."""
+    """Return a score table with a row per network; `values` has, for each board, lists of networks per skin."""
     rows = [
         {"board": board, "skin": f"{board}_s{i}", "accuracy_pct": value}
         for board, skins in values.items() for i, networks in enumerate(skins) for value in networks
@@ -82,7 +82,7 @@ def board_scores(values: list[float]) -> pd.DataFrame:
 
 
 def test_seeds_of_a_fold_are_averaged_first():
-    # squared errors: fold b0 has 0 and 4 (two seeds), fold b1 has 16
+    # squared errors: 0 and 4 for the two seeds of fold b0, 16 for fold b1
     cards = [card_with_offset("b0", 0), card_with_offset("b0", 2) | {"seed_i": 1}, card_with_offset("b1", 4)]
     summary = over_folds(tidy(cards))["mse_xy_mm2"]
     assert summary["n"] == 2
@@ -92,7 +92,7 @@ def test_seeds_of_a_fold_are_averaged_first():
     assert "sd" not in over_folds(tidy(cards[:2]))["mse_xy_mm2"]
 
 
-def test_sd_over_seeds_is_within_a_unit():
+def test_sd_over_seeds_is_within_boards():
     rows = score_table({"b0": [[1.0, 3.0], [5.0, 5.0]], "b1": [[8.0]]})
     found = add_seed_sd({"accuracy_pct": {"mean": 5.5, "n": 2}}, rows, "board", "skin")["accuracy_pct"]
     assert found == {"mean": 5.5, "n": 2, "sd_seeds": pytest.approx(np.mean([2**0.5, 0]))}
@@ -106,12 +106,12 @@ def test_adapted_networks_are_pooled_by_fold_and_seed():
     assert set(rows.rows_n) == {20}
     for places, part in ((AS_LABELLED, "all"), (REGISTERED, "registered")):
         for _, row in whole(tidy(adapted_cards()), places).iterrows():
-            own = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
-            for name in METRICS[:3]:  # R^2: see test_unequal_skins_pool_to_the_score_of_all_rows
+            cards = [one for one in adapted_cards() if (one["fold"], one["seed_i"]) == (row.fold, row.seed)]
+            for name in METRICS[:3]:  # R^2 is tested in test_unequal_skins_pool_to_the_score_of_all_rows
                 total = 0.0
-                for one in own:
+                for one in cards:
                     total += one["scores"][part][name]
-                assert row[name] == pytest.approx(total / 2, rel=1e-12)  # float64
+                assert row[name] == pytest.approx(total / 2, rel=1e-12)  # rounding in float64
 
 
 def test_unequal_skins_pool_to_the_score_of_all_rows():
@@ -124,17 +124,17 @@ def test_unequal_skins_pool_to_the_score_of_all_rows():
     assert [row[name] for name in METRICS] == pytest.approx([whole_board[name] for name in METRICS], rel=1e-12)
 
 
-def test_tidy_table_survives_csv():
+def test_tidy_table_is_restored_from_csv():
     points = {"labels": [{"method": "ridge", "inputs": "raw", "labels_n": 5, "fold": "b0", "seed_i": 1,
                           "scores": adapted_cards()[0]["scores"]}]}  # fmt: skip
     table = tidy([card_with_offset("b0", 1), *adapted_cards()], points)
     assert list(table.columns) == [*KEYS, *METRICS, *UNCERTAINTY]
-    assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # as labelled, registered, and each skin
+    assert len(table) == (2 + 3) + (2 * 6 + 12) + (2 + 1)  # rows: as labelled, registered, and per skin
     (row,) = by_skin(select(table, question="labels")).to_dict("records")
     assert (row["board"], row["skin"], row["labels_n"], row["method"]) == ("b0", "s0", 5, "ridge")
     again = pd.read_csv(io.StringIO(to_csv(table)), keep_default_na=False, na_values={name: "" for name in METRICS})
     assert again["labels_n"].iloc[-1] == "5"
-    np.testing.assert_allclose(again[list(METRICS)], table[list(METRICS)], rtol=1e-5)  # six digits
+    np.testing.assert_allclose(again[list(METRICS)], table[list(METRICS)], rtol=1e-5)  # the CSV has six digits
 
 
 @given(VALUES)
@@ -159,16 +159,17 @@ def test_paired_equals_scipys_paired_t_test(pairs):
         assert (verdict(stat) == UNDECIDED) == (test.pvalue > 0.05)
 
 
-def test_differences_are_means_over_networks_then_skins():
-    of = score_table({"b0": [[1.0, 3.0], [10.0]], "b1": [[5.0]]})  # of b0: 2 and 10; unequal numbers of networks
-    over = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # of b0: 1 and 2
-    found = paired(of, over)
+def test_differences_are_averaged_over_networks_then_skins():
+    # means of the skins of b0: 2 and 10; skins have different numbers of networks
+    first = score_table({"b0": [[1.0, 3.0], [10.0]], "b1": [[5.0]]})
+    second = score_table({"b0": [[1.0], [1.0, 3.0]], "b1": [[9.0]]})  # means of the skins of b0: 1 and 2
+    found = paired(first, second)
     assert found["by_board"] == {"b0": {"accuracy_pct": (1 + 8) / 2}, "b1": {"accuracy_pct": -4.0}}
     assert (found["accuracy_pct"]["mean"], found["accuracy_pct"]["n"]) == (0.25, 2)
 
 
 def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str, float]:
-    """Return the mean difference of each board, by loops over skins and seeds."""
+    """Reference: return the mean difference of each board, by loops over skins and seeds."""
     found: dict[str, list[float]] = {}
     for board, skin in SKINS:
         sides = [
@@ -176,7 +177,7 @@ def looped_boards(cards: list[dict], others: list[dict], name: str) -> dict[str,
             for side in (cards, others)
         ]
         found.setdefault(board, []).append(sum(sides[0]) / len(sides[0]) - sum(sides[1]) / len(sides[1]))
-    return {board: sum(own) / len(own) for board, own in found.items()}
+    return {board: sum(differences) / len(differences) for board, differences in found.items()}
 
 
 def test_paired_equals_naive_loops():
@@ -190,7 +191,7 @@ def test_paired_equals_naive_loops():
             "mean": pytest.approx(mean), "sd": pytest.approx(sd), "n": 2,
             "values": pytest.approx([looped[board] for board in sorted(looped)]),
         }  # fmt: skip
-    assert found["mse_xy_mm2"]["mean"] < 0  # the first side is better
+    assert found["mse_xy_mm2"]["mean"] < 0  # the first side has the smaller error
 
 
 def test_paired_with_itself_is_zero():
@@ -212,16 +213,16 @@ def test_more_skins_of_equal_scores_change_nothing():
 @FEW
 @given(VALUES, st.integers(0, 99))
 def test_order_of_rows_does_not_matter(values, seed):
-    of = score_table({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
+    first = score_table({f"b{i}": [[value], [2 * value]] for i, value in enumerate(values)})
     over = score_table({f"b{i}": [[1.0], [0.0]] for i in range(len(values))})
-    assert paired(of.sample(frac=1, random_state=seed), over[::-1]) == paired(of, over)
+    assert paired(first.sample(frac=1, random_state=seed), over[::-1]) == paired(first, over)
 
 
 @FEW
 @given(VALUES)
-def test_swapping_sides_negates_the_difference(values):
-    of, over = board_scores(values), board_scores([1.0] * len(values))
-    ahead, back = paired(of, over)["accuracy_pct"], paired(over, of)["accuracy_pct"]
+def test_swapping_the_sides_negates_the_difference(values):
+    first, second = board_scores(values), board_scores([1.0] * len(values))
+    ahead, back = paired(first, second)["accuracy_pct"], paired(second, first)["accuracy_pct"]
     turned = negate(ahead)
     assert back["ci95"] == pytest.approx(turned["ci95"], abs=DOUBLE)
     assert back["mean"] == pytest.approx(turned["mean"], abs=DOUBLE)
@@ -231,8 +232,8 @@ def test_swapping_sides_negates_the_difference(values):
 
 @FEW
 @given(VALUES, st.floats(-50, 50))
-def test_threshold_is_a_shift(values, above):
-    stat, moved = (statistic(own, boards=True) for own in (values, [value - above for value in values]))
+def test_threshold_is_equivalent_to_a_shift(values, above):
+    stat, moved = (statistic(scores, boards=True) for scores in (values, [value - above for value in values]))
     if min(abs(end) for end in moved["ci95"]) > DOUBLE:
         assert verdict(stat, above=above) == verdict(moved)
 
@@ -241,7 +242,7 @@ def test_threshold_is_a_shift(values, above):
     ("ends", "expected"),
     [([0.1, 4.0], SUPPORTED), ([-4.0, -0.1], CONTRADICTED), ([-0.1, 4.0], UNDECIDED), ([0.0, 1.0], UNDECIDED)],
 )
-def test_verdict_is_undecided_if_the_interval_has_zero(ends, expected):
+def test_verdict_is_undecided_if_the_interval_includes_zero(ends, expected):
     assert verdict({"mean": 1.0, "n": 6, "ci95": ends}) == expected
 
 
@@ -265,10 +266,10 @@ def test_single_board_has_no_verdict():
     assert verdict(stat) == verdict_within(stat, 5.0) == verdict(negate(stat)) == FEW_BOARDS
 
 
-def test_repeats_on_one_skin_are_not_boards():
+def test_repeats_on_one_skin_do_not_count_as_boards():
     assert (
         verdict({"mean": 96.0, "sd": 0.1, "n": 5}, above=90.0) == FEW_BOARDS
-    )  # n counts repeats: no interval over boards
+    )  # n counts repeats, so there is no interval over boards
 
 
 def test_combined_verdicts():
@@ -285,7 +286,7 @@ def test_paired_needs_equal_skins():
 
 
 def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
-    """Return a table of scores by training skin (fold) and test board, one skin per board."""
+    """Return a score table of networks trained on one skin (a fold); rows are folds, columns are test boards."""
     rows = [
         {"fold": fold, "board": board, "skin": f"{board}_s0", "accuracy_pct": value}
         for fold, boards in values.items() for board, value in boards.items()
@@ -296,12 +297,15 @@ def transfer_scores(values: dict[str, dict[str, float]]) -> pd.DataFrame:
 def test_paired_with_single_counts_training_skins():
     boards = [f"b{i}" for i in range(4)]
     alike = transfer_scores({fold: {board: 20.0 + i for i, board in enumerate(boards)} for fold in ("t0", "t1", "t2")})
-    apart = transfer_scores({f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)})
+    differing = transfer_scores(
+        {f"t{j}": {board: 20.0 + i + 10 * j for i, board in enumerate(boards)} for j in range(3)}
+    )
     many = board_scores([80.0, 81.0, 82.0, 83.0])
-    sure, unsure = (paired_with_single(many, one)["accuracy_pct"] for one in (alike, apart))
+    sure, unsure = (paired_with_single(many, one)["accuracy_pct"] for one in (alike, differing))
     assert sure["mean"] == pytest.approx(60.0)
-    assert sure["ci95"] == pytest.approx([60.0, 60.0])  # equal gains
-    # Boards gain 50 each; training skins gain 60, 50, 40: variance 100 / 3 with two degrees of freedom.
+    assert sure["ci95"] == pytest.approx([60.0, 60.0])  # all gains are equal
+    # The mean gains are 50 on every board and 60, 50, 40 for the training skins: variance 100 / 3, two degrees of
+    # freedom.
     low, high = t.interval(0.95, 2, 50, np.sqrt(100 / 3))
     assert unsure["ci95"] == pytest.approx([low, high])
     assert unsure["p"] == pytest.approx(2 * t.sf(50 / np.sqrt(100 / 3), 2))
@@ -321,7 +325,7 @@ def test_crossed_variance_is_at_least_that_of_either_factor(rows, columns):
     assert se**2 == pytest.approx(row_variance + column_variance)
     assert min(len(rows), len(columns)) - 1 <= freedom * (1 + 1e-9)
     assert freedom <= (len(rows) + len(columns) - 2) * (1 + 1e-9)
-    assert two_way_error(table[[0, 1]]) is None  # two boards
+    assert two_way_error(table[[0, 1]]) is None  # undefined for two boards
 
 
 @FEW
@@ -332,14 +336,14 @@ def test_intervals_stay_in_the_range_of_the_metric(values):
         ends = interval(values, metric)
         assert low <= ends[0] <= mean * (1 + 1e-12)
         assert mean * (1 - 1e-12) <= ends[1] <= high
-    ends = interval([1 - value for value in values], "r2_f")  # far below 1
+    ends = interval([1 - value for value in values], "r2_f")  # values far below the upper limit of 1
     assert ends[0] <= 1 - mean + 1e-9
     assert 1 - mean - 1e-9 <= ends[1] <= 1
 
 
 @FEW
 @given(st.lists(st.floats(49.9, 50.1), min_size=4, max_size=9))
-def test_bounded_interval_tends_to_students(values):
+def test_bounded_interval_approaches_students_interval_far_from_the_bounds(values):
     plain, bounded = np.array(interval(values)), np.array(interval(values, "accuracy_pct"))
     np.testing.assert_allclose(bounded, plain, atol=0.02 * np.ptp(plain) + 1e-9)
 
@@ -372,7 +376,7 @@ def test_over_boards_equals_over_folds():
             np.mean([one["scores"]["all"][name] for one in adapted_cards() if one["fold"] == board])
             for board in ("b0", "b1")
         ]
-        if name != "r2_f":  # R^2: see test_unequal_skins_pool_to_the_score_of_all_rows
+        if name != "r2_f":  # R^2 is tested in test_unequal_skins_pool_to_the_score_of_all_rows
             assert stat["values"] == pytest.approx(means)
 
 
@@ -422,12 +426,12 @@ TRAININGS = st.lists(st.fixed_dictionaries({"collapsed": st.booleans(), "collaps
 
 
 @given(TRAININGS)
-def test_tally_counts_every_attempt(done):
+def test_tally_of_training_runs_counts_every_attempt(done):
     attempts = [[True] * one["collapsed_before_n"] + [one["collapsed"]] for one in done]
     assert tally(done) == {
         "trainings_n": sum(map(len, attempts)),
         "collapsed_n": sum(map(sum, attempts)),
-        "kept_collapsed_n": sum(own[-1] for own in attempts),
+        "kept_collapsed_n": sum(collapses[-1] for collapses in attempts),
     }
 
 

@@ -1,4 +1,4 @@
-"""Tests of the report's tables: our numbers, the paper's numbers and their source."""
+"""Tests of the report's tables: our numbers, numbers of the paper, source."""
 
 import json
 
@@ -59,10 +59,10 @@ COUNTS = [
 ]
 
 
-def numbers(made: list[dict] = CARDS, source: str = "recorded") -> dict:
+def numbers(cards: list[dict] = CARDS, source: str = "recorded") -> dict:
     provenance = {"source": source, "scene": "x", "git": "y", "seed": 1, "device": "z", "seconds": 1.0}
     capture = add_up(COUNTS) | {"left_out": {"low_force_rows_n": 3}}
-    return {"provenance": provenance, "capture": capture, **learning_numbers(tidy(made), headline="paper")}
+    return {"provenance": provenance, "capture": capture, **learning_numbers(tidy(cards), headline="paper")}
 
 
 def test_pooled_scores_are_over_boards_and_single_ones_over_pairs():
@@ -73,7 +73,7 @@ def test_pooled_scores_are_over_boards_and_single_ones_over_pairs():
     assert table2["single"]["accuracy_pct"] == pairs
 
 
-def test_before_touch_rows_are_below_their_split():
+def test_rows_before_touch_follow_the_row_of_their_split():
     columns = {"question": ["single_temporal"] * 4, "fold": ["s0", "s0", "s1", "s1"], "told_by": ["noload", "scan"] * 2}
     predicted = pa.table(columns | {"accuracy_pct": [10.0, 99.0, 20.0, 97.0], "mse_xy_mm2": [9.0, 0.1, 8.0, 0.3]})
     shown = numbers([card("single_temporal", "s0", 95.0)])
@@ -85,7 +85,7 @@ def test_before_touch_rows_are_below_their_split():
     assert len(make_tables(shown)["single_sensor"]) == 1
 
 
-def test_missing_experiment_is_absent():
+def test_missing_experiment_has_no_table():
     only_single = numbers([card("single_temporal", "s0", 99.0)])
     assert "table2" not in only_single
     assert "lobo" not in only_single
@@ -106,11 +106,11 @@ def test_splits_of_one_skin_start_with_the_papers():
     assert "as in the paper" in table["model"][0]
 
 
-def test_variants_are_separate_from_the_headline():
+def test_variants_have_a_separate_table():
     assert numbers()["variants"]["lobo"]["released"]["accuracy_pct"]["mean"] == 1.0
 
 
-def test_capture_counts_add_up():
+def test_capture_counts_are_summed():
     assert add_up(COUNTS) == {
         "captures_n": 2, "bytes_n": 249, "frames_n": 3, "skipped_resync_bytes_n": 1, "skipped_truncated_bytes_n": 2,
         "lost_bytes_n": 3,
@@ -121,7 +121,7 @@ def test_capture_counts_by_protocol():
     wear = {"accounts": COUNTS, "left_out": {}}
     losses = {
         "drift": wear | {"left_out": {"low_force_rows_n": 4}},
-        "variation": wear,  # the same captures, counted once
+        "variation": wear,  # uses the captures of `drift`, which are counted once
         "shear": {"accounts": COUNTS[1:], "left_out": {"low_force_rows_n": 7}},
         "contacts": {"accounts": [], "left_out": {}},  # uses the main captures
     }
@@ -132,14 +132,14 @@ def test_capture_counts_by_protocol():
     shown = make_tables(numbers() | {"capture_by_protocol": found})["captures"].set_index(["protocol", "what"])["count"]
     assert shown["main", "bytes_n"] == shown["wear", "bytes_n"] == "249"
     assert shown["drag", "left out of training: low_force_rows_n"] == "7"
-    assert ("drag", "lost_bytes_n") not in shown  # no bytes were lost
+    assert ("drag", "lost_bytes_n") not in shown  # zero counts are not shown
     assert shown["wear", "lost_bytes_n"] == "3"
 
 
 def test_every_row_has_its_source():
     for source in ("simulated", "recorded"):
         tables = make_tables(numbers(source=source))
-        ours = tables.pop("table1")[OURS]  # the paper's table with our column
+        ours = tables.pop("table1")[OURS]  # the paper's table, with a column for ours
         assert all(cell == NOT_GIVEN or cell.endswith(f", {source}") for cell in ours)
         assert any(cell != NOT_GIVEN for cell in ours)
         for table in tables.values():
@@ -149,7 +149,7 @@ def test_every_row_has_its_source():
 def test_table_2_has_the_papers_numbers():
     text = to_markdown(make_tables(numbers())["table2"])
     for value in TABLE_2["multi"].values():
-        assert f"{value[0]:g} ± {value[1]:g}" in text  # with the published digits
+        assert f"{value[0]:g} ± {value[1]:g}" in text  # with the digits that the paper prints
     assert "85 ± 7.1" in text
 
 
@@ -202,7 +202,7 @@ def test_all_metrics_have_a_column():
     assert {metric for row in TABLE_2.values() for metric in row} == set(PAPER_METRICS)
 
 
-def test_summary_has_ours_the_papers_and_the_control():
+def test_summary_has_our_scores_the_papers_and_the_control():
     numbers = all_experiments()
     table = summary_table(numbers).set_index(HELD_OUT)
     assert len(table) == len(numbers["table2"]) + 1
@@ -244,7 +244,12 @@ def test_summary_of_recordings_has_labels():
 
 
 def test_no_summary_without_held_out_boards():
-    assert summary_table({name: own for name, own in all_experiments().items() if name != "table2"}) is None
+    assert (
+        summary_table(
+            {name: experiment_numbers for name, experiment_numbers in all_experiments().items() if name != "table2"}
+        )
+        is None
+    )
 
 
 TABLE_1 = read_table1()
@@ -267,7 +272,7 @@ def test_only_reskin_meets_every_requirement():
 
 
 @given(st.dictionaries(st.sampled_from(PROPERTIES), st.text(max_size=9)))
-def test_table_1_keeps_the_papers_cells(measured):
+def test_table_1_has_the_papers_cells(measured):
     table = table1(TABLE_1, measured)
     for (name, cells), (_, row) in zip(TABLE_1.rows.items(), table.iterrows(), strict=False):
         assert [row["property"], *(row[column] for column in TABLE_1.columns)] == [name, *cells]

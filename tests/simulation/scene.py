@@ -1,4 +1,4 @@
-"""A small simulated scene and variations of it."""
+"""A small simulated scene for tests, and changed copies of this scene."""
 
 from reskin.config import parse
 from reskin.simulation.settings import SimulationSettings
@@ -65,10 +65,10 @@ SECTIONS = {
 
 
 def synthesis(section: str = "rig", **changes: object) -> SimulationSettings:
-    """The scene with changes in one of its sections."""
+    """Return the settings of the small scene with changes in one section."""
     return parse(SimulationSettings, SECTIONS | {section: {**SECTIONS[section], **changes}}, "test")  # type: ignore[dict-item]
 
 
 def with_protocol(name: str, protocol: dict[str, object], **changes: object) -> SimulationSettings:
-    """The scene with one more protocol and with other sections."""
+    """Return the settings of the small scene with an additional protocol and with other sections."""
     return parse(SimulationSettings, SECTIONS | {"protocols": {"grid": GRID, name: protocol}} | changes, "test")

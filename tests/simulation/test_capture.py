@@ -1,4 +1,4 @@
-"""A synthetic capture compared with its protocol and with the simulated field; names, seeds and physics terms."""
+"""Tests of simulated captures against the protocol and the simulated field; names, seeds, physics terms."""
 
 import numpy as np
 import pytest
@@ -29,8 +29,8 @@ FRAMES_N = LIFTED_N + MOVING_N + DWELL_N + MOVING_N
 READ = slice(LIFTED_N + MOVING_N + 1, LIFTED_N + MOVING_N + DWELL_N)
 
 
-def capture_of(of=None, protocol="grid", *, board="b0", skin="b0_s0", seed=1):
-    return simulate_capture(of or synthesis(), protocol, board=board, skin=skin, seed=seed)
+def capture_of(scene=None, protocol="grid", *, board="b0", skin="b0_s0", seed=1):
+    return simulate_capture(scene or synthesis(), protocol, board=board, skin=skin, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def same(one, other):
 
 
 def frames_by_indentation(capture, frames_n=FRAMES_N):
-    """Frames as [indentation, frame, chip, axis]."""
+    """Return the fields of a capture as [indentation, frame, chip, axis]."""
     return capture.b_uT.astype(np.float64).reshape(-1, frames_n, 5, 3)
 
 
@@ -68,23 +68,23 @@ def test_frames_and_dwells_of_each_indentation(capture):
 
 
 def test_noiseless_capture_equals_the_field():
-    of = noiseless_scene()
-    b_uT = frames_by_indentation(capture_of(of))
-    board = draw_board(of.boards["rigid"].design, of.spreads, seed=1, name="b0")
-    rule = of.boards["rigid"].quadrature.in_si()
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0", rule=rule)
+    scene = noiseless_scene()
+    b_uT = frames_by_indentation(capture_of(scene))
+    board = draw_board(scene.boards["rigid"].design, scene.spreads, seed=1, name="b0")
+    rule = scene.boards["rigid"].quadrature.in_si()
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0", rule=rule)
     pokes_m = np.array([[x - 8, y - 8, depth] for depth in (0.6, 1.2) for x, y in points_mm()]) * 1e-3
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
     found_uT = (b_uT[:, READ] - b_uT[:, 1:2])[:130]
-    assert np.abs(found_uT - truth_uT[:, None]).max() < 0.75  # one LSB of z: two roundings
+    assert np.abs(found_uT - truth_uT[:, None]).max() < 0.75  # one LSB of z, because two readings are rounded
 
 
 def test_robot_spread_changes_fields_but_not_labels():
     exact, loose = capture_of(noiseless_scene()), capture_of(synthesis("rig", robot_place_sd_mm=0.3))
     assert np.array_equal(exact.probe.x_mm, loose.probe.x_mm)
     moved_uT = (frames_by_indentation(exact) - frames_by_indentation(loose))[:, READ].std()
-    assert moved_uT > 2 * 5.0  # twice the noise of one reading
+    assert moved_uT > 2 * 5.0  # twice the noise of a reading
 
 
 def test_labels_are_commanded_and_forces_measured(capture):
@@ -94,27 +94,29 @@ def test_labels_are_commanded_and_forces_measured(capture):
         np.tile(points_mm(), (4, 1)),
     )
     assert not log.depth_mm[~log.contact].any()
-    of = synthesis()
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="b0_s0")
+    scene = synthesis()
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="b0_s0")
     noise_N = labels_in_contact(capture, "Fz_N") - forces(skin, np.repeat([0.6e-3, 1.2e-3] * 2, 65))
-    assert noise_N.std() == pytest.approx(0.006, rel=0.2)  # four times the sampling error of 260 draws
+    assert noise_N.std() == pytest.approx(0.006, rel=0.2)  # four standard errors for 260 draws
     assert np.abs(np.concatenate([noise_N, log.Fz_N[~log.contact], log.Fx_N, log.Fy_N])).max() < 6 * 0.006
 
 
-def test_passes_of_a_perfect_robot_differ_by_noise(capture):
-    still = [1, 2, 3, 4, 8, 9, 10]  # while the tip moves, chips that convert earlier see less
-    b_uT = frames_by_indentation(capture)[:, still]
+def test_passes_of_an_exact_robot_differ_only_by_noise(capture):
+    # Frames without motion: while the tip moves, chips that convert earlier read less.
+    without_motion = [1, 2, 3, 4, 8, 9, 10]
+    b_uT = frames_by_indentation(capture)[:, without_motion]
     differences = (b_uT[:130] - b_uT[130:]) / np.sqrt(2)
-    np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)  # 7000 draws: 0.8 %
+    # standard error for 7000 draws: 0.8 %
+    np.testing.assert_allclose(differences.std(axis=(0, 1, 2)), (3.3, 3.3, 5.0), rtol=0.05)
 
 
-def test_protocol_may_have_its_own_rate():
+def test_protocol_may_have_another_frame_rate():
     slow, usual = (
-        capture_of(with_protocol("other", GRID | {"passes_n": 1} | own), "other") for own in ({"rate_hz": 133.0}, {})
+        capture_of(with_protocol("other", GRID | {"passes_n": 1} | rate), "other") for rate in ({"rate_hz": 133.0}, {})
     )
     for capture, rate_hz in ((slow, 133.0), (usual, 400.0)):
         frames_n, log = 130 * FRAMES_N, capture.probe
-        # A chunk arrives a few tenths of a millisecond late; the capture lasts 3 s and more.
+        # Tolerance: a chunk arrives a few tenths of a millisecond late; the capture lasts 3 s or more.
         assert capture.arrived_s[-1] == pytest.approx(frames_n / rate_hz, rel=1e-3)
         np.testing.assert_allclose((log.t_end_s - log.t_start_s)[log.contact], 3 / rate_hz, rtol=1e-3)
 
@@ -135,17 +137,17 @@ def sleeve(**changes):
 
 
 def test_scattered_pokes_are_at_their_labels():
-    of = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
-    one = capture_of(of, "sleeve", board="v0", skin="v0_s0")
+    scene = sleeve(chip=SECTIONS["chip"] | {"noise_xy_uT": 0.0, "noise_z_uT": 0.0})
+    one = capture_of(scene, "sleeve", board="v0", skin="v0_s0")
     place_mm = np.column_stack([labels_in_contact(one, "x_mm"), labels_in_contact(one, "y_mm")]).astype(float)
-    board = draw_board(of.boards["sleeve"].design, of.spreads, seed=1, name="v0")
-    rule = of.boards["sleeve"].quadrature.in_si()
-    skin = draw_skin(of.skin, of.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
+    board = draw_board(scene.boards["sleeve"].design, scene.spreads, seed=1, name="v0")
+    rule = scene.boards["sleeve"].quadrature.in_si()
+    skin = draw_skin(scene.skin, scene.spreads, seed=1, name="v0_s0", rule=rule, sides_m=(50.8e-3, 101.6e-3))
     pokes_m = np.column_stack([place_mm - (25.4, 50.8), labels_in_contact(one, "depth_mm")]) * 1e-3
     _, changes_T = changes_of_field(board, skin, pokes_m)
     truth_uT = 1e6 * np.einsum("kij,klj,nkl->nki", board.sensitivity, board.turn, changes_T)
     b_uT = one.b_uT.astype(np.float64).reshape(-1, FRAMES_N, 40, 3)
-    # one LSB of z (two roundings); the rounding of float32 labels (4 nm) is negligible
+    # one LSB of z, because two readings are rounded; the rounding of labels to float32 (4 nm) is negligible
     assert np.abs(b_uT[:, READ] - b_uT[:, 1:2] - truth_uT[:, None]).max() < 0.75
 
 
@@ -168,7 +170,8 @@ def test_hand_pokes_have_fields_but_no_labels():
     change_uT = np.linalg.norm(
         (frames_by_indentation(one)[:, READ] - frames_by_indentation(one)[:, 1:2]).mean(axis=1).reshape(12, 15), axis=1
     )
-    assert change_uT.min() > 30  # noise alone: difference of two readings in 15 channels, averaged over 3: 13
+    # noise alone, a difference of two readings in 15 channels averaged over 3, would give 13 uT
+    assert change_uT.min() > 30
 
 
 def aged_capture(**changes):
@@ -179,7 +182,7 @@ def aged_capture(**changes):
 def test_aging_softens_and_drifts(capture):
     old = capture_of(aged_capture(ageing=AGEING))
     ratio = labels_in_contact(old, "Fz_N")[-65:] / labels_in_contact(capture, "Fz_N")[-65:]
-    # 1 - 0.1 (1 - exp(-227/300)) - 0.01 log10(1.227) = 0.946 at contact 227, half way through the last 65
+    # At contact 227, the middle of the last 65: 1 - 0.1 (1 - exp(-227/300)) - 0.01 log10(1.227) = 0.946.
     assert np.median(ratio) == pytest.approx(0.946, abs=0.005)
     drift_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
         -1
@@ -188,13 +191,14 @@ def test_aging_softens_and_drifts(capture):
     early_uT = (frames_by_indentation(old)[:, 1:5].mean(axis=1) - frames_by_indentation(capture)[:, 1:5].mean(axis=1))[
         0
     ]
-    assert np.abs(early_uT).max() < 12  # noise only: difference of two means with 5 / sqrt(2), three sd
+    # noise alone: three standard deviations of a difference of two means of two readings with 5 uT
+    assert np.abs(early_uT).max() < 12
 
 
 def test_relaxation_lowers_the_force_only(capture):
     slack = capture_of(aged_capture(relaxation=RELAXATION))
     ratio = np.median(labels_in_contact(slack, "Fz_N")[65:130] / labels_in_contact(capture, "Fz_N")[65:130])
-    # after 1 s the two fastest terms, 0.05 each, are gone, and at most a tenth of the third
+    # After 1 s, the two fastest terms (0.05 each) have relaxed, and at most a tenth of the third.
     assert 0.88 < ratio < 0.91
     assert np.array_equal(slack.b_uT, capture.b_uT)
 
@@ -204,7 +208,7 @@ def test_temperature_is_read_and_weakens_the_field(capture):
     assert warm.temperature_degC[-50:].mean() - warm.temperature_degC[:50].mean() == pytest.approx(2.3, abs=0.3)
     before_uT, after_uT = (frames_by_indentation(one)[-40:, 1:5].mean(axis=(0, 1)) for one in (capture, warm))
     change_uT = np.abs(after_uT).sum() - np.abs(before_uT).sum()
-    offset = 5 * 3 * 200 * 0.8  # the chips' offset is constant: mean |normal| of 15 channels
+    offset = 5 * 3 * 200 * 0.8  # sum over 15 channels of the chips' constant offset of 200 uT (mean of |normal| = 0.8)
     assert change_uT == pytest.approx(-0.0012 * 2.5 * np.abs(before_uT).sum(), abs=0.003 * offset)
 
 
@@ -220,7 +224,7 @@ def test_more_boards_skins_and_protocols_change_nothing(capture):
     assert same(capture, capture_of(more))
 
 
-def test_order_of_captures():
+def test_order_of_captures_does_not_matter():
     assert list_captures(with_protocol("few", GRID | {"skins_n": 3}), "few") == [
         ("b0", "b0_s0"),
         ("b0", "b0_s1"),
@@ -228,11 +232,11 @@ def test_order_of_captures():
     ]
 
 
-def test_skins_of_a_board_share_chips_only(capture):
+def test_skins_of_a_board_have_the_same_chips_and_different_fields(capture):
     other = capture_of(skin="b0_s1")
     assert not np.allclose(
         frames_by_indentation(capture)[0, 1], frames_by_indentation(other)[0, 1], atol=20
-    )  # six times the noise
+    )  # six standard deviations of the noise
 
 
 def test_skin_without_magnetisation_has_no_signal():
@@ -251,8 +255,8 @@ def test_unknown_parameter_is_named(section, name):
     [
         (GRID | {"skins_n": 5}, {}, "skins_n 5 is more than the 4 skins of rigid boards"),
         (GRID | {"boards": "soft"}, {}, "boards must be one of .'rigid'., not 'soft'"),
-        (GRID | {"terms": ["ageing"]}, {}, "terms must be exactly those of the protocols"),
-        (GRID, {"terms": {"ageing": AGEING}}, "terms must be exactly those of the protocols"),
+        (GRID | {"terms": ["ageing"]}, {}, "terms must be those that the protocols list"),
+        (GRID, {"terms": {"ageing": AGEING}}, "terms must be those that the protocols list"),
         (HAND | {"depth_mm": (1.2, 0.4)}, {}, "must list the smaller depth first"),
         (HAND | {"tilt_sd_deg": 5.0}, {}, "a tilted stylus .tilt_sd_deg. needs the term friction"),
         (DRAG | {"terms": []}, {}, "protocol other: a drag needs the term friction"),

@@ -1,4 +1,4 @@
-"""The contact response compared with the formulas of its terms; without terms, nothing changes."""
+"""Tests of the contact response against the formulas of its terms; without terms, all contacts are equal."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ TIP_M = np.tile([[[1e-3, 2e-3, 0.8e-3]]], (200, 1, 1))
 
 @pytest.fixture(scope="module")
 def first() -> tuple[np.ndarray, np.ndarray]:
-    """The field at rest and its change at the first contact, in T, at the chips."""
+    """Return the field at rest and the field change of the first contact, in T, at the chips."""
     rest_T, change_T = changes_of_field(BOARD, SKIN, TIP_M[0])
     return rest_T, change_T[0]
 
@@ -43,10 +43,10 @@ def test_field_fades_per_decade_of_contacts(first):
 
 
 def test_force_softens_and_relaxes_in_every_direction():
-    how, slack = Ageing(settling=0.2, ageing=0.0, fading_per_decade=0.0, wandering_uT=0.0), (0.1, 2.0)
+    ageing, slack = Ageing(settling=0.2, ageing=0.0, fading_per_decade=0.0, wandering_uT=0.0), (0.1, 2.0)
     relaxation = Relaxation(approach_s=slack[0], hold_s=slack[1])
     plain = response(tilt=0.1, friction=Friction(coefficient=0.8))
-    worn = response(tilt=0.1, friction=Friction(coefficient=0.8), ageing=how, relaxation=relaxation)
+    worn = response(tilt=0.1, friction=Friction(coefficient=0.8), ageing=ageing, relaxation=relaxation)
     left = (1 - 0.2 * -np.expm1(-199 / 300)) * relaxed_share(relaxation)
     np.testing.assert_allclose(worn.force_N[199], left * plain.force_N[199], rtol=1e-12)
 

@@ -1,4 +1,4 @@
-"""Weights compared with the skin's force curve; half sines, footfalls and random presses."""
+"""Tests of protocols with weights and dynamic presses: forces, half sines, footfalls, random presses."""
 
 import numpy as np
 import pytest
@@ -44,9 +44,9 @@ def draw_presses(presses_n, name="presses"):
 
 
 @given(st.floats(1e-3, 2.0))
-def test_depth_of_a_weight_balances_it(weight_N):
+def test_force_at_the_depth_of_a_weight_equals_the_weight(weight_N):
     depth_m = depths_under_load(SKIN, np.array([[weight_N]]))
-    # 1e-12 m on at most 20 N/mm is 2e-8 N
+    # tolerance: 1e-12 m times at most 20 N/mm is 2e-8 N
     assert forces(SKIN, depth_m[0])[0] == pytest.approx(weight_N, abs=2e-8)
 
 
@@ -70,17 +70,18 @@ def test_filling_has_weights_and_no_depth():
     log = capture.probe
     assert np.isnan(log.depth_mm[log.contact]).all()
     read_N = log.Fz_N[log.contact].reshape(3, 5)
-    np.testing.assert_allclose(read_N, np.tile([0, 0.25, 0.5, 0.75, 1.0], (3, 1)), atol=6 * 0.006)  # six sd
+    # six standard deviations
+    np.testing.assert_allclose(read_N, np.tile([0, 0.25, 0.5, 0.75, 1.0], (3, 1)), atol=6 * 0.006)
     assert set(log.x_mm[log.contact]) == {8.0}
 
 
-def test_more_weight_changes_the_field_more():
+def test_field_change_grows_with_the_weight():
     quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
     b_uT = capture_of("glass", GLASS, chip=quiet).b_uT.reshape(3, -1, 15)
     lifted_n, dwell_n = 1 + 4 + 2, 1 + 3
     stops_uT = b_uT[:, lifted_n : lifted_n + 5 * dwell_n].reshape(3, 5, dwell_n, 15)[:, :, -1]
     change_uT = np.linalg.norm(stops_uT - b_uT[:, 1:2], axis=2)
-    assert (change_uT[:, 0] <= 0.7 * 4).all()  # rounding of each channel: sqrt(15) / 2 LSB
+    assert (change_uT[:, 0] <= 0.7 * 4).all()  # tolerance: each of 15 channels is rounded by half an LSB
     assert (np.diff(change_uT, axis=1) > 10).all()
 
 
@@ -89,16 +90,15 @@ def test_half_sine_is_symmetric():
     assert depth_mm.argmax() == 50
     assert depth_mm[50] == pytest.approx(0.8)
     np.testing.assert_allclose(depth_mm, depth_mm[::-1], atol=1e-12)
-    assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)  # midpoint rule: (pi / 2 n)^2 / 6
+    assert depth_mm.mean() == pytest.approx(0.8 * 2 / np.pi, rel=1e-3)  # error of the midpoint rule: (pi / 2 n)^2 / 6
 
 
 def test_durations_are_log_uniform():
     stops = draw_presses(2000)
     frames_n = (stops.depth_mm > 0).sum(axis=1)
     position = np.log(frames_n / 20) / np.log(20)
-    np.testing.assert_allclose(
-        np.quantile(position, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.05
-    )  # 4 x 0.5/sqrt(n)
+    # four standard errors of a median, 0.5 / sqrt(n) each
+    np.testing.assert_allclose(np.quantile(position, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.05)
     after = np.arange(stops.depth_mm.shape[1]) >= frames_n[:, None]
     assert (stops.depth_mm[after] == LIFTED_MM).all()
     assert stops.depth_mm.max() <= 1.2
@@ -115,7 +115,7 @@ def test_walk_has_footfalls_and_swings():
     assert not down[-50:].any()
 
 
-def test_frames_in_contact_are_dwells():
+def test_frames_in_contact_form_dwells():
     log = capture_of("press", PRESS).probe
     plan = Press(**PRESS | {"terms": ()}).plan(rng_for(1, "recording", "press", "b0", "b0_s0", "plan"), SKIN_MM)
     assert log.contact.sum() == (plan.depth_mm > 0).sum()
@@ -129,23 +129,24 @@ def test_chips_read_a_rising_press_late():
     quiet = {**synthesis().chip.model_dump(), "noise_xy_uT": 0.0, "noise_z_uT": 0.0}
     fast, slow = (
         capture_of("press", PRESS | {"rate_hz": rate_hz, "presses_n": 1, "duration_s": (duration_s,) * 2}, chip=quiet)
-        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))  # 20 frames each, 2.5 ms and 250 ms apart
+        for rate_hz, duration_s in ((400.0, 0.05), (4.0, 5.0))  # both have 20 frames: 2.5 ms and 250 ms apart
     )
     still_uT, moving_uT = (one.b_uT.reshape(-1, 5, 3)[4:24].astype(float) for one in (slow, fast))
     late_uT = np.abs(moving_uT - still_uT)[3].max(axis=1)
-    assert (late_uT > 1.0).all()  # three LSB of z
-    # the same press read up to 1.84 ms late, with 2.5 ms between frames: each reading is between two of the slow press
+    assert (late_uT > 1.0).all()  # 1 uT is more than three LSB of z
+    # The fast press is read up to 1.84 ms late, and frames are 2.5 ms apart: each reading is between two readings of
+    # the slow press.
     low_uT, high_uT = (np.sort([still_uT[1:], still_uT[:-1]], axis=0)[i] for i in (0, 1))
-    assert (moving_uT[1:] >= low_uT - 1).all()  # uT: one LSB of x and y, and of z
+    assert (moving_uT[1:] >= low_uT - 1).all()  # tolerance in uT: more than one LSB of x, y and z
     assert (moving_uT[1:] <= high_uT + 1).all()
 
 
-def test_walk_truth_uses_the_logs_clock():
+def test_truth_of_a_walk_uses_the_clock_of_the_log():
     capture = capture_of("log", WALK)
     assert capture.card_rate_hz == 250.0
     log = capture.probe
     assert log.t_start_s[0] == pytest.approx(0.5 / 250)
-    assert log.t_end_s[0] == pytest.approx(100.5 / 250)  # after 0.4 s at rest
+    assert log.t_end_s[0] == pytest.approx(100.5 / 250)  # the first contact starts after 0.4 s at rest
     touched = log.depth_mm[log.contact].astype(float)
     skin = draw_skin(
         synthesis().skin,
@@ -154,8 +155,8 @@ def test_walk_truth_uses_the_logs_clock():
         name="b0_s0",
         rule=synthesis().main_boards.quadrature.in_si(),
     )
-    np.testing.assert_allclose(log.Fz_N[log.contact], forces(skin, touched * 1e-3), rtol=1e-4)  # float32 depths
-    assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2  # three footfalls
+    np.testing.assert_allclose(log.Fz_N[log.contact], forces(skin, touched * 1e-3), rtol=1e-4)  # depths are float32
+    assert (np.diff(log.t_start_s[log.contact]) > 1.5 / 250).sum() == 2  # two gaps, so three footfalls
 
 
 def test_force_controlled_presses_refuse_relaxation_and_wear():
@@ -167,14 +168,14 @@ def test_force_controlled_presses_refuse_relaxation_and_wear():
         with_protocol("glass", GLASS | {"step_N": 0.3})
 
 
-def test_walk_is_an_sd_card_log_not_a_capture(tmp_path):
+def test_walk_is_written_as_sd_card_log(tmp_path):
     capture = capture_of("log", WALK)
     header = write_capture(tmp_path / capture.name, *to_files(capture, with_protocol("log", WALK)))
     assert sorted(header.files) == ["log.csv", "probe.csv"]
     assert (header.layout, header.wire, header.source) == ("sd-card", None, "simulated")
     t_s, b_uT, temperature_degC, account = read_log(tmp_path / capture.name / "log.csv")
     np.testing.assert_allclose(t_s, (1 + np.arange(len(capture.b_uT))) / 250)
-    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # two decimals
+    np.testing.assert_allclose(b_uT, capture.b_uT, atol=5.1e-3)  # the log has two decimals
     np.testing.assert_allclose(temperature_degC, capture.temperature_degC, atol=5.1e-3)
     assert account["rows_n"] == len(t_s)
     with pytest.raises(CaptureError, match="layout must be native or one of .*; got sd-card"):

@@ -1,4 +1,4 @@
-"""The paper's counts; order, spacing and randomness of each protocol."""
+"""Tests of protocols: counts of the paper, order and spacing of places, random draws."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def test_grid_pass_has_390_indentations():
 
 def test_drag_lines_are_2_mm_apart():
     plan = plan_of(DRAG)
-    assert plan.x_mm.shape == (2 * 18, 17)  # 9 rows and 9 columns, at two depths
+    assert plan.x_mm.shape == (2 * 18, 17)  # lines along 9 rows and 9 columns, at two depths
     rows, columns = slice(0, 9), slice(9, 18)
     np.testing.assert_array_equal(plan.y_mm[rows], np.repeat(2.0 * np.arange(9)[:, None], 17, axis=1))
     np.testing.assert_array_equal(plan.x_mm[columns], plan.y_mm[rows])
@@ -58,21 +58,23 @@ def test_every_second_pass_drags_backwards():
     np.testing.assert_array_equal(two.pass_i, np.repeat([0, 1, 2], n))
 
 
-def test_hand_pokes_325_times_without_labels():
+def test_hand_protocol_has_325_pokes_without_labels():
     plan = plan_of(HAND)
     assert len(plan) == 325  # paper section 5.2
     assert not plan.labelled
     x_mm, y_mm = plan.x_mm.reshape(13, 25), plan.y_mm.reshape(13, 25)
     assert (np.diff(x_mm.mean(axis=0)) > 0).all()
     assert (np.diff(y_mm.mean(axis=1)) > 0).all()
-    assert (y_mm - np.linspace(0, 16, 13)[:, None]).std() == pytest.approx(0.3, rel=0.15)  # 325 draws, edges clipped
+    # 325 draws, clipped at the edges
+    assert (y_mm - np.linspace(0, 16, 13)[:, None]).std() == pytest.approx(0.3, rel=0.15)
     assert plan.depth_mm.min() > 0.4
     assert plan.depth_mm.max() < 1.2
-    assert plan.tilt.std() == pytest.approx(np.tan(np.radians(5.0)), rel=0.15)  # 650 draws, cut at two sd
-    assert plan.depth_mm.mean() == pytest.approx(0.8, abs=0.05)  # four times 0.23 / sqrt(325)
+    # 650 draws, limited to two standard deviations
+    assert plan.tilt.std() == pytest.approx(np.tan(np.radians(5.0)), rel=0.15)
+    assert plan.depth_mm.mean() == pytest.approx(0.8, abs=0.05)  # four standard errors 0.23 / sqrt(325)
 
 
-def test_only_a_hand_is_random():
+def test_only_hand_pokes_are_random():
     for protocol, alike in ((GRID, True), (DRAG, True), (HAND, False)):
         one, other = plan_of(protocol, "one"), plan_of(protocol, "other")
         assert np.array_equal(one.x_mm, other.x_mm) == alike
@@ -92,14 +94,14 @@ def scattered(name="plan", skin_mm=SLEEVE_MM, **changes):
 
 def test_scattered_places_and_depths_are_uniform():
     plan = scattered()
-    for drawn, low, high in ((plan.x_mm, 4.0, 46.8), (plan.y_mm, 4.0, 97.6), (plan.depth_mm, 0.4, 1.2)):
-        # A correct draw is further off once in a thousand times.
-        assert kstest(drawn.ravel(), "uniform", args=(low, high - low)).pvalue > 1e-3
+    for values, low, high in ((plan.x_mm, 4.0, 46.8), (plan.y_mm, 4.0, 97.6), (plan.depth_mm, 0.4, 1.2)):
+        # A correct draw exceeds this tolerance with a probability of 1 in 1000.
+        assert kstest(values.ravel(), "uniform", args=(low, high - low)).pvalue > 1e-3
     assert abs(np.corrcoef(plan.x_mm.ravel(), plan.y_mm.ravel())[0, 1]) < 4 / np.sqrt(3000)
 
 
 @given(st.tuples(st.floats(5, 200), st.floats(5, 200)), st.floats(0, 2.4))
-def test_margin_to_the_edges(skin_mm, margin_mm):
+def test_scattered_places_keep_a_margin_to_the_edges(skin_mm, margin_mm):
     plan = scattered(skin_mm=skin_mm, margin_mm=margin_mm, pokes_n=50)
     place_mm = np.hstack([plan.x_mm, plan.y_mm])
     to_edge_mm = np.minimum(place_mm, np.array(skin_mm) - place_mm)
@@ -109,7 +111,7 @@ def test_margin_to_the_edges(skin_mm, margin_mm):
     assert not plan.tilt.any()
 
 
-def test_draws_differ():
+def test_different_names_have_different_draws():
     assert not np.array_equal(scattered("one").x_mm, scattered("other").x_mm)
     assert np.array_equal(scattered("one").x_mm, scattered("one").x_mm)
 

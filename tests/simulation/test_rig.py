@@ -1,4 +1,4 @@
-"""The rig's timeline, clocks, chunks and dwells, and the noise and range of its force sensor."""
+"""Tests of the simulated rig: timeline, clocks, chunks, dwells; noise and range of the force sensor."""
 
 import numpy as np
 import pytest
@@ -52,8 +52,8 @@ def test_timeline_of_a_dragged_line():
 @given(st.integers(1, 7), st.floats(0, 0.01), st.integers(0, 1000))
 def test_chunks_contain_every_frame_once_and_never_early(chunk_frames_max_n, jitter_s, seed):
     frame_s = (1 + np.arange(500)) / 400.0
-    how = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
-    arrived_n, arrived_s = draw_arrivals(frame_s, how, rng_for(seed, "chunks"))
+    settings_of_rig = rig(chunk_frames_max_n=chunk_frames_max_n, arrival_jitter_s=jitter_s)
+    arrived_n, arrived_s = draw_arrivals(frame_s, settings_of_rig, rng_for(seed, "chunks"))
     assert (arrived_n[0], arrived_n[-1]) == (0, 500)
     sizes = np.diff(arrived_n)
     assert sizes.min() >= 1
@@ -64,14 +64,14 @@ def test_chunks_contain_every_frame_once_and_never_early(chunk_frames_max_n, jit
 
 @pytest.mark.parametrize("protocol", [None, DRAG])
 def test_dwells_contain_their_frames(protocol):
-    how, one = rig(), plan(protocol)
+    settings_of_rig, one = rig(), plan(protocol)
     stops_n = one.x_mm.shape[1]
-    frames = timeline(how, stops_n)
-    offset_s, rate = clock = draw_clock(how, rng_for(1, "clock"))
-    log = probe_log(one, np.zeros((len(one), 1 + stops_n, 3)), how, clock)
+    frames = timeline(settings_of_rig, stops_n)
+    offset_s, rate = clock = draw_clock(settings_of_rig, rng_for(1, "clock"))
+    log = probe_log(one, np.zeros((len(one), 1 + stops_n, 3)), settings_of_rig, clock)
     assert abs(offset_s) > 0.01
     assert 0 < abs(rate - 1) < 5e-4
-    frame_s = (1 + np.arange(len(one) * len(frames))) / how.rate_hz
+    frame_s = (1 + np.arange(len(one) * len(frames))) / settings_of_rig.rate_hz
     first_i, after_i = (np.searchsorted(frame_s, (t_s - offset_s) / rate) for t_s in (log.t_start_s, log.t_end_s))
     begins = np.arange(len(one))[:, None] * len(frames) + np.append(frames.noload_i, frames.contact_i)
     np.testing.assert_array_equal(first_i, begins.ravel())
@@ -89,13 +89,14 @@ def test_log_has_every_stop_of_a_line():
     np.testing.assert_array_equal(log.indentation, np.repeat(np.arange(18), 6))
 
 
-def test_robot_spread():
+def test_robot_misses_places_by_the_given_spread():
     grid, line = plan(), plan(DRAG)
     exact_mm = actual_positions(grid, rig(), rng_for(0, "robot"))
     np.testing.assert_array_equal(exact_mm[:, 0], np.hstack([grid.x_mm, grid.y_mm, grid.depth_mm]))
     loose = rig(robot_place_sd_mm=0.1, robot_depth_sd_mm=0.02)
     missed_mm = actual_positions(grid, loose, rng_for(0, "robot")) - exact_mm
-    np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)  # 130 draws: 6 %
+    # 25 %: four standard errors of 6 % for 130 draws
+    np.testing.assert_allclose(missed_mm.std(axis=(0, 1)), [0.1, 0.1, 0.02], rtol=0.25)
     planned_mm = np.stack([line.x_mm, line.y_mm, line.depth_mm], axis=2)
     along_mm = actual_positions(line, loose, rng_for(0, "robot")) - planned_mm
     np.testing.assert_allclose(along_mm, np.repeat(along_mm[:, :1], 5, axis=1))
@@ -123,11 +124,11 @@ def test_force_beyond_range_is_clipped_and_counted():
 
 def test_noise_has_the_given_deviation():
     read_N, clipped_n = read_clipped(np.zeros((40_000, 3)), noise_N=1 / 160)
-    np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)  # four times 1 / sqrt(2 n)
+    np.testing.assert_allclose(read_N.std(axis=0), 1 / 160, rtol=0.02)  # four standard errors 1 / sqrt(2 n)
     assert clipped_n == 0
     read_N, clipped_n = read_clipped(np.tile(FORCE_RANGE_N, (1000, 1)), noise_N=1 / 160)
     assert (read_N <= np.float32(FORCE_RANGE_N)).all()
-    assert 1400 < clipped_n < 1600  # half of 3000 within 3.7 sd
+    assert 1400 < clipped_n < 1600  # half of 3000, within 3.7 standard deviations
 
 
 def test_readings_follow_the_generator():

@@ -1,4 +1,4 @@
-"""Tangential forces compared with Coulomb's law and a spring; drags without friction and mirrored drags."""
+"""Tests of dragged tips: tangential forces against Coulomb's law and a spring, no friction, mirrored drags."""
 
 from dataclasses import replace
 
@@ -52,24 +52,25 @@ def test_without_friction_the_drag_is_a_press():
     np.testing.assert_array_equal(found.change_T, press_T(tip_m))
 
 
-def test_push_direction_changes_the_field():
-    there, back = drag(line(-2.0, 1.0)), drag(line(4.0, 1.0))
-    np.testing.assert_allclose(there.force_N[0, 1], -back.force_N[0, 1])
+def test_direction_of_the_drag_changes_the_field():
+    forward, back = drag(line(-2.0, 1.0)), drag(line(4.0, 1.0))
+    np.testing.assert_allclose(forward.force_N[0, 1], -back.force_N[0, 1])
     alone_T = press_T(line(1.0))[0, 0]
     size_T = np.linalg.norm(alone_T)
-    for one, other in ((there, alone_T), (back, alone_T)):
+    for one, other in ((forward, alone_T), (back, alone_T)):
         assert np.linalg.norm(one.change_T[0, 1] - other) > 0.1 * size_T
-    assert np.linalg.norm(there.change_T[0, 1] - back.change_T[0, 1]) > 0.2 * size_T
+    assert np.linalg.norm(forward.change_T[0, 1] - back.change_T[0, 1]) > 0.2 * size_T
 
 
 def test_mirror_symmetry_of_a_drag():
-    # Chips 1 and 3 swap; B is axial, and so is the checkerboard: its Jx flips instead (as for a poke).
+    # Reflection x -> -x swaps chips 1 and 3 and leaves the checkerboard unchanged as a field of axial vectors, so By
+    # and Bz change sign.
     one = drag(line(-1.0, 2.0))
     mirrored = drag(line(1.0, -2.0)).change_T[0][:, [0, 3, 2, 1, 4]]
     np.testing.assert_allclose(mirrored, one.change_T[0] * (1, -1, -1), atol=1e-9 * np.abs(one.change_T).max())
 
 
-def test_lean_of_the_tip_is_limited_by_friction():
+def test_force_of_a_leaning_tip_is_limited_by_friction():
     normal_N = forces(SKIN, np.array([DEPTH_M]))[0]
     for lean, share in ((0.1, 0.1), (2.0, 0.8)):
         found = drag(line(1.0), tilt=np.array([[0.0, lean]])).force_N[0, 0]
@@ -83,7 +84,7 @@ def test_tip_above_the_skin_has_no_effect():
     assert not found.change_T.any()
 
 
-def test_lines_are_independent():
+def test_lines_of_a_drag_are_independent():
     lines_m = np.concatenate([line(0.0, 3.0), line(-3.0, -2.9)])
     both, second = drag(lines_m, tilt=np.zeros((2, 2))), drag(lines_m[1:])
     np.testing.assert_allclose(both.force_N[1], second.force_N[0])
@@ -97,30 +98,30 @@ def test_force_is_limited_by_coulomb(coefficient):
 
 
 def test_drag_equals_press_and_many_small_shears():
-    # Reference: material pressed at its rest position behind the tip, then sheared in fiftieths of the force.
+    # Reference: press the material at its rest position behind the tip, then shear it in 50 steps of the force.
     tip_m, modulus_Pa = line(-2.0, 1.0), SKIN.modulus_Pa
     found = drag(tip_m, coefficient=0.4)
     sizes = {"thickness_m": SKIN.thickness_m, "tip_radius_m": SKIN.tip_radius_m, "base": SKIN.base}
-    of = shear.tabulate_depth(DEPTH_M, **sizes)
+    table = shear.tabulate_depth(DEPTH_M, **sizes)
     force_N = found.force_N[0, 1]
-    behind_m = tip_m[0, 1, :2] - force_N / (modulus_Pa / 3 * of.stiffness_m)
+    behind_m = tip_m[0, 1, :2] - force_N / (modulus_Pa / 3 * table.stiffness_m)
     [(_, before, (nodes_m, moments))] = moved_dipoles(SKIN, np.array([[*behind_m, DEPTH_M]]))
     for _ in range(50):
         step = shear.shear_displacement(
-            of, nodes_m.clip(min=0.0), behind_m, force_N=force_N / 50, modulus_Pa=modulus_Pa
+            table, nodes_m.clip(min=0.0), behind_m, force_N=force_N / 50, modulus_Pa=modulus_Pa
         )
         nodes_m, moments = nodes_m + step.displacement_m, Rotation.from_rotvec(step.half_curl).apply(moments)
     truth_T = change_of_field(before, (nodes_m, moments), BOARD.chips_m)
-    # 20 %: the code takes one or two midpoint steps and carries the traction; a wrong sign costs 50 % and more
+    # 20 %: the code takes one or two midpoint steps and moves the traction; a wrong sign would give 50 % or more.
     assert np.linalg.norm(found.change_T[0, 1] - truth_T) < 0.2 * np.linalg.norm(truth_T)
 
 
-def test_higher_skin_equals_deeper_press():
+def test_drag_on_a_higher_skin_equals_a_deeper_drag():
     high = type(SKIN)(**{**SKIN.__dict__, "depth_zero_m": 0.1e-3})
-    there = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
+    on_higher_skin = drag_tip(BOARD, high, line(0.0, 3.0), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
     deeper = drag_tip(BOARD, SKIN, line(0.0, 3.0) + (0, 0, 0.1e-3), tilt=STRAIGHT, friction=Friction(coefficient=0.5))
-    np.testing.assert_allclose(there.force_N, deeper.force_N, rtol=1e-9)
-    np.testing.assert_allclose(there.change_T, deeper.change_T, atol=1e-9 * np.abs(deeper.change_T).max())
+    np.testing.assert_allclose(on_higher_skin.force_N, deeper.force_N, rtol=1e-9)
+    np.testing.assert_allclose(on_higher_skin.change_T, deeper.change_T, atol=1e-9 * np.abs(deeper.change_T).max())
 
 
 HELD = EVEN.skin.model_copy(
@@ -130,13 +131,13 @@ HELD = EVEN.skin.model_copy(
 
 def test_held_skin_is_in_series_with_its_springs():
     one = draw_skin(HELD, EVEN.spreads, seed=0, name="b0_s0")
-    tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3  # through the middle: no rotation
+    tip_m, so_far_m = line(0.0, 0.1, y_mm=0.0), 0.1e-3  # through the middle, so the skin does not rotate
     force_N = drag_tip(BOARD, one, tip_m, tilt=STRAIGHT, friction=Friction(coefficient=0.8)).force_N[0, 1]
     sizes = {"thickness_m": one.thickness_m, "tip_radius_m": one.tip_radius_m, "base": one.base}
     thinned = (1 - DEPTH_M / one.thickness_m) ** -1.5
     layer_N_per_m = thinned * one.modulus_Pa / 3 * shear.tabulate_depth(DEPTH_M, **sizes).stiffness_m
     np.testing.assert_allclose(force_N, [so_far_m / (1 / layer_N_per_m + 1 / 7e3), 0.0], rtol=1e-9, atol=1e-12)
-    # Far from the tip, where the layer is not sheared, nodes have moved by force over springs.
+    # Far from the tip, where the layer is not sheared, nodes move by force / stiffness of the springs.
     slid = one.nodes_m + (force_N[0] / 7e3, 0.0, 0.0)
     as_one_T = change_of_field((one.nodes_m, one.moments_A_m2), (slid, one.moments_A_m2), BOARD.chips_m)
     pressed_T = changes_of_field(BOARD, one, tip_m[0, 1:])[1][0]

@@ -1,4 +1,4 @@
-"""A touch from the first millinewton to lift-off changes the field continuously, for random skins."""
+"""Tests that the field changes continuously from the first millinewton of a touch to lift-off, on random skins."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -26,11 +26,11 @@ RIGID = parse(BoardDesign, QUICK["simulate"]["boards"]["rigid"]["design"], "boar
 TERMS = parse(Terms, PARAMS["terms"], "terms")
 COARSE = Quadrature(1e-3, 4)
 LIGHT_N, LIGHT_MAX_uT = 1e-3, 5.0
-STOPS_N = 48  # stops of a path, compared with a path of twice as many
-HALVED = 0.75  # ratio of the largest steps of dB: 0.5 if dB is smooth, 1 if it jumps
+STOPS_N = 48  # stops of a path, which is compared with a path of twice as many stops
+HALVED = 0.75  # limit on the ratio of the largest steps of dB: 0.5 if dB is smooth, 1 if dB jumps
 places = st.tuples(st.floats(-8e-3, 8e-3), st.floats(-8e-3, 8e-3))
-ways = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # drags much shorter than sticking
-some = settings(max_examples=8, deadline=None)
+ways = st.tuples(st.floats(-2e-4, 2e-4), st.floats(-2e-4, 2e-4))  # drags so short that the tip sticks
+FEW = settings(max_examples=8, deadline=None)
 
 
 def draw_board_and_skin(name: str) -> tuple[Board, Skin]:
@@ -39,9 +39,9 @@ def draw_board_and_skin(name: str) -> tuple[Board, Skin]:
 
 
 def depths_of_forces_m(skin: Skin, force_N) -> np.ndarray:
-    """Return the commanded depths for forces on a skin; for zero force the tip is 20 um above the skin."""
-    of = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
-    depth_m = slide.depth_at(np.asarray(force_N, float), **of) - skin.depth_zero_m
+    """Return the commanded depths in m for these forces; for zero force, the tip is 20 um above the skin."""
+    skin_settings = {"thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m, "modulus_Pa": skin.modulus_Pa}
+    depth_m = slide.depth_at(np.asarray(force_N, float), **skin_settings) - skin.depth_zero_m
     return np.where(np.asarray(force_N) > 0, depth_m, -20e-6 - skin.depth_zero_m)
 
 
@@ -49,7 +49,7 @@ def sizes_uT(change_T) -> np.ndarray:
     return 1e6 * np.linalg.norm(change_T.reshape(len(change_T), -1), axis=1)
 
 
-@some
+@FEW
 @given(places, st.integers(0, 10**6))
 def test_millinewton_is_below_the_noise(place_m, name_i):
     board, skin = draw_board_and_skin(f"b{name_i}")
@@ -58,13 +58,13 @@ def test_millinewton_is_below_the_noise(place_m, name_i):
     np.testing.assert_allclose(forces(skin, poke_m[:, 2]), force_N, rtol=1e-2)
     found_uT = sizes_uT(changes_of_field(board, skin, poke_m)[1])
     assert found_uT[0] == 0
-    # The slide is proportional to small forces; the flow of the layer falls faster, as F^(4/3) under a round tip.
+    # For small forces, the slide is proportional to the force F; the deformation of the layer falls as F^(4/3).
     assert (found_uT[1:] <= 1.3 * found_uT[-1] * force_N[1:] / LIGHT_N).all()
     assert found_uT[-1] <= LIGHT_MAX_uT
 
 
 def path(skin: Skin, ends_m, forces_N, stops_n: int) -> np.ndarray:
-    """Return a path of approach, press, drag under growing force and release, in equal steps of place and force."""
+    """Return the path of a tip that presses, drags and lifts, in equal steps of place and force."""
     share = np.linspace(0, 3, stops_n + 1)
     place_m = np.stack([np.interp(share, (1, 2), ends) for ends in np.transpose(ends_m)], axis=1)
     force_N = np.interp(share, (0, 1, 2, 3), (0.0, *forces_N, 0.0))
@@ -77,15 +77,15 @@ def largest_step_uT(board: Board, skin: Skin, tip_m, coefficient: float) -> floa
     return float(sizes_uT(np.diff(found.change_T[0], axis=0)).max())
 
 
-@some
+@FEW
 @given(
     places, st.floats(0, 2 * np.pi), st.floats(0.02, 2.5), st.floats(0, 1.2), st.floats(-0.3, 0.3), st.integers(0, 99)
 )
-def test_press_and_drag_share_one_friction(start_m, angle_rad, force_N, friction, lean, name_i):
+def test_friction_limits_press_and_drag_together(start_m, angle_rad, force_N, friction, lean, name_i):
     board, skin = draw_board_and_skin(f"b{name_i}")
     assert skin.hold is not None
-    way_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
-    end_m = np.subtract(start_m, way_m)  # at least a millimetre inside the skin's edge
+    drag_m = 2e-3 * np.array([np.cos(angle_rad), np.sin(angle_rad)])
+    end_m = np.clip(np.subtract(start_m, drag_m), -8e-3, 8e-3)  # on the skin
     tip_m = path(skin, (start_m, end_m), (force_N, force_N), STOPS_N // 4)
     found = drag_tip(board, skin, tip_m, tilt=np.array([[lean, 0.0]]), friction=Friction(coefficient=friction))
     limit_N = friction * forces(skin, tip_m[0, :, 2])
@@ -95,7 +95,7 @@ def test_press_and_drag_share_one_friction(start_m, angle_rad, force_N, friction
         assert not found.slide_m.any()
 
 
-def test_frictionless_tip_moves_no_skin():
+def test_tip_without_friction_does_not_move_the_skin():
     board, skin = draw_board_and_skin("b0")
     tip_m = path(skin, ((0.0, 0.0), (1e-3, 0.0)), (0.5, 0.5), STOPS_N // 4)
     slippery = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=0.0))
@@ -107,7 +107,7 @@ def test_frictionless_tip_moves_no_skin():
 @pytest.mark.parametrize("depth_m", [3e-5, 2e-4, 6e-4])
 def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
     board, skin = draw_board_and_skin("b0")
-    deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # across two depths of the shear tables
+    deeper_m = depth_m + np.arange(41) * 0.5e-6 - skin.depth_zero_m  # crosses a tabulated depth of the shear tables
     place_m = np.column_stack([np.r_[0.0, np.full(41, 4e-5)], np.zeros(42)])
     tip_m = np.column_stack([place_m, np.r_[deeper_m[0], deeper_m]])[None]
     found = drag_tip(board, skin, tip_m, tilt=np.zeros((1, 2)), friction=Friction(coefficient=0.8))
@@ -117,16 +117,16 @@ def test_sinking_and_sticking_tip_changes_the_field_smoothly(depth_m):
 
 @settings(max_examples=4, deadline=None)
 @given(places, ways, st.tuples(st.floats(0.05, 1.5), st.floats(0.05, 1.5)), st.integers(0, 10**6))
-def test_half_steps_halve_the_largest_field_step(start_m, way_m, forces_N, name_i):
+def test_halving_the_steps_halves_the_largest_field_change(start_m, drag_m, forces_N, name_i):
     board, skin = draw_board_and_skin(f"b{name_i}")
-    end_m = tuple(np.add(start_m, way_m))
+    end_m = tuple(np.add(start_m, drag_m))
     coarse, fine = (
         largest_step_uT(board, skin, path(skin, (start_m, end_m), forces_N, n), 0.4) for n in (STOPS_N, 2 * STOPS_N)
     )
     assert fine <= HALVED * coarse
 
 
-def test_planted_jump_at_first_contact_is_detected(monkeypatch):
+def test_field_jump_of_unlimited_slide_is_detected(monkeypatch):
     board, skin = draw_board_and_skin("b0")
     monkeypatch.setattr(slide, "limit_by_friction", lambda whole, *_: whole)
     place_m = (6e-3, 2e-3)
@@ -145,7 +145,7 @@ def test_lift_off_leaves_only_the_memory(terms):
     found = simulate_response(board, skin, tip_m, tilt=np.zeros((3, 2)), terms=TERMS.only(terms), rng=rng)
     left_uT, pressed_uT = sizes_uT(found.change_T[:, -1]), sizes_uT(found.change_T[:, 1])
     assert not found.force_N[:, -1].any()
-    if terms:  # recorded: 5 to 8 % of the last contact remain in the next no-load reading
+    if terms:  # in recordings, 5 to 8 % of the last field change remain in the next no-load reading
         assert (left_uT < 0.2 * pressed_uT).all()
         assert left_uT[0] > 0
     else:
@@ -157,7 +157,7 @@ def test_friction_matters_for_light_touches_only():
     assert skin.hold is not None
     firm = replace(skin, hold=replace(skin.hold, friction=1e12))
     place_m = np.array([7e-3, 4e-3])
-    at = np.column_stack([np.tile(place_m, (2, 1)), depths_of_forces_m(skin, np.array([1e-3, 6.0]))])
-    light_uT, hard_uT = (sizes_uT(changes_of_field(board, one, at)[1]) for one in (skin, firm))
+    tips_m = np.column_stack([np.tile(place_m, (2, 1)), depths_of_forces_m(skin, np.array([1e-3, 6.0]))])
+    light_uT, hard_uT = (sizes_uT(changes_of_field(board, one, tips_m)[1]) for one in (skin, firm))
     assert light_uT[0] < 0.02 * hard_uT[0]
     assert light_uT[1] == pytest.approx(hard_uT[1], rel=1e-3)

@@ -1,4 +1,4 @@
-"""Physics terms that a protocol does not use are not computed (found by profiling a simulation)."""
+"""Tests, by profiling a simulation, that physics terms which a protocol does not use are not computed."""
 
 import sys
 from pathlib import Path
@@ -23,15 +23,15 @@ FEW = GRID | {"passes_n": 1, "depths_mm": (0.6,), "skins_n": 1}
 
 
 def functions_run(scene):
-    """Return the names of the library functions that were called."""
+    """Simulate a capture; return the names of the library functions that are called."""
     called = set()
 
     def note(frame, event, _):
         if event == "call":
             called.add((frame.f_code.co_filename, frame.f_code.co_name))
 
-    simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # computes the deformation tables
-    shear.tabulate_depth.cache_clear()  # a cached result would hide a call
+    simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)  # first run: computes the deformation tables
+    shear.tabulate_depth.cache_clear()  # otherwise, a cached result would hide a call
     sys.setprofile(note)
     try:
         simulate_capture(scene, "few", board="b0", skin="b0_s0", seed=1)
@@ -46,12 +46,12 @@ def scene_with(*terms):
 
 def test_protocol_without_terms_computes_none():
     run = functions_run(scene_with())
-    assert {"simulate_capture", "read_field"} <= run  # the profiler works
+    assert {"simulate_capture", "read_field"} <= run  # checks that the profiler works
     assert not run & OF_TERMS
 
 
 @pytest.mark.parametrize("term", sorted(TERMS))
-def test_term_computes_itself_only(term):
+def test_each_term_computes_only_what_it_needs(term):
     run = functions_run(scene_with(term)) & OF_TERMS
     assert run
     assert run <= TERMS[term][1]

@@ -1,4 +1,4 @@
-"""Copies of this checkout to run stages in: code, configuration and environment, without data or git."""
+"""Copies of this checkout in which tests run stages: code, configuration and environment, without data and git."""
 
 import compileall
 import os
@@ -13,25 +13,25 @@ ROOT = Path(__file__).resolve().parents[2]
 NOT_COPIED = {".git", ".venv", ".reskin", "data", "reports", "mlflow.db", "mlartifacts", ".ci"} | {
     ".mypy_cache", ".ruff_cache", ".import_linter_cache", ".pytest_cache", ".hypothesis",
 }  # fmt: skip
-TEST_BYTECODE = ("*.opt-jaxtyping*.pyc", "*-pytest-*.pyc")  # stages do not read it
+TEST_BYTECODE = ("*.opt-jaxtyping*.pyc", "*-pytest-*.pyc")  # bytecode of the tests, which stages do not read
 ENVIRONMENT = {
     "OMP_NUM_THREADS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DVC_NO_ANALYTICS": "1",
-    "RESKIN_EXECUTOR": "here",  # starting workers takes longer than these training runs
-    "PYTHONDONTWRITEBYTECODE": "",  # write bytecode, because stages start a hundred times
+    "RESKIN_EXECUTOR": "here",  # no worker processes: starting them would take longer than these training runs
+    "PYTHONDONTWRITEBYTECODE": "",  # write bytecode, because about a hundred processes import the code
 }  # fmt: skip
 
-DONE, FAILED = "these stages ended", "these stages did not end"  # printed by warm.py
+DONE, FAILED = "these stages ended", "these stages did not end"  # lines that warm.py prints
 
 
 @cache
 def compile_modules() -> None:
-    """Compile the project once for all copies; stages do not read the bytecode that pytest writes."""
+    """Compile all modules once for all copies, because stages cannot use the bytecode that pytest writes."""
     for package in ("pipeline", "reskin"):
         compileall.compile_dir(ROOT / package, quiet=1)
 
 
 def copy_checkout(folder: Path) -> Path:
-    """Copy the code and configuration of this checkout; DVC runs without git there."""
+    """Copy the code and configuration of this checkout to a folder, in which DVC works without git."""
     compile_modules()
     folder.mkdir(parents=True, exist_ok=True)
     for path in ROOT.iterdir():
@@ -43,7 +43,8 @@ def copy_checkout(folder: Path) -> Path:
             shutil.copy(path, folder)
     (folder / "dvc.lock").unlink(missing_ok=True)
     (folder / "reports/tuning").mkdir(parents=True)
-    shutil.copy(ROOT / "reports/tuning/choice.json", folder / "reports/tuning")  # the audit compares recipes with it
+    # stage audit compares recipes with this file
+    shutil.copy(ROOT / "reports/tuning/choice.json", folder / "reports/tuning")
     (folder / "data").mkdir()
     (folder / "data/captures.yaml").write_text("captures: {}\n")
     (folder / ".venv").symlink_to(ROOT / ".venv")
@@ -53,15 +54,16 @@ def copy_checkout(folder: Path) -> Path:
 
 
 def variables(folder: Path, **environment: str) -> dict[str, str]:
-    """Return the environment variables of programs in the copy, which use its code and its MLflow store."""
+    """Return environment variables with which programs use the code and the MLflow store of the copy."""
     inherited = {name: value for name, value in os.environ.items() if name != "MLFLOW_TRACKING_URI"}
-    path = f"{folder / '.venv/bin'}{os.pathsep}{inherited['PATH']}"  # stages run `python`
+    # so that `python` in commands of stages is the project's Python
+    path = f"{folder / '.venv/bin'}{os.pathsep}{inherited['PATH']}"
     return {**inherited, **ENVIRONMENT, "PYTHONPATH": str(folder), "PATH": path, **environment}
 
 
 @contextmanager
 def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
-    """Yield a function that runs the named stages, or all, in forks of a preloaded process and returns their output."""
+    """Yield a function that runs stages (default: all) in forks of a preloaded process and returns the output."""
     command = [str(folder / ".venv/bin/python"), "tests/stages/warm.py"]
     with subprocess.Popen(
         command, cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
@@ -86,7 +88,7 @@ def warm_stages(folder: Path) -> Iterator[Callable[..., str]]:
 
 
 def run(folder: Path, *arguments: str, check: bool = True, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program of the environment in the copy."""
+    """Run a program of the virtual environment in the copy; return its output."""
     arguments = (str(folder / ".venv/bin" / arguments[0]), *arguments[1:])
     env = variables(folder, **environment)
     done = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, env=env, check=False)

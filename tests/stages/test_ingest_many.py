@@ -1,4 +1,4 @@
-"""Tests of the stage that reads all recorded captures of a scene, each of them once."""
+"""Tests of the stage that ingests all recorded captures of a scene: only new or changed captures are read."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from reskin.errors import CaptureError
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Return a function that runs the stage on three captures and returns the names of those read."""
+    """Return a function that runs the stage on three captures and returns the names of the captures that it read."""
     monkeypatch.chdir(tmp_path)
     read, shared = [], {"faults": {"stuck": "drop"}, "lost_fraction_max": 0.05}
     names = ["c0", "c1", "c2"]
@@ -48,7 +48,7 @@ def test_only_new_captures_are_read(run):
     assert run() == ["c1"]
 
 
-def test_changed_bytes_settings_or_code_are_read_again(run):
+def test_captures_are_read_again_after_changes_of_bytes_settings_or_code(run):
     run()
     io.write_text(run.folder / "raw/c1/stream.bin", "other")
     assert run() == ["c1"]
@@ -57,7 +57,7 @@ def test_changed_bytes_settings_or_code_are_read_again(run):
     assert run() == ["c0", "c1", "c2"]
 
 
-def test_finished_captures_survive_a_broken_one(run):
+def test_finished_captures_are_kept_if_another_is_broken(run):
     io.write_text(run.folder / "raw/c2/stream.bin", "broken")
     with pytest.raises(CaptureError):
         run()
@@ -74,7 +74,7 @@ def test_damaged_cached_file_is_read_again(run, capsys):
     assert run() == []
 
 
-def test_partial_file_of_a_killed_stage_is_read_again(run):
+def test_capture_with_a_partial_file_of_a_killed_stage_is_read_again(run):
     run()
     cached = run.folder / stage.CACHE / "lab"
     (file,) = [file for file in cached.iterdir() if file.read_text() == "c2"]

@@ -1,4 +1,4 @@
-"""Tests of the curves that the report stage logs to MLflow."""
+"""Tests of the numbers and curves that stage publish logs to MLflow."""
 
 from pipeline.scenes import parse_scene
 from pipeline.stages.report import read_curves

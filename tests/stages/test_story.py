@@ -1,4 +1,4 @@
-"""Tests of the whole pipeline on scene ci: repeated and killed runs, deleted outputs, wrong settings."""
+"""Tests of the whole pipeline on scene ci: results, repeated and killed runs, deleted outputs, wrong settings."""
 
 import json
 import os
@@ -36,14 +36,15 @@ LEARNING = (
     "few_labels", "audit",
 )  # fmt: skip
 RANDOM = ("drift", "manual", "contacts", "ambient")  # experiments with random draws
-# Scene ci does not run the experiments on recordings and on many skins.
+# Experiments that scene ci does not run: those on recordings and those on many skins.
 OF_CI = set(ANALYSES) - {"compare", "reference_methods", "touches", "population", "worlds"}
-OUTPUT = "output.txt"  # output of the first run
-pytestmark = pytest.mark.timeout(1800)  # ends tests that hang; a busy machine takes four times as long as an idle one
+OUTPUT = "output.txt"  # file with the output of the first run
+# time limit for tests that hang; long, because a busy machine needs four times as long
+pytestmark = pytest.mark.timeout(1800)
 
 
 def compile_kernels() -> None:
-    """Compile the kernels of simulated presses and of the universal model once, for all stages."""
+    """Compile the Numba kernels of simulated presses and of the universal model once, for all stages."""
     noload_uT, b_uT, force_N = reskin.simulate_pokes(reskin.draw_skin(), [[8.0, 8.0, 1.0]])
     universal = reskin.load_universal().zero(noload_uT)
     universal.label(np.array([[8.0, 8.0]]), force_N, b_uT)
@@ -82,7 +83,7 @@ def test_first_tables_have_all_numbers_and_their_source(story, numbers):
     for row in ("single", "multi", "triplet", "adapted"):
         for metric in ("accuracy_pct", "mse_xy_mm2", "mse_f_N2"):
             assert {"mean", "sd", "n"} <= set(numbers["table2"][row][metric])
-    assert numbers["table2"]["multi"]["accuracy_pct"]["n"] == 3  # boards
+    assert numbers["table2"]["multi"]["accuracy_pct"]["n"] == 3  # n counts boards
     assert {"mean", "sd"} <= set(numbers["single_sensor"]["accuracy_pct"])
     capture = numbers["capture"]
     skipped = sum(n for key, n in capture.items() if key.startswith("skipped_") and key.endswith("_bytes_n"))
@@ -91,11 +92,11 @@ def test_first_tables_have_all_numbers_and_their_source(story, numbers):
     assert "<svg" in (story / "reports/ci/figures/error_grid_lobo.svg").read_text()
 
 
-def test_stages_print_their_position(story):
+def test_stages_print_their_position_in_the_run(story):
     order = json.loads((story / ".reskin/order.json").read_text())["stages"]
     output = (story / OUTPUT).read_text()
     numbers = [int(number) for number in re.findall(rf"stage (\d+) of {len(order)}\b", output)]
-    assert sorted(numbers) == list(range(2, len(order) + 1))  # the first stage, code, prints nothing
+    assert sorted(numbers) == list(range(2, len(order) + 1))  # stage code, the first, prints nothing
 
 
 def test_early_table_2_equals_that_of_the_report(story, numbers):
@@ -123,7 +124,7 @@ def test_stage_costs_count_training_runs(story):
     assert stages["split"]["computed_s"] == stages["split"]["seconds"]
 
 
-def test_protocols_are_recorded_into_separate_folders(story):
+def test_protocols_are_simulated_into_separate_folders(story):
     names = {"ci-wear": "b0_s0-wear", "ci-flexible": "f0_s0-flexible", "ci-hand": "b0_s0-hand", "ci-drag": "b0_s0-drag"}
     for folder, capture in names.items():
         assert [file.stem for file in (story / "data/indentations" / folder).glob("*.parquet")] == [capture]
@@ -133,8 +134,8 @@ def test_protocols_are_recorded_into_separate_folders(story):
     )
     assert np.isnan(hand.x_mm).all()
     assert np.isnan(hand.Fz_N).all()
-    assert len(np.unique(drag.x_mm[drag.indentation == 0])) == 9  # one line, a stop every 2 mm
-    assert np.abs(drag.Fx_N).max() > 0.3  # dragged along x, held by friction
+    assert len(np.unique(drag.x_mm[drag.indentation == 0])) == 9  # a line has a stop every 2 mm
+    assert np.abs(drag.Fx_N).max() > 0.3  # friction when dragged along x
     assert wear.n_contacts.max() == 2 * 2 * 65 - 1
 
 
@@ -145,7 +146,8 @@ def test_experiments_on_many_skins_share_test_rows(story, numbers):
     }
     assert {(row["of"], row["over"]) for row in numbers["paired"]} >= {("triplet", "multi"), ("adapted", "triplet")}
     boards_n = {(row["of"], row["over"]): row["accuracy_pct"]["n"] for row in numbers["paired"]}
-    assert boards_n.pop(("multi", "single")) == 1  # one skin of each of two boards is tested on the third
+    # single networks train on one skin of each of two boards and are tested on the third board
+    assert boards_n.pop(("multi", "single")) == 1
     assert set(boards_n.values()) == {3}
     assert all(len(row["by_board"]) == row["accuracy_pct"]["n"] for row in numbers["paired"])
     assert all(row["accuracy_pct"]["n"] == 3 for row in [*numbers["sweep_sensors"], *numbers["sweep_pokes"]])
@@ -157,7 +159,7 @@ def test_experiments_on_many_skins_share_test_rows(story, numbers):
         for stage_name in ("train_multi", "train_triplet")
         for file in (story / f"data/models/ci/{stage_name}").glob("*.json")
     }
-    assert rows_n == {2 * 130 * 5}  # two skins, the second pass, five readings
+    assert rows_n == {2 * 130 * 5}  # two skins x 130 presses of the second pass x 5 readings
     for name in ("sweep_pokes", "sweep_sensors"):
         assert "<svg" in (story / f"reports/ci/figures/{name}.svg").read_text()
     assert "<svg" in (story / "reports/ci/runtime/training.svg").read_text()
@@ -182,7 +184,7 @@ def test_every_experiment_has_numbers_tables_and_figures(story, numbers):
         assert f'src="figures/{figure.name}"' in page
 
 
-def test_commit_machine_and_time_change_only_provenance(story, tmp_path):
+def test_commit_machine_and_times_change_only_provenance(story, tmp_path):
     again = tmp_path / "again"
     shutil.copytree(
         story, again, symlinks=True, ignore=shutil.ignore_patterns(".dvc", "raw", "mlflow.db", "mlartifacts")
@@ -235,7 +237,7 @@ def test_checklist_rows_resolve_to_numbers_and_files(story):
     numbers = json.loads((reports / "numbers.json").read_text())
     rows = [row for row in read_rows() if row.only != "recorded"]
     missing = [row for row in rows if row.ours and resolve(numbers, row.ours) is None]
-    assert [row.id for row in missing] == ["plateau"]  # the sweep is too short
+    assert [row.id for row in missing] == ["plateau"]  # not reached: the sweep is too short
     assert all(row.experiment and resolve(numbers, row.experiment) is not None for row in missing)
     assert (reports / "tables/checklist.md").read_text().count(NOT_REACHED) == len(missing)
     resolved = [row for row in rows if row not in missing]
@@ -253,14 +255,14 @@ def test_losses_of_all_protocols_are_counted(story, numbers):
         assert account["frames_n"] == sum(io.read_ingest_counts(file)["frames_n"] for file in files)
 
 
-def test_model_predicts_an_sd_card_log(story):
+def test_model_predicts_contacts_of_an_sd_card_log(story):
     model = min((story / "data/models/ci/train_multi").glob("lobo.paper.b0.*.safetensors"))
     (log,) = (story / "data/raw/ci-log").glob("*/log.csv")
     run(story, "reskin", "predict", str(log), "--model", str(model), "--out", "contacts.csv")
     estimates, readings = (pd.read_csv(file) for file in (story / "contacts.csv", log))
     assert len(estimates) == len(readings)
     contact = estimates["contact"].astype(bool)
-    assert 0.1 < contact.mean() < 0.9  # a walk: rest, steps and swings
+    assert 0.1 < contact.mean() < 0.9  # the log of a walk has rest, steps and swings
     assert np.isfinite(estimates.loc[contact, ["x_mm", "y_mm", "F_N"]]).all(axis=None)
 
 
@@ -289,7 +291,7 @@ def test_score_equals_a_naive_loop(story):
     truths = []
     for skin in ("b1_s0", "b1_s1"):
         for reading in pq.read_table(story / f"data/indentations/ci/{skin}.parquet").to_pylist():
-            # The first pass is the pool; the scene selects forces of 0 N or more.
+            # The first pass is the adaptation pool; the scene selects forces of 0 N or more.
             if reading["pass_i"] >= 1 and reading["Fz_N"] >= 0:
                 truths.append((skin, reading["x_mm"], reading["y_mm"], reading["Fz_N"]))
     assert [(row["skin"], row["true_x_mm"], row["true_y_mm"], row["true_Fz_N"]) for row in predicted] == truths
@@ -309,15 +311,16 @@ def test_predictions_equal_those_of_the_saved_model(story):
     features = scaler.encode(np.array([reading["b_uT"]], np.float32) - np.array([reading["noload_uT"]], np.float32))[0]
     for i in range(1, 7):
         features = tensors[f"layer{i}.weight"] @ features + tensors[f"layer{i}.bias"]
-        features = np.maximum(features, 0) if i in (1, 4, 5) else features  # ReLU where the paper has one
+        # a ReLU after the layers that have one in the paper
+        features = np.maximum(features, 0) if i in (1, 4, 5) else features
     expected = scaler.decode(features[None].astype(np.float32))[0]
     first = pq.read_table(folder / "predictions.parquet").filter(pc.field("fold") == "b1").slice(0, 1).to_pylist()[0]
-    # float32 sums in a different order
+    # tolerance: float32 sums in another order
     assert [first[f"predicted_{name}"] for name in ("x_mm", "y_mm", "Fz_N")] == pytest.approx(expected, abs=1e-3)
 
 
-@pytest.mark.filterwarnings("ignore")  # MLflow warns about its own types when pyfunc is imported
-def test_mlflow_model_predicts_the_same(story, monkeypatch):
+@pytest.mark.filterwarnings("ignore")  # importing mlflow.pyfunc causes warnings about MLflow's types
+def test_mlflow_model_predicts_like_the_saved_model(story, monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{story / 'mlflow.db'}")
     client = mlflow.MlflowClient()
     query = "tags.kind = 'training' and tags.question = 'lobo' and tags.current = 'true'"
@@ -331,7 +334,7 @@ def test_mlflow_model_predicts_the_same(story, monkeypatch):
 def test_repeated_training_gives_the_same_lock_file(story, run_stages):
     before = (story / "dvc.lock").read_text()
     for file in (story / ".reskin/cells").glob("*.safetensors"):
-        file.unlink()  # otherwise, finished training runs are reused
+        file.unlink()  # otherwise, the cached training runs would be reused
     stages = [f"{name}@ci" for name in ("simulate", "ingest_simulated", "split", *LEARNING, *RANDOM, "report")]
     run_stages(*stages)
     assert (story / "dvc.lock").read_text() == before
@@ -370,7 +373,7 @@ def test_killed_stage_keeps_finished_folds(story):
     for file in trials.glob("*.safetensors"):
         file.unlink()
 
-    def finished() -> int:  # a stack of three training runs is finished with its last file
+    def finished() -> int:  # whether a stack of three training runs has written its last file
         stacks = Counter(file.stem.rpartition("-")[0] for file in trials.glob("*.safetensors"))
         return sum(written_n for written_n in stacks.values() if written_n == 3)
 
@@ -382,7 +385,7 @@ def test_killed_stage_keeps_finished_folds(story):
     stage.wait()
     finished_n = finished()
     assert not models.exists()
-    environment |= ENVIRONMENT  # the remaining training runs use the stage's own process
+    environment |= ENVIRONMENT  # the remaining training runs run in the process of the stage
     again = subprocess.run(command, cwd=story, env=environment, capture_output=True, text=True, check=True)
     assert f"{finished_n} of 6 training runs were finished before" in again.stderr
     assert len(list(models.glob("*.safetensors"))) == 6
@@ -394,7 +397,7 @@ def test_missing_tracking_server_is_reported_quickly(story):
              "--results", "data/results/ci", "--reports", "reports/ci"]  # fmt: skip
     done = run(story, "python", "-m", "pipeline", "publish", *arguments, MLFLOW_TRACKING_URI="http://127.0.0.1:9")
     assert "does not answer" in done.stderr
-    assert time.monotonic() - start_s < 100  # MLflow itself retries for minutes
+    assert time.monotonic() - start_s < 100  # without our time limit, MLflow would retry for minutes
 
 
 def test_removed_experiment_leaves_no_files(story, run_stages):
@@ -410,7 +413,7 @@ def test_removed_experiment_leaves_no_files(story, run_stages):
     assert "removed sleeve@ci: data/results/ci/sleeve.json" in run(story, "reskin", "scenes", "tidy").stdout
     assert not any("sleeve" in stage for stage in run(story, "dvc", "stage", "list", "--name-only").stdout.split())
     run_stages("report@ci")
-    # data/code has the digests of all stages.
+    # The folder data/code is excluded, because it contains the digests of all stages, including sleeve.
     assert [*story.glob("data/[!c]*/**/*sleeve*"), *story.glob("reports/ci/**/*sleeve*")] == []
     numbers = json.loads((story / "reports/ci/numbers.json").read_text())
     assert "sleeve" not in numbers

@@ -1,8 +1,9 @@
-"""Run stages as DVC does, each in a fork of one process that has imported all modules.
+"""Run stages as DVC does, but each in a fork of one process that has imported all modules.
 
-`warm_stages` starts it in a checkout. Each line of input names stages (`drift@ci sleeve@ci`; none: all). They run in
-DVC's order and are committed as by `dvc commit`; then it prints `DONE` or `FAILED`, and reads the next line. Most of a
-small stage's time is imports and the tables of skin deformation. tests/recordings/test_lab_story.py runs DVC itself.
+`warm_stages` (checkout.py) starts this program in a copy of the checkout. Each line of input names stages (`drift@ci
+sleeve@ci`; an empty line: all). The program runs these stages in DVC's order, commits them like `dvc commit`, prints
+`DONE` or `FAILED`, and reads the next line. This saves time, because small stages spend most of it on imports and
+tables of skin deformation. tests/recordings/test_lab_story.py runs DVC itself.
 """
 
 import gc
@@ -22,11 +23,11 @@ LIBRARIES = (
     "torch", "pandas", "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats", "sklearn.ensemble", "numba",
     "matplotlib.figure", "magpylib", "pydantic", "jinja2",
 )  # fmt: skip
-DEEP_M = 1.3e-3  # deeper than all pokes of scene ci
+DEEP_M = 1.3e-3  # deeper than all pokes in scene ci
 
 
 def run_stage(name: str, command: str) -> int:
-    """Run `python -m pipeline STAGE ...` in a fork; return its exit status."""
+    """Run the command `python -m pipeline STAGE ...` of a stage in a fork; return the exit status."""
     sys.stdout.flush()
     if child := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -47,8 +48,8 @@ def run_stage(name: str, command: str) -> int:
 
 
 def preload(protocols: set[tuple[str, str]]) -> None:
-    """Import the modules of all stages, and compute the deformation tables of skins for (scene, protocol) pairs."""
-    importlib.import_module("pipeline")  # first: it sets variables that NumPy reads when imported
+    """Import the modules of all stages; compute the deformation tables for these (scene, protocol) pairs."""
+    importlib.import_module("pipeline")  # first, because it sets variables that NumPy reads when imported
     import numpy as np
 
     from pipeline.settings import read_settings
@@ -67,14 +68,14 @@ def preload(protocols: set[tuple[str, str]]) -> None:
         skin = draw_skin(
             simulation.skin, simulation.spreads, seed=settings.seed, name=name, rule=rule, sides_m=kind.skin_m
         )
-        list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # caches its tables
-    gc.freeze()  # keeps forks from copying all pages in garbage collection
+        list(moved_dipoles(skin, np.array([[0.0, 0.0, DEEP_M]])))  # caches the deformation tables of the skin
+    gc.freeze()  # so that garbage collection in forks does not copy memory
 
 
 def run_stages(names: list[str]) -> str:
     with Repo() as repo:
         planned = plan_repro(get_active_graph(repo.index.graph))
-        with_commands = [stage for stage in planned if stage.cmd]  # others are added recordings
+        with_commands = [stage for stage in planned if stage.cmd]  # stages without a command are tracked recordings
         stages = {stage.addressing: stage for stage in with_commands if not names or stage.addressing in names}
         commands = [shlex.split(stage.cmd) for name, stage in stages.items() if name.startswith("simulate@")]
         preload(
@@ -82,13 +83,13 @@ def run_stages(names: list[str]) -> str:
         )
         for name, stage in stages.items():
             print(f"Running stage '{name}':", flush=True)
-            for out in stage.outs:  # as `dvc repro` does
+            for out in stage.outs:  # removes outputs first, as `dvc repro` does
                 out.remove()
             if run_stage(name, stage.cmd):
                 return FAILED
         with lock_repo(repo):
             for stage in stages.values():
-                stage.save(run_cache=False)  # no test uses earlier runs
+                stage.save(run_cache=False)  # tests do not use DVC's run cache
                 stage.commit()
             next(iter(stages.values())).dvcfile.dump_stages([*stages.values()], update_pipeline=False)
     return DONE

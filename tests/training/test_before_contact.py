@@ -1,4 +1,4 @@
-"""Tests of places predicted from readings before contact: repeated scans reveal them, random orders do not."""
+"""Tests of predicting places from readings before contact, for scans in a fixed and in a random order."""
 
 from pathlib import Path
 
@@ -17,20 +17,20 @@ from tests.data.tables import readings
 ALL = Selection(force_min_N=0.0)
 PASSES_N, PLACES_N = 4, 64
 SCENE = {"seed": 0, "selection": {"force_min_N": 0.0}}
-CHANCE_MAX_PCT = 15.0  # 1 of 64 places by chance, a little more for means of neighbours
+CHANCE_MAX_PCT = 15.0  # chance level is 1 of 64 places, and a little more for means of neighbouring places
 
 
 def score_scan(folder: Path, *, snake: bool, memory: float) -> dict[str, float]:
-    """Score a scan of a 14 mm grid in four passes; the share `memory` of each poke remains in the next field."""
+    """Score predictions for a grid scan in four passes; a fraction `memory` of each field change remains afterwards."""
     rng = rng_for(0, "scan")
     order = [np.arange(PLACES_N) if snake else rng.permutation(PLACES_N) for _ in range(PASSES_N)]
-    at = np.concatenate(order)
-    x_mm, y_mm = (2 * (at // 8)).astype(np.float32), (2 * (at % 8)).astype(np.float32)
+    place_i = np.concatenate(order)
+    x_mm, y_mm = (2 * (place_i // 8)).astype(np.float32), (2 * (place_i % 8)).astype(np.float32)
     db_uT = np.stack([x_mm, y_mm, x_mm * y_mm], axis=1) * np.float32(10)
     noise_uT = 0.01 * rng.standard_normal(db_uT.shape)
     noload_uT = (100 + memory * np.roll(db_uT, 1, axis=0) + noise_uT).astype(np.float32)
     one = readings(
-        f=len(at), x_mm=x_mm, y_mm=y_mm, noload_uT=noload_uT, b_uT=noload_uT + db_uT,
+        f=len(place_i), x_mm=x_mm, y_mm=y_mm, noload_uT=noload_uT, b_uT=noload_uT + db_uT,
         pass_i=np.repeat(np.arange(PASSES_N, dtype=np.int32), PLACES_N),
     )  # fmt: skip
     io.write_readings(folder / "c0.parquet", [one], {})
@@ -48,30 +48,32 @@ def test_snake_scan_with_memory_reveals_places(tmp_path):
     assert found["noload"] > 95.0
 
 
-def test_snake_scan_without_memory_reveals_places_by_number(tmp_path):
+def test_snake_scan_without_memory_reveals_places_by_their_order(tmp_path):
     found = score_scan(tmp_path, snake=True, memory=0.0)
     assert found["scan"] == 100.0
     assert found["noload"] < CHANCE_MAX_PCT
 
 
 def score_hovering(folder: Path, *, magnetic: bool) -> dict[str, dict[str, float]]:
-    """Score a tip that hovers above each place before it touches; only a magnetic tip changes the readings."""
-    at = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)  # above each place, then in contact
+    """Score predictions from readings while the tip hovers above the next place, which only a magnetic tip affects."""
+    # Two readings per place: above the place, then in contact.
+    place_i = np.tile(np.arange(PLACES_N), PASSES_N).repeat(2)
     touches = np.tile([False, True], PASSES_N * PLACES_N)
-    place_mm = np.column_stack([2 * (at // 8), 2 * (at % 8)]).astype(np.float32)
+    place_mm = np.column_stack([2 * (place_i // 8), 2 * (place_i % 8)]).astype(np.float32)
     rng = rng_for(0, "hover")
     db_uT = np.column_stack([place_mm, place_mm[:, :1] * place_mm[:, 1:]]) * np.float32(10)
     db_uT = (db_uT * (touches | magnetic)[:, None] + rng.standard_normal(db_uT.shape)).astype(np.float32)
-    corner = np.arange(len(at)) % (2 * PLACES_N) == 0  # beside the skin before each pass
+    corner = np.arange(len(place_i)) % (2 * PLACES_N) == 0  # the first reading of each pass is beside the skin
     one = readings(
-        f=len(at), x_mm=np.where(touches, place_mm[:, 0], np.nan).astype(np.float32),
+        f=len(place_i), x_mm=np.where(touches, place_mm[:, 0], np.nan).astype(np.float32),
         y_mm=np.where(touches, place_mm[:, 1], np.nan).astype(np.float32),
         Fz_N=touches.astype(np.float32), noload_uT=np.zeros_like(db_uT), b_uT=db_uT,
         pass_i=np.repeat(np.arange(PASSES_N, dtype=np.int32), 2 * PLACES_N),
     )  # fmt: skip
     hover = gather_hover([one])
     assert len(hover) == (~touches & ~corner).sum()
-    np.testing.assert_array_equal(hover.place_mm, place_mm[~touches & ~corner])  # the next touched place
+    # the label of a hover reading is the next touched place
+    np.testing.assert_array_equal(hover.place_mm, place_mm[~touches & ~corner])
     io.write_readings(folder / "c0.parquet", [one], {})
     rows = gather([one], Selection(force_min_N=0.1))
     folds = draw_folds(rows, ["single_temporal"], Split(temporal_test_fraction=0.25), 0)
@@ -84,7 +86,8 @@ def test_hovering_tip_is_located_only_if_magnetic(tmp_path):
     found = score_hovering(tmp_path, magnetic=True)
     assert found["hover"]["accuracy_pct"] > 95
     assert found["hover"]["hover_uT"] > 0.9 * found["hover"]["touch_uT"]
-    assert found["hover_network"]["accuracy_pct"] < CHANCE_MAX_PCT  # this network always predicts one corner
+    # the network predicts the same corner for all readings
+    assert found["hover_network"]["accuracy_pct"] < CHANCE_MAX_PCT
     found = score_hovering(tmp_path, magnetic=False)
     assert found["hover"]["accuracy_pct"] < CHANCE_MAX_PCT
     assert found["hover"]["hover_uT"] < 0.1 * found["hover"]["touch_uT"]
@@ -108,7 +111,7 @@ def test_excluded_rows_keep_their_numbers():
     assert scan.noload_uT[:, 0].tolist() == [0, 6, 9, 15]
 
 
-def test_rows_are_aligned_with_gather():
+def test_rows_before_contact_are_in_the_order_of_gathered_rows():
     def made(name: str, first: float) -> Readings:
         x_mm = first + np.arange(6, dtype=np.float32)
         return readings(name, x_mm=x_mm, noload_uT=np.tile(x_mm[:, None], 3))

@@ -1,4 +1,4 @@
-"""Tests of the choice of settings from synthetic cards."""
+"""Tests of the choice of training settings from cards of candidate networks."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ Card = dict[str, Any]
 
 
 def card(experiment: str, name: str, mse_xy_mm2: float, fold: str = "b0", **changes: Any) -> Card:
-    """Return a card with one skin per board, whose accuracy and force error rank opposite to the place error."""
+    """Return a card with one skin per board; accuracy and force error improve as the place error gets worse."""
     score = {"accuracy_pct": mse_xy_mm2, "mse_xy_mm2": mse_xy_mm2, "mse_f_N2": 1 / mse_xy_mm2}
     scores = {
         "all": score,
@@ -58,7 +58,8 @@ def test_smallest_place_error_is_chosen_with_the_base_of_adaptation():
     chosen = choose(CARDS)
     assert names(chosen) == {"train_multi": "fast", "adapt": "from-heavy", "train_triplet": "heavy"}
     assert chosen["train_multi"]["settings"]["rate_max"] == 6e-3
-    assert chosen["train_triplet"]["settings"]["triplet_weight"] == 1.0  # light is better alone, heavy after adaptation
+    # recipe `light` is better without adaptation, `heavy` after adaptation
+    assert chosen["train_triplet"]["settings"]["triplet_weight"] == 1.0
     assert chosen["adapt"]["settings"]["unlabelled_weight"] == 0.1
 
 
@@ -81,7 +82,7 @@ def test_all_candidates_are_listed_with_scores():
 
 
 def test_mean_over_boards_decides():
-    # Seeds of a board are averaged first: (0.4 + 0.9) / 2 is less than 0.695, (0.4 + 0.9 + 0.9) / 3 is not.
+    # Seeds of a board are averaged first: (0.4 + 0.9) / 2 is less than 0.695, but (0.4 + 0.9 + 0.9) / 3 is not.
     boards = [
         card("lobo", "fast", 0.29, "b0", recipe=RECIPE | {"rate_max": 6e-3}),
         card("lobo", "fast", 1.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}),
@@ -96,7 +97,7 @@ def test_mean_over_boards_decides():
 
 
 def test_adapted_skins_are_pooled_by_board():
-    # Two skins of board b0 (0.2, 0.4) and one of b1 (0.9): (0.3 + 0.9) / 2, not the mean of three.
+    # Board b0 has two skins (0.2, 0.4), b1 has one (0.9): the mean is (0.3 + 0.9) / 2, not that of three skins.
     skins = [
         adapted_card("from-light", error, "light", fold=fold, test_skins=[skin])
         for fold, skin, error in (("b0", "b0_s0", 0.2), ("b0", "b0_s1", 0.4), ("b1", "b1_s0", 0.9))
@@ -104,7 +105,7 @@ def test_adapted_skins_are_pooled_by_board():
     chosen = choose([one for one in CARDS if one["question"] != "adapt"] + skins)["adapt"]
     scores = chosen["candidates"][0]["mse_xy_mm2"]
     assert scores["mean"] == pytest.approx(0.6)
-    assert "sd_seeds" not in scores  # skins are not seeds
+    assert "sd_seeds" not in scores  # a spread over skins is not one over seeds
 
 
 SHAPED = {"inputs": "shape"}
@@ -158,7 +159,7 @@ def test_record_lists_boards_skins_and_settings():
 
 
 def with_steps(one: Card, steps_n: int, **scores: float) -> Card:
-    """Return a card with the same settings, another number of steps and another error."""
+    """Return a copy of a card with another number of steps and another error."""
     return card(one["question"], f"{one['recipe_name']}-{steps_n}", scores["mse_xy_mm2"],
                 recipe=one["recipe"] | {"steps_n": steps_n})  # fmt: skip
 
@@ -171,7 +172,8 @@ def test_candidates_need_equal_steps():
     with pytest.raises(ParamsError, match="steps of train_multi's fast differ between candidates"):
         choose([*unfair, *others])
     chosen = choose([*unfair, with_steps(fast, 900, mse_xy_mm2=0.15), *others])["train_multi"]
-    assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3  # 0.275 against 0.3
+    # mean errors: 0.275 for `fast`, 0.3 for `slow`
+    assert chosen["recipe_name"] == "fast" or chosen["settings"]["rate_max"] == 6e-3
 
 
 def test_control_is_listed_but_not_chosen():
@@ -185,7 +187,7 @@ def test_control_is_listed_but_not_chosen():
 
 @pytest.mark.parametrize("failure", [{"collapsed": True}, {"collapsed_before_n": 1}])
 def test_settings_of_a_collapsed_training_are_not_chosen(failure):
-    # The other board of the same settings did not collapse.
+    # With the same settings, the training on the other board did not collapse.
     again = card("lobo", "fast", 0.1, "b1", recipe=RECIPE | {"rate_max": 6e-3}, **failure)
     assert names(choose([*CARDS, again]))["train_multi"] == "fastest"
     collapsed_cards = [one | failure if one["question"] == "lobo" else one for one in CARDS]

@@ -1,4 +1,4 @@
-"""Tests of training with a few labels of a new board: folds, labels, scalers, adaptation and fine-tuning."""
+"""Tests of training with a few labels on a new board: folds, labels, scalers, adaptation, fine-tuning."""
 
 from collections import Counter
 from dataclasses import replace
@@ -44,7 +44,7 @@ METHODS = [
 
 
 def example_rows() -> Rows:
-    """Return rows of two skins on the first board, one on the others: 3 x 3 places, two passes, two readings each."""
+    """Return rows: two skins on board b0, one on each other board; 3 x 3 places, two passes, two readings per press."""
     own_n = PLACES_N * PASSES_N * READINGS_N
     rng, f = rng_for(0, "few labels"), len(SKINS) * own_n
     place_i = np.tile(np.arange(PLACES_N).repeat(READINGS_N), len(SKINS) * PASSES_N)
@@ -86,11 +86,11 @@ def initial_result(job: TrainingJob) -> TrainingResult:
     )
 
 
-def networks_of(at: few.Study) -> list[few.TrainedEntry]:
-    """Return all networks of the study, step by step as in the stage."""
+def networks_of(tested_study: few.Study) -> list[few.TrainedEntry]:
+    """Return all entries of the study with jobs and untrained results, in the order of the steps of the stage."""
     done: list[few.TrainedEntry] = []
     for step in (few.network_jobs, few.adaptation_jobs, few.fine_tuning_jobs):
-        done = [*done, *((entry, job, initial_result(job)) for entry, job in step(at, done))]
+        done = [*done, *((entry, job, initial_result(job)) for entry, job in step(tested_study, done))]
     return done
 
 
@@ -101,23 +101,25 @@ ADAPTED = [job for _, job, _ in NETWORKS if isinstance(job.tuning, Adaptation)]
 LABELLED = [(entry, job) for entry, job, _ in NETWORKS if isinstance(job.tuning, FineTuning)]
 
 
-def all_tried(at: few.Study, networks: list[few.TrainedEntry]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
-    return [*((entry, job) for entry, job, _ in networks), *few.classical_jobs(at)]
+def all_tried(
+    tested_study: few.Study, networks: list[few.TrainedEntry]
+) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
+    return [*((entry, job) for entry, job, _ in networks), *few.classical_jobs(tested_study)]
 
 
-def test_every_method_fold_and_number_of_labels_has_one_entry():
+def test_there_is_one_entry_per_method_fold_and_number_of_labels():
     folds = [f"b{board}-draw{draw}" for board in range(3) for draw in range(2)]
     assert [fold.name for fold in STUDY.folds] == folds
     entry = Counter((one.method, one.inputs, one.fold.name, one.labels_n) for one, _ in all_tried(STUDY, NETWORKS))
     assert entry == Counter((*method, fold, n) for method in METHODS for fold in folds for n in (0, 2, 5))
 
 
-def test_names_of_trainings_are_unique():
+def test_names_of_jobs_are_unique():
     names = [one.name for _, one in all_tried(STUDY, NETWORKS)]
     assert len(set(names)) == len(names) == 3 * 2 * 3 * len(METHODS)
 
 
-def test_entries_of_a_fold_share_test_and_training_rows():
+def test_entries_of_a_fold_have_the_same_test_and_training_rows():
     for entry, one in all_tried(STUDY, NETWORKS):
         assert (one.test == entry.fold.test).all()
         assert (one.train == entry.fold.train).all()
@@ -129,8 +131,10 @@ def labels_of(one: TrainingJob | ClassicalJob) -> np.ndarray:
     return one.few_labels if isinstance(one, ClassicalJob) else one.tuning.row
 
 
-def with_labels(at: few.Study, networks: list[few.TrainedEntry]) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
-    return [(entry, one) for entry, one in all_tried(at, networks) if entry.labels_n]
+def with_labels(
+    tested_study: few.Study, networks: list[few.TrainedEntry]
+) -> list[tuple[few.Entry, TrainingJob | ClassicalJob]]:
+    return [(entry, one) for entry, one in all_tried(tested_study, networks) if entry.labels_n]
 
 
 def test_labels_are_whole_indentations_of_the_pool():
@@ -139,7 +143,8 @@ def test_labels_are_whole_indentations_of_the_pool():
         assert {*labelled_rows} <= {*entry.fold.pool}
         labelled = np.unique(ROWS.indentation[labelled_rows])
         assert len(labelled) == entry.labels_n
-        assert {*labelled_rows} == {*np.flatnonzero(np.isin(ROWS.indentation, labelled))}  # all readings of them
+        # all readings of labelled indentations, and no others
+        assert {*labelled_rows} == {*np.flatnonzero(np.isin(ROWS.indentation, labelled))}
         assert not {*labelled} & {*ROWS.indentation[one.test]}
 
 
@@ -149,7 +154,7 @@ def test_entries_without_labels_have_none():
             assert len(one.few_labels) == 0 if isinstance(one, ClassicalJob) else not isinstance(one.tuning, FineTuning)
 
 
-def test_methods_share_labels_and_folds_do_not():
+def test_labels_are_the_same_for_all_methods_but_not_for_all_folds():
     given_labels: dict[tuple[str, int], set[tuple[int, ...]]] = {}
     for entry, one in with_labels(STUDY, NETWORKS):
         given_labels.setdefault((entry.fold.name, entry.labels_n), set()).add(tuple(labels_of(one)))
@@ -170,31 +175,31 @@ def test_labelled_pokes_are_drawn_for_each_fold():
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32), st.lists(st.integers(0, 8), min_size=2, max_size=4, unique=True))
 def test_fewer_labels_are_a_subset_of_more(seed, labels_n):
-    at = study(seed, labels_n=labels_n)
-    tasks = few.classical_jobs(at)
+    tested_study = study(seed, labels_n=labels_n)
+    tasks = few.classical_jobs(tested_study)
     rows = {(entry.fold.name, entry.labels_n): {*task.few_labels} for entry, task in tasks if "ridge" in task.name}
-    for fold in at.folds:
+    for fold in tested_study.folds:
         for less, more in pairwise(sorted(labels_n)):
             assert rows[fold.name, less] < rows[fold.name, more]
 
 
 def test_labels_depend_on_the_seed_but_not_on_order():
     first, again, other, turned = (
-        [sorted(task.few_labels.tolist()) for entry, task in few.classical_jobs(at) if entry.labels_n == 5]
-        for at in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
+        [sorted(task.few_labels.tolist()) for entry, task in few.classical_jobs(tested_study) if entry.labels_n == 5]
+        for tested_study in (study(), study(), replace(study(), seed=6), study(labels_n=[5, 0]))
     )
     assert first == again == turned
     assert all(one != changed for one, changed in zip(first, other, strict=True))
 
 
 def with_unknown_targets(what: np.ndarray, rows: Rows = ROWS) -> Rows:
-    """Return the rows with unknown places and forces for some of them."""
+    """Return the rows with NaN as place and force of the rows `what`."""
     target = rows.target.copy()
     target[what] = np.nan
     return replace(rows, target=target)
 
 
-def test_labels_of_a_new_board_change_no_scaler():
+def test_labels_of_the_new_board_do_not_change_the_scaler():
     pooled = {(entry.method, entry.fold.name): one.scaler for entry, job, one in NETWORKS if job.tuning is None}
     for entry, job in LABELLED:
         changed = training_data(ROWS).db_uT.copy()
@@ -204,7 +209,7 @@ def test_labels_of_a_new_board_change_no_scaler():
         for name, values in pooled[entry.method.removesuffix(", adapted"), entry.fold.name].arrays().items():
             assert (scaler.arrays()[name] == values).all()
             assert (same.arrays()[name] == values).all()
-        assert (other.few_labels.inputs != prepared.few_labels.inputs).any()  # but they are trained on
+        assert (other.few_labels.inputs != prepared.few_labels.inputs).any()  # labels are used for training
         assert len(prepared.few_labels.inputs) == READINGS_N * entry.labels_n
 
 
@@ -218,15 +223,16 @@ def test_fine_tuning_starts_from_the_network_of_its_fold():
 def test_only_listed_networks_are_adapted():
     assert [(job.recipe_name, job.fold) for job in ADAPTED] == [("triplet", fold.name) for fold in STUDY.folds]
     for job, fold in zip(ADAPTED, STUDY.folds, strict=True):
-        assert {*job.tuning.lines.row} == {*fold.pool}  # each of 8 places on a 3 x 3 grid has a neighbour on its lines
+        # all pool rows are on a line: each of 8 places on a 3 x 3 grid has a neighbour
+        assert {*job.tuning.lines.row} == {*fold.pool}
     assert few.adaptation_jobs(study(adapted=[]), networks_of_no_labels(study(adapted=[]))) == []
 
 
-def networks_of_no_labels(at: few.Study) -> list[few.TrainedEntry]:
-    return [(entry, job, initial_result(job)) for entry, job in few.network_jobs(at, [])]
+def networks_of_no_labels(tested_study: few.Study) -> list[few.TrainedEntry]:
+    return [(entry, job, initial_result(job)) for entry, job in few.network_jobs(tested_study, [])]
 
 
-def test_adaptation_uses_no_label_of_the_new_board():
+def test_adaptation_does_not_use_labels_of_the_new_board():
     for job in ADAPTED:
         unlabelled_data = training_data(with_unknown_targets(ROWS.board == job.fold[:2]))
         prepared, other = prepare(job, training_data(ROWS))[0], prepare(job, unlabelled_data)[0]

@@ -1,4 +1,4 @@
-"""The fingerprint of the simulated skin identifies all settings that change a capture."""
+"""Tests of the fingerprint of the simulated skin: it changes with every setting that changes a capture."""
 
 from copy import deepcopy
 from pathlib import Path
@@ -36,9 +36,9 @@ def test_every_setting_changes_the_fingerprint(section, name, value):
 
 def test_fingerprint_depends_on_physics_but_not_rounding(monkeypatch):
     rigid = slide.press_displacement_m
-    monkeypatch.setattr(slide, "press_displacement_m", lambda *of, **how: rigid(*of, **how) * (1 + 1e-12))
+    monkeypatch.setattr(slide, "press_displacement_m", lambda *args, **kwargs: rigid(*args, **kwargs) * (1 + 1e-12))
     assert fingerprint(PARAMS) == TODAY
-    monkeypatch.setattr(slide, "press_displacement_m", lambda *of, **how: rigid(*of, **how) * 1.02)
+    monkeypatch.setattr(slide, "press_displacement_m", lambda *args, **kwargs: rigid(*args, **kwargs) * 1.02)
     assert fingerprint(PARAMS) != TODAY
 
 

@@ -11,11 +11,11 @@ from tests.models.example_jobs import OWN, POKED, ROWS_N, TEST, TRAIN, adaptatio
 
 
 def rows() -> Rows:
-    own = example_data()
-    board = np.array([skin[:2] for skin in own.skin])
+    data = example_data()
+    board = np.array([skin[:2] for skin in data.skin])
     indentation = np.arange(ROWS_N) // 2
     passes = np.zeros(ROWS_N, np.int32)
-    return Rows(np.array(["c"] * ROWS_N), board, own.skin, own.db_uT, own.target, passes, indentation, {})
+    return Rows(np.array(["c"] * ROWS_N), board, data.skin, data.db_uT, data.target, passes, indentation, {})
 
 
 def card(job: TrainingJob, **changes: object) -> dict:
@@ -24,7 +24,7 @@ def card(job: TrainingJob, **changes: object) -> dict:
     return model_card(job, trained, rows(), scene="lab")
 
 
-def test_card_has_training_and_test_data():
+def test_card_describes_training_and_test_data():
     result = card(pooled())
     assert (result["scene"], result["key"], result["question"]) == ("lab", "k", "triplet")
     assert (result["train_boards"], result["train_skins"]) == (["b0"], ["b0_s0", "b0_s1"])
@@ -53,12 +53,12 @@ def test_card_is_json(job):
 
 
 @pytest.mark.parametrize(("explained", "collapsed"), [(None, False), (0.9, False), (0.049, True), (-3.0, True)])
-def test_card_has_collapse_and_attempts(explained, collapsed):
+def test_card_states_collapse_and_attempts(explained, collapsed):
     result = card(pooled(), explained_min=explained, collapsed_before_n=1)
     assert (result["explained_min"], result["collapsed"], result["collapsed_before_n"]) == (explained, collapsed, 1)
 
 
-def test_card_has_an_early_stop():
+def test_card_states_an_early_stop():
     assert card(pooled())["stopped_step"] is None
     assert card(pooled(), stopped_step=150)["stopped_step"] == 150
 
@@ -68,9 +68,9 @@ def test_card_has_an_early_stop():
     [(adaptation(), "unlabelled", POKED), (fine_tuning(), "labelled", OWN)],
     ids=["unlabelled", "labelled"],
 )
-def test_card_of_a_tuned_network_has_its_tuning(job, kind, used):
+def test_card_of_a_tuned_network_describes_the_tuning(job, kind, used):
     tuning = card(job)["tuning"]
     assert (tuning["from"], tuning["kind"], tuning["skins"]) == ("start", kind, ["b1_s1"])
     assert tuning["settings"] == job.tuning.settings.model_dump()
-    assert tuning["pokes_n"] == len({row // 2 for row in used})  # two readings per indentation
+    assert tuning["pokes_n"] == len({row // 2 for row in used})  # an indentation has two readings
     assert not set(used) & set(TEST)

@@ -1,4 +1,4 @@
-"""Tests of the shipped universal model against the tested variant."""
+"""Tests that the shipped universal model equals the variant that the experiments test."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def model() -> Universal:
 
 
 def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
-    """Return skins near the nominal one, with presses on the lattice and errors proportional to the field."""
+    """Return simulated skins near the nominal one: presses on the lattice, law errors proportional to the field."""
     tables, rng = model.tables, rng_for(0, "shipping")
     at = rng.integers(2, len(tables.axis_mm) - 2, (2, skins_n, PRESSES_N))
     force_i = rng.integers(1, len(tables.force_N), (skins_n, PRESSES_N))
@@ -41,7 +41,7 @@ def skins_of(model: Universal, skins_n: int, error: float = 0.3) -> Population:
 
 
 @pytest.mark.parametrize("labels_n", [0, 3, 10])
-def test_shipped_model_estimates_as_the_tested_variant(model, labels_n):
+def test_shipped_model_estimates_like_the_tested_variant(model, labels_n):
     skins = skins_of(model, 1)
     b_uT, _ = calibrate(model, skins, 0, (65, labels_n), even=True, seed=0)
     prior = PriorModel(new_map(model.tables), model.networks)
@@ -52,7 +52,8 @@ def test_shipped_model_estimates_as_the_tested_variant(model, labels_n):
     found = model.estimate(b_uT)
     assert model.misfit == pytest.approx(calibration.misfit, rel=1e-3)
     assert model.power == pytest.approx(powers[0].combined, rel=1e-3)
-    np.testing.assert_allclose(found.place_mm - 8, expected.place_mm, atol=1e-3)  # mm; fields in single precision
+    # tolerance in mm: fields are in single precision
+    np.testing.assert_allclose(found.place_mm - 8, expected.place_mm, atol=1e-3)
     np.testing.assert_allclose(found.sd_mm, expected.sd_mm, rtol=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Tests of the variants of the universal model: frames, recorded boards, saved networks, calibrated intervals."""
+"""Tests of the variants of the universal model: axes, recorded boards, saved networks, calibrated intervals."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -50,7 +50,7 @@ def test_place_and_label_are_inverse():
 
 
 def test_recorded_readings_are_grouped_by_press():
-    counts = [2, 150, 1, 3]  # readings of presses; the third has no force, the last is on another board
+    counts = [2, 150, 1, 3]  # numbers of readings of four presses; the third has no force, the last is on another board
     press = np.repeat(np.arange(4), counts)
     board = np.where(press == 3, "other", "own")
     target = np.stack([8 + press, 7 + press, np.where(press == 2, 0.0, 1 + press)], axis=1).astype(np.float32)
@@ -110,7 +110,7 @@ def test_best_powers_cover_90_percent():
     assert best_powers((1.0, 0.5, 0.1), found) == (0.5, 0.5)
 
 
-def test_larger_misfit_widens_intervals_only(nominal):
+def test_larger_misfit_widens_intervals_without_changing_estimates(nominal):
     (fitting, _), (misfitting, tested) = (calibrate_to_errors(nominal, error) for error in (unchanged, scaled_channels))
     assert misfitting.misfit > 2 * fitting.misfit
     powers = misfitting.nominal_powers(Powers(0.2, 0.1))
@@ -125,7 +125,7 @@ def test_larger_misfit_widens_intervals_only(nominal):
 
 @pytest.fixture
 def fits_and_misled(nominal) -> tuple[PoolCalibration, PoolCalibration]:
-    """Return a skin that fits, and the same with labels that have independent errors of 3 mm."""
+    """Return the calibration of a skin with exact labels, and with labels that have independent errors of 3 mm."""
     fits, _ = calibrate_to_errors(nominal, unchanged)
     off_mm = 3 * rng_for(1, "labels").standard_normal(fits.pool.place_mm.shape)
     return fits, replace(fits, pool=replace(fits.pool, place_mm=fits.pool.place_mm + off_mm))
@@ -136,10 +136,9 @@ def test_errors_of_held_out_labels_widen_intervals(fits_and_misled):
     fitting_powers, misled_powers = (np.array(lower_by_labels(one, 40, powers)) for one in fits_and_misled)
     _, misled = fits_and_misled
     assert (misled_powers < fitting_powers / 2).all()
-    assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, unchanged
-    assert (
-        misled_powers < np.array(lower_by_labels(misled, 3, powers))
-    ).all()  # three labels are less informative than forty
+    assert lower_by_labels(misled, 0, [Powers(0.3, 0.2)]) == [(0.3, 0.2)]  # without labels, powers are unchanged
+    # Forty wrong labels lower the powers more than three.
+    assert (misled_powers < np.array(lower_by_labels(misled, 3, powers))).all()
 
 
 def test_single_label_is_held_out(fits_and_misled):

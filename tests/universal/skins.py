@@ -1,4 +1,4 @@
-"""A synthetic skin with fields in closed form, so that tests need no simulation, and the design of the real skin."""
+"""A synthetic skin for tests, whose fields are a simple formula (no simulation); the design of the real skin."""
 
 from pathlib import Path
 
@@ -16,26 +16,26 @@ CHIPS_MM = np.array([[0.0, 0.0], [-7.0, 0.0], [0.0, -7.0], [7.0, 0.0], [0.0, 7.0
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = Setup(DESIGN, CHIPS_MM, 1.1, (20.0, 20.0), True, 2.0)
 WIDE_MM = 5.0
-FORCES_N = np.geomspace(0.55, 9.5, 6)  # enough for the closed form
+FORCES_N = np.geomspace(0.55, 9.5, 6)  # force grid of the tables; few forces suffice for the formula
 NAMES, SPREADS = ("label_x_mm", "label_y_mm", "gap_mm"), np.array([0.25, 0.25, 0.3])
 REST_SLOPE_uT = np.sin(np.arange(45.0)).reshape(15, 3) * 300
 
 
 def fields_uT(place_mm: np.ndarray, force_N: np.ndarray, upright: float = 1.0) -> np.ndarray:
-    """Return 15 channels of a bump around each chip whose field leans away from it; `upright` scales the z axes."""
+    """Return fields in 15 channels: around each chip a bump with field pointing away from it; `upright` scales z."""
     apart = (place_mm[:, None] - CHIPS_MM) / WIDE_MM
     size = 400 * force_N[:, None] ** 0.7 * np.exp(-(apart**2).sum(axis=2) / 2)
     return np.stack([size * apart[..., 0], size * apart[..., 1], size * upright], axis=2).reshape(len(place_mm), -1)
 
 
 def poked_uT(place_mm: np.ndarray, force_N: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Return fields of a skin whose parameters are `number` prior standard deviations from the centre."""
+    """Return fields of a skin whose parameters are `number` prior standard deviations from the prior mean."""
     label_x_mm, label_y_mm, gap_mm = number * SPREADS
     return fields_uT(place_mm + [label_x_mm, label_y_mm], force_N, 1 + gap_mm)
 
 
 def make_tables() -> Tables:
-    """Return tables of the synthetic skin, with slopes by small differences."""
+    """Return tables of the synthetic skin; slopes are computed by small differences."""
     axis_mm = lattice_mm()
     place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.repeat(place_mm, len(FORCES_N), axis=0), np.tile(FORCES_N, len(place_mm))
@@ -49,7 +49,7 @@ def make_tables() -> Tables:
 
 
 def make_population(skins_n: int, rng: np.random.Generator, weight_N: float | None = None) -> Population:
-    """Draw synthetic skins with different parameters; if a weight is given, its press comes last."""
+    """Draw synthetic skins with random parameters; if a weight is given, the press of the weight is the last one."""
     place_mm = np.stack([draw_places(rng) for _ in range(skins_n)])
     force_N = np.exp(rng.uniform(np.log(0.5), np.log(10), (skins_n, PRESSES_N)))
     number = rng.standard_normal((skins_n, 3))

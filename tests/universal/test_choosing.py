@@ -1,4 +1,4 @@
-"""The information gain of a labelled press equals the variance removed by Gaussian conditioning."""
+"""Tests that the expected gain of a labelled press equals the variance removed by Gaussian conditioning."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from reskin.universal.map import NOISE_uT, SkinMap, condition_on_labels, expecte
 from reskin.universal.model import load_universal
 from tests.universal.skins import fields_uT, make_tables
 
-PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])  # lattice points
+PLACE_mm, FORCE_N = np.array([[0.4, -1.2], [5.2, 2.8]]), np.array([2.0, 2.0])  # places and forces at lattice points
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +23,13 @@ def test_gain_equals_removed_variance(skin):
     at_mm, at_log_N = (part[some] for part in of.at)
     force_N = np.exp(of.log_N[3:4])
     press_uT = np.linalg.norm(of.mean_uT[some[i]])
-    # All channels at all places, together with those of the press, which is one of these places.
+    # Covariance of all channels at all places; the press is at one of these places.
     alike = kernel(at_mm, at_mm[i : i + 1], at_log_N, at_log_N[i : i + 1])[:, 0]
     beside = slope @ skin.cov @ slope[i].T + alike[:, None, None] * skin.error_cov
     read = beside[i] + skin.residual.noise * skin.error_cov + (NOISE_uT / press_uT) ** 2 * np.eye(15)
     taken = [np.trace(one @ np.linalg.solve(read, one.T)) for one in beside]
     found = expected_gain(skin, of.place_mm[i : i + 1], force_N)
-    assert found[0] == pytest.approx(np.mean(taken), rel=1e-5)  # single-precision tables
+    assert found[0] == pytest.approx(np.mean(taken), rel=1e-5)  # tables are in single precision
 
 
 def test_labelled_place_gains_less_than_a_far_one(skin):

@@ -1,4 +1,4 @@
-"""Map and networks are combined as normal distributions; labels and even presses correct the networks' places."""
+"""Tests of combining map and networks as normal distributions, and of correcting the networks' places."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def evaluation(skin: SkinMap, db_uT: np.ndarray, place_mm: np.ndarray, sd_mm: fl
     return Evaluation(skin.evaluator, skin.evaluator.evaluate(db_uT), network)
 
 
-def test_even_presses_are_centred():
+def test_places_of_evenly_spread_presses_are_centred():
     even_mm, place_mm = RNG.normal(0.7, 3, (65, 2)), np.zeros((10, 2))
     centre_mm, _ = network_offsets_mm(even_mm, place_mm[:0], place_mm[:0])
     np.testing.assert_allclose((even_mm + centre_mm).mean(axis=0), 0, atol=1e-12)
@@ -33,7 +33,7 @@ def test_even_presses_are_centred():
 
 
 @pytest.mark.parametrize("labels_n", [1, 7])
-def test_labels_shift_places_with_a_gaussian_prior(labels_n):
+def test_labels_shift_places_as_with_a_gaussian_prior(labels_n):
     estimated_mm, true_mm = RNG.normal(0, 3, (labels_n, 2)), RNG.normal(0, 3, (labels_n, 2))
     cov = OFFSET_SD_MM**2 * np.ones((labels_n, labels_n)) + LABEL_SD_MM**2 * np.eye(labels_n)
     expected_mm = OFFSET_SD_MM**2 * np.ones(labels_n) @ np.linalg.solve(cov, true_mm - estimated_mm)
@@ -42,7 +42,7 @@ def test_labels_shift_places_with_a_gaussian_prior(labels_n):
     assert (centre_mm == 0).all()
 
 
-def test_network_decides_where_the_map_cannot(skin):
+def test_network_determines_the_place_where_the_map_is_ambiguous(skin):
     place_mm = np.array([[3.0, 2.0], [-4.0, 1.0]])
     db_uT = fields_uT(place_mm, np.array([2.0, 3.0]))
     right = evaluation(skin, db_uT, place_mm).combined(1.0)
@@ -54,7 +54,7 @@ def test_network_decides_where_the_map_cannot(skin):
     assert np.isfinite(blind.place_mm).all()
 
 
-def test_lower_power_widens_intervals_only(skin):
+def test_lower_power_widens_intervals_without_changing_estimates(skin):
     place_mm = np.array([[3.0, 2.0]])
     of = evaluation(skin, fields_uT(place_mm, np.array([2.0])), place_mm)
     full, lower = of.combined(1.0), of.combined(0.25)

@@ -1,4 +1,4 @@
-"""Inversion recovers presses and parameters of the law; slopes equal differences; foreign readings have residuals."""
+"""Tests of the inversion of the law: it recovers presses and parameters, and other readings have large residuals."""
 
 from dataclasses import asdict, replace
 
@@ -21,7 +21,7 @@ FORCE_N = np.exp(rng_for(0, "inversion").uniform(np.log(0.8), np.log(6.0), len(P
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])  # 2.8 mm around the middle
+    monkeypatch.setattr(inversion, "lattice_mm", lambda: lattice_mm()[7:15])  # only places within 2.8 mm, for speed
 
 
 def fields_uT() -> np.ndarray:
@@ -32,7 +32,7 @@ def test_search_recovers_places_and_forces():
     found = search(chart(TRUE, CHEAP), fields_uT())
     np.testing.assert_allclose(
         found.place_mm, PLACE_MM, atol=0.2
-    )  # a quarter of the pitch, after a single step with the slopes of the lattice
+    )  # tolerance: a quarter of the pitch, because the search takes a single step with the slopes at the lattice point
     np.testing.assert_allclose(np.log(found.force_N), np.log(FORCE_N), atol=0.2)
     assert found.residual.max() < 0.1
 
@@ -45,12 +45,12 @@ def test_residuals_are_zero_on_the_lattice_only():
     assert np.median(search(known, -fields_uT()).residual) > 0.5
 
 
-def test_slopes_equal_differences():
+def test_slopes_equal_finite_differences():
     two = _JointFit(TRUE, CHEAP, fields_uT()[:2], at_rest_uT(TRUE, CHEAP).ravel())
     at = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
     values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], at.ravel()])
     columns = two.slopes(values)
-    for i in (0, len(PARAMETERS), len(PARAMETERS) + 4):  # a parameter, x of the first press, y of the second
+    for i in (0, len(PARAMETERS), len(PARAMETERS) + 4):  # a parameter of the law, x of the first press, y of the second
         by = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
         expected = (two.residuals(values + by) - two.residuals(values)) / by.max()
         np.testing.assert_allclose(columns[:, i], expected, rtol=1e-6, atol=1e-9)

@@ -1,4 +1,4 @@
-"""The compiled loops agree with NumPy and, for Gaussians, with the closed form."""
+"""Tests of the compiled loops over hypotheses (place, force) against NumPy and, for Gaussians, closed forms."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ FIRST_mm, FIRST_SD_mm, LOG_N = np.array([1.0, -2.0]), 1.2, 0.8
 
 
 def total() -> np.ndarray:
-    """Deviances of a Gaussian around a place and a force, sharper, with noise and flatter."""
+    """Return deviances [4, hypotheses]: of a Gaussian, a sharper noisy one, a noisy one, and a flat one."""
     of_place = ((AT.place_mm - FIRST_mm) ** 2).sum(axis=1) / FIRST_SD_mm**2
     of_force = (AT.log_N - LOG_N) ** 2 / 0.5
     of_all = (of_place[:, None] + of_force).ravel() + 300.0
@@ -20,8 +20,8 @@ def total() -> np.ndarray:
     return np.stack([of_all, 6 * (of_all + ruffle), of_all + ruffle, 0.1 * of_all]).astype(np.float32)
 
 
-def of(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The deviance and the most likely hypothesis."""
+def with_best(total: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the deviances and the most likely hypothesis of each row."""
     return total, total.argmin(axis=1)
 
 
@@ -37,20 +37,21 @@ def spread(of_place: np.ndarray, about_mm: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
 def test_means_are_sums_over_all_hypotheses(power):
-    place_mm, sd_mm, force_N = means(*of(total()), AT, power)
+    place_mm, sd_mm, force_N = means(*with_best(total()), AT, power)
     of_place = probabilities(power).sum(axis=2)
-    np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)  # below e^-25 of the maximum: omitted
+    # hypotheses below e^-25 of the maximum are omitted
+    np.testing.assert_allclose(place_mm, of_place @ AT.place_mm, atol=1e-6)
     np.testing.assert_allclose(sd_mm, spread(of_place, place_mm), atol=1e-6)
     np.testing.assert_allclose(np.log(force_N), probabilities(power).sum(axis=1) @ AT.log_N, atol=1e-6)
 
 
 @pytest.mark.parametrize("power", [1.0, 0.3])
-def test_product_equals_margins_times_normals(power):
+def test_product_equals_marginal_distribution_times_normal_distributions(power):
     rng = rng_for(1, "answers")
     normals = np.column_stack(
         [rng.normal(0, 3, (4, 2)), rng.uniform(0.5, 2, (4, 2)), rng.normal(0, 1, 4), np.full(4, 0.4)]
     )
-    place_mm, sd_mm, force_N = products(*of(total()), AT, normals, 0.6, power)
+    place_mm, sd_mm, force_N = products(*with_best(total()), AT, normals, 0.6, power)
     off = (AT.place_mm - normals[:, None, :2]) / normals[:, None, 2:4]
     of_place = probabilities(0.6).sum(axis=2) * np.exp(-0.5 * (off**2).sum(axis=2))
     of_force = probabilities(0.6).sum(axis=1) * np.exp(-0.5 * ((AT.log_N - normals[:, 4:5]) / normals[:, 5:]) ** 2)
@@ -64,7 +65,7 @@ def test_product_equals_margins_times_normals(power):
 def test_product_of_two_gaussians():
     second_mm, second_sd = np.array([2.5, 0.0]), np.array([1.0, 0.8])
     second = np.concatenate([second_mm, second_sd, np.ones(2)])[None]
-    place_mm, sd_mm, _ = products(*of(total()[:1]), AT, second, 1.0, 1.0)
+    place_mm, sd_mm, _ = products(*with_best(total()[:1]), AT, second, 1.0, 1.0)
     var = 1 / (1 / FIRST_SD_mm**2 + 1 / second_sd**2)
     np.testing.assert_allclose(place_mm[0], var * (FIRST_mm / FIRST_SD_mm**2 + second_mm / second_sd**2), atol=1e-4)
     np.testing.assert_allclose(sd_mm[0], np.sqrt(var), atol=1e-4)
@@ -74,7 +75,7 @@ def test_excluded_place_keeps_the_minimum_probability():
     far = np.full((1, total().shape[1]), 1e4, np.float32)
     far[0, 0] = 0.0
     normals = np.array([[8.0, 8.0, 0.1, 0.1, 1.0, 1.0]])
-    place_mm, sd_mm, _ = products(*of(far), AT, normals, 1.0, 1.0)
+    place_mm, sd_mm, _ = products(*with_best(far), AT, normals, 1.0, 1.0)
     np.testing.assert_allclose(place_mm, [[8.0, 8.0]], atol=0.05)
     assert np.isfinite(sd_mm).all()
 
@@ -82,7 +83,7 @@ def test_excluded_place_keeps_the_minimum_probability():
 def test_nan_gives_nan():
     none = np.full((1, total().shape[1]), np.nan, np.float32)
     normals = np.ones((1, 6))
-    for found in (means(*of(none), AT, 1.0), products(*of(none), AT, normals, 1.0, 1.0)):
+    for found in (means(*with_best(none), AT, 1.0), products(*with_best(none), AT, normals, 1.0, 1.0)):
         assert all(np.isnan(part).all() for part in found)
 
 
@@ -109,4 +110,4 @@ def test_chi2_is_the_mahalanobis_distance(h):
     np.testing.assert_allclose(chi2, np.einsum("nhi,hij,nhj->nh", off, np.linalg.inv(cov), off), rtol=1e-4, atol=0.01)
     np.testing.assert_allclose(
         deviance - chi2, np.tile(np.linalg.slogdet(cov)[1], (5, 1)), atol=1e-3
-    )  # single precision
+    )  # tolerance of single precision

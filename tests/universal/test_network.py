@@ -1,4 +1,4 @@
-"""The network is conditioned on a set of presses, which may be empty and whose order does not matter."""
+"""Tests of the network, which is conditioned on a set of presses: any order, any number including none."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ ONE, OTHER = (draw_weights(15, rng_for(0, name)) for name in ("one", "other"))
 
 def test_order_of_presses_does_not_matter():
     forward, backward = predict([ONE], READ_uT, REST_uT, PRESSES_uT), predict([ONE], READ_uT, REST_uT, PRESSES_uT[::-1])
-    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)  # different order of summation
+    np.testing.assert_allclose(forward.place_mm, backward.place_mm, atol=1e-4)  # sums in another order
     other = predict([ONE], READ_uT, REST_uT, 2 * PRESSES_uT)
     assert np.abs(forward.place_mm - other.place_mm).max() > 1e-3
 
@@ -65,5 +65,5 @@ def test_numpy_equals_pytorch(presses_n):
         mean, log_sd = (part[0].numpy() for part in network(read, rest, network.encode(presses, rest, kept)))
     found_mean = np.column_stack([found.place_mm / PLACE_MM, found.log_N / LOG_N])
     found_sd = np.column_stack([found.sd_mm / PLACE_MM, found.sd_log_N / LOG_N])
-    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)  # different order of summation
+    np.testing.assert_allclose(found_mean, mean, rtol=1e-5, atol=1e-5)  # sums in another order
     np.testing.assert_allclose(np.log(found_sd), log_sd, rtol=1e-5, atol=1e-5)

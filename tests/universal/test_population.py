@@ -1,4 +1,4 @@
-"""Simulated skins are reproducible and follow their prior."""
+"""Tests that simulated skins are reproducible and follow the prior."""
 
 from dataclasses import fields, replace
 
@@ -26,7 +26,8 @@ COARSE = replace(SETUP, rule=population.COARSE)
 
 
 def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
-    monkeypatch.setattr(population, "THICKNESSES_MM", {2.0: 1.0})  # each thickness and tip takes seconds to tabulate
+    # a single thickness, because tables for each thickness and tip take seconds
+    monkeypatch.setattr(population, "THICKNESSES_MM", {2.0: 1.0})
     monkeypatch.setattr(population, "TIPS_MM", {2.0: 1.0})
     one, two = (draw_population(NOMINAL, NOMINAL_SPREADS, SETUP, n, rng_for(0, "skins")) for n in (1, 2))
     for field in fields(one):
@@ -37,7 +38,8 @@ def test_draws_do_not_depend_on_the_number_of_skins(monkeypatch):
     weighed = draw_population(
         NOMINAL, NOMINAL_SPREADS, SETUP, 1, rng_for(0, "skins"), replace(DEFAULT_FORCES, weight_N=5.0)
     )
-    np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)  # a weight press does not change the others
+    # an additional press with a known weight does not change the others
+    np.testing.assert_array_equal(weighed.db_uT[:, :-1], one.db_uT)
     assert (*weighed.place_mm[0, -1], weighed.force_N[0, -1]) == (0, 0, 5)
 
 
@@ -45,7 +47,7 @@ def test_parameters_have_the_given_spreads_and_bounds():
     rng = rng_for(1, "laws")
     laws = [draw_law(NOMINAL, NOMINAL_SPREADS, rng) for _ in range(300)]
     for name in ("seat_x_mm", "label_y_mm", "tilt_x_deg", "give_x_um"):
-        # The standard error of a standard deviation from 300 draws is 4 %.
+        # Tolerance: the standard error of a standard deviation of 300 draws is 4 %.
         assert np.std([getattr(law, name) for law in laws]) == pytest.approx(NOMINAL_SPREADS[name], rel=0.16)
     for name, least in LEAST.items():
         assert min(getattr(law, name) for law in laws) >= least
@@ -57,7 +59,7 @@ def test_presses_cover_the_grid_and_stay_on_the_skin():
     place_mm = draw_places(rng_for(2, "places"))
     assert place_mm.shape == (2 * PLACES_N, 2)
     assert inside(place_mm).all()
-    assert np.abs(place_mm[:PLACES_N] - grid()).max() < 0.3  # six standard deviations of the jitter
+    assert np.abs(place_mm[:PLACES_N] - grid()).max() < 0.3  # six standard deviations of the random offset
     assert len(np.unique(grid(), axis=0)) == PLACES_N
     assert inside(grid()).all()
 
@@ -70,7 +72,8 @@ def test_filler_scales_and_shifts_fields(monkeypatch):
     np.testing.assert_allclose(at_rest_uT(NOMINAL, COARSE, twice), 2 * at_rest_uT(NOMINAL, COARSE), rtol=1e-9)
     filled = fill(COARSE.rest, rng_for(3, "filler"))
     part = np.linalg.norm(filled.moments_A_m2, axis=1) / np.linalg.norm(COARSE.rest.moments_A_m2, axis=1)
-    assert 0.05 < np.std(np.log(part)) < 0.3  # 0.15 over many skins; a skin is about six correlation lengths wide
+    # 0.15 is the average over many skins; a single skin is only about six correlation lengths wide
+    assert 0.05 < np.std(np.log(part)) < 0.3
 
 
 def test_chips_read_nearly_the_true_field():

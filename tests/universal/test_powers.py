@@ -1,4 +1,4 @@
-"""Likelihood powers and variance inflation from cross-validated labels."""
+"""Tests of likelihood powers and of the variance inflation from cross-validated labels."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_inflation_of_normal_and_doubled_residuals():
     assert variance_inflation(2 * off) == pytest.approx(4, rel=0.01)
 
 
-def test_few_residuals_are_shrunk_to_the_prior():
+def test_inflation_from_few_residuals_is_shrunk_to_the_prior():
     assert variance_inflation(np.zeros((0, 2))) == 1
     none_off = variance_inflation(np.zeros((5, 2)))
     assert none_off == pytest.approx((PRIOR_N / (PRIOR_N + 10)) ** 2)

@@ -1,4 +1,4 @@
-"""The model that comes with the library: accuracy on simulated pokes, misfit, labels, files and invalid input."""
+"""Tests of the model shipped with the library: accuracy on simulated pokes, misfit, labels, files, invalid input."""
 
 import inspect
 import shutil
@@ -39,7 +39,7 @@ def skin() -> Universal:
 
 
 def pokes(skin: Universal, force_i: int = 3) -> np.ndarray:
-    """Readings of a nominal skin at the lattice points next to `PLACES_MM`, in the chips' axes."""
+    """Return readings of the nominal skin at the lattice points nearest to `PLACES_MM`, in the axes of the chips."""
     tables = skin.tables
     at = np.abs((PLACES_MM - 8)[:, :, None] - tables.axis_mm).argmin(axis=2)
     return to_chips(tables.mean_uT[at[:, 0], at[:, 1], force_i])
@@ -61,7 +61,7 @@ def test_labels_move_estimates_towards_them(skin):
     assert np.abs(after[:, :2] - shifted_mm).mean() < 0.5 * np.abs(before[:, :2] - shifted_mm).mean()
 
 
-def test_misfit_of_other_signals_is_large(skin):
+def test_misfit_of_signals_that_are_not_pokes_is_large(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     own = skin.zero(rest_uT).estimate(pokes(skin) + rest_uT).misfit
     alien = skin.estimate(3000 * np.random.default_rng(0).standard_normal((4, CHANNELS_N)) + rest_uT).misfit
@@ -74,7 +74,7 @@ def test_card_describes_the_model(skin):
     assert skin.card["centre"]["gap_mm"] == NOMINAL.gap_mm
     assert skin.card["not_for"]
     assert len(skin.networks) == skin.card["lessons"]["seeds_n"]
-    assert FILE.stat().st_size <= 5e6  # bytes
+    assert FILE.stat().st_size <= 5e6  # limit on the size of the file in bytes
     assert tuple(skin.card["spreads"]) == skin.tables.names
 
 
@@ -82,7 +82,7 @@ def test_other_boards_are_refused(skin):
     for b_uT, got in ((np.zeros((2, 12)), r"shape \(2, 12\)"), (np.zeros(14), "14 numbers")):
         with pytest.raises(SchemaError, match=f"b_uT has {got}.* 15 numbers per reading"):
             skin.predict(b_uT)
-    for b_uT in (["a"] * 15, [[1.0], [1.0, 2.0]]):  # tests check types, users' programs do not
+    for b_uT in (["a"] * 15, [[1.0], [1.0, 2.0]]):  # wrong types, which only users' programs can pass
         with pytest.raises(SchemaError, match="b_uT: .* is not an array of numbers"):
             inspect.unwrap(check_shape)(b_uT)
     assert reskin.load_universal().tables.rest_uT.shape == (CHANNELS_N,)
@@ -111,7 +111,7 @@ def test_fields_in_mT_are_refused(skin):
             calibrate(read_mT)
     assert skin.presses_n == 0
     lightest_uT = pokes(skin, 0)[:1]
-    assert skin.see(lightest_uT + skin.noload_uT).presses_n == 1  # one light touch is enough
+    assert skin.see(lightest_uT + skin.noload_uT).presses_n == 1  # a single light touch is accepted
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_forces_of_labels_far_outside_the_range_are_refused(skin, force_N, valid
     assert skin.presses_n == int(valid)
 
 
-def test_texts_of_models_are_one_line(skin):
+def test_repr_of_models_is_one_line(skin):
     skin.zero(to_chips(skin.tables.rest_uT[None]))
     skin.label(PLACES_MM, np.ones(4), pokes(skin) + skin.noload_uT).see(pokes(skin)[:2] + skin.noload_uT)
     assert repr(skin) == (
@@ -146,7 +146,7 @@ def test_texts_of_models_are_one_line(skin):
     assert "chips_m=[5, 3]" in repr(board)
 
 
-def test_single_and_joint_adaptation_agree(skin):
+def test_adapting_to_presses_singly_or_together_is_equivalent(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     stronger_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT
     at_once = skin.zero(rest_uT).see(stronger_uT).skin.mean
@@ -194,7 +194,8 @@ def test_order_of_data_and_queries_does_not_matter(skin):
 def test_invalid_labels_are_refused_and_change_nothing(skin, place_mm, force_N, rule):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT = pokes(skin)[:1] + rest_uT
-    before = skin.zero(rest_uT).label(PLACES_MM[0], 1.0, read_uT[0]).predict(read_uT)  # one poke, not in a list
+    # arguments for a single poke need no list
+    before = skin.zero(rest_uT).label(PLACES_MM[0], 1.0, read_uT[0]).predict(read_uT)
     with pytest.raises(SchemaError, match=rule):
         skin.label(place_mm, force_N, read_uT)
     for learn in (skin.see, skin.zero):
@@ -222,7 +223,7 @@ def test_model_of_an_earlier_version_is_refused(skin, tmp_path):
         load_universal(file=file)
 
 
-def test_saved_skin_estimates_alike_and_follows_drift(skin, tmp_path):
+def test_saved_skin_has_equal_estimates_and_follows_drift(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
     read_uT, force_N = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3])
     further_uT = np.concatenate([1.25 * pokes(skin, force_i) for force_i in (1, 2, 3, 4)]) + rest_uT
@@ -239,7 +240,7 @@ def test_saved_skin_estimates_alike_and_follows_drift(skin, tmp_path):
     assert again.zero(drifted_uT).presses_n == 0
 
 
-def test_labels_are_kept_on_request(skin):
+def test_adaptation_keeps_labels_on_request(skin):
     rest_uT = to_chips(skin.tables.rest_uT[None])
     read_uT, force_N, shifted_mm = pokes(skin) + rest_uT, np.full(4, skin.tables.force_N[3]), PLACES_MM + (0.8, -0.5)
     at_once = skin.zero(rest_uT).label(shifted_mm, force_N, read_uT).predict(read_uT)
@@ -253,7 +254,7 @@ def test_labels_are_kept_on_request(skin):
     assert skin.label(shifted_mm[2:], force_N[2:], read_uT[2:]).presses_n == 2
 
 
-def test_saved_skin_keeps_incremental_pokes(skin, tmp_path):
+def test_saved_skin_includes_pokes_added_one_by_one(skin, tmp_path):
     rest_uT, file = to_chips(skin.tables.rest_uT[None]), tmp_path / "s0.safetensors"
     skin.zero(rest_uT)
     for one_uT in np.concatenate([1.25 * pokes(skin, force_i) for force_i in (2, 3, 4)]) + rest_uT:
@@ -265,7 +266,7 @@ def test_saved_skin_keeps_incremental_pokes(skin, tmp_path):
 
 
 def repeated_labels(labels_n):
-    """Return this number of equal labels in the middle of the skin."""
+    """Return data of a saved skin with this number of equal labels in the middle of the skin."""
     return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
 
 
@@ -305,7 +306,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
         load_universal(FILE)
 
 
-def test_no_rows():
+def test_no_readings_give_empty_estimates():
     model = load_universal().zero(np.zeros(15))
     assert model.predict(np.empty((0, 15))).shape == (0, 3)
     assert len(model.estimate(np.empty((0, 15))).place_mm) == 0

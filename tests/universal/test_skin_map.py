@@ -1,4 +1,4 @@
-"""A map is conditioned as a Gaussian process and reproduces labelled places."""
+"""Tests of the map: it is conditioned like a Gaussian process and reproduces labelled places."""
 
 from dataclasses import replace
 
@@ -33,10 +33,10 @@ def presses(number=NUMBER, seed=0):
     return grid(), force_N, poked_uT(grid(), force_N, number)
 
 
-def test_no_load_field_conditions_as_a_gaussian(skin):
+def test_conditioning_on_the_no_load_field_equals_that_of_a_gaussian(skin):
     noload_uT = rng_for(1, "rest").normal(0, 300, 15)
     found = map.condition_on_noload(skin, noload_uT)
-    # Covariance form; the map computes in information form.
+    # Reference in covariance form; the map is computed in information form.
     gain = REST_SLOPE_uT.T @ np.linalg.inv(REST_SLOPE_uT @ REST_SLOPE_uT.T + OFFSET_uT**2 * np.eye(15))
     np.testing.assert_allclose(found.mean, gain @ noload_uT, rtol=1e-9)
     np.testing.assert_allclose(found.cov, np.eye(3) - gain @ REST_SLOPE_uT, rtol=1e-9, atol=1e-12)
@@ -57,7 +57,7 @@ def test_deviance_is_that_of_a_gaussian(skin):
         chi2 = off_uT @ np.linalg.solve(cov, off_uT)
         deviance = chi2 + np.linalg.slogdet(cov)[1]
         found = skin.evaluator.evaluate(db_uT[row : row + 1])
-        assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)  # single precision
+        assert found.chi2[0, i] == pytest.approx(chi2, abs=0.01)  # tolerance of single precision
         assert found.deviance[0, i] == pytest.approx(deviance, abs=0.02)
 
 
@@ -70,7 +70,7 @@ def test_presses_of_the_tabulated_skin_are_located(skin):
 
 def test_labelled_place_overrides_the_law(skin):
     place_mm, force_N, db_uT = presses()
-    wrong_uT = db_uT[::-1] * 0.9  # each place reads like the opposite one
+    wrong_uT = db_uT[::-1] * 0.9  # each place has the field of the opposite place
     some = [12, 32, 50]
     found = condition_on_labels(skin, place_mm[some], force_N[some], wrong_uT[some]).evaluator.estimate(wrong_uT[some])
     assert np.abs(found.place_mm - place_mm[some]).max() < 0.5
@@ -83,7 +83,8 @@ def test_order_of_labels_does_not_matter(skin):
     order = rng_for(2, "order").permutation(10)
     maps = [condition_on_labels(skin, place_mm[i], force_N[i], db_uT[i]) for i in (np.arange(10), order)]
     one, other = (each.evaluator.estimate(db_uT) for each in maps)
-    np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)  # mm; single-precision deviance
+    # tolerance in mm: deviances are in single precision
+    np.testing.assert_allclose(one.place_mm, other.place_mm, atol=1e-3)
     np.testing.assert_allclose(one.sd_mm, other.sd_mm, atol=1e-3)
 
 
@@ -91,13 +92,13 @@ def test_order_of_labels_does_not_matter(skin):
 def test_unlabelled_presses_improve_the_parameters(skin, gap):
     _, _, db_uT = presses(np.array([0.0, 0.0, gap]))
     found = condition_on_presses(skin, db_uT + rng_for(3, "noise").normal(0, 3, db_uT.shape))
-    # The estimate is not closer because the place and force of each press absorb part of the parameter's effect.
+    # The tolerance is wide because the estimated place and force of each press absorb part of the parameter's effect.
     assert abs(found.mean[2] - gap) < 0.8 * abs(gap)
     assert found.cov[2, 2] < skin.cov[2, 2]
 
 
-def test_even_presses_determine_the_middle_of_the_labels(skin):
-    shifted = np.array([2.0, -1.0, 0.0])  # spreads of 0.25 mm
+def test_evenly_spread_presses_determine_the_middle_of_the_labels(skin):
+    shifted = np.array([2.0, -1.0, 0.0])  # shift in standard deviations of 0.25 mm
     _, _, db_uT = presses(shifted)
     found = condition_on_even_presses(skin, db_uT)
     assert np.linalg.norm((found.mean - shifted)[:2]) < 0.5 * np.linalg.norm(shifted)

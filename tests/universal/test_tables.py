@@ -1,4 +1,4 @@
-"""Tables contain the simulated fields of the law and their slopes."""
+"""Tests that tables contain the simulated fields of the law and the slopes of these fields."""
 
 from dataclasses import asdict, replace
 
@@ -20,7 +20,8 @@ def test_tables_equal_simulated_fields_and_slopes(monkeypatch):
         np.testing.assert_allclose(found.mean_uT[0, 1, i], there_uT, rtol=1e-9)
         moved_uT = simulate_uT(NOMINAL, SETUP, at_mm + [STEP * 0.5, 0], np.array([force_N])).ravel()
         np.testing.assert_allclose(found.slope_uT[0, 1, i, :, 1], (moved_uT - there_uT) / STEP, rtol=1e-9, atol=1e-9)
-    grown = (np.exp(STEP * 0.2) - 1) / STEP  # fields are linear in the amplitude, whose logarithm has the spread
+    # finite difference: fields are linear in the amplitude, whose logarithm has the spread
+    grown = (np.exp(STEP * 0.2) - 1) / STEP
     np.testing.assert_allclose(found.slope_uT[..., 0], grown * found.mean_uT, rtol=1e-9)
     np.testing.assert_allclose(found.rest_slope_uT, np.outer(found.rest_uT, [grown, 0]), rtol=1e-9, atol=1e-9)
 

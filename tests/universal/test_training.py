@@ -1,4 +1,4 @@
-"""A short training learns and is reproducible."""
+"""Tests that a short training run learns and is reproducible."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_weights_follow_the_generator():
     assert all((one[name] == other[name]).all() for name in one)
 
 
-def test_errors_of_the_law_have_the_given_size():
+def test_law_errors_have_the_given_size():
     db_uT = np.full((400, 20, 15), 100.0, np.float32)
     rng = rng_for(3, "errors")
     place_mm = rng.uniform(-8, 8, (400, 20, 2)).astype(np.float32)
@@ -54,7 +54,7 @@ def test_errors_of_the_law_have_the_given_size():
     assert off_uT.std() == pytest.approx(30.0, rel=0.05)
     same_mm = np.zeros((400, 20, 2), np.float32)
     together_uT = add_error(db_uT, same_mm, np.zeros((400, 20), np.float32), (0.3, 0.3), rng)
-    assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01  # one error per place and force
+    assert np.abs(np.diff(together_uT, axis=1)).max() < 0.01  # the error is equal for equal place and force
 
 
 def test_number_of_conditioning_presses_varies():
@@ -71,7 +71,7 @@ def test_batches_mix_recorded_boards_and_simulated_skins():
     db_uT = np.repeat(fields_uT(place_mm, force_N[:, 0])[:, None], 3, axis=1).astype(np.float32)
     board = RecordedBoard(db_uT, np.ones(15, np.float32), place_mm, force_N)
     drawn = draw_recorded(board, rng_for(5, "recorded"))
-    assert drawn[0].shape == (PRESSES_N, 15)  # drawn from 40 presses with repeats
+    assert drawn[0].shape == (PRESSES_N, 15)  # drawn from 40 presses, with repetitions
     np.testing.assert_allclose(drawn[0], fields_uT(drawn[2], np.exp(drawn[3])), rtol=1e-4, atol=1e-2)
 
     residual = fit_residual([place_mm.astype(float)], [force_N[:, 0].astype(float)], [np.full((40, 15), 0.1)])

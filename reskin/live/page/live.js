@@ -1,9 +1,10 @@
-// Shows the messages of session.py: binary messages (Traces.message) as numbers, board and traces; JSON messages (Session.state)
-// as texts. Each board has its own socket, state and canvases, so that an unplugged board does not affect the others.
+// Displays the messages of reskin/live/session.py: binary messages (Traces.message) as numbers, a picture of the board, and traces;
+// JSON messages (Session.state) as texts. Each board has its own socket, state and canvases, so that an unplugged board does not
+// affect the other boards.
 "use strict";
 const NUMBERS_N = 12, HEAD_BYTES_N = 16, RETRY_MS = 1000, DRAWING_MS = 12;
-const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a field change of ARROW_UT is drawn ARROW_MM long; arrows are always shorter than twice that
-const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // of the force, then of the chips
+const ARROW_UT = 300, ARROW_MM = 4, MARGIN_PX = 20; // a field change of ARROW_UT has an arrow of length ARROW_MM; the length tends to 2 ARROW_MM for large field changes
+const COLOURS = ["--link", "--ink", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0072B2"]; // the colour of the force trace, then those of the chips
 const style = getComputedStyle(document.documentElement); // a live object, which follows changes of the colour scheme
 const colour = (name) => style.getPropertyValue(name);
 const ink = (j) => { const name = COLOURS[j ? 1 + (j - 1) % (COLOURS.length - 1) : 0]; return name.startsWith("--") ? colour(name) : name; };
@@ -50,7 +51,7 @@ class Board {
       while (this.rows.length && this.rows[this.rows.length - 1].n >= bin(0)) this.rows.pop();
       for (let i = 0; i < bins; i++) this.rows.push({n: bin(i), low: values.slice(low + i * width, low + (i + 1) * width),
         high: values.slice(high + i * width, high + (i + 1) * width)});
-      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // lines that start in this bin can reach into the window
+      const oldest = bin(bins - 1) - WINDOW_S / BIN_S - GAP_BINS_N - 1; // oldest bin from which a line can reach into the window
       this.rows = this.rows.slice(Math.max(this.rows.findIndex(({n}) => n >= oldest), 0));
       this.changed = Math.min(this.changed, bin(0));
     }
@@ -91,7 +92,7 @@ class Board {
     pen.lineWidth = 2;
     state.chips_mm.forEach(([x, y], i) => {
       const [px, py] = at(x, y), side = Math.max(1.5 * scale, 8);
-      pen.strokeStyle = ink(i + 1); pen.strokeRect(px - side / 2, py - side / 2, side, side); // in the colour of the chip's trace
+      pen.strokeStyle = ink(i + 1); pen.strokeRect(px - side / 2, py - side / 2, side, side); // same colour as the chip's trace
       pen.fillStyle = colour("--soft"); pen.textAlign = "left"; pen.fillText(`${i}`, px + side / 2 + 3, py + side / 2 + 10);
       if (last && !state.silent && last.chips === state.chips_mm.length) arrow(pen, px, py, last.change.subarray(3 * i, 3 * i + 3), scale);
     });
@@ -124,11 +125,11 @@ class Board {
     this.say("screen", `${number(last.screen50, 0, "ms")} (median), ${number(last.screen99, 0, "ms")} (99 %)`);
     if (document.hidden || last === this.drawn) return;
     this.drawn = last;
-    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // by then, the reading has been drawn
+    requestAnimationFrame(() => { if (this.socket.readyState === 1) this.socket.send(JSON.stringify({seen: last.id})); }); // the next animation frame starts after the reading has been drawn
   }
 }
 
-function penOn(canvas, high) { // clears a canvas at the screen's resolution; returns [context in CSS pixels, width, device pixels per CSS pixel]
+function penOn(canvas, high) { // resizes a canvas to the screen's resolution and clears it; returns [context with CSS pixels as units, width, device pixels per CSS pixel]
   const ratio = devicePixelRatio || 1, wide = canvas.clientWidth, size = [Math.floor(wide * ratio), Math.floor(high * ratio)];
   if (canvas.width !== size[0] || canvas.height !== size[1]) { [canvas.width, canvas.height] = size; canvas.style.height = `${high}px`; }
   const pen = canvas.getContext("2d");
@@ -136,7 +137,7 @@ function penOn(canvas, high) { // clears a canvas at the screen's resolution; re
   return [pen, wide, ratio];
 }
 
-function arrow(pen, px, py, [bx, by, bz], scale) { // an arrow for x and y; a ring for z, dashed if negative
+function arrow(pen, px, py, [bx, by, bz], scale) { // draws Bx and By as an arrow, and Bz as a ring, dashed if Bz is negative
   const size = 2 * ARROW_MM * scale / (ARROW_UT + Math.hypot(bx, by, bz)), dx = bx * size, dy = -by * size, long = Math.hypot(dx, dy), turn = Math.atan2(dy, dx);
   pen.strokeStyle = colour("--ink");
   pen.beginPath(); pen.arc(px, py, Math.abs(bz) * size, 0, 7); pen.setLineDash(bz < 0 ? [3, 3] : []); pen.stroke(); pen.setLineDash([]);
@@ -149,7 +150,7 @@ function arrow(pen, px, py, [bx, by, bz], scale) { // an arrow for x and y; a ri
 function draw() {
   while (boards.length < Math.max(boards[0].state.boards_n || 0, 1)) boards.push(new Board(boards.length));
   document.getElementById("boards").classList.toggle("single", boards.length === 1);
-  const end_ms = performance.now() + DRAWING_MS; // if the time of one frame is too short for all boards, they take turns
+  const end_ms = performance.now() + DRAWING_MS; // if this time is too short for all boards, the next frame continues with the remaining boards
   for (let i = 0; i < boards.length && performance.now() < end_ms; i++) boards[next++ % boards.length].draw();
   requestAnimationFrame(draw);
 }

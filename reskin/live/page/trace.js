@@ -1,17 +1,17 @@
-// Draws ten seconds of values as lines. To keep many chips cheap, the existing picture is shifted, and only new values are drawn.
-// When the scale or size changes, the picture is first stretched, then redrawn in several frames, starting with the newest values.
+// Draws ten seconds of values as lines. For speed, the existing picture is shifted, and only new values are drawn. When the scale
+// or the size changes, the picture is first stretched, and then redrawn in several frames, starting with the newest values.
 "use strict";
-// WINDOW_S and BIN_S must equal those in session.py.
+// WINDOW_S and BIN_S must equal the constants of the same names in reskin/live/session.py.
 const WINDOW_S = 10, BIN_S = .02, GAP_BINS_N = 5, TRACE_PX = 170, LEFT_PX = 44, ABOVE_PX = 6, HIGH_PX = 144;
-const NARROW_PX = 400; // narrower traces have fewer time labels
+const NARROW_PX = 400; // below this width, the time axis has fewer labels
 const REDRAW_MS = 3, LINE_PX = 1.5; // REDRAW_MS: time per frame for redrawing old values
-const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // round upper ends of a scale, times a power of ten, so that the scale seldom changes
+const NICE = [1, 1.5, 2, 3, 4, 5, 6, 8, 10]; // upper ends of the scale, times a power of ten; few values, so that the scale seldom changes
 
 class Trace {
   constructor(canvas, first, least) {
     this.canvas = canvas; this.first = first; this.least = least;
     this.layer = {width: 0}; this.top = least;
-    this.columns = 64; // pixel columns to redraw per frame, adjusted so that they take REDRAW_MS
+    this.columns = 64; // number of pixel columns to redraw per frame, adjusted so that redrawing takes REDRAW_MS
   }
 
   // Draws the minimum and the maximum of each bin; bins from `changed` on are new. Returns whether older bins must still be redrawn.
@@ -29,7 +29,7 @@ class Trace {
     this.drawn -= redrawn;
     this.drawScale(pen, wide, top);
     pen.setTransform(1, 0, 0, 1, 0, 0);
-    pen.drawImage(layer, Math.round(LEFT_PX * ratio), 0); // drawn before the time is taken below, because the browser paints the layer here
+    pen.drawImage(layer, Math.round(LEFT_PX * ratio), 0); // before the measurement of time below, to include the time for this call
     if (redrawn) this.columns = Math.min(Math.max(Math.round(this.columns * Math.min(REDRAW_MS / (performance.now() - begun_ms), 2)), 8), layer.width);
     return this.drawn > left;
   }
@@ -44,7 +44,7 @@ class Trace {
       this.edge = this.drawn = edge;
     }
     const {layer, pen} = this, later = edge - this.edge;
-    if (later < 0 || later >= wide) { // a new stream, or the whole picture has left the window
+    if (later < 0 || later >= wide) { // a new stream has started, or the whole picture has left the window
       pen.clearRect(0, 0, wide, layer.height); this.drawn = edge;
     } else if (later || top !== this.top) {
       const times = this.top / top, zero = (ABOVE_PX + HIGH_PX) * ratio;
@@ -59,7 +59,7 @@ class Trace {
 
   y(value) { return ABOVE_PX + HIGH_PX * (1 - value / (this.top * 1.05)); }
 
-  drawLines(rows, from, to) { // draws only within these pixel columns, but everything that crosses them, so that no seam is visible
+  drawLines(rows, from, to) { // draws all lines that cross pixel columns from..to, clipped to these columns, so that no seam is visible
     if (to <= from) return;
     const {layer, pen, bin_px, ratio, aside} = this, left = this.edge - layer.width, x = (n) => n * bin_px - left;
     let last = rows.length, begin;

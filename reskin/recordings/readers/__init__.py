@@ -1,4 +1,7 @@
-"""Readers of other layouts, one module each. They convert files to `Readings` and an account of dropped rows."""
+"""Readers of recordings in layouts other than `native`, one module per layout.
+
+A reader converts the files of a recording to `Readings`, and counts the rows that it drops.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,13 +17,16 @@ class Reader(Protocol):
     """The functions that each reader module defines."""
 
     def collect(self, recording: Path) -> dict[str, Path]:
-        """Find a recording's files; return their paths, by the file name to use in the capture folder."""
+        """Find the files of a recording; return the path of each by its file name in the capture folder."""
 
     def count_chips(self, files: Mapping[str, Path]) -> int:
         """Count the chips from the columns of the collected files."""
 
     def read(self, folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, dict[str, int]]:
-        """Read a capture folder; `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`."""
+        """Return the readings of a capture folder, and the account of its rows.
+
+        In the account, `rows_n` + `noload_rows_n` + all `dropped_*_rows_n` = `rows_read_n`.
+        """
 
 
 READERS: Mapping[str, Reader] = {

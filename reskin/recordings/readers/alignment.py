@@ -1,4 +1,4 @@
-"""Align files row by row: find changes of the lag within a recording, and number the passes over the skin."""
+"""Find a change of the lag between fields and labels within a recording, and number the passes over the skin."""
 
 from typing import NamedTuple
 
@@ -6,12 +6,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32, Int64
 
 LAGS = np.arange(-2, 6)  # possible lags of the fields behind their labels, in rows
-ROWS_MIN_N = 300  # in a shorter recording, a change cannot be detected
+ROWS_MIN_N = 300  # in a shorter recording, a change of the lag cannot be detected
 BLOCK_ROWS_N = 500  # length of the blocks over which the field's slow drift is removed
-ROUNDS_N = 4
+ROUNDS_N = 4  # how many times `find_change` fits the lines and splits the rows
 OUTLIER = 4.0  # distances are clipped to this multiple of the median distance
-# A change is reported if it explains as much as this many misaligned rows. In the two public recordings and in windows
-# of them, the largest value without a change is 12; a row lost 100 rows before the end gives 40 or more.
+# A change of the lag is reported if it reduces the sum of distances by at least the cost of this many misaligned rows.
+# In the two public recordings and in windows of them, the largest value without a change is 12; a row that is lost 100
+# rows before the end gives 40 or more.
 EVIDENCE_ROWS_MIN_N = 30
 # Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. Noise alone reaches 0.17 in 300
 # rows.
@@ -19,7 +20,10 @@ CONTRAST_MIN = 0.3
 
 
 class Change(NamedTuple):
-    """Fields lag by `before` rows in the label rows above `row` (counted from 0), and by `after` rows from it on."""
+    """A change of the lag of the fields behind the labels, in rows.
+
+    The lag is `before` in the label rows before `row` (counted from 0), and `after` from `row` on.
+    """
 
     row: int
     before: int
@@ -30,11 +34,11 @@ def find_change(
     b_uT: Float64[np.ndarray, "f ch"], label: Float64[np.ndarray, "f 3"], contact: Bool[np.ndarray, " f"],
     sound: Bool[np.ndarray, " f"],
 ) -> Change | None:  # fmt: skip
-    """Return where the lag changes; None if a single lag explains the rows as well.
+    """Return the change of the lag; None if a single lag explains the rows as well.
 
-    For each place, a line of field against force is fitted to all rows, as they are aligned so far. Then the rows are
-    split into two parts with different lags such that the fields are nearest to these lines, and the lines are
-    fitted again. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
+    For each place, a line of field against force is fitted to all rows, with the current estimate of the lags. Then the
+    rows are split into two parts with different lags, such that the fields are nearest to these lines. Both steps are
+    repeated. `label` is x and y in mm and force in N; rows that are not `sound` are ignored.
     """
     if len(label) < ROWS_MIN_N or not contact.any():
         return None
@@ -47,7 +51,7 @@ def find_change(
         lag = np.where(row < change_row, LAGS[before_i], LAGS[after_i])
     gain = distance.sum(axis=1).min() - distance[before_i, :change_row].sum() - distance[after_i, change_row:].sum()
     extra_cost = distance[after_i] - distance[before_i]
-    # Mean cost of giving a row the lag of the other part.
+    # Mean increase of a row's distance if it has the lag of the other part.
     misaligned = float(np.where(row < change_row, extra_cost, -extra_cost).mean())
     if misaligned <= CONTRAST_MIN * extra_cost.std() or gain < EVIDENCE_ROWS_MIN_N * misaligned:
         return None
@@ -55,6 +59,7 @@ def find_change(
 
 
 def _without_drift(b_uT: Float64[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
+    """Subtract the median field of each block of about `BLOCK_ROWS_N` rows."""
     blocks = np.array_split(b_uT, max(1, len(b_uT) // BLOCK_ROWS_N))
     return np.concatenate([block - np.median(block, axis=0) for block in blocks])
 
@@ -63,7 +68,7 @@ def _best_lag(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], force_N: Float64[np.ndarray, " f"],
     place: Int64[np.ndarray, " f"],
 ) -> Int64[np.ndarray, " f"]:  # fmt: skip
-    """Return for every row the single lag with which the lines fit best."""
+    """Return an array with the lag that fits best if all rows have the same lag, one element per row."""
     costs = []
     for lag_i, lag in enumerate(LAGS):
         lags = np.full(len(place), lag)
@@ -96,7 +101,7 @@ def _fit_lines(
 def _distances(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], expected_uT: Float64[np.ndarray, "f ch"]
 ) -> Float[np.ndarray, "l f"]:
-    """Return for each lag and label row the distance of the field from the expected one; 0 if either is unknown."""
+    """Return for each lag and label row the distance in uT of the field from the expected field; 0 if unknown."""
     distance = np.zeros((len(LAGS), len(field_uT)))
     row = np.arange(len(field_uT))
     known = (row + LAGS[0] >= 0) & (row + LAGS[-1] < len(row))
@@ -107,7 +112,10 @@ def _distances(
 
 
 def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
-    """Return the indices of two different lags, and the row of the change, with the least sum of distances."""
+    """Find the two different lags and the row of the change with the least sum of distances.
+
+    Returns the indices of the lags before and after the change, and the row.
+    """
     lags_n = len(distance)
     before = np.concatenate([np.zeros((lags_n, 1)), np.cumsum(distance, axis=1)], axis=1)  # sums over earlier rows
     after = before[:, -1:] - before
@@ -117,26 +125,30 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
     return int(before_i), int(after_i), int(row)
 
 
+# A move is a change of place between two contacts. A period of the passes is accepted if this fraction of the moves
+# that can be compared with the move one period later have the same places.
 AGREEMENT_MIN = 0.95
-# A shift by half the recording leaves only half the moves to compare, some of them without contact.
-SEEN_TWICE_MIN = 0.25
-PROBES_N = 256
-PROBES_MIN_N = 8  # with fewer probes, no period is excluded
+# Minimum fraction of the moves that can be compared. If the period is half the recording, only half of the moves have
+# a move one period later, and in some of them the rows may be without contact.
+COMPARED_MIN = 0.25
+PROBES_N = 256  # number of moves in the sample that excludes most periods
+PROBES_MIN_N = 8  # if fewer of these moves can be compared, a period is not excluded
 GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
 def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
-    """Number the passes; all rows are pass 0 if the places do not repeat. Places of rows without contact are ignored.
+    """Return the number of the pass of each row, from 0: a new pass begins when the sequence of places repeats.
 
-    The last pass may be incomplete.
+    If it does not repeat, all rows are in pass 0. Places of rows without contact are ignored. The last pass may be
+    incomplete.
     """
     rows_n = len(place_mm)
     moves = _find_moves(place_mm, contact)
     for period_n in _likely_periods(place_mm, contact, moves):
-        here = moves[moves[:, 1] < rows_n - period_n]
-        here = here[contact[here + period_n].all(axis=1)]
-        if len(here) and len(here) >= SEEN_TWICE_MIN * len(moves):
-            same = (place_mm[here] == place_mm[here + period_n]).all(axis=(1, 2))
+        compared = moves[moves[:, 1] < rows_n - period_n]
+        compared = compared[contact[compared + period_n].all(axis=1)]
+        if len(compared) and len(compared) >= COMPARED_MIN * len(moves):
+            same = (place_mm[compared] == place_mm[compared + period_n]).all(axis=(1, 2))
             if same.mean() >= AGREEMENT_MIN:
                 return (np.arange(rows_n) // period_n).astype(np.int32)
     return np.zeros(rows_n, np.int32)
@@ -145,12 +157,15 @@ def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " 
 def _likely_periods(
     place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"], moves: Int64[np.ndarray, "moves 2"]
 ) -> Int64[np.ndarray, " p"]:
-    """Return the periods that fit a sample of moves from the first half; testing all moves would be quadratic."""
+    """Return the periods in rows that fit a sample of the moves in the first half of the recording.
+
+    To test all moves for all periods would take quadratic time.
+    """
     half_n = len(contact) // 2
     early = moves[moves[:, 1] < half_n]
     if not len(early):
         return np.arange(1, half_n + 1) if len(moves) else np.zeros(0, np.int64)
-    # Multiples of the golden ratio modulo 1 are evenly spread, and not in phase with any grid.
+    # Multiples of the golden ratio modulo 1 are spread evenly, but do not repeat with the period of a grid.
     probes = early[np.unique((np.arange(PROBES_N) * GOLDEN % 1 * len(early)).astype(np.int64))]
     tried_n, same_n = np.zeros((2, half_n), np.int64)
     for first, second in probes:
@@ -164,9 +179,9 @@ def _likely_periods(
 
 
 def _find_moves(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, "moves 2"]:
-    """Return the rows of the last contact at each place and of the first contact at the next place.
+    """Return the moves: pairs of the last row in contact at a place and the first row in contact at the next place.
 
-    A shift that stays within a dwell cannot match both.
+    A period that is wrong by less than a dwell cannot match both places.
     """
     rows = np.flatnonzero(contact)
     pairs = np.stack([rows[:-1], rows[1:]], axis=1)

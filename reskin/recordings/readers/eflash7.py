@@ -25,16 +25,18 @@ from reskin.schema import Readings
 
 READINGS = "readings.csv"
 FILES = (READINGS,)
-FIRST_LINE_N = 2  # line of the first row of numbers in the file
+FIRST_LINE_N = 2  # line number of the first row of numbers in the file
 SIDE_N = 3  # places per side of the grid
 ONE, TWO = ("x_pos", "y_pos"), ("pos1_x", "pos1_y", "pos2_x", "pos2_y")
 FORCES = ("fx", "fy", "fz")
-ON_SKIN = -1.0  # the file has compression as negative fz
-TOUCH_N = 0.5  # assumed: a touch, which the file does not mark, begins when the force rises above this
-# The chips measure about ten times a second, and the recorder writes zeros when it polls too early.
-ZERO_FRACTION_MAX = 0.25  # 4 to 10 % in 19 recordings
-GAP_s = 0.5
-# 19 recordings begin with 1.4 to 17 s without contact; the noise is 3 to 6 uT, a touch is 500 uT or more.
+ON_SKIN = -1.0  # sign of the force on the skin relative to that in the file, where compression is negative fz
+TOUCH_N = 0.5  # assumed: the file does not mark touches; one begins when the force rises above this
+# The chips measure about ten times a second, and the recorder writes a row of zeros when it polls too early. In 19
+# recordings, these are 4 to 10 % of the rows.
+ZERO_FRACTION_MAX = 0.25
+GAP_s = 0.5  # a longer time between two rows is counted as a gap
+# 19 recordings begin with 1.4 to 17 s without contact. Before the first touch, the field varies by 3 to 6 uT (noise); a
+# touch changes it by 500 uT or more.
 STILL_uT = 40.0
 STILL_ROWS_MIN_N = 5
 
@@ -43,7 +45,10 @@ Account = dict[str, int]
 
 @dataclass(frozen=True)
 class _Table:
-    """The columns of one file; `places` are the numbers of the touched places, `force_N` is the force on the gauge."""
+    """The columns of one file.
+
+    `places` are the numbers of the touched places. `force_N` is the force on the gauge.
+    """
 
     time_s: Float64[np.ndarray, " f"]
     b_uT: Float64[np.ndarray, "f ch"]
@@ -70,7 +75,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read all rows from the first touch on as readings, in contact or not; earlier rows are the no-load reading."""
+    """Return all rows from the first touch on as readings, in contact or not; earlier rows give the no-load field."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.b_uT.shape[1] != 3 * header.chips_n:
@@ -124,7 +129,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 
 
 def _count_chips(names: Sequence[str]) -> int:
-    return max((int(found[1]) + 1 for name in names if (found := re.fullmatch(r"mag(\d{1,2})_[xyz]", name))), default=1)
+    return max((int(match[1]) + 1 for name in names if (match := re.fullmatch(r"mag(\d{1,2})_[xyz]", name))), default=1)
 
 
 def _read_table(path: Path, where: str) -> _Table:
@@ -151,7 +156,7 @@ def _read_table(path: Path, where: str) -> _Table:
 
 
 def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
-    """Number the touched places from their columns and rows, each 1 to 3; a recording has one place or one pair."""
+    """Return the numbers of the touched places, one or two per recording, from their columns and rows (1 to 3)."""
     moved = np.flatnonzero((place != place[0]).any(axis=1))
     if len(moved):
         raise CaptureError(f"{where}: the place changes in line {FIRST_LINE_N + moved[0]}. Add each place separately.")
@@ -166,7 +171,7 @@ def _number_places(place: Float64[np.ndarray, "f c"], where: str) -> list[int]:
 
 
 def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows with zeros for all chips, which the recorder writes without a reading; raise for too many."""
+    """Mark the rows with zeros for all chips, written when there was no new reading; raise if there are too many."""
     zero = np.asarray(zero_reads(b_uT).all(axis=1))
     if zero.mean() > ZERO_FRACTION_MAX:
         problem = f"{int(zero.sum())} of {len(zero)} rows are zeros, more than {ZERO_FRACTION_MAX:.0%}"
@@ -175,7 +180,7 @@ def _zero_rows(b_uT: Float64[np.ndarray, "f ch"], where: str) -> Bool[np.ndarray
 
 
 def _untouched(b_uT: Float64[np.ndarray, "f ch"], whole: Bool[np.ndarray, " f"], where: str) -> Bool[np.ndarray, " f"]:
-    """Mark the rows at the start, before any channel changes by more than `STILL_uT`; raise if there are too few."""
+    """Mark the first rows, until any channel changes by more than `STILL_uT`; raise if there are too few."""
     first_uT = np.median(b_uT[whole][:STILL_ROWS_MIN_N], axis=0)
     moved = whole & (np.abs(b_uT - first_uT) > STILL_uT).any(axis=1)
     untouched = whole & ~np.logical_or.accumulate(moved)
@@ -199,7 +204,10 @@ def _check_force(gauge_N: Float64[np.ndarray, "f 3"], force_N: Float64[np.ndarra
 
 
 def _number_touches(pressed_N: Float64[np.ndarray, " f"], whole: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
-    """Number the touches: a touch begins when the force rises above `TOUCH_N`, and lasts until the next one."""
+    """Number the touches from 0: a touch begins when the force rises above `TOUCH_N`, and lasts until the next touch.
+
+    `pressed_N` is the force on the skin; rows before the first touch have number 0.
+    """
     pressed = pressed_N >= TOUCH_N
     begins = pressed & ~np.concatenate([[False], pressed[:-1]])
     return np.maximum(np.cumsum(begins) - 1, 0)

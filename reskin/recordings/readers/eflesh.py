@@ -1,9 +1,9 @@
 """Read layout `eflesh`: a robot arm over an eFlesh skin, three CSV files in a folder.
 
-Places are robot coordinates minus their minimum, so a scan begins at 0 mm. The depth is counted down from the highest z
-of the recording, which may be above the skin, so its offset is unknown. The force along one axis is known. Its sign is
-unknown along x and y, because the recorder does not state whether it is the force on the skin or on the gauge; these
-rows are counted.
+Places are robot coordinates minus their minimum, so a scan begins at 0 mm. The depth is measured downwards from the
+highest z of the recording, which may be above the skin, so the depth has an unknown offset. The force is known along
+one axis. Along x and y, its sign is unknown, because the recorder does not state whether it is the force on the skin or
+on the gauge; the account counts these rows.
 """
 
 from collections.abc import Mapping
@@ -37,13 +37,14 @@ FORCE_AXES = ("x", "y", "z")
 NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
 WEIGHT_COLUMN = 4  # of states.csv, after time, x, y and z; missing if only places were recorded
 NO_NEW_WEIGHT = -1.0
-CLOCKS_APART_MAX_s = 0.05  # both files are written in one loop, milliseconds apart
+CLOCKS_APART_MAX_s = 0.05  # the recorder writes a row to both files in one step of its loop, milliseconds apart
 PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
-# Rounding of raw - dB in float32 stays below 0.004 uT; in a new no-load reading at least one channel changes by an LSB,
-# 0.15 uT or more.
+# No-load fields that differ by less are the same. Rounding errors of (raw field - field change) in float32 are below
+# 0.004 uT; in a new no-load reading, at least one channel changes by an LSB, 0.15 uT or more.
 SAME_NOLOAD_uT = 0.02
 
-# Fraction of the height: 1e-4 for a robot that holds its height; some hundredths for a press in m that is taken for mm.
+# If z varies by less than this fraction of its largest value, the robot kept a constant height. The fraction is 1e-4
+# for a robot at constant height, and some hundredths for presses whose z is in m instead of mm.
 HELD_FRACTION = 1e-3
 
 Account = dict[str, int]
@@ -70,7 +71,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read each row as one indentation; its no-load field is the baseline that the recorder subtracted, raw - dB."""
+    """Return each row as the reading of one indentation.
+
+    The no-load field is the baseline that the recorder subtracted: the raw field minus the field change.
+    """
     time_s, b_uT, noload_uT = _read_fields(folder, header)
     states = _read_states(folder, header)
     _check_rows_n({SENSOR: len(time_s), STATES: len(states)}, header)
@@ -144,7 +148,7 @@ def _check_rows_n(rows_n: Mapping[str, int], header: Header) -> None:
 
 
 def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndarray, " f"], header: Header) -> None:
-    """Raise unless the clocks agree row by row (rows are paired in order) and times increase."""
+    """Raise unless the times in both files agree in every row, and increase."""
     disagreeing = np.flatnonzero(np.abs(states_s - sensor_s) >= CLOCKS_APART_MAX_s)
     if len(disagreeing):
         where = f"{header.capture}/{STATES} line {disagreeing[0] + 1}"
@@ -164,20 +168,20 @@ def _number_passes(
 ) -> tuple[Int32[np.ndarray, " f"], Int32[np.ndarray, " f"]]:
     """Return the pass number of each row, and the number of touches before it.
 
-    With many places, each row is a touch, and a pass ends when the places repeat. With a single place, the robot
-    strokes up and down and takes a new baseline before each stroke, so each new no-load field begins a pass with one
-    touch.
+    With many places, each row is a touch, and a new pass begins when the places repeat. With a single place, the robot
+    strokes up and down, and the recorder takes a new baseline before each stroke. Each new no-load field therefore
+    begins a new pass, which has one touch.
     """
     if place_mm.any():
         everywhere = np.ones(len(place_mm), bool)
         return find_passes(place_mm, everywhere), np.arange(len(place_mm), dtype=np.int32)
-    fresh = (np.abs(np.diff(noload_uT, axis=0)) > SAME_NOLOAD_uT).any(axis=1)
-    pass_i = np.concatenate([[0], np.cumsum(fresh)]).astype(np.int32)
+    is_new = (np.abs(np.diff(noload_uT, axis=0)) > SAME_NOLOAD_uT).any(axis=1)
+    pass_i = np.concatenate([[0], np.cumsum(is_new)]).astype(np.int32)
     return pass_i, pass_i
 
 
 def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str, Float64[np.ndarray, " f"]]:
-    """Return the gauge's force by column name, with NaN in rows without a new value; empty without a gauge."""
+    """Return the force column by name, with NaN in rows without a new value; no column if there was no gauge."""
     if states.shape[1] <= WEIGHT_COLUMN:
         return {}
     if "force_axis" not in header.options or header.options["force_axis"] not in FORCE_AXES:
@@ -192,11 +196,12 @@ def _read_force(states: Float64[np.ndarray, "f c"], header: Header) -> dict[str,
 
 
 def _read_depth(states: Float64[np.ndarray, "f c"], header: Header) -> Float64[np.ndarray, " f"]:
-    """Return depths below the highest z; NaN if the robot held z constant or the gauge measured along the skin."""
+    """Return depths below the highest z; NaN if z was constant or the gauge measured a force along the skin."""
     along = states.shape[1] > WEIGHT_COLUMN and header.options["force_axis"] != "z"
     z_mm = states[:, 3]
     return np.full(len(states), np.nan) if along or _holds_height(z_mm) else z_mm.max() - z_mm
 
 
 def _holds_height(z_mm: Float64[np.ndarray, " f"]) -> bool:
+    """Return whether the robot kept a constant height; see `HELD_FRACTION`."""
     return bool(np.ptp(z_mm) <= max(SAME_PLACE_mm, min(DEPTH_MIN_mm, HELD_FRACTION * np.abs(z_mm).max())))

@@ -1,8 +1,8 @@
 """Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row per indentation.
 
-Rows with a force below 0.02 N count as no contact, whatever place the truths state; they are kept without place and
-with zero force. The rows at the start of a pass, at a corner of the grid, are its no-load reading. `t_s` and `depth_mm`
-are unknown (NaN).
+Rows with a force below 0.02 N count as no contact, whatever their place in the truths; the readings have no place and
+zero force. The first rows of a pass, with the indenter at a corner of the grid, give the no-load field of the pass.
+`t_s` and `depth_mm` are unknown (NaN).
 
 The fields may lag: row i of the truths belongs to a later row of the readings. The lag in rows is given in the header
 (`rows_late`); otherwise it is the lag at which |dB| correlates best with the force. If the lag changes within a
@@ -26,11 +26,11 @@ from reskin.schema import Readings
 READINGS = "readings.txt"
 TRUTHS = "truths.txt"
 FILES = (READINGS, TRUTHS)
-CONTACT_MIN_N = 0.02  # the recorder labels weaker rows (10, 10, 0), which is also a real place
+CONTACT_MIN_N = 0.02  # below this force, the recorder writes (x, y, F) = (10, 10, 0), but (10, 10) is also a real place
 VALUES_PER_CHIP_N = 4
 ROWS_LATE = ("0", "1", "2", "3", "4", "5")
-# A lag is trusted if it was found over this many rows and improves the correlation by this much. In the public
-# recording of 23300 rows, the lag improves the correlation from 0.45 to 0.65.
+# An estimated lag is used only if the recording has at least this many rows, and the lag increases the correlation by
+# at least this much. In the public recording of 23300 rows, the lag increases the correlation from 0.45 to 0.65.
 LATE_ROWS_MIN_N, LATE_GAIN_MIN = 100, 0.1
 
 Account = dict[str, int]
@@ -57,7 +57,10 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read all rows without faults; the no-load field of a row is the mean over the corner rows of its pass."""
+    """Return all fault-free rows as readings; the no-load field of a row is the mean over the corner rows of its pass.
+
+    The corner rows are the first rows of a pass, before the first contact.
+    """
     given_late_n = _rows_late(header)
     b_uT, temperature_degC = _read_fields(folder, header)
     truths = _read_truths(folder, header)
@@ -102,7 +105,7 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
 
 
 def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f ch"], Float64[np.ndarray, "f k"]]:
-    """Read fields and temperatures, chip by chip."""
+    """Read fields and temperatures, with one column per channel and per chip."""
     names = [f"{value}{chip}" for chip in range(header.chips_n) for value in ("Bx", "By", "Bz", "T")]
     where = f"{header.capture}/{READINGS}"
     numbers = to_numbers(read_cells(folder / READINGS, where, separator=None), where, names=names)
@@ -113,7 +116,7 @@ def _read_fields(folder: Path, header: Header) -> tuple[Float64[np.ndarray, "f c
 
 
 def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
-    """Read x mm, y mm, F N."""
+    """Read the truths: columns x in mm, y in mm and force in N."""
     where = f"{header.capture}/{TRUTHS}"
     truths = to_numbers(read_cells(folder / TRUTHS, where, separator=None), where, names=["x_mm", "y_mm", "F_N"])
     check_forces(truths[:, 2], where, first_line_n=1)
@@ -125,7 +128,7 @@ def _read_truths(folder: Path, header: Header) -> Float64[np.ndarray, "f 3"]:
 def _check_rows_n(readings_n: int, truths_n: int, rows_late_n: int, header: Header) -> None:
     if readings_n <= rows_late_n:
         raise CaptureError(
-            f"{header.capture}: {readings_n} rows are not more than the {rows_late_n} of option rows_late. Was the "
+            f"{header.capture}: the recording has {readings_n} rows, but option rows_late is {rows_late_n}. Was the "
             "recording cut?"
         )
     if readings_n != truths_n:
@@ -149,7 +152,7 @@ def _rows_late(header: Header) -> int | None:
 def _best_rows_late(
     b_uT: Float64[np.ndarray, "f ch"], force_N: Float64[np.ndarray, " f"], rows: CheckedRows
 ) -> tuple[int, bool]:
-    """Return the lag in rows at which |dB| correlates best with the force, and whether it can be trusted."""
+    """Return the lag in rows at which |dB| correlates best with the force, and whether the estimate is reliable."""
     correlations = []
     for rows_late_n in range(min(len(ROWS_LATE), len(force_N) - 1)):
         whole = rows.keep[rows_late_n:]

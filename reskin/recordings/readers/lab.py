@@ -1,8 +1,8 @@
 """Read layout `lab`: a robot and a six-axis gauge, one CSV file per depth, about 100 readings per indentation.
 
-The file has the force on the gauge (Fz negative in compression), so all three components are negated; see
-`reskin.schema` and `ON_SKIN`. The depth is only an index in the file's name, so `depth_mm` is NaN; there is no clock,
-so `t_s` is NaN.
+The file contains the force on the gauge (Fz is negative in compression), so all three components are negated; see
+`reskin.schema` and `ON_SKIN`. `depth_mm` is NaN, because the file's name contains only an index of the depth; `t_s` is
+NaN, because there is no clock.
 """
 
 from collections.abc import Mapping
@@ -30,12 +30,12 @@ from reskin.schema import Readings
 
 READINGS = "readings.csv"
 FILES = (READINGS,)
-FIRST_LINE_N = 2  # line of the first row of numbers in the file
-# The force on the skin is the opposite of that on the gauge. Evidence along x: on both public boards, pokes shift the
-# skin by 48 um along the labels' +x (fitted to fields alone by experiment `compare`), and the mean Fx is negative in
-# all six files, so the negated force pushes along +x. Along y, the shift and the mean force are too small to
-# decide. But the sign of Fz requires that z points into the skin; if the axes are right-handed, the force's y axis then
-# has the direction of the labels' y axis.
+FIRST_LINE_N = 2  # line number of the first row of numbers in the file
+# Factor from the force in the file (on the gauge) to the force on the skin. For x, the evidence is that pokes shift the
+# skin by 48 um along +x on both public boards (experiment `compare` fits this shift to the fields alone), while the
+# mean Fx is negative in all six files. For y, the shift and the mean force are too small for a decision. But the sign
+# of Fz requires a z axis that points into the skin. If the axes are right-handed, the y axis of the force then has the
+# direction of the y axis of the places.
 ON_SKIN = -1.0
 
 Account = dict[str, int]
@@ -55,7 +55,7 @@ class _Table:
 
 
 def collect(recording: Path) -> dict[str, Path]:
-    """Find the file of a recording: the CSV file itself, one depth of one skin."""
+    """Find the file of a recording: the CSV file itself, which contains one depth of one skin."""
     if not recording.is_file():
         raise CaptureError(
             f"{recording}: not a file. A recording of layout lab is one CSV file: add each depth's file separately."
@@ -69,7 +69,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read contact rows as readings; the no-load field of a row is the mean over the `noload` rows of its press."""
+    """Return the contact rows as readings; the no-load field is the mean over the `noload` rows of the same press."""
     where = f"{header.capture}/{READINGS}"
     table = _read_table(folder / READINGS, where)
     if table.temperature_degC.shape[1] != header.chips_n:
@@ -132,6 +132,7 @@ def _read_table(path: Path, where: str) -> _Table:
 
 
 def _number_presses(indent: Float64[np.ndarray, " f"], where: str) -> Int[np.ndarray, " f"]:
+    """Number the blocks of rows with equal `indent` from 0; raise if two blocks have the same `indent`."""
     begins = np.flatnonzero(np.diff(indent, prepend=np.nan) != 0)
     seen: set[float] = set()
     for row_i in begins:

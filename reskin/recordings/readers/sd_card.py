@@ -19,24 +19,24 @@ from reskin.recordings.units import check_fields
 TIME = "t_s"
 CHIP_COLUMNS = ("T", "Bx", "By", "Bz")
 HEADER_CHARACTERS_MAX = 10_000  # line 1 of a log of 64 chips has 1,500
-RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs slower, and a chip reads no faster
-SHOWN_CHIPS_MAX = 5  # with more chips, line 1 is too long for an error message
-KEPT_SHARE_MIN = 0.5  # assumed: with fewer good frames, contacts would be missed
+RATE_MIN_HZ, RATE_MAX_HZ = 1.0, 10_000.0  # assumed: no board logs more slowly, and no chip measures faster
+SHOWN_CHIPS_MAX = 5  # with more chips, line 1 is too long to be quoted in an error message
+KEPT_SHARE_MIN = 0.5  # assumed: with a smaller fraction of fault-free frames, contacts would be missed
 Log = tuple[
     Float64[np.ndarray, " rows"], Float32[np.ndarray, "rows ch"], Float32[np.ndarray, "rows k"], dict[str, int]
-]  # s, uT, degC, account
-GAP_FRAMES = 1.5  # times the usual time step; in longer steps, frames are missing
+]  # times in s, fields in uT, temperatures in degC, account
+GAP_FRAMES = 1.5  # frames are missing in a time step that exceeds the median step by this factor
 
 
 def column_names(chips_n: int) -> list[str]:
-    """Name the columns of a log."""
+    """Return the names of a log's columns, in order."""
     return [TIME, *(f"{name}{chip_i}" for chip_i in range(chips_n) for name in CHIP_COLUMNS)]
 
 
 def render(
     t_s: Float64[np.ndarray, " f"], b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"]
 ) -> str:
-    """Write a log: times to 0.1 ms, readings with the two decimals of the text firmware."""
+    """Return a log as CSV text: times to 0.1 ms, readings with two decimals as in the text firmware."""
     frames_n, chips_n = temperature_degC.shape
     chips = np.concatenate([temperature_degC[:, :, None], b_uT.reshape(frames_n, chips_n, 3)], axis=2)
     line = ",".join(["%.4f", *["%.2f"] * (4 * chips_n)])
@@ -45,11 +45,11 @@ def render(
 
 
 def read_log(path: Path) -> Log:
-    """Read time in s, field in uT and temperature in degC of the frames in which every chip was read, and an account.
+    """Read a log; return times in s, fields in uT and temperatures in degC of the fault-free frames, and an account.
 
-    Frames with failed reads or stuck chips are dropped and counted. A log is refused if fewer than half of its frames
-    are left, or if a chip lost its settings. `gaps_n` counts the time steps that are longer than usual, and
-    `gap_frames_n` the frames that are missing in them.
+    Frames with failed reads or stuck chips are dropped and counted. Raises `CaptureError` if fewer than half of the
+    frames remain, or if a chip lost its settings. In the account, `gaps_n` is the number of overlong time steps, and
+    `gap_frames_n` the number of frames that are missing in them.
     """
     where = str(path)
     chips_n = _chips_n(path, where)
@@ -70,7 +70,7 @@ def keep_whole(
     *,
     first_row: int = 1,
 ) -> Log:
-    """Keep the frames in which every chip was read, and count the others; errors number rows from `first_row`."""
+    """Return the fault-free frames, and count the others; in errors, the number of the first row is `first_row`."""
     _check_time(t_s, where, first_row)
     check_fields(b_uT, where, first_line_n=first_row)
     failed, stuck = _faults(b_uT, temperature_degC, where, first_row)
@@ -86,19 +86,19 @@ def keep_whole(
 
 
 def _check_kept(account: dict[str, int], where: str) -> None:
-    """Raise an error that names the faults if too few frames without faults are left."""
+    """Raise an error that lists the faults, if too few fault-free frames remain."""
     read_n, kept_n = account["rows_read_n"], account["rows_n"]
     if kept_n < max(2, KEPT_SHARE_MIN * read_n):
         failed_n, stuck_n = account["dropped_failed_read_rows_n"], account["dropped_stuck_chip_rows_n"]
         counts = f"{failed_n} had failed I2C reads, {stuck_n} stuck chips"
         raise CaptureError(
             f"{where}: only {kept_n} of {read_n} lines are fault-free: {counts}. At least "
-            f"{100 * KEPT_SHARE_MIN:g} % must be. Check the wiring, and log again."
+            f"{100 * KEPT_SHARE_MIN:g} % must be fault-free. Check the wiring, and log again."
         )
 
 
 def _chips_n(path: Path, where: str) -> int:
-    """Count the chips that the header line names; raise if the last line has no end, because it was cut."""
+    """Count the chips from the column names in line 1; raise if the last line has no line break, as in a cut file."""
     try:
         with path.open("rb") as file:
             first = file.readline(HEADER_CHARACTERS_MAX)
@@ -141,6 +141,7 @@ def _header_fault(names: list[str]) -> str:
 
 
 def _finite(table: pa.Table, name: str, where: str) -> Float64[np.ndarray, " f"]:
+    """Return the column `name`; raise if it has a value that is not finite."""
     values = np.asarray(table.column(name), np.float64)  # an empty cell is NaN
     remedy = "Remove that line; the gap is counted."
     tables.refuse_row(~np.isfinite(values), where, name, "a finite number", values, remedy)
@@ -166,6 +167,7 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> N
 def _faults(
     b_uT: Float32[np.ndarray, "f ch"], temperature_degC: Float32[np.ndarray, "f k"], where: str, first_row: int
 ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
+    """Return the masks of frames with failed reads and with stuck chips; raise if a chip lost its settings."""
     failed = np.asarray(faults.failed_reads(b_uT, temperature_degC).any(axis=1))
     if failed.all():
         raise CaptureError(f"{where}: every line has failed I2C reads. Check the wiring, and log again.")
@@ -182,6 +184,7 @@ def _faults(
 
 
 def _gaps(t_s: Float[np.ndarray, " f"]) -> dict[str, int]:
+    """Count the overlong time steps, and the frames that are missing in them."""
     steps = np.diff(t_s) / np.median(np.diff(t_s))
     wide = steps > GAP_FRAMES
     return {"gaps_n": int(wide.sum()), "gap_frames_n": int((np.round(steps[wide]) - 1).sum())}

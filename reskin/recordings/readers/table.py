@@ -37,24 +37,25 @@ CSV, PARQUET = "readings.csv", "readings.parquet"
 FILES = (CSV,)
 NEEDED = ("phase", "x_mm", "y_mm")
 OPTIONAL = ("indentation", "pass", "t_s", "depth_mm", "Fx_N", "Fy_N", "Fz_N")
-FIRST_LINE_N = 2  # line of the first row of numbers in a CSV file
+FIRST_LINE_N = 2  # line number of the first row of numbers in a CSV file
 EMPTY = ("", "nan", "NaN")
+# A column whose name begins with one of these words, but is not known, is probably a known column with a wrong name.
 STEMS = {"f", "fx", "fy", "fz", "force", "depth", "x", "y", "t", "time", "indent", "indentation", "press", "pass"}
 
-
-SUBTRACTED_RATIO = 0.5  # assumed: no-load field / field in contact, both at the chip with the strongest field
+# assumed: if weak fields without contact are below this fraction of the fields in contact, a baseline was subtracted
+SUBTRACTED_RATIO = 0.5
 
 Account = dict[str, int]
 
 
 def columns_of(chips_n: int) -> list[str]:
-    """List all columns that a file may have, in the order of a template."""
+    """Return the names of all columns that a file may have, in the order of a template file."""
     fields = [f"{axis}{chip}" for chip in range(chips_n) for axis in ("Bx", "By", "Bz")]
     return [*NEEDED, *fields, *OPTIONAL, *(f"T{chip}" for chip in range(chips_n))]
 
 
 def collect(recording: Path) -> dict[str, Path]:
-    """Find the file of a recording."""
+    """Find the file of a recording: the CSV or Parquet file itself."""
     if not recording.is_file():
         raise CaptureError(f"{recording}: not a file. A table is one CSV or Parquet file: add each file separately.")
     return {PARQUET if recording.suffix == ".parquet" else CSV: recording}
@@ -67,7 +68,7 @@ def count_chips(files: Mapping[str, Path]) -> int:
 
 
 def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, Account]:
-    """Read contact rows as readings; a row's no-load field is the mean over the block of no-load rows before it."""
+    """Return the contact rows as readings; the no-load field is the mean over the block of no-load rows before them."""
     name = next(name for name in (CSV, PARQUET) if (folder / name).exists())
     where = f"{header.capture}/{name}"
     names, cells = _read_cells(folder / name, where)
@@ -132,7 +133,7 @@ def _read_cells(path: Path, where: str) -> tuple[list[str], list[list[str]]]:
 
 
 def _refuse_near_names(names: Sequence[str], columns: Sequence[str], where: str) -> None:
-    """Raise for an unknown column, which would be ignored, if its name resembles a known one: `Fz` for `Fz_N`."""
+    """Raise if the name of an unknown column, which would be ignored, resembles a known name: `Fz` for `Fz_N`."""
     for name in names:
         if name not in columns and name.lower().split("_")[0] in STEMS:
             known = ", ".join((*NEEDED, *OPTIONAL))
@@ -187,7 +188,8 @@ def _check(
 def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarray, " f"], where: str) -> None:
     """Raise if fields are weak, and much weaker without contact than in contact: a baseline was subtracted.
 
-    Wrong units also make fields weak, but scale both equally; in raw fields, the field at rest exceeds its change.
+    In raw fields, the field without contact exceeds its change in contact. Wrong units also make fields weak, but do
+    not change the ratio of the two fields.
     """
     chips_uT = np.linalg.norm(b_uT.reshape(len(b_uT), -1, 3), axis=2)
     if np.median(chips_uT) >= WEAKEST_uT or contact.all() or not contact.any():
@@ -203,7 +205,11 @@ def _refuse_subtracted(b_uT: Float64[np.ndarray, "f ch"], contact: Bool[np.ndarr
 def _number_presses(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], contact: Bool[np.ndarray, " f"], where: str
 ) -> Int[np.ndarray, " f"]:
-    """Number presses from 0: by column `indentation` if present, else one per touch and per new place."""
+    """Return the number of each row's press, from 0.
+
+    A press is a block of rows with equal `indentation`. Without this column, each touch begins a press, and so does
+    each new place within a touch.
+    """
     if "indentation" in numbers:
         rows = np.flatnonzero(contact)  # the numbers of rows without contact are ignored
         number = numbers["indentation"][rows]
@@ -226,12 +232,16 @@ def _number_presses(
 def _find_passes(
     numbers: Mapping[str, Float64[np.ndarray, " f"]], press: Int[np.ndarray, " f"], contact: Bool[np.ndarray, " f"]
 ) -> Int[np.ndarray, " f"]:
-    """Number the passes: a new pass begins where the presses' sequence of places and greatest depths repeats."""
+    """Return the number of each row's pass, from 0.
+
+    A new pass begins when the sequence of the presses' places and greatest depths repeats.
+    """
+    begins = np.flatnonzero(np.diff(press[contact])) + 1
     of_press = [
-        np.array([part.max() for part in np.split(numbers[name][contact], np.flatnonzero(np.diff(press[contact])) + 1)])
+        np.array([values.max() for values in np.split(numbers[name][contact], begins)])
         for name in ("x_mm", "y_mm", "depth_mm")
         if name in numbers
     ]
-    _, kind = np.unique(np.round(np.stack(of_press, axis=1), 3), axis=0, return_inverse=True)
-    pass_of_press = find_passes(np.stack([kind, kind], axis=1).astype(float), np.ones(len(kind), bool))
+    _, target_i = np.unique(np.round(np.stack(of_press, axis=1), 3), axis=0, return_inverse=True)
+    pass_of_press = find_passes(np.stack([target_i, target_i], axis=1).astype(float), np.ones(len(target_i), bool))
     return pass_of_press.astype(int)[press]

@@ -1,4 +1,4 @@
-"""Tests of the audit stage on a tiny scene: clean files pass, and each planted leak is detected and named."""
+"""Tests of the audit stage on a tiny scene: files without leaks pass, and each planted leak is detected and named."""
 
 import shutil
 from collections.abc import Callable
@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PHYSICS = ("skin", "rig", "chip", "spreads")
 MODELS = ("train_single", "train_multi", "train_triplet", "adapt")
 SKINS = ("b0_s0", "b0_s1", "b1_s0", "b2_s0")
-COPY = "b3_s0"  # a copy of b0_s0 as a skin of another board
+COPY = "b3_s0"  # a copy of skin b0_s0, labelled as a skin of another board
 TRIPLET = RECIPE | {"triplet_weight": 0.1}
 ADAPTATION = SHARED["adaptations"]["paper"]
 SCENE = recorded_scene(
@@ -55,7 +55,7 @@ CHOICE = {
 
 
 def capture(skin: str) -> Readings:
-    """Return two passes over a grid; the field exceeds the noise and is a function of place for each skin."""
+    """Return readings of two passes over a grid; each skin's field is a function of the place and exceeds the noise."""
     rng = rng_for(0, "skin", "b0_s0" if skin == COPY else skin)
     place_i = np.tile(np.arange(PLACES_N), PASSES_N)
     x, y = place_i // 4, place_i % 4
@@ -74,7 +74,7 @@ def capture(skin: str) -> Readings:
 
 
 def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
-    """Write the files of a scene as its stages do, with untrained networks."""
+    """Write the files that the stages of a scene write, with untrained networks."""
     for skin in skins:
         io.write_readings(folder / f"indentations/{skin}.parquet", [capture(skin)], {})
     io.write_json(folder / "scene.json", SCENE)
@@ -82,8 +82,8 @@ def build(folder: Path, skins: tuple[str, ...] = SKINS) -> Path:
     rows = load_rows(
         [folder / f"indentations/{skin}.parquet" for skin in skins], parsed.section(Selection, "selection")
     )
-    drawn = draw_folds(rows, ("single_random", "lobo"), parsed.section(Split, "split"), parsed.seed)
-    io.write_json(folder / "folds.json", render_folds(skins, rows, drawn))
+    folds = draw_folds(rows, ("single_random", "lobo"), parsed.section(Split, "split"), parsed.seed)
+    io.write_json(folder / "folds.json", render_folds(skins, rows, folds))
     data = load_scene_data(folder)
     for arm, section, experiment in (
         ("train_single", parsed.section(Training, "train_single"), "single_random"),
@@ -125,7 +125,7 @@ def initial_result(job: TrainingJob, data: SceneData) -> TrainingResult:
 
 @pytest.fixture(autouse=True)
 def _working_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # costs are written to the working folder
+    monkeypatch.chdir(tmp_path)  # stages write their costs to the working folder
     monkeypatch.setattr(_training, "code_version_of", lambda modules: "abc")
 
 
@@ -176,11 +176,12 @@ def test_files_without_leaks_pass_all_checks(scene, capsys):
     assert {check["where"] for check in checks if check["what"] == "scaler"} == trained
     variants = {check["where"] for check in checks if check["what"] == "settings: recipe"}
     assert variants == {"train_single", "train_multi", "train_triplet", "adapt"}
-    assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]  # as in the paper
+    # only the paper's random split fails
+    assert [check["where"] for check in checks if not check["holds"]] == ["single_random/repeat0"]
     assert f"tiny: {len(checks)} checks, no leak; 1 known" in capsys.readouterr().err
 
 
-def test_settings_for_speed_need_no_choice(scene):
+def test_settings_that_affect_only_speed_need_no_tuning(scene):
     io.write_json(scene / "scene.json", SCENE | {"audit": {"settings": "for speed"}})
     (scene / "choice.json").unlink()
     assert not any(check["what"].startswith("settings") for check in run_audit(scene))
@@ -195,7 +196,7 @@ def test_settings_for_speed_need_no_choice(scene):
         ("train_triplet", "triplet.paper.b1.seed0"),
     ],
 )
-def test_scaler_fitted_to_test_rows_is_a_leak(scene, arm, name, seen_n):
+def test_scaler_fitted_to_test_rows_is_detected(scene, arm, name, seen_n):
     file, data = scene / f"models/{arm}/{name}.safetensors", load_scene_data(scene)
     (fold,) = (one for one in data.folds_of("lobo") if one.name == "b1")
     seen = np.concatenate([fold.train, fold.test[:seen_n]])
@@ -216,9 +217,9 @@ def change_fold(folder: Path, change: Callable[[Fold, SceneData], Fold]) -> None
 
 
 def train_on_a_test_skin(fold: Fold, data: SceneData) -> Fold:
-    own = data.rows.skin[fold.test] == "b0_s0"
+    on_skin = data.rows.skin[fold.test] == "b0_s0"
     pool = fold.pool[data.rows.skin[fold.pool] != "b0_s0"]
-    return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[own]), fold.test[~own], pool)
+    return Fold(fold.experiment, fold.name, np.union1d(fold.train, fold.test[on_skin]), fold.test[~on_skin], pool)
 
 
 def train_on_a_test_reading(fold: Fold, data: SceneData) -> Fold:
@@ -247,12 +248,12 @@ def adapt_to_a_training_skin(fold: Fold, data: SceneData) -> Fold:
         (adapt_to_a_training_skin, "pool skins must be skins of the test; got 1 of 3 are not held out: b1_s0"),
     ],
 )
-def test_fold_with_test_rows_is_a_leak(scene, leak, sentence):
+def test_fold_that_trains_on_test_rows_is_detected(scene, leak, sentence):
     change_fold(scene, leak)
     assert_leak(scene, f"audit of tiny, lobo/b0: {sentence}")
 
 
-def test_copied_capture_is_a_leak(tmp_path):
+def test_copied_capture_is_detected(tmp_path):
     assert_leak(
         build(tmp_path / "scene", (*SKINS, COPY)),
         r"audit of tiny, lobo/b0: copies must be .*; got 2 of 2 captures compared; b0_s0 like b3_s0: 100.0 %",
@@ -267,7 +268,7 @@ def test_copied_capture_is_a_leak(tmp_path):
     ],
     ids=["board", "skin"],
 )
-def test_settings_chosen_on_test_boards_or_skins_are_a_leak(scene, changes, sentence):
+def test_settings_chosen_on_test_boards_or_skins_are_detected(scene, changes, sentence):
     io.write_json(scene / "choice.json", CHOICE | changes)
     assert_leak(scene, f"audit of tiny, {sentence}")
 
@@ -286,7 +287,7 @@ def test_settings_chosen_on_test_boards_or_skins_are_a_leak(scene, changes, sent
     ],
     ids=["another rate", "no choice"],
 )  # fmt: skip
-def test_setting_that_was_not_chosen_is_reported(scene, chosen, arm, found):
+def test_setting_that_differs_from_the_choice_is_reported(scene, chosen, arm, found):
     io.write_json(scene / "choice.json", CHOICE | {"chosen": chosen})
     rows = {check["where"]: check for check in run_audit(scene) if check["what"] == "settings: recipe"}
     assert (rows[arm]["found"], rows[arm]["holds"]) == (found, True)
@@ -302,12 +303,12 @@ def test_setting_that_was_not_chosen_is_reported(scene, chosen, arm, found):
     ],
     ids=["a network trained on the board", "test pokes", "pokes of a training skin"],
 )
-def test_adaptation_from_a_wrong_network_or_pokes_is_a_leak(scene, change, sentence):
+def test_adaptation_of_a_wrong_network_or_to_wrong_pokes_is_detected(scene, change, sentence):
     file = next((scene / "models/adapt").glob("*.json"))
     card = io.read_json(file)
     data = load_scene_data(scene)
     fold = next(fold for fold in data.folds_of("lobo") if fold.name == card["fold"])
     sides = {"tested": fold.test, "trained": fold.train}
-    own = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
-    io.write_json(file, card | {"tuning": change(card["tuning"], own)})
+    by_side = {name: np.unique(data.rows.indentation[rows])[:3].tolist() for name, rows in sides.items()}
+    io.write_json(file, card | {"tuning": change(card["tuning"], by_side)})
     assert_leak(scene, f"{file.stem}: {sentence}")

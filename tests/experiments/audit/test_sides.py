@@ -1,4 +1,4 @@
-"""Tests of the checks of the audit, with planted leaks of split, copy, scaler, settings and pool."""
+"""Tests of the audit's checks, with leaks planted in the split, captures (copies), scaler, settings and pool."""
 
 import doctest
 from dataclasses import replace
@@ -24,12 +24,12 @@ from reskin.seeds import rng_for
 
 NONE = np.zeros(0, np.int64)
 READINGS_N = 3
-NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # measured in the lab recordings
+NOISE_uT = np.tile([3.3, 3.3, 5.0], 5)  # noise of x, y, z in the lab recordings
 UNSEEN = ("lobo", "sensors", "transfer")
 
 
 def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.ndarray]:
-    """Return presses of two skins per board, with a shared response and an individual one a third as large."""
+    """Return presses of two skins per board; skins have a common response and an individual one, a third as large."""
     rng = rng_for(0, "audit")
     common, dbs_uT = rng.normal(0, 25, (9, 15)), []
     for _ in range(2 * boards_n):
@@ -46,8 +46,8 @@ def example_presses(boards_n: int = 3, pokes_n: int = 60) -> tuple[Labels, np.nd
 
 
 def held_out(labels: Labels, experiment: str = "lobo", board: str = "b0") -> Sides:
-    own = labels.board == board
-    return Sides(experiment, board, np.flatnonzero(~own), NONE, np.flatnonzero(own))
+    on_board = labels.board == board
+    return Sides(experiment, board, np.flatnonzero(~on_board), NONE, np.flatnonzero(on_board))
 
 
 def run_audit(fold: Sides, labels: Labels, db_uT: np.ndarray):
@@ -104,27 +104,28 @@ def test_split_leak_is_detected(leak, named):
 
 
 def test_shared_reading_is_detected_within_a_skin():
-    own = np.flatnonzero(LABELS.skin == "b0_s0")
-    fold = Sides("single_random", "repeat0", own[:100], NONE, own[99:])
+    rows = np.flatnonzero(LABELS.skin == "b0_s0")
+    fold = Sides("single_random", "repeat0", rows[:100], NONE, rows[99:])
     assert failing(run_audit(fold, LABELS, DB_uT)) == ["readings", "indentations"]
     assert not passes(run_audit(fold, LABELS, DB_uT))
 
 
 def test_papers_random_readings_are_a_known_leak():
-    own = np.flatnonzero(LABELS.skin == "b0_s0")
-    checks = run_audit(Sides("single_random", "repeat0", own[::2], NONE, own[1::2]), LABELS, DB_uT)
+    rows = np.flatnonzero(LABELS.skin == "b0_s0")
+    checks = run_audit(Sides("single_random", "repeat0", rows[::2], NONE, rows[1::2]), LABELS, DB_uT)
     (leak,) = [check for check in checks if not check.holds]
     assert (leak.what, leak.known) == ("indentations", True)
-    assert leak.found.startswith("60 of 60 on both sides")  # 3 readings: one side has 2, the other 1
+    # each indentation has 3 readings: 2 are on one side of the split, 1 on the other
+    assert leak.found.startswith("60 of 60 on both sides")
     assert passes(checks)
 
 
 @pytest.mark.parametrize("experiment", ["single_temporal", "single_indentation", "single_pass"])
 def test_indentations_within_a_skin_must_be_separate(experiment):
-    own = np.flatnonzero(LABELS.skin == "b0_s0")
-    fold = Sides(experiment, "b0_s0", own[: 20 * READINGS_N], NONE, own[20 * READINGS_N :])
+    rows = np.flatnonzero(LABELS.skin == "b0_s0")
+    fold = Sides(experiment, "b0_s0", rows[: 20 * READINGS_N], NONE, rows[20 * READINGS_N :])
     assert failing(run_audit(fold, LABELS, DB_uT)) == []
-    split_indentation = replace(fold, train=own[:61], test=own[61:])
+    split_indentation = replace(fold, train=rows[:61], test=rows[61:])
     assert failing(run_audit(split_indentation, LABELS, DB_uT)) == ["indentations"]
     assert not passes(run_audit(split_indentation, LABELS, DB_uT))
 
@@ -140,10 +141,12 @@ def test_pool_must_be_untested_pokes_of_held_out_skins():
     assert trained[-1].found == "1 of 1 are not held out: b1_s0"
 
 
-def with_copy(db_uT: np.ndarray, labels: Labels, of: str, to: str, *, sd_uT: float, factor: float) -> np.ndarray:
+def with_copy(
+    db_uT: np.ndarray, labels: Labels, source_skin: str, target_skin: str, *, sd_uT: float, factor: float
+) -> np.ndarray:
     rng = rng_for(1, "copy")
-    planted, source = db_uT.copy(), db_uT[labels.skin == of]
-    planted[labels.skin == to] = factor * source + rng.normal(0, sd_uT, source.shape)
+    planted, source = db_uT.copy(), db_uT[labels.skin == source_skin]
+    planted[labels.skin == target_skin] = factor * source + rng.normal(0, sd_uT, source.shape)
     return planted
 
 
@@ -157,8 +160,8 @@ def test_perturbed_copy_is_detected(sd_uT, factor):
 
 
 def test_copied_capture_is_detected_among_others():
-    own, copied = (np.flatnonzero(LABELS.skin == skin) for skin in ("b0_s1", "b2_s1"))
-    few = own[: 8 * READINGS_N]
+    copy_rows, copied = (np.flatnonzero(LABELS.skin == skin) for skin in ("b0_s1", "b2_s1"))
+    few = copy_rows[: 8 * READINGS_N]
     capture = LABELS.capture.astype("U20")
     capture[few] = "c_b0_s1_more"
     planted = DB_uT.copy()
@@ -173,20 +176,22 @@ def test_copy_is_detected_in_a_sample(monkeypatch):
     monkeypatch.setattr(audit, "SAMPLE_MIN_N", 1)
     planted = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=5, factor=1)
     check = run_audit(held_out(LABELS), LABELS, planted)[-1]
-    assert check.found.endswith("of 25 indentations")  # 12,000 pairs over 240 training indentations and 2 captures
+    # 12,000 compared pairs / (240 training indentations x 2 captures)
+    assert check.found.endswith("of 25 indentations")
     assert not check.holds
     assert run_audit(held_out(LABELS), LABELS, DB_uT)[-1].holds
 
 
-def test_equal_directions_of_other_strengths_are_not_a_copy():
-    planted, own = DB_uT.copy(), LABELS.skin == "b0_s1"
-    factor = rng_for(4, "factor").uniform(1, 4, (own.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
-    planted[own] = factor * DB_uT[LABELS.skin == "b2_s1"]
+def test_equal_directions_with_other_magnitudes_are_not_a_copy():
+    planted, on_skin = DB_uT.copy(), LABELS.skin == "b0_s1"
+    factor = rng_for(4, "factor").uniform(1, 4, (on_skin.sum() // READINGS_N, 1)).repeat(READINGS_N, axis=0)
+    planted[on_skin] = factor * DB_uT[LABELS.skin == "b2_s1"]
     assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
 def test_response_rotated_by_ten_degrees_is_not_a_copy():
-    # Re-seating a skin rotates it by more. The distance of each row from its ray is 0.17 |dB|, at least 39 uT.
+    # Re-seating a skin rotates the fields by more than 10 degrees. Here each row is 0.17 |dB|, at least 39 uT, from its
+    # ray.
     planted, source = DB_uT.copy(), DB_uT[LABELS.skin == "b2_s1"]
     one, other = source[:, :14:2], source[:, 1:14:2]
     cos, sin = np.cos(np.radians(10)), np.sin(np.radians(10))
@@ -195,7 +200,7 @@ def test_response_rotated_by_ten_degrees_is_not_a_copy():
     assert run_audit(held_out(LABELS), LABELS, planted)[-1].holds
 
 
-def test_fields_within_the_noise_do_not_pass():
+def test_fields_within_the_noise_are_undecidable():
     checks = run_audit(held_out(LABELS), LABELS, np.where((LABELS.skin == "b0_s1")[:, None], DB_uT / 1000, DB_uT))
     assert failing(checks) == ["copies"]
     assert checks[-1].found == "undecidable: fields within the noise: b0_s1"
@@ -203,28 +208,28 @@ def test_fields_within_the_noise_do_not_pass():
 
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([*UNSEEN, "single_random"]))
 @settings(max_examples=30, deadline=None)
-def test_order_of_rows_does_not_matter(draw, copied, experiment):
+def test_audit_does_not_depend_on_row_order(draw, copied, experiment):
     db_uT = with_copy(DB_uT, LABELS, "b2_s1", "b0_s1", sd_uT=3, factor=1) if copied else DB_uT
     order = rng_for(draw, "order").permutation(len(DB_uT))
-    place = np.argsort(order)  # the new index of each row
+    new_index = np.argsort(order)  # new index of each old row
     fold = held_out(LABELS, experiment)
     shuffled = Labels(*(label[order] for label in vars(LABELS).values()))
-    moved = replace(fold, train=place[fold.train], test=place[fold.test])
+    moved = replace(fold, train=new_index[fold.train], test=new_index[fold.test])
     assert run_audit(moved, shuffled, db_uT[order]) == run_audit(fold, LABELS, db_uT)
 
 
-def test_nearest_ray_has_the_smallest_angle(monkeypatch):
-    monkeypatch.setattr(audit, "CHUNK_PAIRS_N", 100)  # several chunks
+def test_nearest_ray_is_at_the_smallest_angle(monkeypatch):
+    monkeypatch.setattr(audit, "CHUNK_PAIRS_N", 100)  # so that the pairs are processed in several chunks
     rng = rng_for(2, "rays")
     rows, others = (rng.normal(0, 100, (n, 6)).astype(np.float32) for n in (13, 40))
     nearest, off_uT = nearest_rays(rows, others)
     for row, i, off in zip(rows.astype(float), nearest, off_uT, strict=True):
         angles = [np.arccos(row @ o / np.linalg.norm(row) / np.linalg.norm(o)) for o in others.astype(float)]
         assert i == np.argmin(angles)
-        assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)  # float32 rays
+        assert off == pytest.approx(np.linalg.norm(row) * np.sin(min(angles)), rel=1e-5)  # rays are float32
 
 
-def test_recorded_skins_pass_and_a_copy_fails(shared_data):
+def test_lab_recordings_pass_and_a_copy_fails(shared_data):
     frames = {
         board: pd.concat([pd.read_csv(shared_data / f"lab/{board}_depth{i}.csv").assign(depth_i=i) for i in (1, 3)])
         for board in ("board1", "board2")
@@ -245,7 +250,7 @@ def test_recorded_skins_pass_and_a_copy_fails(shared_data):
 
 
 @pytest.mark.parametrize("experiment", ["lobo", "by_weather"])
-def test_unusable_folds_are_an_error(experiment):
+def test_empty_side_or_unknown_experiment_is_an_error(experiment):
     fold = replace(held_out(LABELS, experiment), test=NONE)
     sentence = {
         "lobo": "one side of the fold has no rows: 720 to train on, 0",
@@ -268,7 +273,7 @@ def scaler_check(arrays, fold: Sides, db_uT: np.ndarray, scaling: str):
 @pytest.mark.parametrize("scaling", list(FIT))
 @given(st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
-def test_scaler_of_training_rows_passes_in_any_order(scaling, draw):
+def test_scaler_of_training_rows_passes(scaling, draw):
     fold = held_out(LABELS)
     train = rng_for(draw, "order").permutation(fold.train)
     assert scaler_check(FIT[scaling](DB_uT[train], TARGET[train]).arrays(), fold, DB_uT, scaling).holds
@@ -301,20 +306,20 @@ def test_one_test_row_in_100000_is_detected(scaling):
     assert [check.holds for check in checks] == [True, False]
 
 
-def test_last_bit_of_a_scaler_may_differ():
+def test_rounding_differences_of_a_scaler_pass():
     fold = held_out(LABELS)
     arrays = FIT["standard"](DB_uT[fold.train], TARGET[fold.train]).arrays()
     rounded = {name: np.nextafter(value, np.float32(np.inf)) for name, value in arrays.items()}
     assert scaler_check(rounded, fold, DB_uT, "standard").holds
 
 
-def test_scaler_closer_to_that_of_both_sides_fails():
+def test_scaler_fitted_to_both_sides_fails_even_if_close():
     fold = held_out(LABELS)
 
     def fit(db_uT, target):
         return {"shift": np.array([1 + 1e-10 * len(db_uT)])}
 
-    arrays = fit(DB_uT, TARGET)  # lobo: both sides are all rows
+    arrays = fit(DB_uT, TARGET)  # fitted to all rows: the training side and the test side
     check = audit_scaler("m", arrays, db_uT=DB_uT, target=TARGET, sides=fold, fit=fit)
     assert check.found == "off by 3.6e-08 from training rows alone, by 0 from both sides"
     assert not check.holds
@@ -342,13 +347,13 @@ def choice_checks(choice=CHOICE, recipes=None, source="simulated", seed=2021):
     return audit_choice(choice, recipes, source=source, seed=seed, **names)
 
 
-def test_settings_chosen_with_another_seed_pass():
+def test_choice_on_another_seed_passes():
     assert failing(choice_checks()) == []
     assert failing(choice_checks(source="recorded")) == []
 
 
 @pytest.mark.parametrize(("source", "seed"), [("simulated", 777), ("recorded", 5)])
-def test_settings_leak_is_detected(source, seed):
+def test_choice_on_test_data_is_detected(source, seed):
     checks = choice_checks(CHOICE | {"source": source}, source=source, seed=seed)
     assert failing(checks) == ["settings: boards", "settings: skins"]
     assert checks[1].found == "1 of 3 tested were chosen on: b0_s0"
@@ -363,7 +368,7 @@ def test_settings_leak_is_detected(source, seed):
         ({"scaling": "standard", "rate_max": 0.003, "tau": 1}, "steps_n absent (study: 4000), tau 1 (study: absent)"),
     ],
 )  # fmt: skip
-def test_recipe_that_was_not_chosen_is_reported(recipe, found):
+def test_recipe_that_differs_from_the_choice_is_reported(recipe, found):
     checks = choice_checks(recipes={"train_multi": recipe})
     assert passes(checks)
     assert checks[-1].found == f"not chosen by the study: {found}"

@@ -1,4 +1,4 @@
-"""Tests of the departures of a capture from its scene."""
+"""Tests of departures: differences between a capture and the skin of its scene that suggest wrong labels."""
 
 from dataclasses import replace
 
@@ -14,12 +14,12 @@ from tests.recordings.test_recordings import ingest
 
 @pytest.fixture(scope="module")
 def real(shared_data, tmp_path_factory) -> Readings:
-    """Return a third of the pokes of a file of board 1, five readings each."""
+    """Return every third poke of a recording of lab board 1, with five readings per poke."""
     readings, _ = ingest(lab, shared_data / "lab/board1_depth2.csv", tmp_path_factory.mktemp("lab"))
-    return some(readings, (readings.indentation % 3 == 0) & (readings.reading_i < 5))
+    return select(readings, (readings.indentation % 3 == 0) & (readings.reading_i < 5))
 
 
-def some(readings: Readings, rows: np.ndarray) -> Readings:
+def select(readings: Readings, rows: np.ndarray) -> Readings:
     arrays = {name: value[rows] for name, value in vars(readings).items() if isinstance(value, np.ndarray)}
     return replace(readings, **arrays)
 
@@ -28,7 +28,7 @@ def test_agreeing_recording_has_no_departure(real):
     assert find_departure([real], SECTION, DESIGN) is None
 
 
-def test_exchanged_chips_are_named(real):
+def test_swapped_chips_are_named(real):
     order = np.arange(15).reshape(5, 3)[[0, 2, 1, 3, 4]].ravel()
     swapped = replace(real, b_uT=real.b_uT[:, order], noload_uT=real.noload_uT[:, order])
     assert find_departure([swapped], SECTION, DESIGN) == "Against the scene, chips 1 and 2 are exchanged."
@@ -41,7 +41,7 @@ def test_mirrored_labels_are_named(real):
 
 def test_incomplete_captures_have_no_departure(real):
     unknown = np.full(len(real), np.nan, np.float32)
-    few = some(real, real.indentation < 30)
+    few = select(real, real.indentation < 30)
     fewer_chips = replace(real, b_uT=real.b_uT[:, :12], noload_uT=real.noload_uT[:, :12])
     for cannot in (replace(real, Fz_N=unknown), replace(real, x_mm=unknown), few, fewer_chips):
         assert find_departure([cannot], SECTION, DESIGN) is None

@@ -1,4 +1,4 @@
-"""Tests of fits and frames of simulated recordings with known parameters, and of real ones."""
+"""Tests that experiment compare recovers parameters and axes, from simulated and from real recordings."""
 
 import itertools
 from dataclasses import asdict, replace
@@ -32,22 +32,22 @@ from tests.recordings.test_recordings import LAB, ingest
 
 ROOT = Path(__file__).resolve().parents[3]
 SECTION = parse(Compare, read_yaml(ROOT / "pipeline/scenes/lab.yaml")["compare"], "lab.yaml: compare")
-# The nominal skin has the same tip because computing the flow of a tip takes seconds.
+# The nominal skin is pressed with the same tip: tables for another tip would take seconds to compute.
 DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yaml: skin")
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
-# Errors of a fit to 50 pokes with 3 uT of noise; gap and amplitude are correlated.
+# Tolerances: errors of a fit to 50 pokes with 3 uT of noise; errors of gap and amplitude are correlated.
 NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
 TURN = chip_rotations(SECTION)
 
 
-def simulated_presses(how: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
-    """Return presses at 25 places and two forces with a known law and noise, in the frames of scene lab."""
+def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
+    """Return simulated presses at 25 places and two forces, with these parameters, in the axes of scene lab."""
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
-    db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(how, SETUP, place_mm, force_N))
-    rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(how, SETUP))
+    db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(parameters, SETUP, place_mm, force_N))
+    rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(parameters, SETUP))
     return RecordedPresses(
         board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), capture_i=np.repeat([0, 1], 25),
         place_mm=place_mm * (1, -1) + SECTION.labels_middle_mm, force_N=force_N,
@@ -72,7 +72,7 @@ def test_fit_recovers_the_true_parameters(recorded):
     } == {}
 
 
-def test_refit_changes_only_parameters_of_the_board(recorded):
+def test_refit_for_a_board_changes_only_its_parameters(recorded):
     start = replace(fit.START, modulus_MPa=0.25, away_um_mm=6.0, give_x_um=40.0, give_y_um=10.0)
     fitted = fit.fit(
         to_board_axes(simulated_presses(replace(TRUE, rotation_deg=2.0)), SECTION), SETUP, fit.SEVEN, start
@@ -86,7 +86,7 @@ def test_agreeing_recording_has_no_departure(recorded):
     assert sentence(recorded) == "Labels, chips and skin lie as the scene says."
 
 
-def test_exchanged_chips_are_named(recorded):
+def test_swapped_chips_are_named(recorded):
     swapped = replace(recorded, db_uT=recorded.db_uT[:, [0, 2, 1, 3, 4]])
     assert sentence(swapped) == "Against the scene, chips 1 and 2 are exchanged."
 
@@ -129,46 +129,47 @@ def test_sixteen_orientations_are_distinct():
 
 
 def test_flipped_skin_is_a_rotated_checkerboard():
-    plain, flipped = (replace(SETUP, skin_flipped=way).rest for way in (False, True))
+    plain, flipped = (replace(SETUP, skin_flipped=is_flipped).rest for is_flipped in (False, True))
     turn = compare.quarter_turn(1)
-    there = {
+    moments_by_node = {
         tuple(np.round(node * 1e6).astype(int)): moment
         for node, moment in zip(plain.nodes_m, plain.moments_A_m2, strict=True)
     }
     for node, moment in zip(flipped.nodes_m[::97], flipped.moments_A_m2[::97], strict=True):
-        before = there[tuple(np.round(turn.T @ node * 1e6).astype(int))]
+        before = moments_by_node[tuple(np.round(turn.T @ node * 1e6).astype(int))]
         np.testing.assert_allclose(turn @ before, moment, atol=1e-6 * np.abs(plain.moments_A_m2).max())
 
 
-def test_law_without_slide_and_offsets_is_the_nominal_skin():
+def test_law_without_slide_and_offsets_equals_the_nominal_skin():
     plain = law.Law(0.0, 0.0, 0.0, 1.1, 1.0, 0.0, 0.0, 0.2, 0.0, 0.0, 0.0)
     setup = replace(SETUP, tip_radius_mm=DESIGN.tip_radius_mm)
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
     nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
     lengths = [np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N))) for force_N in
-               np.geomspace(0.2, 8, 30)]  # one of the forces is as deep  # fmt: skip
+               np.geomspace(0.2, 8, 30)]  # one of these forces gives the same depth  # fmt: skip
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
-def test_pokes_beyond_the_deepest_are_counted_and_clamped():
+def test_pokes_beyond_the_greatest_depth_are_counted_and_clamped():
     deepest_m = np.array([0.72e-3 * DESIGN.thickness_mm])
-    of = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
-    (deepest_N,) = layer.force(deepest_m, **of, base="slipping") * 0.28**-1.5
+    layer_settings = {"modulus_Pa": 1e6 * TRUE.modulus_MPa, "thickness_m": SETUP.thickness_m, "tip_radius_m": 2e-3}
+    (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    still = replace(TRUE, away_um_mm=0.0)  # the slide would grow with force
-    held_uT = law.simulate_uT(still, SETUP, np.zeros((4, 2)), force_N)
-    soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)  # reaches the same depth at half the force
+    without_slide = replace(TRUE, away_um_mm=0.0)  # no slide, because it would grow with the force
+    held_uT = law.simulate_uT(without_slide, SETUP, np.zeros((4, 2)), force_N)
+    # a skin with half the modulus is indented as deeply by half the force
+    soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)
     assert law.beyond_n(soft, SETUP, force_N[1:]) == 3
     np.testing.assert_allclose(held_uT[2], held_uT[3])
 
 
-def test_nominal_skin_counts_pokes_beyond_its_curve():
+def test_nominal_skin_counts_pokes_beyond_its_force_curve():
     known_N, _ = law._nominal_curve(SETUP)
     assert law.beyond_n(None, SETUP, known_N[-1] * np.array([0.9, 1.1, 2.0])) == 2
 
 
-def test_direction_size_and_growth_of_known_fields():
+def test_direction_magnitude_and_growth_of_known_fields():
     one_uT = np.array([[[3.0, 0.0, 0.0]], [[0.0, 4.0, 0.0]]])
     assert cosines(one_uT, 2 * one_uT).tolist() == [1.0, 1.0]
     assert cosines(one_uT, one_uT[:, :, [1, 0, 2]]).tolist() == [0.0, 0.0]
@@ -179,13 +180,13 @@ def test_direction_size_and_growth_of_known_fields():
     assert growth(replace(pokes, force_N=np.ones(50)), power_uT) is None
 
 
-def test_memory_is_estimated_despite_drift():
+def test_memory_is_estimated_despite_no_load_drift():
     pokes, rng = simulated_presses(), rng_for(1, "compare")
     for part in (0.0, 0.07):
         rest_uT = np.linspace(0, 60, 50)[:, None, None] ** 2 / 60 + 0.3 * rng.standard_normal((50, 5, 3))
         rest_uT[1:] += part * pokes.db_uT[:-1]
         assert memory(pokes, pokes.db_uT, rest_uT) == pytest.approx(part, abs=0.004)
-    assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None  # a single no-load reading
+    assert memory(pokes, pokes.db_uT, np.tile(rest_uT[:1], (50, 1, 1))) is None  # unknown with a single no-load reading
 
 
 def test_presses_are_means_of_readings_with_force():
@@ -193,7 +194,7 @@ def test_presses_are_means_of_readings_with_force():
                    Fz_N=np.array([1, 2, 3, 4, 4, np.nan], np.float32))  # fmt: skip
     pokes = pool([one])
     assert pokes.force_N.tolist() == [2.0, 4.0]
-    assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # rows 0, 1, 2 and 3, 4
+    assert pokes.db_uT[:, 0, 0].tolist() == [1.0, 3.5]  # means of rows 0-2 and of rows 3-4; row 5 has no force
     assert pokes.excluded_n == 1
     assert pokes.groups == ("c0 1 mm",)
     with pytest.raises(SchemaError, match="experiment compare: board .* has no press with a known place and force"):
@@ -204,20 +205,21 @@ def test_presses_are_means_of_readings_with_force():
 
 @pytest.fixture(scope="module")
 def real(shared_data, tmp_path_factory) -> dict[str, RecordedPresses]:
-    """Return the presses of lab boards 1 and 2."""
+    """Return the presses of the recordings of lab boards 1 and 2."""
     captures: dict[str, list] = {}
     for name in LAB:
         file = shared_data / "lab" / f"{name}.csv"
         board = name.partition("_")[0]
         one, _ = ingest(lab, file, tmp_path_factory.mktemp(name), board=board, capture=name)
         captures.setdefault(board, []).append(one)
-    return {board: pool(own) for board, own in captures.items()}
+    return {board: pool(recordings) for board, recordings in captures.items()}
 
 
-def test_laws_fitted_to_a_third_of_the_places_agree_with_all(real):
-    # A third is 22 of 65 places in each of three files; the fitted laws must agree with all places.
-    some = {board: _some(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
-    numbers, drawn = compare_boards(some, SECTION, DESIGN, seed=2021)
+def test_fit_to_a_third_of_the_places_agrees_with_the_fit_to_all(real):
+    # A third of the places: 22 of 65 in each of three recordings. Parameters fitted there must agree with those of all
+    # places.
+    third = {board: _select(pokes, np.arange(len(pokes)) % 65 % 3 == 0) for board, pokes in real.items()}
+    numbers, figure_data = compare_boards(third, SECTION, DESIGN, seed=2021)
     cosine_min = {"fitted": 0.89, "refitted": 0.85}
     for board, way in itertools.product(real, cosine_min):
         parameters, seen = numbers["by_board"][board]["laws"][way], to_board_axes(real[board], SECTION)
@@ -226,15 +228,17 @@ def test_laws_fitted_to_a_third_of_the_places_agree_with_all(real):
         assert agreed["cosine_mean"] > cosine_min[way]
         assert agreed["explained_median"] > 0.78
         assert agreed["growth"]["simulated"] == pytest.approx(agreed["growth"]["recorded"], abs=0.12)
-    for board, own in numbers["by_board"].items():
-        assert 0.6 < own["nominal"]["cosine_mean"] < 0.82
-        assert own["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
-        assert own["pokes_n"] == 66
-        assert len(drawn["boards"][board]["arrows_uT"]["recorded"]) == len(drawn["boards"][board]["places_mm"])
+    for board, of_board in numbers["by_board"].items():
+        assert 0.6 < of_board["nominal"]["cosine_mean"] < 0.82
+        assert of_board["frames"]["sentence"] == "Labels, chips and skin lie as the scene says."
+        assert of_board["pokes_n"] == 66
+        assert len(figure_data["boards"][board]["arrows_uT"]["recorded"]) == len(
+            figure_data["boards"][board]["places_mm"]
+        )
     assert numbers["over_boards"]["refitted"]["cosine_mean"]["n"] == 2
 
 
-def _some(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
+def _select(pokes: RecordedPresses, chosen: np.ndarray) -> RecordedPresses:
     names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
     return replace(pokes, **{name: getattr(pokes, name)[chosen] for name in names})
 

@@ -42,7 +42,7 @@ DRAWN = {
 }  # fmt: skip
 
 
-def test_simulations_are_compared_with_bounds():
+def test_table_compares_simulations_with_bounds():
     table = tables(NUMBERS, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes", "no", "undecided"]
     assert table["cosine"].tolist()[:3] == ["0.700 (≥ 0.90)", "0.910 (≥ 0.90)", "0.910 (≥ 0.85)"]
@@ -56,10 +56,10 @@ def test_simulations_are_compared_with_bounds():
 
 def test_single_board_of_equal_forces_has_no_growth_or_refit():
     alone = copy.deepcopy(BOARD)
-    for own in (alone, alone["nominal"]):
-        del own["growth"]
-    for own, name in ((alone, "refitted"), (alone["laws"], "refitted"), (alone, "memory")):
-        del own[name]
+    for section in (alone, alone["nominal"]):
+        del section["growth"]
+    for section, name in ((alone, "refitted"), (alone["laws"], "refitted"), (alone, "memory")):
+        del section[name]
     numbers = NUMBERS | {"by_board": {"b1": alone}, "over_boards": {}}
     table = tables(numbers, "recorded")["compare"]
     assert table["within bounds"].tolist() == ["no", "yes"]
@@ -67,7 +67,7 @@ def test_single_board_of_equal_forces_has_no_growth_or_refit():
     assert "simulated" in texts_of(figures(numbers, DRAWN, "recorded")["compare_growth.svg"])
 
 
-def test_tables_of_frames_and_parameters():
+def test_tables_of_axes_and_parameters():
     found = tables(NUMBERS, "recorded")
     assert found["compare_frames"]["orientation"].tolist() == ["Against the scene, chips 1 and 2 are exchanged."]
     assert found["compare_frames"]["cosine by chip, best"].tolist() == ["0.80"]
@@ -75,13 +75,13 @@ def test_tables_of_frames_and_parameters():
 
 
 def test_figure_labels():
-    drawn = figures(NUMBERS, DRAWN, "recorded")
+    svgs = figures(NUMBERS, DRAWN, "recorded")
     for word in ("recorded", "simulated", "µT", "(recorded; ×: poke; number: along z, µT)", "b1"):
-        assert word in texts_of(drawn["compare_arrows.svg"])
-    assert "recorded: power 0.30" in texts_of(drawn["compare_growth.svg"])
+        assert word in texts_of(svgs["compare_arrows.svg"])
+    assert "recorded: power 0.30" in texts_of(svgs["compare_growth.svg"])
     for word in ("k / μ 8.75 N/mm (used)", "no friction limit", "recorded"):
-        assert word in texts_of(drawn["compare_touch.svg"])
-    assert figures(NUMBERS, DRAWN, "recorded") == drawn
+        assert word in texts_of(svgs["compare_touch.svg"])
+    assert figures(NUMBERS, DRAWN, "recorded") == svgs
 
 
 def test_friction_table_has_the_field_of_a_light_touch():

@@ -1,4 +1,4 @@
-"""Tests of pairs of pokes, predictions for known contacts, and thresholds."""
+"""Tests of readings of two contacts, made by adding the field changes of two pokes; of predictions and thresholds."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ SKINS = ("b0_s0", "b0_s1", "b1_s0")
 
 
 def grid_rows(force=True):
-    """Return rows with each place of the grid twice on each skin, at random forces."""
+    """Return rows of several skins: each place of the grid twice per skin, at random forces."""
     skins = np.repeat(SKINS, 130)
     rows = tables.rows([name[:2] for name in skins], skins)
     target = np.column_stack([np.tile(points_mm(), (6, 1)), rng_for(0, "force").uniform(0, 3, len(skins))])
@@ -37,8 +37,8 @@ ROWS = grid_rows()
 OWN = np.flatnonzero(ROWS.board == "b0")
 
 
-def pairs_at(separation_mm, rows=ROWS, own=OWN, pairs_n=80):
-    return draw_pairs(rows, own, separation_mm, pairs_n=pairs_n, rng=rng_for(0, "pairs", f"{separation_mm}"))
+def pairs_at(separation_mm, rows=ROWS, tested=OWN, pairs_n=80):
+    return draw_pairs(rows, tested, separation_mm, pairs_n=pairs_n, rng=rng_for(0, "pairs", f"{separation_mm}"))
 
 
 @given(st.sampled_from([2.0, 4.2, 6.0, 8.5, 12.0, 16.0]))
@@ -47,20 +47,21 @@ def test_pairs_are_on_one_skin_at_the_given_distance(separation_mm):
     assert (ROWS.skin[pairs.weaker] == ROWS.skin[pairs.stronger]).all()
     assert set(ROWS.board[pairs.weaker]) == {"b0"}
     apart_mm = np.linalg.norm(ROWS.target[pairs.weaker, :2] - ROWS.target[pairs.stronger, :2], axis=1)
-    assert np.abs(apart_mm - separation_mm).max() <= TOLERANCE_MM + 1e-5  # float32 of 16 mm
+    assert np.abs(apart_mm - separation_mm).max() <= TOLERANCE_MM + 1e-5  # rounding of 16 mm to float32
     assert (ROWS.target[pairs.weaker, 2] <= ROWS.target[pairs.stronger, 2]).all()
     assert len(pairs.weaker) == 80
 
 
-def test_zero_distance_is_one_place_and_small_distances_are_two():
+def test_only_distance_zero_pairs_one_place_with_itself():
     same = pairs_at(0.0)
     np.testing.assert_array_equal(ROWS.target[same.weaker, :2], ROWS.target[same.stronger, :2])
-    close = replace(ROWS, target=(ROWS.target * [0.2, 0.2, 1]).astype(np.float32))  # places 0.4 mm apart
+    # neighbouring places are 0.4 mm apart
+    close = replace(ROWS, target=(ROWS.target * [0.2, 0.2, 1]).astype(np.float32))
     pairs = pairs_at(0.4, rows=close)
     assert (close.target[pairs.weaker, :2] != close.target[pairs.stronger, :2]).any(axis=1).all()
 
 
-def test_weaker_contact_without_forces_has_the_smaller_field():
+def test_without_forces_the_weaker_contact_has_the_smaller_field():
     rows = grid_rows(force=False)
     pairs = pairs_at(4.0, rows=rows)
     length = [np.linalg.norm(rows.db_uT[side], axis=1) for side in (pairs.weaker, pairs.stronger)]
@@ -69,7 +70,7 @@ def test_weaker_contact_without_forces_has_the_smaller_field():
     assert not {"force_over_sum", "force_over_larger"} & set(numbers)
 
 
-def test_pair_readings_are_sums():
+def test_reading_of_a_pair_is_the_sum_of_field_changes():
     pairs = pairs_at(6.0)
     for i in range(5):
         both = ROWS.db_uT[pairs.weaker[i]] + ROWS.db_uT[pairs.stronger[i]]
@@ -89,7 +90,8 @@ def test_prediction_between_two_known_contacts():
     weaker, stronger = contacts_of([0, 0, 1], [0, 0, 1]), contacts_of([4, 0, 3], [0, 8, 3])
     predicted = contacts_of([3, 0.5, 4], [0, 5, 2])
     numbers = compare_prediction(weaker, stronger, predicted)
-    assert numbers["near_either_pct"] == 50  # the first: 1 mm and 0.5 mm from the stronger
+    # only the first prediction is within 1 mm of a contact in x and in y
+    assert numbers["near_either_pct"] == 50
     assert numbers["nearest_mm"] == pytest.approx((np.hypot(1, 0.5) + 3) / 2)
     assert numbers["along"] == pytest.approx((3 / 4 + 5 / 8) / 2)
     assert numbers["nearer_the_stronger_pct"] == 100
@@ -98,11 +100,11 @@ def test_prediction_between_two_known_contacts():
 
 
 @given(st.floats(-1, 2), st.floats(-5, 5))
-def test_perpendicular_offset_keeps_the_projection(share, aside_mm):
+def test_perpendicular_offset_does_not_change_the_position_along_the_line(share, aside_mm):
     weaker, stronger = contacts_of([2, 3, 1]), contacts_of([5, 7, 2])
     foot = weaker[0] + share * (stronger - weaker)[0]
     predicted = contacts_of(foot + aside_mm * np.array([-0.8, 0.6, 0]))
-    assert position_along_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # float32
+    assert position_along_line(weaker, stronger, predicted)[0] == pytest.approx(share, abs=1e-5)  # tolerance of float32
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,7 @@ def test_perpendicular_offset_keeps_the_projection(share, aside_mm):
         (["b0", "b0", "b0"], ["s0", "s0", "s0"], [0, 1, 2], [2], "pass"),
     ],
 )
-def test_board_skin_or_pass_is_held_out(boards, skins, passes, aside, what):
+def test_thresholds_come_from_another_board_skin_or_pass(boards, skins, passes, aside, what):
     fit, kept, unit = keep_aside(tables.rows(boards, skins, passes), np.arange(3))
     assert (kept.tolist(), unit) == (aside, what)
     assert sorted([*fit, *kept]) == [0, 1, 2]
@@ -137,8 +139,8 @@ def test_thresholds_depend_only_on_held_out_contacts():
 
 
 def test_total_auc_excludes_pairs_at_one_place():
-    single, apart = scores("single"), scores("four", 2)
-    found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: apart}, 0.1)
+    single, separated = scores("single"), scores("four", 2)
+    found = detection_rates(scores("aside"), single, {0.0: scores("same", -9), 4.0: separated}, 0.1)
     assert found["auc"] == found["by_separation"][4.0]["auc"]
     assert found["by_separation"][0.0]["auc"]["odd"] < 0.01
 

@@ -1,4 +1,4 @@
-"""Two contacts on a linear skin whose network is exact for single contacts."""
+"""Tests of experiment contacts on a linear skin, with a predictor that is exact for single contacts."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ def scene_data():
     rows = tables.rows(boards, [f"{board}_s0" for board in boards])
     force_N = rng_for(0, "forces").uniform(0.5, 3, len(boards))
     places_mm = np.tile(points_mm(), (12, 1))
-    # Each of nine channels reads the force, weighted by the distance from its own spot.
+    # Each of nine channels reads the force, weighted by the distance between the contact and a spot of the channel.
     spots_mm = np.array([[x, y] for x in (2, 8, 14) for y in (2, 8, 14)])
     near = np.exp(-((places_mm[:, None] - spots_mm) ** 2).sum(axis=2) / 50)
     db_uT = (200 * force_N[:, None] * near).astype(np.float32)
@@ -34,7 +34,7 @@ def scene_data():
 
 
 def nearest_neighbour(data):
-    """Return a predictor that is exact for single contacts: the most similar row."""
+    """Return a predictor that is exact for single contacts: it returns the target of the most similar row."""
 
     def predict(db_uT):
         known = data.rows.db_uT / np.linalg.norm(data.rows.db_uT, axis=1, keepdims=True)
@@ -54,18 +54,19 @@ NUMBERS, DRAWN = evaluate_board(DATA, FOLD, SECTION, [nearest_neighbour(DATA)])
 def test_distant_contacts_are_detected_better():
     found = NUMBERS["by_separation"]
     for detector in ("direction and length", "direction above noise", "residual"):
-        assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)  # 0.5 is chance
-        assert NUMBERS["false_alarm_pct"][detector] < 25  # 10 is nominal
+        assert found[8.0]["auc"][detector] > max(found[4.0]["auc"][detector], 0.7)  # chance level is 0.5
+        assert NUMBERS["false_alarm_pct"][detector] < 25  # the threshold aims at 10 %
 
 
-def test_predictions_are_between_contacts_and_nearer_the_stronger():
+def test_prediction_is_between_the_contacts_and_nearer_the_stronger():
     assert 0.5 < NUMBERS["falls"][8.0]["along"] < 1.0
     assert NUMBERS["falls"][4.0]["nearest_mm"] < NUMBERS["falls"][8.0]["nearest_mm"]
-    assert NUMBERS["falls"][0.0]["near_either_pct"] == 100  # the same place twice is one contact of twice the force
+    # two contacts at one place equal one contact with the sum of the forces
+    assert NUMBERS["falls"][0.0]["near_either_pct"] == 100
     assert [len(values) for values in DRAWN["along"].values()] == [40, 40]
 
 
-def test_disagreement_needs_two_networks():
+def test_disagreement_of_networks_needs_two_networks():
     assert "networks disagree" not in NUMBERS["auc"]
     numbers, _ = evaluate_board(
         DATA, FOLD, SECTION, [nearest_neighbour(DATA), lambda db_uT: nearest_neighbour(DATA)(-db_uT)]

@@ -1,4 +1,4 @@
-"""Tests of the superposition of two contacts on one skin."""
+"""Tests of the superposition error: the sum of the field changes of two contacts, compared with both at once."""
 
 import numpy as np
 import pytest
@@ -39,25 +39,23 @@ def test_single_contact_equals_the_simulator():
     poke_m = np.array([[2e-3, -3e-3, DEPTH_M]])
     ((_, before, after),) = moved_dipoles(SKIN, poke_m - [0, 0, SKIN.depth_zero_m])
     theirs_T = change_of_field(before, after, BOARD.chips_m)
-    # Linear interpolation between five heights has an error of 1 %; with the nine in use it is 0.3 %.
+    # Interpolation between the five heights used here has an error of 1 %; between the nine of the experiment, 0.3 %.
     assert rms(pressed_T(poke_m[0]) - theirs_T) < 0.02 * rms(theirs_T)
 
 
-def test_error_of_the_sum_falls_with_distance_and_rises_with_depth():
+def test_superposition_error_falls_with_distance_and_rises_with_depth():
     rows = {
         (row["depth_mm"], row["separation_mm"]): row["error_pct"] for row in superposition(SCENE, (4.0, 12.0), seed=1)
     }
     assert sorted(rows) == [(0.6, 4), (0.6, 12), (1.2, 4), (1.2, 12)]
-    for separation_mm in (
-        4,
-        12,
-    ):  # the error is a product of two displacements, so half the depth gives half the relative error
+    # The error is a product of two displacements: relative to the field change, it is proportional to the depth.
+    for separation_mm in (4, 12):
         assert rows[0.6, separation_mm] < 0.7 * rows[1.2, separation_mm]
     for depth_mm in (0.6, 1.2):
         assert 0 < rows[depth_mm, 12] < rows[depth_mm, 4]
 
 
-def test_both_contacts_contribute():
+def test_field_is_from_both_contacts():
     a_m, b_m = (-5e-3, 0, DEPTH_M), (5e-3, 1e-3, DEPTH_M)
     together_T = pressed_T(a_m, b_m)
     for one_m in (a_m, b_m):
@@ -67,6 +65,6 @@ def test_both_contacts_contribute():
 
 def test_rotated_moments_keep_their_length():
     _, moments = press_on(SKIN, press_on(SKIN, REST, np.array([0, 0, DEPTH_M])), np.array([3e-3, 0, DEPTH_M]))
-    length, before = (np.linalg.norm(of, axis=1) for of in (moments, SKIN.moments_A_m2))
-    # Interpolation between rotated vectors gives a chord, shorter than the arc by its angle squared over 8.
+    length, before = (np.linalg.norm(vectors, axis=1) for vectors in (moments, SKIN.moments_A_m2))
+    # Interpolation between two rotated vectors is along a chord: shorter than the vectors by up to (angle^2) / 8.
     np.testing.assert_allclose(length, before, rtol=0.05)

@@ -1,4 +1,4 @@
-"""Tests of the tables and figure of two contacts."""
+"""Tests of the tables and the figure of experiment contacts."""
 
 from pipeline.experiments.contacts import figures, tables
 from tests.report.synthetic import texts_of
@@ -25,7 +25,7 @@ SUPERPOSED = [{"depth_mm": 1.2, "separation_mm": 4.0, "pairs_n": 6, "error_pct":
 DRAWN = {"along": {"4": [0.5, 0.6, 1.1], "8": [0.2, 0.9, 0.7]}}
 
 
-def test_table_has_all_distances_and_single_contacts():
+def test_table_has_a_row_for_each_distance_and_for_single_contacts():
     table = tables(NUMBERS, "recorded")["contacts"]
     assert table["distance of the contacts, mm"].tolist() == ["0", "4", "8", "single contacts"]
     assert set(table["source"]) == {"recorded"}
@@ -36,17 +36,17 @@ def test_table_has_all_distances_and_single_contacts():
     assert "5 % false alarms" in table.attrs["meaning"]
 
 
-def test_superposition_table_is_only_in_simulated_scenes():
+def test_recorded_scenes_have_no_superposition_table():
     assert set(tables(NUMBERS, "recorded")) == {"contacts"}
     table = tables(NUMBERS | {"superposition": SUPERPOSED}, "simulated")["superposition"]
     assert table["error of the sum, % of the change of field"].tolist() == ["13.2"]
 
 
 def test_figure_labels():
-    drawn = figures(NUMBERS, DRAWN, "recorded")
-    labels = texts_of(drawn["contacts.svg"])
+    svgs = figures(NUMBERS, DRAWN, "recorded")
+    labels = texts_of(svgs["contacts.svg"])
     for label in ("direction", "residual", "stronger contact", "distance of the contacts / mm", "%", "(recorded)"):
         assert label in labels
-    assert figures(NUMBERS, DRAWN, "recorded") == drawn
+    assert figures(NUMBERS, DRAWN, "recorded") == svgs
     nearer = figures(NUMBERS | {"same_place": row(2.0)}, DRAWN, "recorded")
-    assert nearer != drawn  # contacts at one place are drawn too
+    assert nearer != svgs  # contacts at one place are plotted too

@@ -13,11 +13,11 @@ LATE = {
     "network_board": ["b0", "b1", "b2", "b3"],
 }  # fmt: skip
 CONTACTS_N = [5000, 10_000, 15_000, 20_000]
-BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # relative differences between networks
+BY_SEED = (-0.01, -0.003, 0.003, 0.01)  # relative differences of the errors of four networks
 
 
 def errors(start: float, per_window: float, by_seed=BY_SEED, force: bool = True) -> dict[str, np.ndarray]:
-    """Return errors of networks (rows) that grow by `per_window` over four windows."""
+    """Return errors [network, window] in four windows, which grow by `per_window` from one window to the next."""
     places = np.array([[start * (1 + more) + i * per_window * (1 + more) for i in range(4)] for more in by_seed])
     return {"mse_xy_mm2": places} | ({"mse_f_N2": places / 100} if force else {})
 
@@ -37,7 +37,7 @@ def verdicts(networks: dict, late: dict | None = LATE) -> dict[str, str]:
     return {name: one["verdict"] for name, one in findings_by_name(networks, late).items()}
 
 
-def test_errors_as_in_the_paper_support_all_findings():
+def test_errors_like_the_papers_support_all_findings():
     assert verdicts(PAPER) == dict.fromkeys((HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE, OVERESTIMATES), SUPPORTED)
     assert all(one["holds"] for one in findings_by_name(PAPER).values())
 
@@ -45,8 +45,8 @@ def test_errors_as_in_the_paper_support_all_findings():
 @pytest.mark.parametrize(
     ("finding", "changed", "late"),
     [
-        (HIGHER_AND_FASTER, {"initial": errors(1.0, -0.1)}, LATE),  # higher errors that do not grow faster
-        (HIGHER_AND_FASTER, {"initial": errors(0.0, 0.05)}, LATE),  # errors that grow faster but are not higher
+        (HIGHER_AND_FASTER, {"initial": errors(1.0, -0.1)}, LATE),  # the errors are higher but do not grow faster
+        (HIGHER_AND_FASTER, {"initial": errors(0.0, 0.05)}, LATE),  # the errors grow faster but are not higher
         (OFFSET, {"initial": errors(0.1, 0.0)}, LATE),
         (EACH_IS_WORSE, {"each": errors(0.1, 0.01)}, LATE),
         (OVERESTIMATES, {}, LATE | {"bias_N": -0.02, "network_bias_N": [-0.02, -0.021, -0.02, -0.019]}),
@@ -58,17 +58,20 @@ def test_opposite_finding_is_contradicted(finding, changed, late):
 
 
 @pytest.mark.parametrize("finding", [HIGHER_AND_FASTER, OFFSET, EACH_IS_WORSE])
-def test_disagreement_of_boards_is_undecided(finding):
-    signs = (-1.0, 1.2, 0.3, 0.1)  # of the difference by board; the mean agrees with the paper
+def test_finding_is_undecided_if_boards_disagree(finding):
+    # factors of the difference, one per board; the mean over boards agrees with the paper
+    signs = (-1.0, 1.2, 0.3, 0.1)
     near = errors(0.2, 0.01)
-    apart = {name: of + np.array(signs)[:, None] * 0.1 * np.arange(1, 5) * of for name, of in near.items()}
-    changed = {"each": apart} if finding == EACH_IS_WORSE else {"initial": apart}
+    disagreeing = {
+        name: values + np.array(signs)[:, None] * 0.1 * np.arange(1, 5) * values for name, values in near.items()
+    }
+    changed = {"each": disagreeing} if finding == EACH_IS_WORSE else {"initial": disagreeing}
     one = findings_by_name(PAPER | {"regular": near} | changed)[finding]
     assert (one["holds"], one["verdict"]) == (False, UNDECIDED)
 
 
 def test_single_network_has_no_verdict():
-    alone = {policy: {name: of[:1] for name, of in own.items()} for policy, own in PAPER.items()}
+    alone = {policy: {name: values[:1] for name, values in metrics.items()} for policy, metrics in PAPER.items()}
     findings = findings_by_name(alone, LATE | {"network_bias_N": [0.02], "network_board": ["b0"]}, ("b0",))
     assert {one["verdict"] for one in findings.values()} == {FEW_BOARDS}
     assert {one["of_trainings"] for one in findings.values()} == {UNDECIDED}
@@ -81,7 +84,10 @@ def test_networks_of_one_board_have_no_verdict_over_boards():
 
 
 def test_repeated_networks_do_not_narrow_the_interval():
-    twice = {policy: {name: np.repeat(of, 2, axis=0) for name, of in own.items()} for policy, own in PAPER.items()}
+    twice = {
+        policy: {name: np.repeat(values, 2, axis=0) for name, values in metrics.items()}
+        for policy, metrics in PAPER.items()
+    }
     late = LATE | {"network_bias_N": list(np.repeat(LATE["network_bias_N"], 2))}
     boards = ("b0", "b0", "b1", "b1", "b2", "b2", "b3", "b3")
     again, once = findings_by_name(twice, late | {"network_board": list(boards)}, boards), findings_by_name(PAPER)
@@ -89,47 +95,47 @@ def test_repeated_networks_do_not_narrow_the_interval():
     assert again[OFFSET]["measured"] == once[OFFSET]["measured"]
 
 
-def test_one_contradicting_metric_contradicts_a_finding():
+def test_finding_is_contradicted_if_one_metric_contradicts_it():
     falls = PAPER["initial"] | {"mse_f_N2": 0.02 - 0.004 * np.arange(4) + np.array([[0.0], [1e-5], [2e-5], [3e-5]])}
     assert verdicts(PAPER | {"initial": falls})[HIGHER_AND_FASTER] == CONTRADICTED
     unclear = PAPER["initial"] | {"mse_f_N2": PAPER["regular"]["mse_f_N2"] + np.array([[-1.0], [1.0], [0.3], [0.1]])}
     assert verdicts(PAPER | {"initial": unclear})[OFFSET] == UNDECIDED
 
 
-def test_policies_are_judged_over_all_windows():
-    last_good = {name: of.copy() for name, of in errors(1.0, 0.5).items()}
-    for of in last_good.values():
-        of[:, -1] = 0
+def test_policies_are_compared_over_all_windows():
+    last_good = {name: values.copy() for name, values in errors(1.0, 0.5).items()}
+    for values in last_good.values():
+        values[:, -1] = 0
     assert verdicts(PAPER | {"initial": last_good})[OFFSET] == SUPPORTED
 
 
-def test_paired_differences_cancel_shared_errors():
-    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # one seed is much worse under both policies
-    regular = {name: of + shared for name, of in PAPER["regular"].items()}
-    each = {name: of + shared for name, of in PAPER["each"].items()}
-    assert verdicts(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE] == SUPPORTED
-    own, other = (of["mse_xy_mm2"].mean(axis=1) for of in (each, regular))
-    low, high = ttest_rel(own, other).confidence_interval(0.95)
-    difference = f"difference {(own - other).mean():+.2g} [{low:+.2g}, {high:+.2g}] mm²"
-    assert difference in findings_by_name(PAPER | {"regular": regular, "each": each})[EACH_IS_WORSE]["measured"]
+def test_paired_differences_cancel_errors_common_to_both_policies():
+    shared = np.array([0.0, 5.0, 9.0, 4.0])[:, None]  # errors that a seed has under both policies
+    regular = {name: values + shared for name, values in PAPER["regular"].items()}
+    each_contact = {name: values + shared for name, values in PAPER["each"].items()}
+    assert verdicts(PAPER | {"regular": regular, "each": each_contact})[EACH_IS_WORSE] == SUPPORTED
+    before_each, other = (values["mse_xy_mm2"].mean(axis=1) for values in (each_contact, regular))
+    low, high = ttest_rel(before_each, other).confidence_interval(0.95)
+    difference = f"difference {(before_each - other).mean():+.2g} [{low:+.2g}, {high:+.2g}] mm²"
+    assert difference in findings_by_name(PAPER | {"regular": regular, "each": each_contact})[EACH_IS_WORSE]["measured"]
 
 
 @pytest.mark.parametrize(
     ("bias_N", "se_N", "networks_N", "verdict"),
     [
         (0.02, 0.0099, [0.02, 0.02, 0.02, 0.02], SUPPORTED),
-        (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),  # two standard errors over indentations
+        (0.02, 0.0101, [0.02, 0.02, 0.02, 0.02], UNDECIDED),  # the bias is only two standard errors over indentations
         (-0.02, 0.0101, [-0.02, -0.02, -0.02, -0.02], UNDECIDED),
         (-0.02, 0.0099, [-0.02, -0.02, -0.02, -0.02], CONTRADICTED),
-        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),  # networks differ more
+        (0.02, 0.0001, [-0.02, 0.06, 0.02, 0.02], UNDECIDED),  # the networks differ by more than the bias
     ],
 )
-def test_bias_must_exceed_both_variations(bias_N, se_N, networks_N, verdict):
+def test_bias_must_exceed_the_variation_over_indentations_and_networks(bias_N, se_N, networks_N, verdict):
     late = LATE | {"bias_N": bias_N, "bias_se_N": se_N, "network_bias_N": networks_N}
     assert findings_by_name(PAPER, late)[OVERESTIMATES]["of_trainings"] == verdict
 
 
-def test_without_forces_only_places_are_judged():
+def test_without_forces_only_place_errors_are_judged():
     two = {"initial": errors(1.0, 0.5, force=False), "each": errors(0.3, 0.01, force=False)}
     assert verdicts(two, None) == {HIGHER_AND_FASTER: SUPPORTED, OFFSET: SUPPORTED}
     assert not any("MSE_F" in one["measured"] for one in findings_by_name(two, None).values())
@@ -137,15 +143,18 @@ def test_without_forces_only_places_are_judged():
 
 def test_untestable_findings_are_omitted():
     assert findings_by_name({"initial": errors(1, 1)}, None) == {}
-    one_window = {policy: {name: of[:, :1] for name, of in own.items()} for policy, own in PAPER.items()}
+    one_window = {
+        policy: {name: values[:, :1] for name, values in metrics.items()} for policy, metrics in PAPER.items()
+    }
     assert set(findings_by_name(one_window, None)) == {OFFSET, EACH_IS_WORSE}
 
 
 @given(st.lists(st.floats(0, 10), min_size=2, max_size=9))
-def test_growth_equals_numpys_slope(values):
+def test_growth_equals_the_slope_of_numpys_fit(values):
     contacts_n = [5000 * i for i in range(len(values))]
     slope = np.polyfit(np.array(contacts_n) / 10_000, values, 1)[0]
-    assert growth(contacts_n, np.array([values, values])) == pytest.approx(slope, abs=1e-9)  # both in double precision
+    # rounding in double precision
+    assert growth(contacts_n, np.array([values, values])) == pytest.approx(slope, abs=1e-9)
 
 
 def test_measured_text_has_policies_difference_and_interval():

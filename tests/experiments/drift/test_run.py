@@ -1,4 +1,4 @@
-"""Tests of experiments drift and variation on a skin with a field in closed form, with the settings of scene ci."""
+"""Tests of experiments drift and variation with the settings of scene ci, on a skin whose field is a simple formula."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,12 +21,13 @@ from reskin.seeds import rng_for
 from tests.data.tables import readings
 
 ROOT = Path(__file__).resolve().parents[3]
-DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3  # 390 contacts; drift of each channel per contact
+# 390 contacts per capture; the no-load field of every channel drifts by DRIFT_uT per contact
+DEPTHS_MM, PASSES_N, DRIFT_uT = (0.6, 1.2), 3, 0.3
 EVERY_s, WARMING_K_PER_s = 0.5, 0.01
 
 
 def capture(name: str, board: str = "b0", skin: str = "s0", gain: float = 1.0, pokes_n: int | None = None) -> Readings:
-    """Return a capture with two readings per contact; its field is linear in place and force, and drifts at rest."""
+    """Return a capture: two readings per contact, field change linear in place and force, drifting no-load field."""
     places = np.tile(points_mm(), (len(DEPTHS_MM) * PASSES_N, 1))[:pokes_n]
     depth_mm = np.tile(np.repeat(DEPTHS_MM, 65), PASSES_N)[:pokes_n]
     n = len(places)
@@ -52,7 +53,7 @@ def write(folder: Path, *captures: Readings) -> Path:
 
 @pytest.fixture
 def scene(tmp_path, monkeypatch) -> dict[str, Any]:
-    """Return options of both stages: scene ci with longer training, cached in the folder of the test."""
+    """Return the command-line options of both stages: scene ci with longer training, cached in the test's folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("RESKIN_EXECUTOR", "here")
     settings = YAML(typ="safe").load((ROOT / "pipeline/scenes/ci.yaml").read_text())
@@ -68,7 +69,7 @@ def drift_section(scene: dict[str, Any]) -> Drift:
     return scene["settings"].section(Drift, "drift")
 
 
-def test_single_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
+def test_initial_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     drift(section=drift_section(scene), indentations=write(tmp_path / "wear", capture("s0-wear")), **scene)
     results = io.read_json(scene["results"])
     numbers = results["numbers"]
@@ -77,7 +78,8 @@ def test_single_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     }  # fmt: skip
     for policy in ("initial", "regular", "each"):
         assert [row["contacts_n"] for row in numbers[policy]] == [100, 200, 300]
-    # A reading before each contact removes the drift; the initial one misses all, a regular one up to 20 contacts.
+    # No-load readings before each contact remove the drift. The initial reading removes none, regular ones all but the
+    # drift of up to 20 contacts.
     off_uT = {policy: numbers[policy][-1]["noload_off_uT"] for policy in ("initial", "regular", "each")}
     assert off_uT["each"] == 0
     assert off_uT["initial"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(np.arange(300, 330) ** 2.0)), rel=1e-3)
@@ -85,30 +87,30 @@ def test_single_no_load_reading_is_worst_on_a_drifting_skin(scene, tmp_path):
     assert off_uT["regular"] == pytest.approx(DRIFT_uT * np.sqrt(np.mean(ranks**2.0)), rel=1e-3)
     last = {policy: numbers[policy][-1]["mse_xy_mm2"] for policy in off_uT}
     assert last["initial"] > 2 * max(last["regular"], last["each"])
-    assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # this skin does not soften
+    assert numbers["late"]["force_left_pct"] == pytest.approx(100)  # the skin does not soften
     assert numbers["late"]["indentations_n"] == len(results["drawn"]["late"]["true_N"]) == 30
     assert len(numbers["late"]["network_bias_N"]) == 2
     assert all(row["spread"]["mse_xy_mm2"] > 0 for policy in off_uT for row in numbers[policy])
     assert all(numbers["last_window"][policy]["mse_xy_mm2"]["sd_seeds"] > 0 for policy in off_uT)
     assert {one["verdict"] for one in numbers["findings"]} == {"not judged (fewer than 4 boards)"}
-    # The change of field by a contact does not depend on the policy.
+    # The size of the field change does not depend on the no-load policy.
     db_uT = capture("s0-wear").b_uT - capture("s0-wear").noload_uT
     assert numbers["field"]["contact_uT"] == pytest.approx(np.sqrt(np.mean(db_uT.astype(float) ** 2)), rel=1e-6)
     assert numbers["contact_every_s"] == pytest.approx(EVERY_s)
     assert numbers["lasts_s"] == pytest.approx(389 * EVERY_s)
     assert len(numbers["findings"]) == 4
     assert set(drift_pages.tables(numbers, "simulated")) == {"drift", "drift_findings", "drift_wander"}
-    drawn = drift_pages.figures(numbers, results["drawn"], "simulated")
-    assert set(drawn) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
-    # A walk without steps is the last window; readings before every contact remove any walk.
-    for policy, (still, _) in numbers["wander"].items():
+    svgs = drift_pages.figures(numbers, results["drawn"], "simulated")
+    assert set(svgs) == {"drift.svg", "drift_wander.svg", "drift_force.svg"}
+    # A random walk with steps of 0 uT equals the last window; readings before every contact remove any walk.
+    for policy, (without_walk, _) in numbers["wander"].items():
         last = {name: numbers[policy][-1][name] for name in ("accuracy_pct", "mse_xy_mm2", "noload_off_uT")}
-        assert {name: still[name] for name in last} == pytest.approx(last)
-        assert still["spread"]["mse_xy_mm2"] == pytest.approx(numbers[policy][-1]["spread"]["mse_xy_mm2"])
+        assert {name: without_walk[name] for name in last} == pytest.approx(last)
+        assert without_walk["spread"]["mse_xy_mm2"] == pytest.approx(numbers[policy][-1]["spread"]["mse_xy_mm2"])
     assert numbers["wander"]["each"][1]["mse_xy_mm2"] == pytest.approx(numbers["each"][-1]["mse_xy_mm2"], rel=1e-3)
 
 
-def test_recordings_have_no_added_walk(scene, tmp_path):
+def test_recorded_scenes_have_no_added_walk(scene, tmp_path):
     wear = write(tmp_path / "wear", replace(capture("s0-wear"), source="recorded"))
     with pytest.raises(ParamsError, match="drift.wander_uT is .* but a recorded scene"):
         drift(section=drift_section(scene), indentations=wear, **scene)
@@ -138,14 +140,17 @@ def test_variation_recovers_drift_and_gain(scene, tmp_path):
     variation(section=scene["settings"].section(Variation, "variation"), main=main, indentations=wear, **scene)
     results = io.read_json(scene["results"])
     assert results["numbers"]["contact_every_s"] == pytest.approx(EVERY_s)
-    assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)  # the first 200 contacts
-    assert results["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)  # float32 degrees
+    # the plotted visits are those of the first 200 contacts
+    assert results["numbers"]["shown_s"] == pytest.approx(199 * EVERY_s)
+    # temperatures are float32
+    assert results["numbers"]["warmer_K"] == pytest.approx(199 * EVERY_s * WARMING_K_PER_s, rel=1e-4)
     for place in results["numbers"]["places"]:
-        assert place["time"]["visits_n"] == 2  # two of three are in the first 200 contacts
+        assert place["time"]["visits_n"] == 2  # two of three passes visit the place within the first 200 contacts
         assert place["time"]["raw_change_uT"] == pytest.approx(DRIFT_uT * 130, rel=1e-3)
-        assert place["time"]["db_change_uT"] < 1e-3  # float32 fields of 1000 uT
-        assert place["skins"]["skins"] == ["s0", "s1"]  # the first of each board
-        # The second skin has 1.5 times the field: a difference of half the weaker field, over the rms of both.
+        assert place["time"]["db_change_uT"] < 1e-3  # rounding of fields of 1000 uT to float32
+        assert place["skins"]["skins"] == ["s0", "s1"]  # the first skin of each board
+        # The second skin has 1.5 times the field: the difference is half the weaker field, relative to the rms of both
+        # fields.
         assert place["skins"]["spread_pct"] == pytest.approx(100 * 0.5 / np.sqrt((1 + 1.5**2) / 2), rel=1e-4)
     assert set(variation_pages.figures(results["numbers"], results["drawn"], "simulated")) == {
         "variation_time.svg", "variation_skins.svg",
@@ -163,14 +168,14 @@ def walk_uT(step_uT: float, seed: int = 0) -> np.ndarray:
     return (further.noload_uT - line.noload_uT)[::2].astype(float)  # two readings per contact
 
 
-def test_walk_starts_after_training_and_grows_with_the_root_of_contacts():
+def test_added_walk_starts_after_training_and_grows_with_the_root_of_contacts():
     walk = np.concatenate([walk_uT(2.0, seed) for seed in range(20)], axis=1)
     assert np.abs(walk[:AFTER_N]).max() == 0
     for contacts_n in (1, 16, 256):
         rms_uT = np.sqrt((walk[AFTER_N - 1 + contacts_n] ** 2).mean())
-        assert rms_uT == pytest.approx(2.0 * np.sqrt(contacts_n), rel=0.15)  # 300 walks
+        assert rms_uT == pytest.approx(2.0 * np.sqrt(contacts_n), rel=0.15)  # rms over 300 walks
 
 
-def test_walk_is_proportional_to_its_step():
+def test_added_walk_is_proportional_to_its_step():
     np.testing.assert_allclose(walk_uT(2.0), 2 * walk_uT(1.0), atol=2e-3)
     assert np.abs(walk_uT(0.0)).max() == 0

@@ -8,7 +8,7 @@ from pipeline.report.formatting import to_markdown
 
 
 def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
-    """Return numbers of two windows and three policies; of two seeds if there is a spread."""
+    """Return the numbers of two windows and three policies; with `spread`, there are standard deviations over seeds."""
     policies = {}
     for i, policy in enumerate(("initial", "regular", "each")):
         metrics = {"accuracy_pct": 50.0 + i, "mse_xy_mm2": 2.0 - i / 2} | (
@@ -29,20 +29,20 @@ def numbers(force: bool = True, spread: bool = True, **changed) -> dict:
             ("too much force", "not judged (fewer than 4 boards)", "yes", "bias 0.1 N"),
         )
     ]
-    own = {
+    about = {
         "unit": "indentation", "train_n": 5000, "test_n": 1000, "every_n": 5000, "regular_n": 390, "skins_n": 1,
         "seeds_n": 2, "left_out_units_n": 90, "contact_every_s": 0.0575, "lasts_s": 1166.2,
         "field": {"contact_uT": 140.0, "noload_noise_uT": 1.25},
         "findings": findings,
     }  # fmt: skip
-    return own | policies | ({"late": late} if force else {}) | changed
+    return about | policies | ({"late": late} if force else {}) | changed
 
 
 DRAWN = {"late": {"true_N": [0.1, 1.0, 2.0], "predicted_N": [0.12, 1.02, 2.02]}}
 
 
 @pytest.mark.parametrize("source", ["simulated", "recorded"])
-def test_each_window_is_a_row_with_all_policies(source):
+def test_table_has_a_row_per_window_with_all_policies(source):
     table = tables(numbers(), source)["drift"]
     assert table["contacts"].tolist() == ["5,000", "10,000"]
     assert table["MSE_F, N² (every 390 indentations)"].tolist() == ["0.02 ± 0.0004"] * 2
@@ -65,7 +65,7 @@ def test_findings_table_has_verdicts_and_sizes():
     )
 
 
-def test_note_has_the_protocol_and_omitted_contacts():
+def test_note_states_the_protocol_and_omitted_contacts():
     assert "first 5,000 indentations of each skin, tested on 1,000 indentations after every 5,000" in to_markdown(
         tables(numbers(), "simulated")["drift"]
     )
@@ -76,7 +76,7 @@ def test_note_has_the_protocol_and_omitted_contacts():
     assert "not used" not in text
 
 
-def test_note_has_the_pace():
+def test_note_states_the_time_per_contact():
     simulated, recorded = (to_markdown(tables(numbers(), source)["drift"]) for source in ("simulated", "recorded"))
     for text in (simulated, recorded):
         assert "to the next is 0.0575 s; the whole capture lasts 1,166 s." in text
@@ -86,7 +86,7 @@ def test_note_has_the_pace():
     assert "The times of the contacts are not known." in to_markdown(tables(unknown, "recorded")["drift"])
 
 
-def test_note_has_the_unit_of_the_spread():
+def test_note_states_over_what_the_spread_is():
     text = to_markdown(tables(numbers(), "simulated")["drift"])
     assert "± is the standard deviation over 2 network seeds, all tested on the same contacts." in text
     text = to_markdown(tables(numbers(skins_n=4), "recorded")["drift"])
@@ -102,23 +102,23 @@ def test_single_network_has_no_spread():
 def test_unknown_forces_are_not_shown():
     unknown = numbers(force=False)
     assert "MSE_xy, mm² (before every contact)" in tables(unknown, "recorded")["drift"]
-    assert list(drawn := figures(unknown, {}, "recorded")) == ["drift.svg"]
-    assert "MSE_xy / mm²" in drawn["drift.svg"]
+    assert list(svgs := figures(unknown, {}, "recorded")) == ["drift.svg"]
+    assert "MSE_xy / mm²" in svgs["drift.svg"]
 
 
 def test_figure_labels():
-    drawn = figures(numbers(), DRAWN, "simulated")
-    for text in drawn.values():
+    svgs = figures(numbers(), DRAWN, "simulated")
+    for text in svgs.values():
         ET.fromstring(text)
         assert "(simulated)" in text
     for label in ("accuracy / %", "MSE_F / N²", "contacts of the skin before the test", "every 390 indentations"):
-        assert label in drawn["drift.svg"]
-    assert "bars: the standard deviation over 2 network seeds" in drawn["drift.svg"]
+        assert label in svgs["drift.svg"]
+    assert "bars: the standard deviation over 2 network seeds" in svgs["drift.svg"]
     for label in ("true force / N", "predicted force / N", "bias +0.0157 ± 0.0008 N (+1.3 %)", "45,000 contacts"):
-        assert label in drawn["drift_force.svg"]
+        assert label in svgs["drift_force.svg"]
 
 
-def test_added_walk_has_a_row_for_each_step():
+def test_table_of_the_added_walk_has_a_row_per_step():
     steps = {
         policy: [
             {
@@ -142,15 +142,15 @@ def test_added_walk_has_a_row_for_each_step():
     assert "drift_wander.svg" not in figures(numbers(), DRAWN, "simulated")
 
 
-def test_policies_keep_their_colours():
+def test_each_policy_has_a_fixed_colour():
     both = numbers()
     del both["regular"], both["late"]
     colours = set(re.findall(r"stroke: (#\w{6})", figures(both, {}, "recorded")["drift.svg"]))
-    assert "#d55e00" in colours  # before every contact, the third
+    assert "#d55e00" in colours  # the third colour: policy "before every contact"
     assert "#0072b2" not in colours
 
 
 def test_figures_are_reproducible():
     points = {"late": DRAWN["late"] | {"predicted_N": [0.1, 0.9, 2.1]}}
-    first, again, other = (figures(numbers(), drawn, "simulated") for drawn in (DRAWN, DRAWN, points))
+    first, again, other = (figures(numbers(), figure_data, "simulated") for figure_data in (DRAWN, DRAWN, points))
     assert first == again != other

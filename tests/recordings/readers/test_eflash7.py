@@ -1,4 +1,4 @@
-"""Tests of layout `eflash7`: numbered places, touched and untouched rows, dropped zeros."""
+"""Tests of the reader of layout `eflash7`: numbered places, rows with and without touch, rows of zeros."""
 
 from pathlib import Path
 
@@ -17,13 +17,13 @@ FIELDS = [f"mag{chip}_{axis}" for chip in range(CHIPS_N) for axis in "xyz"]
 NAMES = ["timestamp", "position", "x_pos", "y_pos", "fx", "fy", "fz", "tx", *FIELDS]
 NAMES_OF_TWO = ["timestamp", "fz", "ty", "pos1_x", "pos1_y", "pos2_x", "pos2_y", *FIELDS]
 HEADER = make_header(layout="eflash7", chips_n=CHIPS_N, contacts_before_n=7)
-# Field in steps, per row: untouched, a touch, untouched, a touch that begins with a row of zeros (None).
+# The field in steps, row by row: no touch, a touch, no touch, a touch that begins with a row of zeros (None).
 LEVELS = [0, 1, 0, 1, 0, 1, 40, 80, 41, 2, 1, None, 90]
 GAUGE_N = [0.1, 0.1, 0.1, 0.1, 0.1, 0.1, -0.9, -1.9, -0.9, 0.1, 0.1, -0.4, -2.4]
 
 
 def rows_of(place: str, template: str) -> list[str]:
-    """Return lines of one place or pair; `template` is filled with the place and fz."""
+    """Return the lines of one place or pair of places; `template` is formatted with the place and the force fz."""
     lines = []
     for row_i, (level, fz_N) in enumerate(zip(LEVELS, GAUGE_N, strict=True)):
         b_uT = [0.0] * len(FIELDS) if level is None else [STEP_uT * (level + 5 * i + 1) for i in range(len(FIELDS))]
@@ -50,11 +50,12 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
-def test_rows_from_the_first_touch_on_are_readings(tmp_path: Path) -> None:
+def test_rows_from_the_first_touch_on_become_readings(tmp_path: Path) -> None:
     readings, account = eflash7.read(write(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.t_s.tolist() == [100.6, 100.7, 100.8, 100.9, 101.0, 101.2]
     np.testing.assert_allclose(readings.b_uT[:, 0], STEP_uT * np.array([41, 81, 42, 3, 2, 91]), rtol=1e-6)
-    np.testing.assert_allclose(readings.noload_uT[:, 0], 1.5 * STEP_uT, rtol=1e-6)  # mean of 1 and 2
+    # mean of the rows before the first touch: 1 and 2 steps
+    np.testing.assert_allclose(readings.noload_uT[:, 0], 1.5 * STEP_uT, rtol=1e-6)
     assert account["noload_rows_n"] == 6
 
 
@@ -82,7 +83,7 @@ def test_zeros_of_one_chip_are_counted_separately(tmp_path: Path) -> None:
 
 def test_forces_are_relative_and_compression_is_positive(tmp_path: Path) -> None:
     readings, account = eflash7.read(write(tmp_path), HEADER, DEFAULT_POLICY)
-    np.testing.assert_allclose(readings.Fz_N, [1, 2, 1, 0, 0, 2.5], atol=1e-6)  # float32
+    np.testing.assert_allclose(readings.Fz_N, [1, 2, 1, 0, 0, 2.5], atol=1e-6)  # rounding to float32
     np.testing.assert_allclose(readings.Fx_N, 0, atol=1e-7)
     assert account["force_sign_unknown_rows_n"] == 6
 
@@ -108,7 +109,7 @@ def test_multi_touch_has_normal_force_only(tmp_path: Path) -> None:
     assert account["force_sign_unknown_rows_n"] == 0
 
 
-def test_late_and_repeated_rows_are_counted(tmp_path: Path) -> None:
+def test_delayed_and_repeated_rows_are_counted(tmp_path: Path) -> None:
     rows = [*ONE[:10], ONE[9].replace("100.9", "103.9"), *[row.replace("101.", "104.") for row in ONE[10:]]]
     _, account = eflash7.read(write(tmp_path, rows), HEADER, DEFAULT_POLICY)
     assert (account["gap_rows_n"], account["repeated_rows_n"]) == (1, 1)

@@ -1,4 +1,4 @@
-"""Tests of layout `eflesh`: a folder of three arrays becomes presses and strokes."""
+"""Tests of the reader of layout `eflesh`: a folder of three tables becomes presses (scan) or strokes (force gauge)."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def lines_of(rows: list[list[float]]) -> str:
 
 
 def write(folder: Path, places: list[list[float]], noload_uT: list[float]) -> Path:
-    """Write a recording: row i at `places[i]` (x, y, z [, grams]) reads 500 + i + 10 c uT over `noload_uT[i]`."""
+    """Write a recording: row i is at `places[i]` (x, y, z [, grams]); field change of channel c = 500 + i + 10 c uT."""
     raw = [[500.0 + i + 10.0 * c for c in range(3 * CHIPS_N)] for i in range(len(places))]
     changes = [[float(np.float32(b - base)) for b in row] for row, base in zip(raw, noload_uT, strict=True)]
     time_s = [START_s + 4.25 * i for i in range(len(places))]
@@ -40,7 +40,7 @@ def scan(folder: Path, passes_n: int = 3) -> Path:
 
 
 def strokes(folder: Path, strokes_n: int = 3) -> Path:
-    """Write strokes at one place: down and up in five rows, a fresh baseline before each, no new weight at the top."""
+    """Write strokes at one place: five rows down and up, a new baseline before each, no new weight at the top."""
     stroke = [(288.0, -1.0), (284.0, 100.0), (280.0, 1000.0), (284.0, 150.0), (288.0, -1.0)]
     places = [[315.0, -100.0, z, weight] for z, weight in stroke] * strokes_n
     return write(folder, places, [450.0 + i // len(stroke) for i in range(len(places))])
@@ -60,13 +60,13 @@ def edit(path: Path, line_n: int, column_i: int, cell: str) -> None:
     path.write_text("".join(",".join(line) + "\n" for line in lines))
 
 
-def test_places_count_from_the_corner_of_the_scan(tmp_path: Path) -> None:
+def test_places_are_relative_to_the_corner_of_the_scan(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.x_mm[:4].tolist() == [0, 0, 1, 1]
     assert readings.y_mm[:4].tolist() == [0, 1, 0, 1]
 
 
-def test_depth_counts_from_the_highest_place(tmp_path: Path) -> None:
+def test_depth_is_relative_to_the_highest_place(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     assert readings.depth_mm[:4].tolist() == [0.75, 0.5, 0.25, 0]
 
@@ -74,7 +74,7 @@ def test_depth_counts_from_the_highest_place(tmp_path: Path) -> None:
 def test_noload_is_the_subtracted_baseline(tmp_path: Path) -> None:
     readings, _ = eflesh.read(scan(tmp_path), HEADER, DEFAULT_POLICY)
     np.testing.assert_array_equal(readings.b_uT[5], 505 + 10 * np.arange(6))
-    # 300 + i and the differences are exact in float32.
+    # 300 + i and the differences have no rounding error in float32.
     np.testing.assert_array_equal(readings.noload_uT[5], np.full(6, 305))
 
 
@@ -86,7 +86,7 @@ def test_repeated_places_begin_a_pass(tmp_path: Path) -> None:
     assert np.isnan(readings.Fz_N).all()
 
 
-def test_fresh_baseline_begins_a_stroke(tmp_path: Path) -> None:
+def test_new_baseline_begins_a_stroke(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path), GAUGED, DEFAULT_POLICY)
     assert readings.pass_i.tolist() == [0] * 5 + [1] * 5 + [2] * 5
     assert account["passes_n"] == 3
@@ -96,7 +96,7 @@ def test_fresh_baseline_begins_a_stroke(tmp_path: Path) -> None:
 def test_grams_become_newtons_and_masked_values_nan(tmp_path: Path) -> None:
     readings, account = eflesh.read(strokes(tmp_path, strokes_n=1), GAUGED, DEFAULT_POLICY)
     expected = np.float32([np.nan, 0.980665, 9.80665, 1.4709975, np.nan])
-    # float32 holds seven digits
+    # float32 has seven digits
     np.testing.assert_allclose(readings.Fz_N, expected, rtol=1e-6)
     assert account["no_new_force_rows_n"] == 2
     assert account["force_sign_unknown_rows_n"] == 0
@@ -112,7 +112,7 @@ def test_gauge_axis_comes_from_the_header(tmp_path: Path, axis: str) -> None:
     felt = np.isfinite(getattr(readings, f"F{axis}_N"))
     assert account["force_sign_unknown_rows_n"] == felt.sum() > 0
     assert np.isnan(readings.Fz_N).all()
-    # A stroke along the skin has no depth.
+    # Strokes along x or y have no depth.
     assert np.isnan(readings.depth_mm).all()
 
 
@@ -124,7 +124,7 @@ def test_weight_without_axis_is_refused(tmp_path: Path, options: dict[str, str])
 
 @settings(max_examples=20, deadline=None)
 @given(passes_n=st.integers(1, 6))
-def test_every_row_is_a_reading(tmp_path_factory: pytest.TempPathFactory, passes_n: int) -> None:
+def test_every_row_becomes_a_reading(tmp_path_factory: pytest.TempPathFactory, passes_n: int) -> None:
     readings, account = eflesh.read(scan(tmp_path_factory.mktemp("eflesh"), passes_n), HEADER, DEFAULT_POLICY)
     assert account["rows_n"] == account["rows_read_n"] == len(readings) == 4 * passes_n
     assert account["noload_rows_n"] == 0
@@ -203,7 +203,7 @@ def test_places_in_metres_or_micrometres_are_refused(tmp_path: Path, factor: flo
     folder = write(tmp_path, [[5.0 * i, 0.0, 142.0] for i in range(4)], [300.0] * 4)
     eflesh.read(folder, HEADER, DEFAULT_POLICY)
     rescale(folder / eflesh.STATES, slice(1, 4), factor)
-    assert "states.csv: places must be one, or spread over 1 to 200 mm" in error_of(folder)
+    assert "states.csv: places must be equal, or spread over 1 to 200 mm" in error_of(folder)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e3])

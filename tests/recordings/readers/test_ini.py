@@ -1,4 +1,4 @@
-"""Tests of layout `ini`: two text files become passes over a raster."""
+"""Tests of the reader of layout `ini`: two text files become passes over a raster of places."""
 
 from pathlib import Path
 
@@ -16,7 +16,8 @@ CHIPS_N = 3
 LSB_XY_uT, LSB_Z_uT = 0.15, 0.242
 HEADER = make_header(layout="ini", chips_n=CHIPS_N, contacts_before_n=7)
 
-# One pass: two rows at the corner (one still labelled with its place), then presses, one too weak for the gauge.
+# Labels of one pass: two rows at the corner (one with the label of the last place), then presses, one too weak for the
+# gauge.
 ONE_PASS = [
     (2.0, 2.0, 0.0),
     (10.0, 10.0, 0.0),
@@ -31,7 +32,7 @@ FAILED = "8028.16 5194.0 12943.36 -880.49"
 
 
 def chip_line(row_i: int, chip_i: int, lsb_xy_uT: float = LSB_XY_uT, lsb_z_uT: float = LSB_Z_uT) -> str:
-    """Return X, Y, Z, T of one chip; from row to row, the field rises by one LSB."""
+    """Return the text X, Y, Z, T of a chip; from row to row, the field rises by one LSB."""
     steps = 1000 + row_i + 100 * chip_i
     return f"{steps * lsb_xy_uT:.2f} {(steps + 1) * lsb_xy_uT:.2f} {(steps + 2) * lsb_z_uT:.2f} {28 + chip_i}.5"
 
@@ -54,7 +55,7 @@ def write(folder: Path, truths: list[tuple[float, float, float]]) -> Path:
 def edit(path: Path, line_n: int, line: str) -> None:
     lines = path.read_text().splitlines()
     lines[line_n - 1] = line
-    path.write_text("".join(f"{each}\n" for each in lines))
+    path.write_text("".join(f"{row}\n" for row in lines))
 
 
 def error_of(folder: Path, header: Header = HEADER) -> str:
@@ -65,7 +66,7 @@ def error_of(folder: Path, header: Header = HEADER) -> str:
     return message
 
 
-def test_every_row_is_a_press_of_its_pass(tmp_path: Path) -> None:
+def test_every_row_becomes_a_press_of_its_pass(tmp_path: Path) -> None:
     readings, account = ini.read(write(tmp_path, ONE_PASS * 3), HEADER, DEFAULT_POLICY)
     assert readings.pass_i.tolist() == [0] * 8 + [1] * 8 + [2] * 8
     assert account["passes_n"] == 3
@@ -93,7 +94,7 @@ def test_noload_is_the_mean_of_the_first_rows_of_a_pass(tmp_path: Path) -> None:
     assert account["corner_rows_n"] == 4
 
 
-def test_places_that_never_repeat_are_one_pass(tmp_path: Path) -> None:
+def test_recording_without_repeated_places_is_one_pass(tmp_path: Path) -> None:
     _, account = ini.read(write(tmp_path, ONE_PASS), HEADER, DEFAULT_POLICY)
     assert account["passes_n"] == 1
 
@@ -116,7 +117,7 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
     readings, account = ini.read(tmp_path, HEADER, DEFAULT_POLICY)
     assert account["dropped_failed_read_rows_n"] == 2
     assert readings.indentation.tolist() == [0, 2, *range(4, 16)]
-    # The failed corner row is not part of the no-load mean.
+    # The corner row with a failed read is not included in the no-load mean.
     np.testing.assert_array_equal(readings.noload_uT[0], field_uT(0).astype(np.float32))
 
 
@@ -139,7 +140,7 @@ def header_with_lateness(rows_late: str) -> Header:
 
 
 def write_late(folder: Path, truths: list[tuple[float, float, float]], late_n: int) -> Path:
-    """Write fields that grow with the force, `late_n` rows later."""
+    """Write a recording whose fields grow with the force and are `late_n` rows late."""
     write(folder, truths)
     force = [truths[max(i - late_n, 0)][2] for i in range(len(truths))]
     lines = []
@@ -162,7 +163,7 @@ def test_lateness_of_the_fields_is_reported(tmp_path_factory: pytest.TempPathFac
 
 
 @pytest.mark.parametrize("late_n", [0, 1, 4])
-@pytest.mark.parametrize(("passes_n", "is_long"), [(13, True), (5, False)])  # 104 and 40 rows
+@pytest.mark.parametrize(("passes_n", "is_long"), [(13, True), (5, False)])  # recordings of 104 and of 40 rows
 def test_lateness_is_estimated_if_the_recording_is_long_enough(tmp_path, late_n, passes_n, is_long):
     _, account = ini.read(write_late(tmp_path, ONE_PASS * passes_n, late_n), HEADER, DEFAULT_POLICY)
     assert account["best_rows_late_n"] == late_n
@@ -200,7 +201,7 @@ def test_invalid_lateness_is_refused(tmp_path: Path, rows_late: str) -> None:
 
 
 def test_recording_shorter_than_its_lateness_is_refused(tmp_path: Path) -> None:
-    assert "4 rows are not more than the 5 of option rows_late" in error_of(
+    assert "the recording has 4 rows, but option rows_late is 5" in error_of(
         write(tmp_path, ONE_PASS[:4]), header_with_lateness("5")
     )
 
@@ -220,7 +221,7 @@ def test_public_recording_is_one_row_late(tmp_path: Path, shared_data: Path) -> 
 @pytest.mark.parametrize(
     ("columns", "factor", "expected"),
     [
-        (slice(0, 2), 1e-3, "places must be one, or spread over 1 to 200 mm; got 0.008"),
+        (slice(0, 2), 1e-3, "places must be equal, or spread over 1 to 200 mm; got 0.008"),
         (slice(0, 2), 1e3, "Convert m or um to mm"),
         (slice(2, 3), 0.01, "force must be 0.05 N or more somewhere in contact; got 0.015 at most"),
         (slice(2, 3), 1e3, "Convert grams or mN to N"),
@@ -239,7 +240,7 @@ def test_stuck_chip_loses_its_rows(tmp_path: Path) -> None:
     write(tmp_path, ONE_PASS * 8)
     for row_i in range(20, 64):
         edit(tmp_path / ini.READINGS, row_i + 1, f"{chip_line(row_i, 0)} {chip_line(20, 1)} {chip_line(row_i, 2)}")
-    # Detected from the 20th equal reading on; the corner rows of the last passes are all stuck.
+    # A chip counts as stuck from the 20th equal reading on; all corner rows of the last passes are stuck.
     assert "truths.txt line 41: this pass does not begin with a fault-free row" in error_of(tmp_path)
 
 
@@ -250,7 +251,7 @@ def test_recording_of_failed_reads_is_refused(tmp_path: Path) -> None:
 
 
 def recording_with_resets(folder: Path, reset: set[int], rows: range, passes_n: int = 3) -> Path:
-    """Write passes in which the chips `reset` have lost their settings in `rows`."""
+    """Write passes in which the chips `reset` read with power-on settings in the given rows."""
     write(folder, ONE_PASS * passes_n)
     lines = []
     for row_i in range(len(ONE_PASS) * passes_n):
@@ -275,7 +276,7 @@ def test_recording_with_all_chips_reset_is_refused(tmp_path: Path) -> None:
 
 
 def test_chip_reset_during_the_recording_is_named(tmp_path: Path) -> None:
-    # 2400 rows are checked in two blocks.
+    # The reader checks the 2400 rows in two blocks.
     message = error_of(recording_with_resets(tmp_path, {1}, range(1200, 2400), passes_n=300))
     assert "from row 1201: the LSB of chip 1 must" in message
 

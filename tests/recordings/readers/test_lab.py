@@ -1,4 +1,4 @@
-"""Tests of layout `lab`: one CSV file becomes presses."""
+"""Tests of the reader of layout `lab`: a CSV file becomes presses."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ HEADER = make_header(layout="lab", chips_n=CHIPS_N, contacts_before_n=7)
 
 
 def row(indent: int, phase: str, b_uT: float, *, place: str = "4,6", force: str = "0.1,-0.2,-3.5") -> str:
-    """Return one line; channel c reads b_uT + 10 c."""
+    """Return one CSV line; the field of channel c is b_uT + 10 c."""
     c = [f"{b_uT + 10 * i:.4f}" for i in range(3 * CHIPS_N)]
     return f"{indent},{phase},{place},21.5,{','.join(c[:3])},22.5,{','.join(c[3:])},{force}"
 
@@ -66,7 +66,7 @@ def test_noload_is_the_mean_of_the_same_press(tmp_path: Path) -> None:
     assert readings.noload_uT[0].tolist() == [102, 112, 122, 132, 142, 152]
 
 
-def test_forces_are_turned_from_gauge_to_skin_axes(tmp_path: Path) -> None:
+def test_forces_are_converted_from_gauge_to_skin_axes(tmp_path: Path) -> None:
     readings, _ = lab.read(write(tmp_path, *PRESSES), HEADER, DEFAULT_POLICY)
     np.testing.assert_array_equal(readings.Fz_N, np.float32([3.5, 3.5, 3.5, 0.5]))
     np.testing.assert_array_equal(readings.Fx_N[:3], np.float32([-0.1] * 3))
@@ -104,7 +104,7 @@ def test_row_with_failed_read_is_dropped(tmp_path: Path) -> None:
     assert account["dropped_failed_read_rows_n"] == 2
     assert (account["rows_n"], account["noload_rows_n"], account["rows_read_n"]) == (3, 2, 7)
     assert readings.b_uT[:, 0].tolist() == [160, 162, 50]
-    # The failed no-load row is not part of the mean.
+    # The no-load row with a failed read is not included in the mean.
     assert readings.noload_uT[:, 0].tolist() == [100, 100, 90]
 
 
@@ -178,7 +178,7 @@ def test_millitesla_is_refused(tmp_path: Path) -> None:
 
 
 def scale_column(column: str, factor: float) -> list[str]:
-    """Return the presses with one kind of column (B, place or F) in another unit."""
+    """Return the lines of PRESSES with all columns of a kind (B, place or F) multiplied by `factor`."""
     names = NAMES.split(",")
     chosen = {i for i, name in enumerate(names) if name.startswith(column) or name.endswith(column)}
     return [
@@ -193,7 +193,7 @@ def scale_column(column: str, factor: float) -> list[str]:
         ("B", 1e-2, "Convert mT or G to uT"),
         ("B", 1e-6, "Convert mT or G to uT"),
         ("B", 1e4, "below the full scale"),
-        ("_mm", 1e-3, "places must be one, or spread over 1 to 200 mm; got 0.004. Convert m or um"),
+        ("_mm", 1e-3, "places must be equal, or spread over 1 to 200 mm; got 0.004. Convert m or um"),
         ("_mm", 1e3, "got 4000. Convert m or um"),
         ("F", 102.0, "force must be below 100 N; got -357 in line 4. Convert grams"),
         ("F", 1e3, "Convert grams or mN to N"),

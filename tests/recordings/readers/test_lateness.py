@@ -1,4 +1,4 @@
-"""Tests that a row missing from one of two joined files is detected, and that complete recordings raise no alarm."""
+"""Tests that a row missing in one of the two files of layout `ini` is detected, without false alarms."""
 
 import re
 from pathlib import Path
@@ -15,21 +15,21 @@ from reskin.seeds import rng_for
 from tests.recordings.headers import DEFAULT_POLICY, make_header
 
 PUBLIC = ("artillery_AFG_board2_50_screw", "artillery_AFG_board1_50")
-AT_END_ROWS_N = 100  # a row lost nearer to either end may go undetected
-ROW_OFF_MAX = 15  # tolerance of the reported row; at most 5 in 60 public cases
+AT_END_ROWS_N = 100  # a lost row less than this many rows from the start or the end may remain undetected
+ROW_OFF_MAX = 15  # tolerance of the reported row number; in 60 cases of public recordings, it is off by at most 5
 LATE_N = 1
 
 
 def synthetic_recording(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Return fields and labels like those of a printer and a gauge: |dB| 70 uT, noise 25 uT, drift, one row late."""
+    """Return synthetic fields (|dB| 70 uT, noise 25 uT, drift, one row late) and labels of a printer with a gauge."""
     rng = rng_for(seed, "lateness")
     places_mm = np.stack(np.meshgrid(np.arange(2, 19, 4.0), np.arange(2, 19, 4.0)), axis=-1).reshape(-1, 2)
-    presses_n = rng.integers(3, 8, len(places_mm))  # at each place: one off the skin, then deeper and deeper
+    presses_n = rng.integers(3, 8, len(places_mm))  # rows per place: the first without contact, then deeper and deeper
     of_place = np.repeat(np.arange(len(places_mm)), presses_n)
     step = np.concatenate([np.arange(n) for n in presses_n])
     force_N = np.where(step == 0, 0.0, 0.4 * step)
     label = np.column_stack([places_mm[of_place], force_N])
-    label[force_N == 0, :2] = 10  # the recorder's label of rows without contact
+    label[force_N == 0, :2] = 10  # the recorder labels rows without contact with this place
     one_pass_uT = rng.normal(0, 18, (len(places_mm), 15))[of_place] * np.sqrt(force_N)[:, None]
     label, b_uT = (np.tile(one, (passes_n, 1))[: 100 * passes_n] for one in (label, one_pass_uT))
     drift_uT = np.linspace(0, 60, len(label))[:, None]
@@ -38,7 +38,7 @@ def synthetic_recording(seed: int = 0, passes_n: int = 12) -> tuple[np.ndarray, 
 
 
 def without_row(values: np.ndarray, row: int) -> np.ndarray:
-    """Delete a row and repeat the last one, so that the length stays."""
+    """Delete a row, and repeat the last row to keep the number of rows."""
     return np.concatenate([np.delete(values, row, axis=0), values[-1:]])
 
 
@@ -48,7 +48,7 @@ def change_of(b_uT: np.ndarray, label: np.ndarray):
 
 @settings(max_examples=25)
 @given(st.integers(AT_END_ROWS_N, 1200 - AT_END_ROWS_N), st.booleans(), st.integers(0, 5))
-def test_lost_row_is_found_in_either_file(row, in_fields, seed):
+def test_missing_row_is_found_in_either_file(row, in_fields, seed):
     b_uT, label = synthetic_recording(seed)
     assert len(label) == 1200
     change = change_of(without_row(b_uT, row), label) if in_fields else change_of(b_uT, without_row(label, row))
@@ -74,10 +74,10 @@ def test_uninformative_fields_raise_no_alarm():
     assert change_of(b_uT, same_force) is None
 
 
-def test_ini_recording_with_lost_row_is_refused(tmp_path):
+def test_ini_recording_with_missing_row_is_refused(tmp_path):
     b_uT, label = synthetic_recording()
     chips = np.concatenate([without_row(b_uT, 700).reshape(-1, 5, 3), np.full((1200, 5, 1), 25.0)], axis=2)
-    # The reader checks that values are on the LSB grid of a chip.
+    # The reader checks that values are multiples of a chip's LSB.
     chips[..., :3] = np.round(chips[..., :3] / [0.15, 0.15, 0.242]) * [0.15, 0.15, 0.242] + [600, -900, 1452]
     np.savetxt(tmp_path / ini.READINGS, chips.reshape(1200, -1), fmt="%.3f")
     np.savetxt(tmp_path / ini.TRUTHS, label, fmt="%.3f")

@@ -1,4 +1,4 @@
-"""Tests that passes are found where a synthetic protocol repeats."""
+"""Tests that passes are found from the repetition of places in a recording."""
 
 import time
 from itertools import pairwise
@@ -12,7 +12,7 @@ from reskin.recordings.readers.alignment import find_passes
 
 
 def raster(columns_n: int, rows_n: int, presses_n: int) -> np.ndarray:
-    """Return one pass over a grid of 2 mm, with `presses_n` rows per place."""
+    """Return the places of one pass over a 2 mm grid, with `presses_n` rows per place."""
     places = [(2.0 * x, 2.0 * y) for x in range(columns_n) for y in range(rows_n)]
     return np.repeat(np.array(places), presses_n, axis=0)
 
@@ -22,7 +22,7 @@ grids = st.tuples(st.integers(2, 5), st.integers(2, 5), st.integers(1, 6))
 
 @settings(deadline=None)
 @given(grid=grids, passes_n=st.integers(2, 5))
-def test_raster_is_split_where_it_repeats(grid: tuple[int, int, int], passes_n: int) -> None:
+def test_passes_begin_where_the_raster_repeats(grid: tuple[int, int, int], passes_n: int) -> None:
     once = raster(*grid)
     place_mm = np.tile(once, (passes_n, 1))
     expected = np.repeat(np.arange(passes_n), len(once))
@@ -54,7 +54,7 @@ def test_last_pass_may_be_incomplete() -> None:
     assert np.bincount(find_passes(place_mm, np.ones(len(place_mm), bool))).tolist() == [18, 18, 13]
 
 
-def test_one_mislabelled_row_does_not_matter() -> None:
+def test_single_mislabelled_row_does_not_matter() -> None:
     place_mm = np.tile(raster(9, 9, 6), (5, 1))
     place_mm[700] = (-1.0, -1.0)
     assert find_passes(place_mm, np.ones(len(place_mm), bool)).max() == 4
@@ -70,7 +70,7 @@ def test_recording_without_contact_is_one_pass() -> None:
 
 
 def passes_naively(place_mm: np.ndarray, contact: np.ndarray) -> np.ndarray:
-    """Reference: try every shift."""
+    """Reference: try every period, and accept the first after which the places repeat."""
     rows_n = len(place_mm)
     touched = np.flatnonzero(contact).tolist()
     pairs = pairwise(touched)
@@ -101,5 +101,5 @@ def test_long_recording_without_repeats_is_fast() -> None:
     place_mm = seeds.rng_for(0, "never").random((20000, 2))
     begin_s = time.process_time()
     assert not find_passes(place_mm, np.ones(len(place_mm), bool)).any()
-    # Exhaustive search takes 17 s, this 0.1 to 0.3 s.
+    # The exhaustive search would take 17 s; `find_passes` takes 0.1 to 0.3 s.
     assert time.process_time() - begin_s < 5

@@ -1,4 +1,4 @@
-"""Tests of layout `table`: CSV and Parquet tables, unknown columns, and errors that name their line."""
+"""Tests of the reader of layout `table`: CSV and Parquet tables, unknown quantities, errors with line numbers."""
 
 import re
 from pathlib import Path
@@ -35,7 +35,7 @@ def table(presses_n: int = 6, noload_n: int = 3, contact_n: int = 4, seed: int =
 
 
 def write(folder: Path) -> Path:
-    """Write a capture folder with a complete table."""
+    """Write a capture folder with a table that has all columns."""
     table().to_csv(folder / plain.CSV, index=False)
     return folder
 
@@ -94,7 +94,7 @@ def test_indent_numbers_are_optional(tmp_path_factory, presses_n, noload_n, cont
     assert without.reading_i.tolist() == list(range(contact_n)) * presses_n
 
 
-def test_empty_template_columns_are_unknown(tmp_path):
+def test_empty_columns_are_unknown_quantities(tmp_path):
     rows = table().reindex(columns=plain.columns_of(CHIPS_N))
     readings, account = read(tmp_path, rows)
     assert np.isnan(readings.depth_mm).all()
@@ -123,9 +123,9 @@ def test_noload_places_may_be_empty(tmp_path):
 
 
 def test_constant_zero_depth_is_unknown(tmp_path):
-    still, account = read(tmp_path / "still", table().assign(depth_mm=0.0))
-    assert np.isnan(still.depth_mm).all()
-    assert account["no_depth_rows_n"] == len(still)
+    zero_depth, account = read(tmp_path / "still", table().assign(depth_mm=0.0))
+    assert np.isnan(zero_depth.depth_mm).all()
+    assert account["no_depth_rows_n"] == len(zero_depth)
     moving = table()
     moving["depth_mm"] = np.where(moving.phase == "contact", 0.5 + 0.1 * moving.x_mm, 0.0)
     found, account = read(tmp_path / "moving", moving)
@@ -193,7 +193,7 @@ def test_template_is_the_header_line(tmp_path):
         plain.read(capture, make_header(layout="table", chips_n=3), DEFAULT_POLICY)
 
 
-def test_passes_come_from_repeats_or_the_column(tmp_path):
+def test_passes_are_found_from_repeats_or_read_from_the_column(tmp_path):
     one = table(presses_n=9)
     three = pd.concat([one] * 3, ignore_index=True)
     found, account = read(tmp_path / "found", three)

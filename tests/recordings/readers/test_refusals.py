@@ -1,4 +1,4 @@
-"""Tests that every layout refuses invalid files: random bytes, no rows, truncated lines."""
+"""Tests that the reader of every layout raises an error for random bytes, files without rows, and truncated lines."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Tests of the checks of units, which refuse implausible values."""
+"""Tests of the unit checks, which raise an error for implausible values."""
 
 from typing import get_args
 
@@ -17,12 +17,12 @@ from reskin.schema import to_table
 from tests.recordings.headers import make_header
 
 SKIN_uT = np.array([[-541.2, 917.2, 44.9], [120.0, -3600.0, 700.0]])
-# LSB and usual field of real boards: ReSkin with its own skins, eFlesh, and eFlesh at another gain.
+# LSB and typical field (uT) of real boards: ReSkin with ReSkin skins, eFlesh, eFlesh at another gain.
 BOARDS_uT = {"ini": (0.15, 400.0), "lab": (0.2, 1500.0), "eflesh": (2.4, 9000.0), "eflesh shear": (0.6, 6000.0)}
 
 
 def fields_uT(step_uT: float, usual_uT: float, seed: int = 0) -> np.ndarray:
-    """Return 1000 noisy rows of five chips whose fields have about the size `usual_uT`."""
+    """Return 1000 noisy rows of five chips with fields of about `usual_uT`, rounded to multiples of `step_uT`."""
     rng = seeds.rng_for(seed, "fields")
     axes = rng.standard_normal((5, 3))
     rest_uT = usual_uT * axes / np.linalg.norm(axes, axis=1, keepdims=True)
@@ -48,15 +48,15 @@ def test_board_passes_in_microtesla_only(name: str, seed: int) -> None:
             check_fields(factor * b_uT, "here", first_line_n=1)
 
 
-def test_gauss_is_recognised_by_its_lsb_in_strong_fields() -> None:
+def test_strong_fields_in_gauss_are_recognised_by_the_lsb() -> None:
     with pytest.raises(CaptureError, match="0.15 to 9.68 uT; got steps of 0.024. Convert G to uT"):
         check_fields(1e-2 * fields_uT(*BOARDS_uT["eflesh"]), "here", first_line_n=1)
 
 
 @pytest.mark.parametrize("usual_uT", [30.0, 65.0, 3000.0])
-def test_fields_without_noise_or_grid_pass_from_earth_field_on(usual_uT: float) -> None:
-    still = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
-    check_fields(still, "here", first_line_n=1)
+def test_fields_without_lsb_pass_if_as_strong_as_the_earths_field(usual_uT: float) -> None:
+    constant = np.tile(fields_uT(0.15, usual_uT)[:1] * 0 + usual_uT / np.sqrt(3), (400, 1))
+    check_fields(constant, "here", first_line_n=1)
     smooth = usual_uT + seeds.rng_for(0, "smooth").standard_normal((400, 15))
     check_fields(smooth, "here", first_line_n=1)
     check_fields(smooth.round(2), "here", first_line_n=1)
@@ -94,7 +94,7 @@ def test_places_pass_in_millimetres_only(extent_mm: float, start_mm: float) -> N
     check_places(place_mm, "here")
     for factor in (1e-3, 1e3):
         if extent_mm * factor > 200 or 0.01 < extent_mm * factor < 1:
-            with pytest.raises(CaptureError, match="^here: places must be one, or spread over 1 to 200 mm"):
+            with pytest.raises(CaptureError, match="^here: places must be equal, or spread over 1 to 200 mm"):
                 check_places(factor * place_mm, "here")
 
 
@@ -106,7 +106,7 @@ def test_place_far_from_the_others_is_named_with_its_line() -> None:
         check_places(1e3 * place_mm[:20], "here")
 
 
-def test_one_place_passes_with_rounding() -> None:
+def test_single_place_with_rounding_errors_passes() -> None:
     check_places(np.array([[315.0, -100.0], [315.00003, -99.99999]]), "here")
     check_places(np.full((3, 2), np.nan), "here")
 
@@ -126,7 +126,7 @@ def test_depths_pass_in_millimetres_only(deepest_mm: float, accepted: bool) -> N
 @pytest.mark.parametrize(
     ("text", "message"), [("", "the file is empty"), ("1,2\n1,2.8", "last line has no line break")]
 )
-def test_cut_text_is_refused(tmp_path, text: str, message: str) -> None:
+def test_truncated_text_is_refused(tmp_path, text: str, message: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(CaptureError, match=message):
         read_cells(tmp_path / "a.csv", "a.csv", separator=",")
