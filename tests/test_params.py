@@ -93,7 +93,7 @@ def test_missing_required_experiment_is_an_error(experiment, others):
         ({"test_n": 2}, "test_n must be at most every_n"),
         ({"regular_n": 5}, "regular_n is required if policies contains regular, and not allowed otherwise"),
         ({"policies": ["regular"]}, "regular_n is required if policies contains regular, and not allowed otherwise"),
-        ({"policies": ["each", "each"]}, "policies must name each policy only once"),
+        ({"policies": ["each", "each"]}, "policies contains a policy more than once"),
     ],
 )
 def test_contradictory_drift_windows_are_an_error(changes, message):

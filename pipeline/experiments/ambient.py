@@ -1,7 +1,8 @@
 """Ambient fields and nearby iron that appear after the no-load reading (paper section 7, future work).
 
 Measures how much these disturbances degrade the scores on held-out boards, and how much of the loss is recovered by
-subtracting the reading of a reference chip, or the common part of the readings of the board's own chips.
+two methods. One subtracts the reading of a separate reference chip. The other subtracts the common part: the uniform
+field that best fits the readings of all chips of the board.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,18 +35,19 @@ from reskin.physics.skin import Skin, draw_skin
 from reskin.seeds import rng_for
 from reskin.simulation.settings import SimulationSettings
 
-# From the board's middle to the reference chip, along x; assumed too far away to sense a poke.
+# Distance of the reference chip from the board's middle, along x; assumed too large for the chip to sense a poke.
 REFERENCE_ASIDE_MM = 30.0
 AS_IT_IS, ASIDE, OWN = "as it is", "reference chip subtracted", "own chips' common part subtracted"
 
-Networks = Mapping[str, Sequence[Network]]  # by method
+Networks = Mapping[str, Sequence[Network]]  # networks by method of subtraction: AS_IT_IS, ASIDE, OWN
 
 
 class Iron(Strict):
     """A ball of soft iron directly above the middle of the skin."""
 
     radius_mm: Annotated[float, Field(gt=0, le=100)]
-    distances_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]  # from the skin's top
+    # Distances from the top of the skin to the surface of the ball.
+    distances_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
 
 
 class Ambient(Strict):
@@ -58,7 +60,8 @@ class Ambient(Strict):
 def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Path, models: Path, results: Path) -> None:
     """Score the networks of every held-out board in ambient fields.
 
-    For the last board, networks are also trained on inputs without their common part.
+    For the last board, networks are also trained on inputs from which the common part of all chips has been subtracted
+    (`remove_common_part`).
     """
     data = read_data(settings, indentations, folds)
     synthesis, seed = simulation_settings(data.settings), data.settings.seed
@@ -98,22 +101,24 @@ def ambient(settings: Settings, section: Ambient, folds: Path, indentations: Pat
 
 @dataclass(frozen=True)
 class Instrument:
-    """A board and a separate reference chip as manufactured, and the chip rotations of the design.
+    """A board (`board`) and a separate reference chip (`aside`), both with their manufacturing errors.
 
-    Only the design is known to the methods that subtract a field.
+    `turn` are the rotations of the board's chips by design, without manufacturing errors. The methods that subtract a
+    field know only these.
     """
 
     board: Board
     aside: Board
     turn: Float[np.ndarray, "k 3 3"]
-    noise_uT: Float[np.ndarray, " 3"]  # of a change of field of the reference chip
+    noise_uT: Float[np.ndarray, " 3"]  # standard deviation of the reference chip's change of field, per axis
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One ambient field: its strength or distance, the field added to each row, and the field subtracted from each row.
+    """One ambient field; `added_uT` is the change of each input row that the field causes.
 
-    The subtracted field is estimated from the reading of the reference chip.
+    `reference_uT` is the estimate of this change from the reading of the reference chip. `keys` contains the field's
+    strength, or the distance of the ball of iron and the rms fields that it causes.
     """
 
     keys: Mapping[str, float]
@@ -124,7 +129,10 @@ class Disturbance:
 def train_without_common_part(
     data: SceneData, fold: Fold, training: Training, instrument: Instrument
 ) -> tuple[list[Network], dict[str, int]]:
-    """Train the headline recipe on inputs without their common part; also count collapsed training runs."""
+    """Train the headline recipe on inputs without the common part of all chips.
+
+    Returns the networks, and the numbers of networks trained and collapsed (`pipeline.statistics.tally`).
+    """
     projected_uT = project(data.rows.db_uT, remove_common_part(instrument.turn))
     headline = training.model_copy(update={"recipes": {HEADLINE: training.recipes[HEADLINE]}})
     jobs = make_jobs(data, headline, [fold], experiment="ambient")
@@ -144,7 +152,10 @@ def score_board(
     instrument: Instrument,
     networks: Networks,
 ) -> Iterator[dict[str, Any]]:
-    """Score every network of every method in every field, on one reading of each held-out poke of the board."""
+    """Yield the scores of every network of every method in every ambient field, on the held-out board of `fold`.
+
+    The networks are tested on one reading, drawn at random, of each poke of the board.
+    """
     rows, seed = data.rows, data.settings.seed
     test = one_row_per_poke(rows.indentation, fold.test, rng_for(seed, "ambient", fold.name, "pokes"))
     db_uT, true = rows.db_uT[test], rows.target[test]
@@ -169,18 +180,22 @@ def score_board(
 
 
 def one_row_per_poke(
-    indentation: Int64[np.ndarray, " f"], own: Int64[np.ndarray, " a"], rng: np.random.Generator
+    indentation: Int64[np.ndarray, " f"], candidates: Int64[np.ndarray, " a"], rng: np.random.Generator
 ) -> Int64[np.ndarray, " b"]:
-    """Draw one row of every indentation at random."""
-    shuffled = rng.permutation(own)
+    """Draw one row at random from each indentation; `candidates` are the row numbers to draw from.
+
+    `indentation` has one element for every row of the scene. The result is sorted.
+    """
+    shuffled = rng.permutation(candidates)
     return np.sort(shuffled[np.unique(indentation[shuffled], return_index=True)[1]])
 
 
 def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequence[str]) -> list[dict[str, Any]]:
-    """Summarise scores over boards: one row per value of `axis`, with each method that was tested on these boards.
+    """Summarise scores over `boards`: one row per value of `axis`, with one entry per method tested on these boards.
 
-    Each point contains the scores of one network. `sd_seeds` is the standard deviation over the networks of one board,
-    averaged over boards.
+    Each element of `points` contains the scores of one network in one ambient field; `axis` is `field_uT` or
+    `distance_mm`. In the result, `sd_seeds` is the standard deviation over the networks of one board, averaged over
+    boards.
     """
     selected = [point for point in points if axis in point and point["board"] in boards]
     rows = []
@@ -191,16 +206,16 @@ def scores_by_field(points: Sequence[dict[str, Any]], axis: str, boards: Sequenc
             if size in at_value[0]:
                 row[name] = float(np.sqrt(np.mean([point[size] ** 2 for point in at_value])))
         for method in dict.fromkeys(point["arm"] for point in at_value):
-            own = pd.DataFrame(
+            scores = pd.DataFrame(
                 [{"board": point["board"], **point["scores"]} for point in at_value if point["arm"] == method]
             )
-            row[method] = add_seed_sd(summarise(own.groupby("board").mean(), boards=True), own, "board")
+            row[method] = add_seed_sd(summarise(scores.groupby("board").mean(), boards=True), scores, "board")
         rows.append(row)
     return rows
 
 
 def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
-    """Return the root mean square of the fields' magnitudes."""
+    """Return the root mean square, in uT, of the magnitudes of field vectors in tesla."""
     return float(np.sqrt((b_T**2).sum(axis=-1).mean())) / micro
 
 
@@ -208,7 +223,10 @@ def rms_uT(b_T: Float[np.ndarray, "*f 3"]) -> float:
 
 
 def draw_instrument(simulation: SimulationSettings, name: str, *, seed: int) -> Instrument:
-    """Draw the board of this name as in its captures, and a reference chip with equally large manufacturing errors."""
+    """Draw the same board as in the captures of board `name`, and a reference chip with manufacturing errors.
+
+    The errors of the reference chip have the same distribution as those of the board's chips.
+    """
     design, rig, chip = simulation.main_boards.design, simulation.rig, simulation.chip
     lone = BoardDesign(chips_xy_mm=((REFERENCE_ASIDE_MM, 0.0),), chips_turn_deg=(0.0,), gap_mm=design.gap_mm)
     noise = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
@@ -221,7 +239,7 @@ def draw_instrument(simulation: SimulationSettings, name: str, *, seed: int) -> 
 
 
 def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarray, "f ch"]:
-    """Return the noiseless change of a board's readings that a field in tesla at its chips causes."""
+    """Return the change of a board's readings, without noise, for the fields `b_T` added at the board's chips."""
     to_chip = board.sensitivity @ board.turn.transpose(0, 2, 1)
     return np.einsum("kij,fkj->fki", to_chip, b_T).reshape(len(b_T), -1) / micro
 
@@ -229,7 +247,11 @@ def readings_uT(board: Board, b_T: Float[np.ndarray, "f k 3"]) -> Float[np.ndarr
 def reference_uT(
     instrument: Instrument, aside_T: Float[np.ndarray, "f 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "f ch"]:
-    """Return the field to subtract: the noisy reading of the reference chip, in each chip's axes by the design."""
+    """Return the estimated change of the board's readings, from a noisy reading of the reference chip.
+
+    `aside_T` is the ambient field at the reference chip. The reading of the reference chip is rotated into the axes
+    that each chip of the board has by design.
+    """
     read_uT = readings_uT(instrument.aside, aside_T[:, None]) + instrument.noise_uT * rng.standard_normal(
         (len(aside_T), 3)
     )
@@ -237,20 +259,26 @@ def reference_uT(
 
 
 def remove_common_part(turn: Float[np.ndarray, "k 3 3"]) -> Float[np.ndarray, "ch ch"]:
-    """Return the matrix that removes the least-squares uniform field from a reading, given the design's rotations."""
+    """Return the projection matrix that subtracts, from a reading, the uniform field that fits it best (least squares).
+
+    `turn` are the rotations of the chips by design.
+    """
     uniform = turn.transpose(0, 2, 1).reshape(-1, 3)  # readings of unit fields along x, y, z
     return np.eye(len(uniform)) - uniform @ np.linalg.pinv(uniform)
 
 
 def project(db_uT: Float32[np.ndarray, "f ch"], matrix: Float[np.ndarray, "ch ch"]) -> Float32[np.ndarray, "f ch"]:
-    """Apply a matrix to every change of field."""
+    """Multiply each row of `db_uT` by `matrix`."""
     return (db_uT @ matrix.T).astype(np.float32)
 
 
 def uniform_fields(
     instrument: Instrument, fields_uT: Sequence[float], *, rows_n: int, rng: np.random.Generator
 ) -> Iterator[Disturbance]:
-    """Yield a zero field, then uniform fields; each row has a random direction, the same at all strengths."""
+    """Yield the disturbances by a zero field and by uniform fields of the given strengths, in increasing order.
+
+    Each row has a random direction of the field, which is the same for all strengths.
+    """
     along = random_directions(rows_n, rng)
     for field_uT in sorted({0.0, *fields_uT}):
         b_T = field_uT * micro * along
@@ -266,7 +294,10 @@ def iron_balls(
     *,
     rng: np.random.Generator,
 ) -> Iterator[Disturbance]:
-    """Yield the disturbance by a ball at each distance above the skins; `skin_i` is the index of each row's skin."""
+    """Yield the disturbance by a ball of iron above the skin, for each of its distances in increasing order.
+
+    `skin_i` contains, for each row, the index of its skin in `skins`.
+    """
     for distance_mm in sorted(iron.distances_mm):
         fields_T = [iron_fields(instrument, skin, radius_mm=iron.radius_mm, distance_mm=distance_mm) for skin in skins]
         chips_T, aside_T = np.stack([chips for chips, _ in fields_T]), np.concatenate([aside for _, aside in fields_T])
@@ -278,9 +309,10 @@ def iron_balls(
 def iron_fields(
     instrument: Instrument, skin: Skin, *, radius_mm: float, distance_mm: float
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "1 3"]]:
-    """Return the field in tesla that a ball directly above the skin's middle adds at the chips and the reference chip.
+    """Return the field in tesla that a ball of iron adds at the board's chips, and at the reference chip.
 
-    The ball is magnetised by the earth and the skin at rest; `distance_mm` is from the skin's top to its surface.
+    The ball is directly above the skin's middle; `distance_mm` is the distance from the top of the skin to the ball's
+    surface. The ball is magnetised by the earth's field and by the field of the undeformed skin.
     """
     above_m = skin.thickness_m + (distance_mm + radius_mm) * milli
     centre_m = np.append(skin.seat_m, above_m)
@@ -295,21 +327,22 @@ def iron_fields(
 COLUMNS = {
     "accuracy_pct": ("accuracy, %", 1), "mse_xy_mm2": ("MSE_xy, mm²", 2), "mse_f_N2": ("MSE_F, N²", 3),
 }  # fmt: skip
-DASHES = ("-", "--", "-.")  # lines coincide if a method recovers nothing
+DASHES = ("-", "--", "-.")  # distinguishes the lines of methods that have equal accuracy
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the scores of every method in every field.
 
-    Rows are over all held-out boards, or for the last board alone, which has networks of all methods.
+    There are rows for the mean over all held-out boards, and rows for the last board alone. Only the last board has
+    networks of all methods.
     """
     last = numbers["last_board"]
-    parts = (("all held out", numbers), (str(last["board"]), last))
+    summaries = (("all held out", numbers), (str(last["board"]), last))
     rows = [
         {"field": field, "boards": boards, "method": method} | _scores(row[method]) | {"source": source}
-        for boards, part in parts
+        for boards, summary in summaries
         for kind in ("uniform", "iron")
-        for row in part[kind]
+        for row in summary[kind]
         for field in [_field(kind, row)]
         for method in numbers["arms"]
         if method in row and (boards == last["board"] or row[method]["mse_xy_mm2"]["n"] == numbers["boards_n"])
@@ -329,7 +362,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw accuracy against the strength of a uniform field and the distance of the iron, on the last board."""
+    """Plot accuracy on the last board, against the strength of a uniform field and against the distance of the iron."""
     last, methods = numbers["last_board"], list(numbers["arms"])
     with drawing(7.8, 4.6) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
@@ -353,8 +386,8 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 def _draw(axes: Any, rows: Sequence[Mapping[str, Any]], axis: str, methods: Sequence[str]) -> None:
     for i, method in enumerate(methods):
-        shown = [(row[axis], row[method]["accuracy_pct"]["mean"]) for row in rows]
-        axes.plot(*zip(*shown, strict=True), color=COLOURS[i], marker=MARKERS[i], linestyle=DASHES[i], label=method)
+        points = [(row[axis], row[method]["accuracy_pct"]["mean"]) for row in rows]
+        axes.plot(*zip(*points, strict=True), color=COLOURS[i], marker=MARKERS[i], linestyle=DASHES[i], label=method)
     axes.grid(alpha=0.25)
 
 

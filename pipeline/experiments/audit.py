@@ -1,7 +1,8 @@
 """Audit: check that no information about test rows leaked into training.
 
-Checks folds, copied captures, scalers, adaptation and settings. A leak fails the stage. Known leaks (the paper's own
-protocol) and collapsed networks are reported in the results.
+Checks the folds, whether captures are copies of other captures, the scalers, the adaptation data and the settings. A
+leak fails the stage. Leaks that the paper's own protocol implies, and collapsed networks, are reported in the results
+and do not fail the stage.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,16 +30,17 @@ COLLAPSE = "collapse"
 
 
 class AuditSettings(Strict):
-    """Settings section `audit`: whether training settings were chosen by a study on other boards, or for speed."""
+    """Settings section `audit`: whether training settings were chosen by a study on other boards, or set for speed."""
 
     settings: Literal["chosen", "for speed"]
 
 
 @dataclass(frozen=True)
 class Check:
-    """A rule that separates training from testing, and what was found.
+    """The result of one check: the rule, what was found, and whether the rule holds.
 
-    `known` marks a violation that is reported in the results and does not fail the stage.
+    `what` names the rule, `where` the fold or the network. With `known`, a violation is reported in the results and
+    does not fail the stage.
     """
 
     what: str
@@ -88,9 +90,10 @@ def audit(
 
 # --- Folds ---
 
-SKINS_UNSEEN = ("lobo", "sensors", "labels", "transfer")
-SKIN_SHARED = ("single_temporal", "single_indentation", "single_pass")
-PAPERS_SPLIT = "single_random"  # readings of one indentation on both sides, as in the paper's section 4
+SKINS_UNSEEN = ("lobo", "sensors", "labels", "transfer")  # experiments that test on skins without training rows
+SKIN_SHARED = ("single_temporal", "single_indentation", "single_pass")  # experiments that train and test on one skin
+# The experiment that splits the readings of an indentation between training and test, as the paper does in section 4.
+PAPERS_SPLIT = "single_random"
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ class Labels:
 def audit_fold(
     sides: Sides, labels: Labels, *, db_uT: Float[np.ndarray, "f ch"], rng: np.random.Generator
 ) -> list[Check]:
-    """Check that no test row, and no copy of one, was used for training or adaptation.
+    """Check that neither the test rows of a fold nor copies of them were used for training or adaptation.
 
     >>> skin = np.array(["s1", "s1", "s2"])
     >>> labels = Labels(np.array(["b1", "b1", "b2"]), skin, np.array([0, 0, 1]), capture=skin)
@@ -169,15 +172,18 @@ def _check_readings(sides: Sides) -> Check:
 
 
 def _check_disjoint(what: str, label: np.ndarray, sides: Sides, *, rule: str = "apart", known: bool = False) -> Check:
-    """Check that no label is on both sides; with `known`, shared labels count as a known leak."""
-    own = np.unique(label[sides.test])
-    shared = own[np.isin(own, np.unique(label[sides.train]))]
-    found = f"{len(shared)} of {len(own)} on both sides{_first_names(shared)}"
+    """Check that training rows and test rows have no value of `label` in common.
+
+    With `known`, common values are reported as a known leak.
+    """
+    tested = np.unique(label[sides.test])
+    shared = tested[np.isin(tested, np.unique(label[sides.train]))]
+    found = f"{len(shared)} of {len(tested)} on both sides{_first_names(shared)}"
     return Check(what, sides.where, rule, found, holds=len(shared) == 0, known=known and len(shared) > 0)
 
 
 def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.random.Generator) -> Check:
-    """Check that no test capture is a copy of a training skin under another name."""
+    """Check that no test capture is a copy of a training skin's captures under another name."""
     test, train = (
         strong_indentations(name[side], labels.indentation[side], db_uT[side])
         for name, side in ((labels.capture, sides.test), (labels.skin, sides.train))
@@ -198,7 +204,7 @@ def _check_copies(sides: Sides, labels: Labels, db_uT: np.ndarray, rng: np.rando
 
 
 def _check_pool(sides: Sides, labels: Labels) -> list[Check]:
-    """Check that the unlabelled pokes are of held-out skins, and that none of them is a test indentation."""
+    """Check that the unlabelled pokes for adaptation are of held-out skins, and that none is a test indentation."""
     pokes, tested = (np.unique(labels.indentation[side]) for side in (sides.pool, sides.test))
     shared = pokes[np.isin(pokes, tested)]
     skins = np.unique(labels.skin[sides.pool])
@@ -212,7 +218,7 @@ def _check_pool(sides: Sides, labels: Labels) -> list[Check]:
 
 
 def _first_names(names: np.ndarray) -> str:
-    """List the first few names."""
+    """Format the first three names for the end of a message; return an empty string if there are no names."""
     if len(names) == 0:
         return ""
     return f": {', '.join(map(str, names[:3]))}{', ...' if len(names) > 3 else ''}"
@@ -223,23 +229,27 @@ def _first_names(names: np.ndarray) -> str:
 # Standard deviation of one reading on a chip's x, y and z axes; the lab's recordings have 3.0-3.3 uT on x and y, and
 # 4.4-5.0 uT on z.
 NOISE_uT = np.array([3.3, 3.3, 5.0])
-STRONG_NOISES = 10.0  # least |dB|, in units of a reading's noise; below this, noise dominates the direction
-# Largest distance between a copy and its original, in units of a reading's noise. Two readings of one state differ by
-# 1.4 units (22 uT over 15 channels); a copy with 5 uT added to each channel differs by 1.3 units.
+# Smallest |dB| of the indentations compared, in units of a reading's noise: noise dominates the direction of weaker dB.
+STRONG_NOISES = 10.0
+# Largest distance between a copy and its original, in units of a reading's noise. Two readings of the same contact
+# differ by 1.4 units (22 uT over 15 channels); a copy with 5 uT added to each channel differs by 1.3 units.
 COPY_DISTANCE_NOISES = 2.0
-FACTOR_TOLERANCE = 0.1  # relative; a copy has one factor, while factors of genuine indentations differ with their depth
-# Measured fractions of similar indentations: 0 % between four recorded skins, at most 11 % between independent
-# simulated skins (60 skins, 4 draws); at least 55 % in a copy with up to 8 uT added to single readings, and 42 % in a
-# copy with 5 % random gain per channel.
+# Relative tolerance of the ratio |dB of a copy| / |dB of its original|. In a copied capture, all indentations have the
+# same ratio; between different skins, the ratio varies with the depth of the indentation.
+FACTOR_TOLERANCE = 0.1
+# Fraction of a capture's indentations that look copied, from which on the capture counts as a copy. Measured: 0 %
+# between four recorded skins, at most 11 % between independent simulated skins (60 skins, 4 random draws), at least
+# 55 % in a copy with up to 8 uT added to single readings, and 42 % in a copy with 5 % random gain per channel.
 COPIED_SHARE_MAX = 0.3
-PAIRS_MAX_N = 100_000_000  # pairs of indentations compared per fold, in at most a second; SAMPLE_MIN_N may require more
+# Pairs of indentations compared per fold, which takes at most a second; exceeded where SAMPLE_MIN_N requires it.
+PAIRS_MAX_N = 100_000_000
 SAMPLE_MIN_N = 100  # indentations sampled from each capture
-CHUNK_PAIRS_N = 4_000_000  # pairs compared at once: 16 MB
+CHUNK_PAIRS_N = 4_000_000  # pairs compared at once, in 16 MB of memory
 
 
 @dataclass(frozen=True)
 class MeanFields:
-    """The mean dB of each indentation with a field well above the noise, and the name of its capture or skin."""
+    """Mean dB of the indentations whose |dB| is well above the noise, each with the name of its capture or skin."""
 
     name: np.ndarray
     db_uT: Float32[np.ndarray, "n ch"]
@@ -258,7 +268,7 @@ class Likeness:
 def strong_indentations(
     name: np.ndarray, indentation: Int[np.ndarray, " f"], db_uT: Float[np.ndarray, "f ch"]
 ) -> MeanFields:
-    """Average the readings of each indentation, and keep those whose |dB| is above ten times a reading's noise."""
+    """Average the readings of each indentation; return the means whose |dB| exceeds ten times a reading's noise."""
     _, first, group = np.unique(indentation, return_index=True, return_inverse=True)
     sums = np.stack([np.bincount(group, weights=channel) for channel in db_uT.T], axis=1)
     mean_uT = (sums / np.bincount(group)[:, None]).astype(np.float32)
@@ -267,31 +277,34 @@ def strong_indentations(
 
 
 def noise_uT(ch_n: int) -> float:
-    """Return the norm of one reading's noise over all channels."""
+    """Return the norm, over `ch_n` channels, of the noise of one reading."""
     return float(np.sqrt(ch_n / len(NOISE_uT) * (NOISE_uT**2).sum()))
 
 
 def most_alike(test: MeanFields, train: MeanFields, *, rng: np.random.Generator) -> list[Likeness]:
-    """Find the training skin most like each test capture.
+    """Find, for each test capture, the training skin that most of its indentations look copied from.
 
-    A random sample of the capture's indentations is compared with all indentations of every skin.
+    A random sample of the capture's indentations is compared with all indentations of every training skin.
     """
     captures = np.unique(test.name)
     sample_n = max(SAMPLE_MIN_N, PAIRS_MAX_N // len(train.name) // len(captures))
     likenesses = []
     for capture in captures:
-        own_uT = test.db_uT[test.name == capture]
-        own_uT = own_uT[rng.permutation(len(own_uT))[:sample_n]]
-        shares = _copied_shares(own_uT, train)
+        db_uT = test.db_uT[test.name == capture]
+        sample_uT = db_uT[rng.permutation(len(db_uT))[:sample_n]]
+        shares = _copied_shares(sample_uT, train)
         closest_skin = max(shares, key=lambda skin: shares[skin])
-        likenesses.append(Likeness(str(capture), closest_skin, shares[closest_skin], len(own_uT)))
+        likenesses.append(Likeness(str(capture), closest_skin, shares[closest_skin], len(sample_uT)))
     return likenesses
 
 
 def nearest_rays(
     db_uT: Float32[np.ndarray, "n ch"], others_uT: Float32[np.ndarray, "m ch"]
 ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Find, for each row of `db_uT`, the row of `others_uT` nearest in direction, and the distance in uT to its ray."""
+    """Find, for each row of `db_uT`, the index of the row of `others_uT` that is nearest in direction.
+
+    The second result is the distance in uT from the row to the line through the origin in that direction.
+    """
     rays = others_uT / np.linalg.norm(others_uT, axis=1, keepdims=True)
     rows_n = max(1, CHUNK_PAIRS_N // len(rays))
     chunks = [db_uT[i : i + rows_n] for i in range(0, len(db_uT), rows_n)]
@@ -301,33 +314,35 @@ def nearest_rays(
     return nearest, np.linalg.norm(db_uT - along_uT * ray, axis=1)
 
 
-def _copied_shares(own_uT: Float32[np.ndarray, "n ch"], train: MeanFields) -> dict[str, float]:
-    nearest, off_uT = nearest_rays(own_uT, train.db_uT)
-    similar = off_uT < COPY_DISTANCE_NOISES * noise_uT(own_uT.shape[1])
-    factor = np.linalg.norm(own_uT, axis=1) / np.linalg.norm(train.db_uT[nearest], axis=1)
+def _copied_shares(sample_uT: Float32[np.ndarray, "n ch"], train: MeanFields) -> dict[str, float]:
+    """Return, for each training skin, the fraction of a capture's indentations that look copied from this skin."""
+    nearest, off_uT = nearest_rays(sample_uT, train.db_uT)
+    similar = off_uT < COPY_DISTANCE_NOISES * noise_uT(sample_uT.shape[1])
+    factor = np.linalg.norm(sample_uT, axis=1) / np.linalg.norm(train.db_uT[nearest], axis=1)
     shares = {}
     for skin in np.unique(train.name):
         factors = factor[similar & (train.name[nearest] == skin)]
         copied = np.abs(factors / np.median(factors) - 1) < FACTOR_TOLERANCE if len(factors) else factors
-        shares[str(skin)] = float(copied.sum() / len(own_uT))
+        shares[str(skin)] = float(copied.sum() / len(sample_uT))
     return shares
 
 
 # --- Networks ---
 
-# The same rows give the same scaler except for the order of float64 sums, which changes a float32 by its last bit at
-# most; 4 such bits are 5e-7. One foreign row in 100,000 moves a mean by about 1e-5 of its standard deviation.
+# Largest relative difference between two scalers fitted to the same rows: 4 float32 roundings, or 5e-7. The order of
+# float64 sums may differ, which changes a float32 result by at most one rounding. In comparison, one additional row
+# among 100,000 moves a column's mean by about 1e-5 of the column's standard deviation.
 SCALER_TOLERANCE = 4 * float(np.finfo(np.float32).eps)
 
 Arrays = Mapping[str, np.ndarray]
-Fits = dict[tuple[str, str, str, str, int], Arrays]  # by fold, view, scaling and number of rows
+Fits = dict[tuple[str, str, str, str, int], Arrays]  # scaler arrays by experiment, fold, view, scaling and row count
 
 
 def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: Path) -> Iterator[Check]:
-    """Check the scaler of every network, whether it collapsed, and the data it was adapted with."""
+    """Check, for every network, which rows its scaler was fitted to, whether it collapsed, and how it was adapted."""
     views = {name: view(data.rows.db_uT) for name, view in VIEW.items()}
     fits: Fits = {}
-    keys: dict[tuple[str, int], set[str]] = {}  # keys of the networks that may be adapted, by fold and seed
+    keys: dict[tuple[str, int], set[str]] = {}  # by fold and seed: keys of the pretrained networks that may be adapted
     for variant in data.settings.models:
         cards = {file: io.read_json(file) for file in sorted((models / variant).glob("*.json"))}
         yield audit_collapse(variant, list(cards.values()))
@@ -350,7 +365,8 @@ def model_checks(data: SceneData, sides: dict[tuple[str, str], Sides], models: P
 
 
 def _fit_once(fits: Fits, key: tuple[str, str, str, str], db_uT: np.ndarray, target: np.ndarray) -> Arrays:
-    fit_key = (*key, len(db_uT))  # the number of rows distinguishes the training rows from both sides together
+    """Fit a scaler, or return the cached arrays of the same fit."""
+    fit_key = (*key, len(db_uT))  # the row count distinguishes training rows from training and test rows
     if fit_key not in fits:
         fits[fit_key] = FIT[key[-1]](db_uT, target).arrays()
     return fits[fit_key]
@@ -365,7 +381,7 @@ def audit_scaler(
     sides: Sides,
     fit: Callable[[np.ndarray, np.ndarray], Arrays],
 ) -> Check:
-    """Check that a model's scaler was fitted to its training rows, and not to training and test rows together."""
+    """Check that a network's scaler was fitted to the training rows alone, and not to training and test rows."""
     both_sides = np.concatenate([sides.train, sides.test])
     train_gap, both_gap = (
         _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)
@@ -376,11 +392,14 @@ def audit_scaler(
 
 
 def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
-    """Return the largest difference relative to the fitted value (absolute where that is 0); NaN if any is NaN."""
+    """Return the largest relative difference between a network's scaler arrays and the fitted ones; NaN if any is NaN.
+
+    The difference is absolute where the fitted value is 0.
+    """
     gaps = []
     for name, value in fitted.items():
         if name not in arrays or arrays[name].shape != value.shape:
-            raise SchemaError(f"{where}: scaler array {name} of shape {value.shape} is missing. Train it again.")
+            raise SchemaError(f"{where}: scaler array {name} of shape {value.shape} is missing. Retrain this network.")
         size = np.where(value == 0, 1.0, np.abs(value))
         gaps.append(np.max(np.abs(arrays[name].astype(np.float64) - value) / size))
     return float(np.max(gaps))
@@ -389,13 +408,16 @@ def _relative_gap(where: str, arrays: Arrays, fitted: Arrays) -> float:
 def audit_tuning(
     where: str, tuning: Mapping[str, Any], *, bases: set[str], sides: Sides, indentation: Int[np.ndarray, " f"]
 ) -> list[Check]:
-    """Check section `tuning` of a model card; `bases` are the keys of the pretrained networks of its fold and seed."""
-    own = np.array(tuning["indentations"], np.int64)
-    tested = np.intersect1d(own, indentation[sides.test])
-    foreign = np.setdiff1d(own, indentation[sides.pool])
+    """Check section `tuning` of an adapted network's model card: the pretrained network, and the pokes adapted to.
+
+    `bases` are the keys of the pretrained networks that have the fold and seed of the adapted network.
+    """
+    adapted_to = np.array(tuning["indentations"], np.int64)
+    tested = np.intersect1d(adapted_to, indentation[sides.test])
+    foreign = np.setdiff1d(adapted_to, indentation[sides.pool])
     base_known = tuning["from"] in bases
     base = "one of this fold and seed" if base_known else "another"
-    pokes = f"{len(tested)} of {len(own)} are tested, {len(foreign)} are not of the pool"
+    pokes = f"{len(tested)} of {len(adapted_to)} are tested, {len(foreign)} are not of the pool"
     return [
         Check("base", where, "a network of its fold and seed", base, holds=base_known),
         Check("pokes", where, "of the pool, and none tested", pokes, holds=not len(tested) and not len(foreign)),
@@ -403,7 +425,7 @@ def audit_tuning(
 
 
 def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
-    """Count the networks of a variant that predict nearly the same for any input, and the repeated training runs."""
+    """Count the networks of a variant that collapsed (nearly constant predictions), and the repeated training runs."""
     collapsed = [
         f"{card['question']}.{card['recipe_name']}.{card['fold']}.seed{card['seed_i']}"
         for card in cards
@@ -420,11 +442,14 @@ def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
 
 # --- Settings ---
 
-SAME_AS = {"train_single": "train_multi"}  # networks of one skin and of many share a recipe
+SAME_AS = {"train_single": "train_multi"}  # variants that use the recipe that the study chose for another variant
 
 
 class Choice(Strict, extra="allow"):
-    """The record of a study of settings: its boards and skins, and the recipe chosen for each variant of models."""
+    """The record of the study that chose the training settings.
+
+    Contains the boards and skins of the study, and the recipe that it chose for each variant of the networks.
+    """
 
     scene: str
     source: str
@@ -436,7 +461,7 @@ class Choice(Strict, extra="allow"):
 
 
 def settings_checks(data: SceneData, choice: Path, models: Path) -> list[Check]:
-    """Compare the headline recipes that were trained with the record of the study."""
+    """Compare the headline recipes of the trained networks with those that the study of settings chose."""
     recipes = {variant: without_budget(_headline(models / variant)) for variant in data.settings.models}
     held_out = np.unique(np.concatenate([fold.test for fold in data.folds]))
     return audit_choice(
@@ -448,7 +473,7 @@ def settings_checks(data: SceneData, choice: Path, models: Path) -> list[Check]:
 
 
 def _headline(models: Path) -> dict[str, Any]:
-    """Read the settings of the headline recipe from the model cards of a stage."""
+    """Return the settings of the headline recipe, from the model cards in folder `models`."""
     cards = (io.read_json(file) for file in sorted(models.glob("*.json")))
     return settings_of(next(card for card in cards if card["recipe_name"] == HEADLINE))
 
@@ -463,9 +488,10 @@ def audit_choice(
     test_skins: Sequence[str],
     physics: str,
 ) -> list[Check]:
-    """Check that settings were chosen on other boards and skins, and report headline recipes that were not chosen.
+    """Check that the settings were chosen on boards and skins that are not tested here.
 
-    Simulated skins of another seed are different skins, whatever their names; recorded skins are identified by name.
+    Also reports headline recipes that differ from the chosen ones. Simulated skins of another seed are different skins
+    even if their names are equal; recorded skins are identified by name.
     """
     record = parse(Choice, dict(choice), "record of the study of settings")
     same_draw = record.source == source and (source == "recorded" or record.seed == seed)
@@ -482,7 +508,7 @@ def audit_choice(
 
 
 def audit_recipe(variant: str, recipe: Mapping[str, Any], record: Choice) -> Check:
-    """Report how a recipe differs from the chosen one; a difference is not a leak."""
+    """Report the differences between a recipe and the one that the study chose; a difference is not a leak."""
     rule = f"the recipe chosen on scene {record.scene}, or one that is stated here"
     studied = SAME_AS.get(variant, variant)
     chosen = record.chosen.get(studied)

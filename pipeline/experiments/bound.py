@@ -1,6 +1,7 @@
-"""Bound: smallest error that the chips' noise allows, compared with a network's scores (paper section 4).
+"""Smallest error that the noise of the chips allows, compared with a network's scores (paper section 4).
 
-Computes the Cramér-Rao bound for place and force estimated from one row of a simulated skin with known properties.
+Computes the Cramér-Rao bound of place and force, estimated from one input row. The skin is simulated, and its
+properties are assumed to be known.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,14 +33,14 @@ from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
 ROW_READINGS_N = 1  # readings in one input row of a network (dataset.rows)
-STEP_MM = 0.01  # of the finite differences; 0.002 to 0.05 mm give the same bound within 2 %
-NETWORK = "single_pass"  # the experiment that holds out all readings of the tested presses
+STEP_MM = 0.01  # step of the finite differences; steps from 0.002 to 0.05 mm give the same bound within 2 %
+NETWORK = "single_pass"  # training and test data never share readings of a press in this experiment
 
-Measure = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # of x, y and depth in mm
+Measure = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # x, y, depth in mm -> measured channels
 
 
 def bound(settings: Settings, models: Path, results: Path) -> None:
-    """Bound the errors of estimates from one row, and compare them with those of the paper's network."""
+    """Bound the errors of estimates from one input row, and compare them with the errors of the paper's network."""
     numbers = bound_errors(simulation_settings(settings), seed=settings.seed)
     write_results(results, numbers | {"network": score_network(models, numbers["skin"])}, {})
     overall = numbers["all"]["with_label_errors"]
@@ -50,9 +51,10 @@ def bound(settings: Settings, models: Path, results: Path) -> None:
 
 
 def bound_errors(simulation: SimulationSettings, *, seed: int) -> dict[str, Any]:
-    """Bound the errors at every place and depth of the main protocol, on its first skin.
+    """Return the bound of the errors on the first skin of the main protocol, averaged over places.
 
-    Pokes that do not reach the skin are excluded and counted.
+    There is one bound for each depth, and one over all depths. Pokes that do not reach the skin are excluded, and their
+    number is reported.
     """
     kind, (board_name, skin_name) = simulation.main_boards, list_captures(simulation, MAIN)[0]
     board = draw_board(kind.design, simulation.spreads, seed=seed, name=board_name)
@@ -80,26 +82,33 @@ def bound_errors(simulation: SimulationSettings, *, seed: int) -> dict[str, Any]
 
 
 def reach_skin(skin: Skin, depths_mm: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Mark commanded depths that indent the skin by more than the finite-difference step; raise if none does."""
+    """Return which commanded depths indent the skin by more than the finite-difference step `STEP_MM`.
+
+    Raises `ParamsError` if none of the depths does.
+    """
     touched = depths_mm - STEP_MM + skin.depth_zero_m / milli > 0
     if not touched.any():
         what = (
             f"its surface is {-skin.depth_zero_m / milli:.2g} mm below depth 0, and depths_mm are at most "
             f"{depths_mm.max():g}"
         )
-        raise ParamsError(f"skin {skin.name}: {what}. Poke deeper.")
+        raise ParamsError(f"skin {skin.name}: {what}. Increase depths_mm of the main protocol.")
     return touched
 
 
 def noise_var_uT2(chip: ChipDesign, chips_n: int, *, readings_n: int, noload_frames_n: int) -> Float[np.ndarray, " ch"]:
-    """Return the noise variance of one row's change of field: mean of its readings minus mean of its no-load frames."""
+    """Return the noise variance of each channel of an input row.
+
+    A row is the mean of `readings_n` readings minus the mean of `noload_frames_n` no-load readings.
+    """
     noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
-    frame_uT2 = noise_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12  # rounding is uniform because the noise exceeds a step
+    # Rounding errors are uniformly distributed, because the noise is larger than one step of the converter.
+    frame_uT2 = noise_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12
     return np.tile(frame_uT2 * (1 / readings_n + 1 / noload_frames_n), chips_n)
 
 
 def slopes(measure: Measure, pokes_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n ch 3"]:
-    """Differentiate a measurement with respect to x, y and depth, per mm, by central differences."""
+    """Return the derivatives of `measure` at each poke with respect to x, y and depth, per mm (central differences)."""
     steps_mm = STEP_MM * np.concatenate([np.eye(3), -np.eye(3)])
     values = measure((pokes_mm + steps_mm[:, None]).reshape(-1, 3)).reshape(2, 3, len(pokes_mm), -1)
     return np.moveaxis((values[0] - values[1]) / (2 * STEP_MM), 0, -1)
@@ -108,10 +117,10 @@ def slopes(measure: Measure, pokes_mm: Float[np.ndarray, "n 3"]) -> Float[np.nda
 def least_covariance(
     db_slopes: Float[np.ndarray, "n ch 3"], force_slopes: Float[np.ndarray, "n 3"], var_uT2: Float[np.ndarray, " ch"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """Bound the covariance of x, y (mm) and force (N) by the inverse of the Fisher information of x, y and depth.
+    """Return the Cramér-Rao bound on the covariance of x, y (mm) and force (N), for each poke.
 
-    Slopes are derivatives with respect to x, y and depth, in uT/mm and N/mm; `force_slopes` transform the bound from
-    depth to force.
+    The bound is the inverse Fisher information of x, y and depth, transformed from depth to force by `force_slopes`.
+    Both slopes are derivatives with respect to x, y and depth: of the field in uT/mm, and of the force in N/mm.
     """
     information = np.einsum("nci,c,ncj->nij", db_slopes, 1 / var_uT2, db_slopes)
     to_force = np.broadcast_to(np.eye(3), information.shape).copy()
@@ -122,7 +131,10 @@ def least_covariance(
 def expected_scores(
     covariance: Float[np.ndarray, "n 3 3"], *, place_sd_mm: float, force_sd_N: float
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the expected scores for normal errors with this covariance plus independent errors of the labels."""
+    """Return the expected scores of each poke if the errors of estimates are normally distributed.
+
+    The errors have the given covariance, plus independent errors of the labels with the given standard deviations.
+    """
     variance = np.diagonal(covariance, axis1=1, axis2=2) + np.array([place_sd_mm, place_sd_mm, force_sd_N]) ** 2
     correlation = covariance[:, 0, 1] / np.sqrt(variance[:, 0] * variance[:, 1])
     within = probability_within(ACCURACY_LIMIT_MM / np.sqrt(variance[:, :2]), correlation)
@@ -132,9 +144,10 @@ def expected_scores(
 def probability_within(
     limits: Float[np.ndarray, "n 2"], correlation: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
-    """Return P(|x| <= h, |y| <= k) for standard normal x and y with a correlation; `limits` are h and k, above 0.
+    """Return P(|x| <= h and |y| <= k) for standard normal x and y with a correlation; `limits` are h and k, above 0.
 
-    Adds up the four corners by Owen's function (Owen 1956, equation 2.1): exact, unlike integration by sampling.
+    The probabilities of the four outer corners are exact: they are computed with Owen's T function (Owen 1956,
+    equation 2.1).
     """
     h, k = limits.T
     outside = np.zeros(len(h))
@@ -147,7 +160,11 @@ def probability_within(
 def by_depth(
     depth_mm: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n 3 3"], labels: Mapping[str, float]
 ) -> dict[str, Any]:
-    """Average expected scores over places, by depth and over all depths, without and with errors of the labels."""
+    """Return expected scores averaged over places, for each depth and over all depths.
+
+    `signal` has the scores without errors of the labels, `with_label_errors` those with the standard deviations
+    `labels`.
+    """
     no_errors = dict.fromkeys(labels, 0.0)
     scores = {
         name: pd.DataFrame(expected_scores(covariance, **sds))
@@ -161,13 +178,16 @@ def by_depth(
 
 
 def score_network(models: Path, skin: str) -> dict[str, Any]:
-    """Summarise the scores of the paper's network on a skin over its folds; raise if it was trained on another skin."""
+    """Summarise, over folds, the scores of the paper's network on a skin.
+
+    Raises `SchemaError` if the networks were trained on another skin.
+    """
     cards = [io.read_json(file) for file in sorted(models.glob("*.json"))]
     cards = [card for card in cards if (card["question"], card["recipe_name"]) == (NETWORK, HEADLINE)]
     skins = sorted({name for card in cards for name in card["train_skins"]})
     if skins != [skin]:
         raise SchemaError(
-            f"{models}: the networks of {NETWORK} are trained on {skins}, not on {skin}. Train them again."
+            f"{models}: the networks of {NETWORK} were trained on skins {skins}, not on {skin}. Retrain them."
         )
     scores = over_folds(tidy(cards))
     return {metric: scores[metric] for metric in METRICS if metric in scores}
@@ -178,7 +198,7 @@ NONE = "–"
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the bound by depth, and over all depths together with the network, which has no score by depth."""
+    """Tabulate the bound by depth and over all depths. Only the row over all depths has the scores of the network."""
     lines = [_line(f"{row['depth_mm']:g}", row, {}, source) for row in numbers["by_depth"]]
     lines.append(_line("all", numbers["all"], numbers["network"], source))
     spread = "± is the standard deviation of the network's scores over n folds."

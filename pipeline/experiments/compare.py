@@ -1,9 +1,11 @@
-"""Compare recorded changes of field with simulated ones, poke by poke (ours; boards with known forces).
+"""Compare recorded changes of field with simulated ones, poke by poke, on boards with known forces (not in the paper).
 
 Each board is simulated in three ways: with the nominal skin, with a physical model (law) fitted to the board, and with
-the law of another board after fitting only the parameters that may differ between boards. Besides agreement, the
-experiment examines the friction under the tip, the fraction of a poke's change of field that remains in the next
-no-load reading (memory), and whether labels, chips and skin are oriented as the scene states.
+the law of another board after refitting only the parameters that may differ between boards. The experiment also
+examines:
+- the friction under the tip,
+- the memory: the fraction of a poke's change of field that remains in the next no-load reading,
+- whether labels, chips and skin are oriented as the scene's settings state.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -34,13 +36,14 @@ from reskin.seeds import rng_for
 from reskin.universal.law import SEVEN, START, TEN, AlignedPresses, Law, Setup, beyond_n, fit, nominal_uT, simulate_uT
 from reskin.universal.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, memory, pool
 
-ARROWS_N = 4  # places that the figure shows
-WALK_uT = 0.5  # random-walk step of the simulated no-load field from poke to poke, assumed
+ARROWS_N = 4  # places per board in the figure of arrows
+WALK_uT = 0.5  # assumed step of the random walk of the simulated no-load field, from one poke to the next
 NOLOAD_READINGS_N = 10
-CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve from the lightest touch to a firm press
-LIGHT_N = 1e-3
-EVERY = 5  # the curve uses every fifth place of a board
-# Friction under the tip limits the slide: k / mu in N/mm, from no limit (full slide at any force) to a slippery tip.
+CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against force, from a light touch to a firm press
+LIGHT_N = 1e-3  # force of a light touch
+PLACE_STRIDE = 5  # the curve is a median over every fifth place of a board
+# Values of k / mu in N/mm (spring constant of the skin's hold / friction coefficient under the tip). This ratio limits
+# how far a tip slides a skin: from no limit (full slide at any force) to a slippery tip.
 GRIPS_N_MM = (1e-6, 4.0, START.grip_N_mm, 18.0)
 
 Fields = Float[np.ndarray, "n k 3"]
@@ -52,8 +55,8 @@ class Compare(Strict):
 
     design: BoardDesign
     skin_mm: tuple[Side_mm, Side_mm]
-    skin_flipped: bool  # every field has the opposite sign, as for a checkerboard skin rotated by a quarter turn
-    labels_middle_mm: tuple[float, float]  # label of the place at the board's middle
+    skin_flipped: bool  # all magnetic poles are swapped, as in a checkerboard skin rotated by a quarter turn
+    labels_middle_mm: tuple[float, float]  # label (x, y) of the place at the board's middle
     labels_mirrored: bool  # the labels' y has the opposite sign of the board's y
     tip_radius_mm: Annotated[float, Field(gt=0, le=50)]
     # Fraction of a poke's change of field that remains in the next no-load reading; assumed.
@@ -61,7 +64,7 @@ class Compare(Strict):
 
 
 def compare(settings: Settings, section: Compare, indentations: Path, results: Path) -> None:
-    """Compare the recorded boards of a scene with simulated ones."""
+    """Compare the recorded changes of field of a scene's boards with simulated ones, and write the results."""
     design = settings.shared_section(SkinDesign, "skin")
     boards = pool_skins(read_captures(indentations, tuple(settings.captures_in(indentations))))
     write_results(results, *compare_boards(boards, section, design, settings.seed))
@@ -70,36 +73,40 @@ def compare(settings: Settings, section: Compare, indentations: Path, results: P
 def compare_boards(
     boards: Mapping[str, RecordedPresses], section: Compare, design: SkinDesign, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Compare every board; return the numbers, and the data for the figures."""
+    """Compare the recordings of every board with simulations; return the numbers, and the data for the figures."""
     setup = make_setup(section, design)
     aligned = {board: to_board_axes(pokes, section) for board, pokes in boards.items()}
-    fitted = {board: fit(own, setup, TEN) for board, own in aligned.items()}
+    fitted = {board: fit(presses, setup, TEN) for board, presses in aligned.items()}
     names = list(aligned)
     by_board, plot_data = {}, {}
-    for i, (board, own) in enumerate(aligned.items()):
+    for i, (board, aligned_presses) in enumerate(aligned.items()):
         laws, parameters = {"fitted": fitted[board]}, {"fitted": asdict(fitted[board])}
         if len(names) > 1:
             law_of = names[(i + 1) % len(names)]
-            laws["refitted"] = fit(own, setup, SEVEN, fitted[law_of])
+            laws["refitted"] = fit(aligned_presses, setup, SEVEN, fitted[law_of])
             parameters["refitted"] = asdict(laws["refitted"]) | {"law_of": law_of}
-        simulated_uT = {name: simulate_uT(law, setup, own.place_mm, own.recorded.force_N) for name, law in laws.items()}
-        simulated_uT["nominal"] = nominal_uT(setup, own.place_mm, own.recorded.force_N)
+        simulated_uT = {
+            name: simulate_uT(law, setup, aligned_presses.place_mm, aligned_presses.recorded.force_N)
+            for name, law in laws.items()
+        }
+        simulated_uT["nominal"] = nominal_uT(setup, aligned_presses.place_mm, aligned_presses.recorded.force_N)
         agreements = {
-            name: agreement(own, fields_uT) | {"beyond_n": beyond_n(laws.get(name), setup, own.recorded.force_N)}
+            name: agreement(aligned_presses, fields_uT)
+            | {"beyond_n": beyond_n(laws.get(name), setup, aligned_presses.recorded.force_N)}
             for name, fields_uT in simulated_uT.items()
         }
-        frictions = fit_frictions(own, setup, fitted[board])
+        frictions = fit_frictions(aligned_presses, setup, fitted[board])
         curves = {f"{row['grip_N_mm']:g}": row.pop("curve_uT") for row in frictions}
         by_board[board] = (
             agreements.pop("fitted")
             | {"grips": frictions}
             | agreements
-            | estimate_memory(own, simulated_uT["fitted"], section, seed)
-            | {"laws": parameters, "frames": check_frames(own, setup, section)}
-            | {"noise_uT": dict(zip("xyz", own.recorded.noise_uT.tolist(), strict=True))}
-            | {"pokes_n": len(own.recorded), "left_out_n": own.recorded.excluded_n}
+            | estimate_memory(aligned_presses, simulated_uT["fitted"], section, seed)
+            | {"laws": parameters, "frames": check_frames(aligned_presses, setup, section)}
+            | {"noise_uT": dict(zip("xyz", aligned_presses.recorded.noise_uT.tolist(), strict=True))}
+            | {"pokes_n": len(aligned_presses.recorded), "left_out_n": aligned_presses.recorded.excluded_n}
         )
-        plot_data[board] = _plot_data(own, simulated_uT["fitted"]) | {"curve_uT": curves}
+        plot_data[board] = _plot_data(aligned_presses, simulated_uT["fitted"]) | {"curve_uT": curves}
     numbers = {
         "by_board": by_board,
         "over_boards": summarise_boards(by_board),
@@ -111,15 +118,19 @@ def compare_boards(
 
 
 def summarise_boards(by_board: Mapping[str, Any]) -> dict[str, Any]:
-    """Summarise agreement over boards."""
+    """Return statistics over boards of the agreement of each simulation with the recordings."""
     summary: dict[str, Any] = {}
     for simulation in ("nominal", "fitted", "refitted"):
-        rows = [_of_simulation(own, simulation) for own in by_board.values() if _has_simulation(own, simulation)]
-        values = {name: [own[name] for own in rows] for name in ("cosine_mean", "explained_median")}
-        grown = [own["growth"] for own in rows if "growth" in own]
+        rows = [
+            _of_simulation(numbers, simulation) for numbers in by_board.values() if _has_simulation(numbers, simulation)
+        ]
+        values = {name: [numbers[name] for numbers in rows] for name in ("cosine_mean", "explained_median")}
+        grown = [numbers["growth"] for numbers in rows if "growth" in numbers]
         values["growth_difference"] = [growths["simulated"] - growths["recorded"] for growths in grown]
         if rows:
-            summary[simulation] = {name: statistic(each, boards=True) for name, each in values.items() if each}
+            summary[simulation] = {
+                name: statistic(board_values, boards=True) for name, board_values in values.items() if board_values
+            }
     return summary
 
 
@@ -128,23 +139,29 @@ def _has_simulation(board: Mapping[str, Any], simulation: str) -> bool:
 
 
 def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, Any]:
-    """Return the agreement of a simulation; for the fitted law this is the board's own mapping."""
-    own: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
-    return own
+    """Return the agreement of a simulation with a board's recordings.
+
+    The agreement of the fitted law is stored in the board's mapping itself, that of other simulations under their name.
+    """
+    agreement_numbers: Mapping[str, Any] = board if simulation == "fitted" else board[simulation]
+    return agreement_numbers
 
 
 def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
-    """Choose the data for the figures: changes of field at some places of the middle group, and |dB| against force."""
-    own = np.flatnonzero(aligned.recorded.group_i == len(aligned.recorded.groups) // 2)
-    order = own[np.argsort(np.hypot(*aligned.place_mm[own].T), kind="stable")]
+    """Return the data for the figures: changes of field at a few places, and |dB| against force.
+
+    The places are those of the group of pokes in the middle of the board's list of groups.
+    """
+    in_group = np.flatnonzero(aligned.recorded.group_i == len(aligned.recorded.groups) // 2)
+    order = in_group[np.argsort(np.hypot(*aligned.place_mm[in_group].T), kind="stable")]
     chosen = order[np.unique(np.linspace(0, len(order) - 1, ARROWS_N).round().astype(int))]
     fields = {"recorded": aligned.db_uT, "simulated": simulated_uT}
     return {
         "group": aligned.recorded.groups[len(aligned.recorded.groups) // 2],
         "places_mm": aligned.place_mm[chosen].round(2).tolist(),
-        "arrows_uT": {name: each_uT[chosen].round(1).tolist() for name, each_uT in fields.items()},
+        "arrows_uT": {name: changes_uT[chosen].round(1).tolist() for name, changes_uT in fields.items()},
         "force_N": aligned.recorded.force_N.round(3).tolist(),
-        "length_uT": {name: magnitudes_uT(each_uT).round(1).tolist() for name, each_uT in fields.items()},
+        "length_uT": {name: magnitudes_uT(changes_uT).round(1).tolist() for name, changes_uT in fields.items()},
     }
 
 
@@ -152,28 +169,31 @@ def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]
 
 
 def pool_skins(captures: Sequence[Readings]) -> dict[str, RecordedPresses]:
-    """Pool the captures of each skin; skins are named by their board, or by board and skin where it has several."""
+    """Pool the captures of each skin.
+
+    Keys are names of boards, or `board/skin` for boards with several skins.
+    """
     skins: dict[str, list[Readings]] = {}
     for capture in captures:
         skins.setdefault(f"{capture.board}/{capture.skin}", []).append(capture)
     boards = [name.partition("/")[0] for name in skins]
     names = {name: board if boards.count(board) == 1 else name for name, board in zip(skins, boards, strict=True)}
-    return {names[name]: pool(own) for name, own in skins.items()}
+    return {names[name]: pool(captures_of_skin) for name, captures_of_skin in skins.items()}
 
 
 def chip_rotations(section: Compare) -> Float[np.ndarray, "k 3 3"]:
-    """Return the rotations from the chips' axes to the board's, as the scene states them."""
+    """Return the rotations from the chips' axes to the board's axes, according to the scene's settings."""
     return Rotation.from_euler("z", np.array(section.design.turns_deg)[:, None], degrees=True).as_matrix()
 
 
 def make_setup(section: Compare, design: SkinDesign) -> Setup:
-    """Place the designed skin over the scene's chips."""
+    """Return the setup for the simulation: the designed skin on the scene's board, pressed with the scene's tip."""
     chips_mm, flipped = np.array(section.design.places_mm), section.skin_flipped
     return Setup(design, chips_mm, section.design.gap_mm, section.skin_mm, flipped, section.tip_radius_mm)
 
 
 def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
-    """Transform labels and fields to the board's axes."""
+    """Transform the labels (places) and the fields of pokes to the board's axes."""
     turn, chips_n = chip_rotations(section), pokes.db_uT.shape[1]
     if len(turn) != chips_n:
         what = f"{chips_n} chips were recorded, but compare.design has {len(turn)}"
@@ -187,7 +207,7 @@ def to_board_axes(pokes: RecordedPresses, section: Compare) -> AlignedPresses:
 
 
 def agreement(aligned: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
-    """Compare simulated changes with recorded ones: direction, size and growth with force."""
+    """Compare the direction and size of simulated and recorded changes of field, and their growth with force."""
     cosine, groups = cosines(simulated_uT, aligned.db_uT), aligned.recorded.groups
     grown = {"recorded": growth(aligned.recorded, aligned.db_uT), "simulated": growth(aligned.recorded, simulated_uT)}
     return {
@@ -198,8 +218,12 @@ def agreement(aligned: AlignedPresses, simulated_uT: Fields) -> dict[str, Any]:
 
 
 def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Compare, seed: int) -> dict[str, Any]:
-    """Estimate the memory of the recordings, and of simulated no-load readings with the memory of section compare."""
-    pokes = aligned.recorded  # memory does not depend on the axes of the chips
+    """Estimate the memory from the recordings, and from simulated no-load readings whose memory is `section.memory`.
+
+    Memory is the fraction of a poke's change of field that remains in the next no-load reading. Returns an empty dict
+    if either estimate is impossible.
+    """
+    pokes = aligned.recorded  # in the chips' axes, on which memory does not depend
     rng = rng_for(seed, "compare", pokes.board)
     walk_uT = WALK_uT * rng.standard_normal(simulated_uT.shape).cumsum(axis=0)
     noise_uT = pokes.noise_uT / np.sqrt(NOLOAD_READINGS_N) * rng.standard_normal(simulated_uT.shape)
@@ -212,17 +236,17 @@ def estimate_memory(aligned: AlignedPresses, simulated_uT: Fields, section: Comp
 
 
 def size_against_force(law: Law, setup: Setup, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " c"]:
-    """Return |dB| in uT of presses with the forces `CURVE_N`, as the median over some places."""
-    places_mm = np.unique(place_mm.round(2), axis=0)[::EVERY]
-    at_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
-    length_uT = magnitudes_uT(simulate_uT(law, setup, at_mm, force_N)).reshape(len(places_mm), -1)
+    """Return the simulated |dB| in uT for each of the forces `CURVE_N`: the median over every fifth place."""
+    places_mm = np.unique(place_mm.round(2), axis=0)[::PLACE_STRIDE]
+    tips_mm, force_N = np.repeat(places_mm, len(CURVE_N), axis=0), np.tile(CURVE_N, len(places_mm))
+    length_uT = magnitudes_uT(simulate_uT(law, setup, tips_mm, force_N)).reshape(len(places_mm), -1)
     return np.median(length_uT, axis=0)
 
 
 def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[dict[str, Any]]:
-    """Refit the law with other frictions under the tip; return agreement, and the field of a light touch.
+    """Refit the law for each friction under the tip in `GRIPS_N_MM`; return agreement, and |dB| of a light touch.
 
-    `grip_N` is the force at which two thirds of the slide are reached in the skin's middle.
+    In the result, `grip_N` is the force at which the slide in the skin's middle reaches two thirds of its limit.
     """
     rows = []
     for grip_N_mm in GRIPS_N_MM:
@@ -241,8 +265,9 @@ def fit_frictions(aligned: AlignedPresses, setup: Setup, fitted: Law) -> list[di
 
 # --- Frames: are labels, chips and skin oriented as the scene states? ---
 
-# A departure from the scene must raise the sum of the cosines over chips by this much. Assumed: each chip with wrong
-# axes loses 0.5 or more, and a skin displaced by 0.5 mm changes every cosine by less.
+# An orientation other than the scene's is reported only if it raises the sum, over chips, of the cosines between
+# recorded and simulated fields by this much. Assumed: wrong axes lower the cosine of a chip by 0.5 or more, and a skin
+# displaced by 0.5 mm changes every cosine by less than 0.1.
 PENALTY = 0.1
 AXES = "xyz"
 AS_SAID = "Labels, chips and skin lie as the scene says."
@@ -250,7 +275,7 @@ AS_SAID = "Labels, chips and skin lie as the scene says."
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation by quarter turns about z, applied after sign changes of a chip's axes."""
+    """Orientation of a chip's or the labels' axes relative to the scene: sign changes, then quarter turns about z."""
 
     quarters: int
     signs: tuple[int, int, int]
@@ -260,27 +285,33 @@ class Turn:
         return quarter_turn(self.quarters) @ np.diag(self.signs)
 
     def describe(self) -> str:
-        """Describe how a chip differs from the scene; empty if it does not."""
+        """Describe the difference from the orientation that the scene states; return an empty string if none."""
         mirrored = " and ".join(axis for axis, sign in zip(AXES, self.signs, strict=True) if sign < 0)
         turned = [f"turned by {90 * self.quarters} degrees more than the scene says"] * bool(self.quarters)
         return " and ".join(turned + [f"mirrored along {mirrored}"] * bool(mirrored))
 
 
-# Each of 16 orientations once: mirroring x and rotating by a half turn is the same as mirroring y. The first is the
-# scene's own; the first eight leave z unchanged, and only these are possible for labels.
+# The 16 different orientations. (Mirroring x and rotating by a half turn is the same as mirroring y, so some
+# combinations of turns and signs are left out.) The first is the orientation that the scene states. The first eight
+# leave z unchanged; only these are possible for labels.
 PLAIN = [(quarters, 1, 1) for quarters in range(4)] + [(0, -1, 1), (0, 1, -1), (1, -1, 1), (1, 1, -1)]
 TURNS = [Turn(quarters, (x, y, z)) for z in (1, -1) for quarters, x, y in PLAIN]
 
 
 def quarter_turn(quarters: int) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation by this number of quarter turns about z."""
+    """Return the matrix that rotates by this number of quarter turns about z."""
     cos, sin = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters % 4]
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The orientations that agree best; `chips` is the position of each recorded chip, in the scene's numbering."""
+    """The orientations of labels, skin and chips with which recordings and the nominal skin agree best.
+
+    `chips[i]` is the position of recorded chip i, in the scene's numbering; `turns[i]` is its orientation. `cosines`
+    are between recorded and simulated fields in these orientations, `as_written` in those that the scene states.
+    `worth` is the sum of the cosines minus penalties for differences from the scene.
+    """
 
     labels: Turn
     flipped: bool
@@ -292,17 +323,17 @@ class Frames:
 
     @property
     def sentence(self) -> str:
-        """Describe what departs from the scene."""
-        parts = [f"the labels are {self.labels.describe()}"] * (self.labels != TURNS[0])
-        parts += ["the skin is flipped: every field has the other sign"] * self.flipped
-        parts += _describe_exchanges(self.chips)
+        """Describe all differences from the orientations that the scene states."""
+        differences = [f"the labels are {self.labels.describe()}"] * (self.labels != TURNS[0])
+        differences += ["the skin is flipped: every field has the other sign"] * self.flipped
+        differences += _describe_exchanges(self.chips)
         for turn in dict.fromkeys(self.turns):
-            own = [i for i, found in enumerate(self.turns) if found == turn]
+            chips = [i for i, chip_turn in enumerate(self.turns) if chip_turn == turn]
             if turn != TURNS[0]:
-                parts.append(f"{_name_chips(own, len(self.turns))} {turn.describe()}")
-        if not parts:
+                differences.append(f"{_name_chips(chips, len(self.turns))} {turn.describe()}")
+        if not differences:
             return AS_SAID
-        return f"Against the scene, {'; '.join(parts)}."
+        return f"Against the scene, {'; '.join(differences)}."
 
 
 def _name_chips(chips: Sequence[int], chips_n: int) -> str:
@@ -323,7 +354,7 @@ def check_frames(aligned: AlignedPresses, setup: Setup, section: Compare) -> dic
     """Check whether labels, chips and skin are oriented as the scene states."""
     frames = find_frames(
         aligned.place_mm, aligned.recorded.db_uT, chip_rotations(section),
-        lambda at_mm: nominal_uT(setup, at_mm, aligned.recorded.force_N),
+        lambda places_mm: nominal_uT(setup, places_mm, aligned.recorded.force_N),
     )  # fmt: skip
     columns = zip(frames.chips.tolist(), frames.as_written.tolist(), frames.cosines.tolist(), frames.turns, strict=True)
     chips = [
@@ -339,18 +370,20 @@ def find_frames(
     chips_turn: Float[np.ndarray, "k 3 3"],
     nominal: Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n k 3"]],
 ) -> Frames:
-    """Find the orientations of labels, skin and chips that agree best with the nominal skin.
+    """Find the orientations of labels, skin and chips with which recordings and the nominal skin agree best.
 
-    `read_uT` is in the chips' axes, `chips_turn` the scene's rotations of the chips; `nominal` simulates places in the
-    board's axes. A chip at another chip's position is assumed to have that chip's rotation.
+    `read_uT` are recorded changes of field in the chips' axes; `chips_turn` are the rotations of the chips according to
+    the scene. `nominal` simulates pokes at places in the board's axes. A chip at the position of another chip is
+    assumed to have the rotation of that chip.
     """
     turns = np.stack([turn.matrix for turn in TURNS])
     as_written, candidate_frames = np.empty(0), []
     for labels in TURNS[:8]:
         simulated_uT = nominal(place_mm @ labels.matrix[:2, :2].T)
-        # [recorded chip, simulated chip, turn]: cosine over all pokes of the turned recorded and the simulated field.
-        at_chips_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
-        moments = np.einsum("nka,nlb->klab", read_uT, at_chips_uT)
+        # Entry [k, l, t] of `cosine`: cosine, over all pokes, between the field of recorded chip k after orientation t
+        # and the field simulated at chip l.
+        rotated_uT = np.einsum("kij,nki->nkj", chips_turn, simulated_uT)
+        moments = np.einsum("nka,nlb->klab", read_uT, rotated_uT)
         sizes = np.linalg.norm(read_uT, axis=(0, 2))[:, None] * np.linalg.norm(simulated_uT, axis=(0, 2))
         cosine = np.einsum("klab,tba->klt", moments, turns) / sizes[..., None]
         if labels == TURNS[0]:
@@ -363,28 +396,32 @@ def find_frames(
 def _best_chips(
     labels: Turn, flipped: bool, common: Turn, cosine: Float[np.ndarray, "k l t"], as_written: np.ndarray
 ) -> Frames:
-    """Find the best places and turns of the chips, given the labels, the skin and the turn most chips share.
+    """Find the best positions and orientations of the chips for given orientations of labels and skin.
 
-    A turn that all chips share counts as one departure with a larger penalty, because a flipped skin looks like such a
-    turn, too.
+    `common` is the orientation that most chips share. If it differs from the scene's, this counts as one difference
+    whose penalty is 1.5 times as large, because a flipped skin can look like such a common turn.
     """
     signed = -cosine if flipped else cosine
     worth = signed - PENALTY * np.array([turn != common for turn in TURNS])
-    of_pair = worth.max(axis=2) - PENALTY * (1 - np.eye(len(worth)))
-    own, positions = linear_sum_assignment(of_pair, maximize=True)
-    turn_i = worth[own, positions].argmax(axis=1)
-    total = of_pair[own, positions].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
+    pair_worth = worth.max(axis=2) - PENALTY * (1 - np.eye(len(worth)))
+    chips, positions = linear_sum_assignment(pair_worth, maximize=True)
+    turn_i = worth[chips, positions].argmax(axis=1)
+    total = pair_worth[chips, positions].sum() - PENALTY * ((labels != TURNS[0]) + flipped + 1.5 * (common != TURNS[0]))
     turns = tuple(TURNS[i] for i in turn_i)
-    return Frames(labels, flipped, positions, turns, signed[own, positions, turn_i], as_written, float(total))
+    return Frames(labels, flipped, positions, turns, signed[chips, positions, turn_i], as_written, float(total))
 
 
-CHIPS_N = 5  # orientations are determined only for boards with chips on all sides of the middle
-# Fewer pokes are unreliable; more take seconds without a gain (in scene lab, every third of 65 places is enough).
+CHIPS_N = 5  # orientations are checked only on boards with five chips, which are on all sides of the middle
+# The check is unreliable with fewer pokes, and takes seconds with more pokes, which do not improve the result (in
+# scene lab, every third of 65 places is enough).
 POKES_MIN_N, POKES_MAX_N = 20, 70
 
 
 def find_departure(blocks: Sequence[Readings], section: Compare, design: SkinDesign) -> str | None:
-    """Describe how a capture departs from the scene; None if it does not, or if there is too little data to decide."""
+    """Describe how labels, chips and skin of a capture differ from the orientations that the scene states.
+
+    Returns None if there is no difference, or too little data to decide. `blocks` are the readings of the capture.
+    """
     if blocks[0].chips_n != CHIPS_N or not any(_pressed_rows(block).any() for block in blocks):
         return None
     pokes = _thin(pool(blocks))
@@ -399,7 +436,7 @@ def _pressed_rows(readings: Readings) -> np.ndarray:
 
 
 def _thin(pokes: RecordedPresses) -> RecordedPresses:
-    """Keep at most `POKES_MAX_N` pokes, evenly distributed over the recording."""
+    """Select at most `POKES_MAX_N` pokes, evenly distributed over the recording."""
     kept = np.unique(np.linspace(0, len(pokes) - 1, POKES_MAX_N).round().astype(int))
     names = ("group_i", "capture_i", "place_mm", "force_N", "db_uT", "noload_uT")
     return replace(pokes, **{name: getattr(pokes, name)[kept] for name in names})
@@ -463,51 +500,51 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate agreement with its bounds, the fitted parameters, and the orientation of labels, chips and skin."""
     by_board = numbers["by_board"]
     rows = [
-        _board_row(board, name, _of_simulation(own, name), own["laws"].get(name, {}))
-        for board, own in by_board.items()
+        _board_row(board, name, _of_simulation(numbers_of_board, name), numbers_of_board["laws"].get(name, {}))
+        for board, numbers_of_board in by_board.items()
         for name in SIMULATIONS
-        if _has_simulation(own, name)
-    ] + [_summary_row(name, own) for name, own in numbers["over_boards"].items()]
+        if _has_simulation(numbers_of_board, name)
+    ] + [_summary_row(name, stats) for name, stats in numbers["over_boards"].items()]
     laws = [
         {"board": board, "law": _title(name, law)}
         | {title: f"{law[parameter]:.3g}" for parameter, title in TITLES.items()}
-        for board, own in by_board.items()
-        for name, law in own["laws"].items()
+        for board, numbers_of_board in by_board.items()
+        for name, law in numbers_of_board["laws"].items()
     ]
-    made = {
+    result = {
         "compare": tabulate(rows, meaning=MEANING.format(100 * numbers["memory_put_in"])),
         "compare_parameters": tabulate(laws, meaning=ABOUT_PARAMETERS),
         "compare_grip": tabulate(_friction_rows(by_board), meaning=ABOUT_GRIP.format(**numbers)),
         "compare_frames": tabulate([_frames_row(*row) for row in by_board.items()], meaning=ABOUT_FRAMES),
     }
-    for table in made.values():
+    for table in result.values():
         table["source"] = source
-    return made
+    return result
 
 
-def _board_row(board: str, name: str, own: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
-    good = [own["cosine_mean"] >= COSINE_MIN[name], own["explained_median"] >= EXPLAINED_MIN]
-    row = _cells(board, _title(name, law), f"{own['cosine_mean']:.3f}", f"{own['explained_median']:.3f}", name)
-    row[HELD] = f"{own['beyond_n']}"
-    row["cosine by file"] = ", ".join(f"{value:.3f}" for value in own["cosine_by_group"].values())
-    if "growth" in own:
-        grown = own["growth"]
+def _board_row(board: str, name: str, agreed: Mapping[str, Any], law: Mapping[str, Any]) -> dict[str, str]:
+    good = [agreed["cosine_mean"] >= COSINE_MIN[name], agreed["explained_median"] >= EXPLAINED_MIN]
+    row = _cells(board, _title(name, law), f"{agreed['cosine_mean']:.3f}", f"{agreed['explained_median']:.3f}", name)
+    row[HELD] = f"{agreed['beyond_n']}"
+    row["cosine by file"] = ", ".join(f"{value:.3f}" for value in agreed["cosine_by_group"].values())
+    if "growth" in agreed:
+        grown = agreed["growth"]
         row[GROWTH] = f"{grown['simulated']:.2f} / {grown['recorded']:.2f}"
         good.append(abs(grown["simulated"] - grown["recorded"]) <= GROWTH_WITHIN)
-    if "memory" in own:
-        row[MEMORY] = " / ".join(f"{100 * own['memory'][side]:.1f}" for side in ("simulated", "recorded"))
+    if "memory" in agreed:
+        row[MEMORY] = " / ".join(f"{100 * agreed['memory'][side]:.1f}" for side in ("simulated", "recorded"))
     return row | {"within bounds": "yes" if all(good) else "no"}
 
 
-def _summary_row(name: str, own: Mapping[str, Any]) -> dict[str, str]:
+def _summary_row(name: str, stats: Mapping[str, Any]) -> dict[str, str]:
     verdicts = [
-        verdict(own["cosine_mean"], above=COSINE_MIN[name]), verdict(own["explained_median"], above=EXPLAINED_MIN)
+        verdict(stats["cosine_mean"], above=COSINE_MIN[name]), verdict(stats["explained_median"], above=EXPLAINED_MIN)
     ]  # fmt: skip
-    cosine, explained = (show_digits(own[metric], 3) for metric in ("cosine_mean", "explained_median"))
-    row = _cells(f"all ({own['cosine_mean']['n']})", SIMULATIONS[name], cosine, explained, name)
-    if "growth_difference" in own:
-        row[GROWTH] = f"difference {show_digits(own['growth_difference'], 2)}"
-        verdicts.append(verdict_within(own["growth_difference"], GROWTH_WITHIN))
+    cosine, explained = (show_digits(stats[metric], 3) for metric in ("cosine_mean", "explained_median"))
+    row = _cells(f"all ({stats['cosine_mean']['n']})", SIMULATIONS[name], cosine, explained, name)
+    if "growth_difference" in stats:
+        row[GROWTH] = f"difference {show_digits(stats['growth_difference'], 2)}"
+        verdicts.append(verdict_within(stats["growth_difference"], GROWTH_WITHIN))
     return row | {"within bounds": combine_verdicts(verdicts)}
 
 
@@ -518,8 +555,8 @@ def _cells(board: str, law: str, cosine: str, explained: str, name: str) -> dict
 
 def _friction_rows(by_board: Mapping[str, Any]) -> list[dict[str, str]]:
     lines = []
-    for board, own in by_board.items():
-        for row in own.get("grips", []):
+    for board, board_numbers in by_board.items():
+        for row in board_numbers.get("grips", []):
             line = {"board": board, "k / mu, N/mm": f"{row['grip_N_mm']:.3g}"}
             line["force at two thirds of the slide, N"] = f"{row['grip_N']:.2g}"
             line |= {"cosine": f"{row['cosine_mean']:.3f}", "explained": f"{row['explained_median']:.3f}"}
@@ -546,7 +583,7 @@ def _frames_row(board: str, board_numbers: Mapping[str, Any]) -> dict[str, str]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw recorded and simulated changes of field at the chips for a few places, and their growth with force."""
+    """Draw recorded and simulated changes of field: as arrows at the chips for a few places, and against force."""
     boards = dict(list(drawn["boards"].items())[:BOARDS_MAX_N])
     return {
         "compare_arrows.svg": _draw_arrows(boards, np.array(drawn["chips_mm"]), source),
@@ -556,15 +593,15 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 
 def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: str) -> str:
-    """Draw |dB| against force from the lightest touch on: recorded presses, and the law with several frictions."""
+    """Plot |dB| against force, from 0.3 mN on: recorded presses, and simulated presses with several frictions."""
     boards, used = drawn["boards"], f"{numbers['grip_N_mm']:g}"
     with drawing(4.2 * len(boards) + 0.6, 4.2) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]
-        for axes, (board, own) in zip(panels, boards.items(), strict=True):
+        for axes, (board, board_data) in zip(panels, boards.items(), strict=True):
             style = {"color": COLOURS[0], "marker": MARKERS[0], "linestyle": "", "markersize": 3, "alpha": 0.5}
-            axes.plot(own["force_N"], own["length_uT"]["recorded"], label="recorded", **style)
+            axes.plot(board_data["force_N"], board_data["length_uT"]["recorded"], label="recorded", **style)
             styles = iter(("-.", ":", "--", (0, (1, 3))))
-            for grip, length_uT in own["curve_uT"].items():
+            for grip, length_uT in board_data["curve_uT"].items():
                 line = {"linestyle": "-", "linewidth": 2} if grip == used else {"linestyle": next(styles)}
                 friction = "no friction limit" if float(grip) < 1e-3 else f"k / μ {grip} N/mm"
                 label = f"simulated, {friction}" + (" (used)" if grip == used else "")
@@ -579,17 +616,19 @@ def _draw_touch(drawn: Mapping[str, Any], numbers: Mapping[str, Any], source: st
 
 
 def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -> str:
-    columns_n = max(len(own["places_mm"]) for own in boards.values())
+    columns_n = max(len(board_data["places_mm"]) for board_data in boards.values())
     half_mm = np.abs(chips_mm).max() + 0.6 * ARROW_MM
     with drawing(2.0 * columns_n, 4.2 * len(boards) + 0.6) as figure:
         panels = figure.subplots(2 * len(boards), columns_n, squeeze=False)
-        for row_i, (board, own) in enumerate(boards.items()):
-            recorded_uT = np.array(own["arrows_uT"]["recorded"])
+        for row_i, (board, board_data) in enumerate(boards.items()):
+            recorded_uT = np.array(board_data["arrows_uT"]["recorded"])
             longest_uT = np.linalg.norm(recorded_uT[..., :2], axis=-1).max()
             for side_i, (side, colour) in enumerate(zip(("recorded", "simulated"), COLOURS, strict=False)):
                 row = panels[2 * row_i + side_i]
                 row[0].set_ylabel(f"{board}\n{side}")
-                for axes, db_uT, place_mm in zip(row, own["arrows_uT"][side], own["places_mm"], strict=False):
+                for axes, db_uT, place_mm in zip(
+                    row, board_data["arrows_uT"][side], board_data["places_mm"], strict=False
+                ):
                     sides_mm = np.array(db_uT)[:, :2] * ARROW_MM / longest_uT
                     style = {"angles": "xy", "scale_units": "xy", "scale": 1, "width": 0.014}
                     axes.quiver(*chips_mm.T, *sides_mm.T, color=colour, **style)
@@ -607,12 +646,12 @@ def _draw_arrows(boards: Mapping[str, Any], chips_mm: np.ndarray, source: str) -
 def _draw_growth(boards: Mapping[str, Any], by_board: Mapping[str, Any], source: str) -> str:
     with drawing(3.6 * len(boards) + 0.6, 3.6) as figure:
         panels = figure.subplots(1, len(boards), squeeze=False)[0]
-        for axes, (board, own) in zip(panels, boards.items(), strict=True):
+        for axes, (board, board_data) in zip(panels, boards.items(), strict=True):
             for side, colour, marker in zip(("recorded", "simulated"), COLOURS, MARKERS, strict=False):
                 slope = by_board[board].get("growth", {}).get(side)
                 label = side if slope is None else f"{side}: power {slope:.2f}"
                 style = {"color": colour, "marker": marker, "linestyle": "", "markersize": 3, "alpha": 0.6}
-                axes.plot(own["force_N"], own["length_uT"][side], label=label, **style)
+                axes.plot(board_data["force_N"], board_data["length_uT"][side], label=label, **style)
             axes.set(xscale="log", yscale="log", xlabel="force / N", ylabel="|dB| / µT", title=board)
             axes.legend(frameon=False, fontsize=8)
         figure.suptitle(f"Change of field against force ({source})", x=0.01, ha="left", fontsize=11)

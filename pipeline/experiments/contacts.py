@@ -1,7 +1,7 @@
-"""Two contacts at once, as sums of two pokes of a held-out skin (paper section 7, future work).
+"""Two contacts at once, modelled as the sum of two pokes of a held-out skin (paper section 7, future work).
 
-Tests what networks trained on single contacts predict for two, whether two contacts can be detected, and how well the
-fields of two contacts add.
+Tests what networks trained on single contacts predict for two contacts, whether two contacts can be detected, and how
+closely the field change of two contacts equals the sum of the field changes of the single contacts.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -48,18 +48,18 @@ from reskin.seeds import rng_for
 from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-KNOWN_ROWS_N = 6000  # rows, drawn at random, in which detectors search for neighbours
-SINGLES_N = 1000  # single contacts for setting a threshold, and as many for testing
+KNOWN_ROWS_N = 6000  # training rows, drawn at random, in which detectors search for nearest neighbours
+SINGLES_N = 1000  # single contacts that set the thresholds; the same number tests them
 DRAWN_N = 60  # pairs per board and separation in the figure
-SAME_PLACE = 0.0  # mm: two pokes at one place show the effect of strength and noise alone
-TOLERANCE_MM = 0.5  # of a pair's distance, assumed; needed because places are on a grid
-PLACE_DECIMALS = 2  # places closer than 0.01 mm count as one
+SAME_PLACE = 0.0  # separation in mm: two pokes at one place show the effect of signal strength and noise alone
+TOLERANCE_MM = 0.5  # tolerance of a pair's separation, assumed; needed because places are on a grid
+PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
 
 Predict = Callable[[np.ndarray], np.ndarray]  # changes of field in uT -> x and y in mm, F in N
 
 
 class Contacts(Strict):
-    """Settings section `contacts`: the pairs to draw, and the fraction of false alarms that thresholds are set for."""
+    """Settings section `contacts`: number and separations of the pairs, and the intended fraction of false alarms."""
 
     pairs_n: Annotated[int, Field(ge=1)]
     separations_mm: Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
@@ -69,7 +69,7 @@ class Contacts(Strict):
 def contacts(
     settings: Settings, section: Contacts, folds: Path, indentations: Path, models: Path, results: Path
 ) -> None:
-    """Add the pokes of every held-out board in pairs, and test networks trained without the board on the sums."""
+    """Test networks on sums of two pokes of a held-out board, for every board; the networks were trained without it."""
     data = read_data(settings, indentations, folds)
     boards, plot_data = zip(
         *(evaluate_board(data, fold, section, networks_held_out(models, fold.name)) for fold in data.folds_of("lobo")),
@@ -84,7 +84,7 @@ def contacts(
     numbers: dict[str, Any] = {
         "pairs_n": section.pairs_n,
         "boards_n": len(boards),
-        # The networks behind two of the detectors were trained on all other boards, including these contacts.
+        # Two detectors use networks that were trained on all other boards, including the contacts that set thresholds.
         "threshold_set_on": (
             f"training contacts of a {plot_data[0]['kept_aside']} among which detectors look no neighbours up; the "
             "networks behind `residual` and `networks disagree` were trained on them"
@@ -109,14 +109,14 @@ def contacts(
 def evaluate_board(
     data: SceneData, fold: Fold, section: Contacts, networks: Sequence[Predict]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Evaluate pairs of one held-out board; return its numbers, and the predicted places for the figure."""
+    """Evaluate pairs of pokes of one held-out board; return the board's numbers, and the predicted places to plot."""
     rows = data.rows
     rng = rng_for(data.settings.seed, "contacts", fold.name)
     fit, aside, kept_aside = keep_aside(rows, fold.train)
     known = rng.choice(fit, min(KNOWN_ROWS_N, len(fit)), replace=False)
     singles = {
-        side: rng.choice(own, min(SINGLES_N, len(own)), replace=False)
-        for side, own in (("aside", aside), ("test", fold.test))
+        side: rng.choice(row_i, min(SINGLES_N, len(row_i)), replace=False)
+        for side, row_i in (("aside", aside), ("test", fold.test))
     }
     pairs = {
         separation_mm: draw_pairs(rows, fold.test, separation_mm, pairs_n=section.pairs_n, rng=rng)
@@ -135,15 +135,17 @@ def evaluate_board(
         }
         return scores | ({"networks disagree": disagreement(predicted)} if len(predicted) > 1 else {})
 
-    predicted = {s: predict(one.sum_uT(rows.db_uT)) for s, one in pairs.items()}
-    double = {s: detect(one.sum_uT(rows.db_uT), predicted[s]) for s, one in pairs.items()}
-    single = {side: detect(rows.db_uT[own], predict(rows.db_uT[own])) for side, own in singles.items()}
+    predicted = {s: predict(drawn_pairs.sum_uT(rows.db_uT)) for s, drawn_pairs in pairs.items()}
+    double = {s: detect(drawn_pairs.sum_uT(rows.db_uT), predicted[s]) for s, drawn_pairs in pairs.items()}
+    single = {side: detect(rows.db_uT[row_i], predict(rows.db_uT[row_i])) for side, row_i in singles.items()}
     numbers = detection_rates(single["aside"], single["test"], double, section.false_alarm_fraction)
-    truth = {s: (rows.target[one.weaker], rows.target[one.stronger]) for s, one in pairs.items()}
+    truth = {s: (rows.target[both.weaker], rows.target[both.stronger]) for s, both in pairs.items()}
     numbers["falls"] = {}
     for separation_mm, true_pair in truth.items():
-        each = [compare_prediction(*true_pair, one) for one in predicted[separation_mm]]
-        numbers["falls"][separation_mm] = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+        by_network = [compare_prediction(*true_pair, prediction) for prediction in predicted[separation_mm]]
+        numbers["falls"][separation_mm] = {
+            name: float(np.mean([comparison[name] for comparison in by_network])) for name in by_network[0]
+        }
     along = {
         f"{s:g}": position_along_line(*truth[s], predicted[s][0])[:DRAWN_N].round(2).tolist()
         for s in section.separations_mm
@@ -156,22 +158,29 @@ def evaluate_board(
 
 @dataclass(frozen=True)
 class Pairs:
-    """Row numbers of two pokes of one skin; the weaker one has less force, or less |dB| where a force is unknown."""
+    """Row numbers of pairs of pokes; both pokes of a pair are of one skin.
+
+    The weaker poke has the smaller force, or the smaller |dB| if some forces are unknown.
+    """
 
     weaker: Int64[np.ndarray, " p"]
     stronger: Int64[np.ndarray, " p"]
 
     def sum_uT(self, db_uT: Float32[np.ndarray, "f ch"]) -> Float32[np.ndarray, "p ch"]:
-        """Add the two changes of field."""
+        """Return the sum of the changes of field of both pokes of each pair."""
         return db_uT[self.weaker] + db_uT[self.stronger]
 
 
 def draw_pairs(
-    rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
+    rows: Rows, candidates: Int64[np.ndarray, " a"], separation_mm: float, *, pairs_n: int, rng: np.random.Generator
 ) -> Pairs:
-    """Draw pairs of rows: two places of a skin at this distance, then one row at each; at 0 mm, one place twice."""
+    """Draw pairs of rows: two places of a skin with this separation, and then one row at each place.
+
+    `candidates` are the row numbers to draw from. With a separation of 0 mm, both rows are at the same place.
+    """
     by_skin = [
-        _pairs_at_distance(rows, own[rows.skin[own] == skin], separation_mm) for skin in np.unique(rows.skin[own])
+        _pairs_at_distance(rows, candidates[rows.skin[candidates] == skin], separation_mm)
+        for skin in np.unique(rows.skin[candidates])
     ]
     sides = [(rows_at[i], rows_at[j]) for rows_at, pairs in by_skin for i, j in pairs]
     if not sides:
@@ -180,18 +189,21 @@ def draw_pairs(
     chosen = [sides[k] for k in rng.integers(len(sides), size=pairs_n)]
     first, second = (np.array([rng.choice(side) for side in both]) for both in zip(*chosen, strict=True))
     force_N, length_uT = rows.target[:, 2], np.linalg.norm(rows.db_uT, axis=1)
-    strength = length_uT if np.isnan(force_N[own]).any() else force_N
+    strength = length_uT if np.isnan(force_N[candidates]).any() else force_N
     swap = strength[first] > strength[second]
     return Pairs(np.where(swap, second, first), np.where(swap, first, second))
 
 
 def _pairs_at_distance(
-    rows: Rows, own: Int64[np.ndarray, " a"], separation_mm: float
+    rows: Rows, skin_rows: Int64[np.ndarray, " a"], separation_mm: float
 ) -> tuple[list[Int64[np.ndarray, " b"]], Int64[np.ndarray, "p 2"]]:
-    """Return the rows at each place of a skin, and the pairs of places (by index) at this distance."""
-    places_mm, place_i = np.unique(rows.target[own, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
+    """Return the row numbers at each place of a skin, and the pairs of places (by index) with this separation.
+
+    `skin_rows` are the row numbers of the skin.
+    """
+    places_mm, place_i = np.unique(rows.target[skin_rows, :2].round(PLACE_DECIMALS), axis=0, return_inverse=True)
     order = np.argsort(place_i.ravel(), kind="stable")
-    rows_at = np.split(own[order], np.cumsum(np.bincount(place_i.ravel()))[:-1])
+    rows_at = np.split(skin_rows[order], np.cumsum(np.bincount(place_i.ravel()))[:-1])
     distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
     near = np.abs(distance_mm - separation_mm) <= TOLERANCE_MM
     # A place is paired with itself only at 0 mm, although 0 mm is also within the tolerance of small separations.
@@ -199,10 +211,10 @@ def _pairs_at_distance(
 
 
 def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray, str]:
-    """Split training rows into those that detectors are fitted to and those that set their thresholds.
+    """Split training rows into those that detectors are fitted to, and those that set the thresholds.
 
-    The latter are the last board, or the last skin of a single board, or the last pass of a single skin; the third
-    return value is `board`, `skin` or `pass`.
+    The thresholds are set by the last board; if there is only one board, by its last skin; if there is only one skin,
+    by its last pass. The third return value says which: `board`, `skin` or `pass`.
     """
     for what, labels in (("board", rows.board), ("skin", rows.skin), ("pass", rows.pass_i)):
         kinds = np.unique(labels[train])
@@ -216,7 +228,10 @@ def keep_aside(rows: Rows, train: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, 
 def compare_prediction(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> dict[str, float]:
-    """Compare a single predicted contact (x_mm, y_mm, F_N) with two true ones; force ratios need known forces."""
+    """Compare a prediction of one contact (x_mm, y_mm, F_N) with the two true contacts of each pair.
+
+    The result has ratios of forces only if all true forces are known.
+    """
     off_mm = np.stack([predicted[:, :2] - side[:, :2] for side in (weaker, stronger)])
     numbers = {
         "near_either_pct": 100 * float((np.abs(off_mm) <= ACCURACY_LIMIT_MM).all(axis=2).any(axis=0).mean()),
@@ -237,7 +252,7 @@ def compare_prediction(
 def position_along_line(
     weaker: Float32[np.ndarray, "p 3"], stronger: Float32[np.ndarray, "p 3"], predicted: Float32[np.ndarray, "p 3"]
 ) -> Float[np.ndarray, " p"]:
-    """Project predictions onto the line through both contacts: 0 at the weaker one, 1 at the stronger one."""
+    """Return the position of each prediction along the line through both contacts: 0 is the weaker, 1 the stronger."""
     line_mm = (stronger - weaker)[:, :2].astype(np.float64)
     return ((predicted - weaker)[:, :2] * line_mm).sum(axis=1) / (line_mm**2).sum(axis=1)
 
@@ -248,20 +263,22 @@ def position_along_line(
 def detection_rates(
     aside: Scores, single: Scores, double: Mapping[float, Scores], false_alarm_fraction: float
 ) -> dict[str, Any]:
-    """Return, by detector, the percentage of single and double contacts above its threshold.
+    """Return, for each detector, the percentages of single and of double contacts that score above its threshold.
 
-    Thresholds are set on the contacts kept `aside`. The rates for double contacts are by separation.
+    `aside` are the scores of the single contacts that set the thresholds. `double` maps each separation in mm to the
+    scores of double contacts; the percentages for double contacts are also by separation.
     """
     limits = thresholds(aside, false_alarm_fraction)
     separated = {
-        name: np.concatenate([own[name] for separation_mm, own in double.items() if separation_mm]) for name in aside
+        name: np.concatenate([scores[name] for separation_mm, scores in double.items() if separation_mm])
+        for name in aside
     }
     return {
         "false_alarm_pct": above_pct(single, limits),
         "auc": roc_areas(single, separated),
         "by_separation": {
-            separation_mm: {"detected_pct": above_pct(own, limits), "auc": roc_areas(single, own)}
-            for separation_mm, own in double.items()
+            separation_mm: {"detected_pct": above_pct(scores, limits), "auc": roc_areas(single, scores)}
+            for separation_mm, scores in double.items()
         },
     }
 
@@ -271,12 +288,12 @@ def residual(
     predicted: Float[np.ndarray, "f 3"],
     db_uT: Float[np.ndarray, "f ch"],
 ) -> Float[np.ndarray, " f"]:
-    """Return the residual of a single contact at the prediction, relative to |dB| plus noise.
+    """Return the difference between dB and the dB of a single contact at the prediction, relative to |dB| plus noise.
 
-    The field of that contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; uT) that are nearest to the
-    prediction in place and, if forces are known, in force.
+    The dB of that single contact is interpolated from the `known` contacts (x_mm, y_mm, F_N; dB in uT) that are nearest
+    to the prediction in place and, if forces are known, in force.
     """
-    from sklearn.neighbors import KNeighborsRegressor  # imported here because it takes a second
+    from sklearn.neighbors import KNeighborsRegressor  # imported here because importing scikit-learn takes a second
 
     target, known_uT = known
     columns = ~np.isnan(target).any(axis=0)
@@ -287,13 +304,16 @@ def residual(
 
 
 def disagreement(predicted: Float[np.ndarray, "m f 3"]) -> Float[np.ndarray, " f"]:
-    """Return the disagreement of networks of several seeds on a contact's place: rms distance from the mean, in mm."""
+    """Return how much networks of several seeds disagree on each contact's place.
+
+    This is the rms distance, in mm, of the predicted places from their mean.
+    """
     place_mm = predicted[:, :, :2]
     return np.sqrt(((place_mm - place_mm.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
 
 
 def summarise_nested(boards: Sequence[Any]) -> Any:
-    """Summarise each number of nested mappings over boards; there is one mapping per board."""
+    """Summarise nested mappings of equal structure, one per board: replace each number by its statistic over boards."""
     first = boards[0]
     if isinstance(first, Mapping):
         return {key: summarise_nested([board[key] for board in boards if key in board]) for key in first}
@@ -302,15 +322,18 @@ def summarise_nested(boards: Sequence[Any]) -> Any:
 
 # --- Superposition of simulated fields ---
 
-PAIRS_N = 6  # pairs drawn for each distance
-MIDDLE_MM = 2.0  # largest distance along each axis from a pair's middle to the skin's middle
-HEIGHTS_N = 9  # heights in the table of displacements, which is interpolated linearly for the second contact
+PAIRS_N = 6  # pairs drawn for each separation
+MIDDLE_MM = 2.0  # largest distance, along each axis, of the point midway between both contacts from the skin's middle
+HEIGHTS_N = 9  # heights in the table of displacements, between which the second contact is interpolated linearly
 
 
 def superposition(
     simulation: SimulationSettings, separations_mm: Sequence[float], *, seed: int
 ) -> list[dict[str, Any]]:
-    """Return the rms error of adding the fields of two contacts on the scene's first skin, at two depths."""
+    """Return, by depth and separation, the rms error of adding the field changes of two single contacts.
+
+    The skin is the first of the scene. The two depths are half the largest commanded depth, and the largest.
+    """
     board_name, skin_name = list_captures(simulation, MAIN)[0]
     board = draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board_name)
     rule = simulation.main_boards.quadrature.in_si()
@@ -324,7 +347,8 @@ def superposition(
         for separation_mm in separations_mm:
             half_mm = separation_mm / 2 * directions
             ends_m = [
-                np.column_stack([at_mm * milli, depth_m]) for at_mm in (centres_mm - half_mm, centres_mm + half_mm)
+                np.column_stack([place_mm * milli, depth_m])
+                for place_mm in (centres_mm - half_mm, centres_mm + half_mm)
             ]
             changes_T = np.array([_changes_of_pair(board, skin, *pair) for pair in zip(*ends_m, strict=True)])
             keys = {"depth_mm": depth_mm, "separation_mm": separation_mm, "pairs_n": PAIRS_N}
@@ -333,7 +357,10 @@ def superposition(
 
 
 def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Dipoles:
-    """Displace and rotate dipoles, at rest or already moved, by a poke (x, y, true depth)."""
+    """Return dipoles after a poke (x, y and true depth in metres) has displaced and rotated them.
+
+    The given dipoles may be at rest, or already displaced by another poke.
+    """
     nodes_m, moments_A_m2 = dipoles
     heights = np.linspace(0, 1, HEIGHTS_N)
     position = nodes_m[:, 2] / skin.thickness_m * (HEIGHTS_N - 1)
@@ -358,7 +385,7 @@ def press_on(skin: Skin, dipoles: Dipoles, poke_m: Float[np.ndarray, "3"]) -> Di
 def _changes_of_pair(
     board: Board, skin: Skin, a_m: Float[np.ndarray, "3"], b_m: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 k 3"]:
-    """Return four changes of field: by contact a alone, b alone, a pressed before b, and b before a."""
+    """Return four changes of field in tesla: by contact a alone, b alone, a pressed before b, and b before a."""
     rest = skin.nodes_m, skin.moments_A_m2
     only_a, only_b = press_on(skin, rest, a_m), press_on(skin, rest, b_m)
     pressed = (only_a, only_b, press_on(skin, only_a, b_m), press_on(skin, only_b, a_m))
@@ -405,14 +432,14 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     table = pd.DataFrame([*rows, false_alarm]).fillna("–").assign(source=source)
     asked = next(iter(numbers["false_alarm_pct"].values()))["asked"]
     table.attrs["meaning"] = f"{MEANING} Thresholds are set for {asked:g} % false alarms. {TWO_TIPS}"
-    made = {"contacts": table}
+    result = {"contacts": table}
     if "superposition" in numbers:
-        made["superposition"] = _superposition(numbers["superposition"], source)
-    return made
+        result["superposition"] = _superposition(numbers["superposition"], source)
+    return result
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw where predictions fall between two contacts, and how often two contacts are detected."""
+    """Plot predicted places along the line between two contacts, and how often two contacts are detected."""
     with drawing(7.8, 4.4) as figure:
         left, right = figure.subplots(1, 2)
         _draw_places(left, drawn["along"])
@@ -485,7 +512,6 @@ def _superposition(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFra
     table.attrs["meaning"] = (
         "Compares the sum of the changes of field of two single contacts with the change of field of both contacts on "
         "one skin, where the second contact displaces material that the first has already displaced (mean of both "
-        "orders; rms over chips and pairs). The effect that one contact lowers the surface under the other is "
-        "neglected."
+        "orders; rms over chips and pairs). Neglected: each contact also lowers the surface under the other tip."
     )
     return table

@@ -1,7 +1,7 @@
-"""Drift: networks trained on a skin's first contacts and tested on later ones (paper section 4, figure 5).
+"""Drift: networks trained on a skin's first contacts and tested on later contacts (paper section 4, figure 5).
 
-Separate networks are trained for each no-load policy (how often the no-load reading is renewed). The paper's statements
-about the policies and about the force bias of late contacts are tested over boards.
+A no-load policy states how often the no-load reading is renewed; each policy has its own networks. The paper's
+statements about the policies, and about the force bias after many contacts, are tested over boards.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,28 +53,30 @@ from reskin.schema import Readings
 from reskin.seeds import rng_for
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
-FORCE = 2  # column of a target
+FORCE = 2  # column of the force in a target (x_mm, y_mm, F_N)
 POINTS_MAX_N = 2000  # points in the scatter plot
-DECIMALS = 3  # of forces in N and places in mm
+DECIMALS = 3  # forces in N and places in mm are rounded to this many decimals
 
 Count = Annotated[int, Field(ge=1)]
-# When the no-load reading is renewed: never, every few contacts, before each contact, or whenever a reading is judged
-# free of contact.
+# When the no-load reading is renewed: `initial`: never; `regular`: every `regular_n` contacts; `each`: before each
+# contact; `free`: whenever a reading is judged free of contact.
 PolicyName = Literal["initial", "regular", "each", "free"]
 UNIT_COLUMN = {"indentation": "indentation", "pass": "pass_i"}
-Errors = Mapping[str, Float[np.ndarray, "u w"]]  # by metric; rows are networks (skin and seed), columns are windows
+# Errors by metric. Rows are networks (one per skin and seed), columns are test windows.
+Errors = Mapping[str, Float[np.ndarray, "u w"]]
 
 
 class Drift(SectionWithTraining):
     """Settings section `drift`: windows of contacts for training and testing, and the no-load policies."""
 
-    unit: Literal["indentation", "pass"]  # unit of the counts below
+    unit: Literal["indentation", "pass"]  # unit of train_n, test_n and every_n
     train_n: Count
     test_n: Count
     every_n: Count
     policies: Annotated[tuple[PolicyName, ...], Field(min_length=1)]
     regular_n: Count | None = None  # indentations from one no-load reading to the next under policy `regular`
-    # Standard deviations per contact of a random walk that is added to the field after training; simulated scenes only.
+    # Step sizes (standard deviation per contact and channel) of the random walks that are added to all readings after
+    # the training contacts; simulated scenes only.
     wander_uT: tuple[Annotated[float, Field(ge=0, le=1000)], ...] = ()
     training: Training
 
@@ -83,11 +85,11 @@ class Drift(SectionWithTraining):
         if self.test_n > self.every_n:
             raise ValueError(f"test_n must be at most every_n ({self.every_n}), so that windows do not overlap")
         if self.train_n > self.every_n:
-            raise ValueError(f"train_n must be at most every_n ({self.every_n}), after which the first test follows")
+            raise ValueError(f"train_n must be at most every_n ({self.every_n}), where the first test window begins")
         if ("regular" in self.policies) != (self.regular_n is not None):
             raise ValueError("regular_n is required if policies contains regular, and not allowed otherwise")
         if len(set(self.policies)) < len(self.policies):
-            raise ValueError(f"policies must name each policy only once; got {list(self.policies)}")
+            raise ValueError(f"policies contains a policy more than once: {list(self.policies)}")
         return self
 
 
@@ -104,14 +106,14 @@ class WindowPredictions:
     seed_i: int
     window_i: int
     contacts_n: int  # contacts of the skin before the window
-    noload_off_uT: float  # rms difference between the policy's no-load field and that read before the contact
+    noload_off_uT: float  # rms difference between the policy's no-load field and one read just before each contact
     indentation: Int[np.ndarray, " f"]
     true: Float[np.ndarray, "f 3"]
     predicted: Float[np.ndarray, "f 3"]
 
 
 def drift(settings: Settings, section: Drift, indentations: Path, results: Path) -> None:
-    """Train and test networks under every no-load policy, on every capture of the scene."""
+    """Train and test networks for every no-load policy, on every capture of the scene, and write the results."""
     preload_training()
     selection = settings.section(Selection, "selection")
     captures = read_captures(indentations, tuple(settings.captures_in(indentations)))
@@ -141,20 +143,23 @@ def drift(settings: Settings, section: Drift, indentations: Path, results: Path)
     headline_numbers, plot_data = summarise_headline(section, predictions.pop(HEADLINE), parts, field_sizes(captures))
     numbers |= headline_numbers
     if predictions:
-        tables_of = {name: score_windows(own) for name, own in predictions.items()}
+        recipe_scores = {name: score_windows(of_recipe) for name, of_recipe in predictions.items()}
         numbers["variants"] = {
             name: {policy: window_means(table, policy) for policy in section.policies}
-            for name, table in tables_of.items()
+            for name, table in recipe_scores.items()
         }
     losses = read_losses(indentations, numbers["dropped"])
     write_results(results, numbers, plot_data, losses, tally(map(collapse_record, trained)))
 
 
 def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selection) -> tuple[Windows, list[Part]]:
-    """Cut all captures into the same windows, and gather the rows of each window under every policy."""
+    """Divide all captures into the same windows, and collect the input rows of each window under every no-load policy.
+
+    A `Part` contains the rows of one window of one capture under one policy.
+    """
     check_one_per_skin(captures)
     units = [rank(getattr(capture, UNIT_COLUMN[section.unit])) for capture in captures]
-    units_n = [1 + int(own.max()) for own in units]
+    units_n = [1 + int(unit_i.max()) for unit_i in units]
     windows = make_windows(units_n, train_n=section.train_n, test_n=section.test_n, every_n=section.every_n)
     policies: dict[str, Policy] = {policy: partial(noload_field, policy, section) for policy in section.policies}
     parts = make_parts(list(zip(captures, units, strict=True)), policies, windows=windows, selection=selection)
@@ -162,7 +167,7 @@ def cut_windows(captures: Sequence[Readings], section: Drift, selection: Selecti
 
 
 def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.ndarray:
-    """Return the no-load field of each reading under a policy."""
+    """Return, for each reading, the no-load field to subtract under a policy."""
     fields = readings.noload_uT, readings.indentation
     if policy == "regular":
         assert section.regular_n is not None
@@ -175,7 +180,7 @@ def noload_field(policy: PolicyName, section: Drift, readings: Readings) -> np.n
 
 
 def make_jobs(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tuple[TrainingJob, list[Part]]]:
-    """Make one job per recipe, skin, policy and seed, with its test windows."""
+    """Yield one training job per skin, policy, recipe and seed, together with its test windows."""
     starts = [i for i, part in enumerate(parts) if part.window_i == TRAIN]
     for start, end in pairwise([*starts, len(parts)]):
         train, tests = parts[start], list(parts[start + 1 : end])
@@ -186,7 +191,7 @@ def make_jobs(parts: Sequence[Part], section: Drift, seed: int) -> Iterator[tupl
 
 
 def split_predictions(job: TrainingJob, trained: TrainingResult, tests: Sequence[Part]) -> Iterator[WindowPredictions]:
-    """Split a network's predictions by window."""
+    """Split the predictions of one network into its test windows."""
     ends = np.cumsum([len(part.rows) for part in tests])[:-1]
     for part, predicted in zip(tests, np.split(trained.predicted, ends), strict=True):
         yield WindowPredictions(
@@ -198,9 +203,10 @@ def split_predictions(job: TrainingJob, trained: TrainingResult, tests: Sequence
 def summarise_headline(
     section: Drift, predictions: Sequence[WindowPredictions], parts: Sequence[Part], field: dict[str, float]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Summarise the networks of the headline recipe: numbers, and the points of figure 5b.
+    """Summarise the networks of the headline recipe: return the numbers, and the points of figure 5b.
 
-    The paper does not say which policy figure 5b shows; `regular` is used if it was run.
+    The paper does not say which no-load policy figure 5b shows. We use `regular` if the scene has it, and the first
+    policy of the scene otherwise.
     """
     scores = score_windows(predictions)
     windows = {policy: window_means(scores, policy) for policy in section.policies}
@@ -226,9 +232,9 @@ def summarise_headline(
 
 
 def score_windows(predictions: Sequence[WindowPredictions]) -> pd.DataFrame:
-    """Score every window of every network: one row each, including `bias_f_N` (mean of predicted minus true force).
+    """Return one row of scores per network and window.
 
-    Metrics of force are absent if no force is known.
+    `bias_f_N` is the mean of predicted minus true force. Metrics of force are missing if no force is known.
     """
     rows = []
     for window in predictions:
@@ -252,13 +258,13 @@ def _metrics_in(scores: pd.DataFrame, *names: str) -> list[str]:
 
 
 def window_means(scores: pd.DataFrame, policy: str) -> list[dict[str, Any]]:
-    """Return one row per window: means over skins and seeds, and under `spread` their standard deviations."""
+    """Return one row per window, with means over skins and seeds; `spread` contains the standard deviations."""
     rows = []
-    for _, own in scores[scores["policy"] == policy].groupby("window_i"):
-        values = {name: own[name].to_numpy() for name in _metrics_in(own, *METRICS, "bias_f_N")}
-        row: dict[str, Any] = {"contacts_n": round(float(np.mean(own["contacts_n"].to_numpy())))}
+    for _, window_scores in scores[scores["policy"] == policy].groupby("window_i"):
+        values = {name: window_scores[name].to_numpy() for name in _metrics_in(window_scores, *METRICS, "bias_f_N")}
+        row: dict[str, Any] = {"contacts_n": round(float(np.mean(window_scores["contacts_n"].to_numpy())))}
         row |= {name: float(scores_of_metric.mean()) for name, scores_of_metric in values.items()}
-        row["noload_off_uT"] = float(np.mean(own["noload_off_uT"].to_numpy()))
+        row["noload_off_uT"] = float(np.mean(window_scores["noload_off_uT"].to_numpy()))
         row["spread"] = {
             name: float(scores_of_metric.std(ddof=1))
             for name, scores_of_metric in values.items()
@@ -273,23 +279,28 @@ def network_errors(scores: pd.DataFrame, policy: str) -> dict[str, Float[np.ndar
 
     Row i has the same skin and seed under every policy, so the rows of two policies form pairs.
     """
-    own = scores[scores["policy"] == policy]
+    policy_scores = scores[scores["policy"] == policy]
     return {
-        name: np.ascontiguousarray(own.pivot_table(name, index=["skin", "seed_i"], columns="window_i"))
-        for name in _metrics_in(own, *METRICS)
+        name: np.ascontiguousarray(policy_scores.pivot_table(name, index=["skin", "seed_i"], columns="window_i"))
+        for name in _metrics_in(policy_scores, *METRICS)
     }
 
 
 def last_window(scores: pd.DataFrame, policy: str) -> dict[str, Any]:
-    """Summarise the scores of the last window over boards; `sd_seeds` is the sd over the networks of one skin."""
-    own = scores[(scores["policy"] == policy) & (scores["window_i"] == scores["window_i"].max())]
-    contacts_n = round(float(np.mean(own["contacts_n"].to_numpy())))
-    rows = own.drop(columns=["policy", "seed_i", "window_i", "contacts_n", "noload_off_uT"]).dropna(axis=1, how="all")
+    """Summarise the scores of the last window over boards.
+
+    `sd_seeds` is the standard deviation over the networks of one skin, averaged over skins.
+    """
+    window_scores = scores[(scores["policy"] == policy) & (scores["window_i"] == scores["window_i"].max())]
+    contacts_n = round(float(np.mean(window_scores["contacts_n"].to_numpy())))
+    rows = window_scores.drop(columns=["policy", "seed_i", "window_i", "contacts_n", "noload_off_uT"]).dropna(
+        axis=1, how="all"
+    )
     return {"contacts_n": contacts_n} | add_seed_sd(summarise(board_means(rows), boards=True), rows, "board", "skin")
 
 
 def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
-    """Find the first window after the paper's 45,000 contacts, or the last window if there is none."""
+    """Return the index of the first window after 45,000 contacts (paper figure 5b), or the index of the last window."""
     late = [i for i, row in enumerate(rows) if row["contacts_n"] >= LATE_CONTACTS_N]
     return late[0] if late else len(rows) - 1
 
@@ -299,7 +310,7 @@ def late_window(rows: Sequence[Mapping[str, Any]]) -> int:
 
 @dataclass(frozen=True)
 class ContactForces:
-    """Forces of one window: one point per indentation with a known force, the mean of its readings."""
+    """True and predicted forces of one window, averaged over the readings of each indentation with a known force."""
 
     skin: Shaped[np.ndarray, " n"]
     true_N: Float[np.ndarray, " n"]
@@ -307,9 +318,9 @@ class ContactForces:
 
 
 def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
-    """Average the readings of each indentation, because they are not independent.
+    """Average true and predicted forces over the readings of each indentation, because readings are not independent.
 
-    All predictions are for one window, each for one skin by one network.
+    All predictions must be for the same window; each element is for one skin, by one network.
     """
     skin = np.concatenate([np.full(len(window.indentation), window.skin) for window in predictions])
     indentation = np.concatenate([window.indentation for window in predictions])
@@ -326,7 +337,10 @@ def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
 
 
 def force_bias(contacts: ContactForces) -> dict[str, Any]:
-    """Return the mean of predicted minus true force, its standard error over contacts, and the least-squares slope."""
+    """Return the mean of predicted minus true force, the standard error of this mean over contacts, and the slope.
+
+    The slope is that of predicted against true force, by least squares.
+    """
     error_N = contacts.predicted_N - contacts.true_N
     deviation_N = contacts.true_N - contacts.true_N.mean()
     return {
@@ -341,41 +355,47 @@ def force_bias(contacts: ContactForces) -> dict[str, Any]:
 def late_force(
     predictions: Sequence[WindowPredictions], policy: str, window_i: int
 ) -> tuple[dict[str, Any], dict[str, list[float]]] | None:
-    """Return the force bias of one window (mean over seeds, and of each network), and the first seed's points to draw.
+    """Return the force bias of one window under one policy, and the points of the first seed for the figure.
 
-    Returns None if fewer than two contacts have a known force.
+    The bias is given as the mean over seeds, and for each network. Returns None if fewer than two contacts have a known
+    force.
     """
-    own = [one for one in predictions if (one.policy, one.window_i) == (policy, window_i)]
-    seeds = sorted({one.seed_i for one in own})
-    contacts = [contact_forces([one for one in own if one.seed_i == seed_i]) for seed_i in seeds]
+    window = [network for network in predictions if (network.policy, network.window_i) == (policy, window_i)]
+    seeds = sorted({network.seed_i for network in window})
+    contacts = [contact_forces([network for network in window if network.seed_i == seed_i]) for seed_i in seeds]
     if len(contacts[0].true_N) < 2:
         return None
-    biases = [force_bias(one) for one in contacts]
-    # The indentations are the same for every seed, so their standard error does not shrink with more seeds.
-    means = {name: float(np.mean([one[name] for one in biases])) for name in biases[0]}
+    biases = [force_bias(contacts_of_seed) for contacts_of_seed in contacts]
+    # Standard errors over indentations are averaged over seeds. They do not shrink with the number of seeds, because
+    # all seeds have the same indentations.
+    means = {name: float(np.mean([bias[name] for bias in biases])) for name in biases[0]}
     means["indentations_n"] = biases[0]["indentations_n"]
-    each_N = [force_bias(contact_forces([one]))["bias_N"] for one in own]
-    return means | {"network_bias_N": each_N, "network_board": [one.board for one in own]}, points(contacts[0])
+    network_bias_N = [force_bias(contact_forces([network]))["bias_N"] for network in window]
+    boards = [network.board for network in window]
+    return means | {"network_bias_N": network_bias_N, "network_board": boards}, points(contacts[0])
 
 
 def points(contacts: ContactForces) -> dict[str, list[float]]:
-    """Return true and predicted forces for the figure, to 1 mN; at most about `POINTS_MAX_N` contacts."""
+    """Return the true and predicted forces of at most `POINTS_MAX_N` contacts for the figure, rounded to 1 mN."""
     every_n = ceil(len(contacts.true_N) / POINTS_MAX_N)
     sides = {"true_N": contacts.true_N, "predicted_N": contacts.predicted_N}
     return {name: np.round(values[::every_n], DECIMALS).tolist() for name, values in sides.items()}
 
 
 def force_left_pct(parts: Sequence[Part], policy: str, window_i: int) -> float | None:
-    """Return `force_left` of a window relative to training, mean over skins; None if unknown for any skin."""
-    own = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
-    ratios_pct = [force_left(own[skin, TRAIN], late) for (skin, i), late in own.items() if i == window_i]
+    """Return the mean over skins of `force_left` between the training window and window `window_i`.
+
+    Returns None if `force_left` is unknown for any skin.
+    """
+    windows = {(part.readings.skin, part.window_i): part.readings for part in parts if part.policy == policy}
+    ratios_pct = [force_left(windows[skin, TRAIN], late) for (skin, i), late in windows.items() if i == window_i]
     return None if None in ratios_pct else float(np.mean([value for value in ratios_pct if value is not None]))
 
 
 def force_left(early: Readings, late: Readings) -> float | None:
-    """Return the ratio of late to early force at equal places and depths, in %; below 100 if the skin softened.
+    """Return late force / early force at equal places and depths, in percent; below 100 if the skin softened.
 
-    Returns None if no place and depth with a known force was visited both early and late.
+    Returns None if no place was pressed to the same depth both early and late with known forces.
     """
     sides = []
     for readings in (early, late):
@@ -384,12 +404,12 @@ def force_left(early: Readings, late: Readings) -> float | None:
         sides.append((stop[known], readings.Fz_N[known].astype(float)))
     stops, where = np.unique(np.concatenate([stop for stop, _ in sides]), axis=0, return_inverse=True)
     stop_i = np.split(where.ravel(), [len(sides[0][0])])
-    n = [np.bincount(own, minlength=len(stops)) for own in stop_i]
+    n = [np.bincount(side_i, minlength=len(stops)) for side_i in stop_i]
     both = (n[0] > 0) & (n[1] > 0)
     if not both.any():
         return None
-    sums_N = [np.bincount(own, force_N, len(stops)) for own, (_, force_N) in zip(stop_i, sides, strict=True)]
-    early_N, late_N = (total_N[both] / own_n[both] for total_N, own_n in zip(sums_N, n, strict=True))
+    sums_N = [np.bincount(side_i, force_N, len(stops)) for side_i, (_, force_N) in zip(stop_i, sides, strict=True)]
+    early_N, late_N = (total_N[both] / side_n[both] for total_N, side_n in zip(sums_N, n, strict=True))
     return float(100 * late_N.sum() / early_N.sum())
 
 
@@ -397,22 +417,22 @@ def force_left(early: Readings, late: Readings) -> float | None:
 
 
 def field_sizes(captures: Sequence[Readings]) -> dict[str, float]:
-    """Return the rms over channels of the change of field by a contact, and of the noise of a no-load reading.
+    """Return two rms values over channels: the change of field by a contact, and the noise of a no-load reading.
 
-    The change is relative to the no-load reading before that contact, whatever the policy. The noise is estimated from
-    differences between successive no-load readings, where drift is small.
+    The change is relative to the no-load reading just before each contact, independent of the policy. The noise is
+    estimated from the differences between successive no-load readings, between which there is little drift.
     """
     changes_uT = [subtract(capture.b_uT, capture.noload_uT)[~np.isnan(capture.x_mm)] for capture in captures]
     steps_uT = [np.diff(capture.noload_uT[_first_rows(capture)].astype(float), axis=0) for capture in captures]
-    pairs_n = sum(len(own) for own in steps_uT)
+    pairs_n = sum(len(differences_uT) for differences_uT in steps_uT)
     noise_uT = rms(np.concatenate(steps_uT)) / float(np.sqrt(2)) if pairs_n else 0.0
     return {"contact_uT": rms(np.concatenate(changes_uT)), "noload_noise_uT": noise_uT}
 
 
 def pace(captures: Sequence[Readings]) -> dict[str, float]:
-    """Return the median time from one indentation to the next, and the duration of the longest capture.
+    """Return the median time from one indentation to the next, and the duration of the longest capture, in s.
 
-    Returns an empty dict if the recordings have no times, or only one indentation.
+    Returns an empty dict if no capture has times and more than one indentation.
     """
     timed = [capture for capture in captures if np.isfinite(capture.t_s).all()]
     steps_s = [step_s for capture in timed for step_s in np.diff(capture.t_s[_first_rows(capture)])]
@@ -425,7 +445,7 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
 
 
 def describe_pace(numbers: Mapping[str, Any], source: str) -> str:
-    """Describe the result of `pace` in words, with a remark on temperature for simulated captures."""
+    """Return a sentence on the times in `numbers` (see `pace`), with a remark on temperature for simulated captures."""
     if "lasts_s" not in numbers:
         return "The times of the contacts are not known."
     every = f"The median time from one contact to the next is {numbers['contact_every_s']:.3g} s"
@@ -457,12 +477,12 @@ def score_wandering(
     networks: Sequence[tuple[TrainingJob, list[Part], TrainingResult]],
     seed: int,
 ) -> dict[str, list[dict[str, Any]]]:
-    """Test the networks on their last window again, after a random walk was added to the captures.
+    """Test each network again on its last test window, after a random walk has been added to all readings.
 
-    Returns, by policy, one row per step size: mean scores over skins and seeds, and their standard deviations under
-    `spread`.
+    Returns, for each policy, one row per step size of the walk, with mean scores over skins and seeds; `spread`
+    contains the standard deviations.
     """
-    from reskin.models.network import Predictor  # imports torch: only when needed
+    from reskin.models.network import Predictor  # imported here because it imports torch, which takes seconds
 
     trained_on = rank(getattr(captures[0], UNIT_COLUMN[section.unit])) < section.train_n
     after_n = 1 + int(rank(captures[0].indentation)[trained_on].max())
@@ -478,9 +498,13 @@ def score_wandering(
             inputs = trained.scaler.encode(VIEW[job.recipe.inputs](part.rows.db_uT))
             scores.setdefault(part.policy, []).append(score(part.rows.target, trained.scaler.decode(predict(inputs))))
             off_uT.setdefault(part.policy, []).append(part.noload_off_uT)
-        for policy, own in scores.items():
-            stats = summarise(pd.DataFrame(own)[[name for name in METRICS if name in own[0]]])
-            row: dict[str, Any] = {"step_uT": step_uT, "noload_off_uT": float(np.mean(off_uT[policy])), "n": len(own)}
+        for policy, network_scores in scores.items():
+            stats = summarise(pd.DataFrame(network_scores)[[name for name in METRICS if name in network_scores[0]]])
+            row: dict[str, Any] = {
+                "step_uT": step_uT,
+                "noload_off_uT": float(np.mean(off_uT[policy])),
+                "n": len(network_scores),
+            }
             row |= {name: stat["mean"] for name, stat in stats.items()}
             row["spread"] = {name: stat["sd"] for name, stat in stats.items() if "sd" in stat}
             rows.setdefault(policy, []).append(row)
@@ -488,9 +512,12 @@ def score_wandering(
 
 
 def add_walk(readings: Readings, step_uT: float, *, after_n: int, seed: int) -> Readings:
-    """Add a random walk to all readings after `after_n` contacts; `step_uT` is its sd per contact and channel."""
+    """Add a random walk to all readings, including no-load readings, after the first `after_n` contacts.
+
+    The steps of the walk have a standard deviation of `step_uT` per contact and channel.
+    """
     since_n = np.maximum(rank(readings.indentation) + 1 - after_n, 0)
-    rng = rng_for(seed, "drift", "wander", readings.skin)  # the same walk for all step sizes, scaled
+    rng = rng_for(seed, "drift", "wander", readings.skin)  # all step sizes scale the same random walk
     walk_T = baseline_walk(since_n, readings.b_uT.shape[1], step_T=step_uT * micro, rng=rng)
     walk_uT = (walk_T / micro).astype(np.float32)
     return replace(readings, b_uT=readings.b_uT + walk_uT, noload_uT=readings.noload_uT + walk_uT)
@@ -506,27 +533,30 @@ EACH_IS_WORSE = '"errors are also higher when no-load measurements are updated b
 OVERESTIMATES = (
     '"the model, on average, overestimates the applied force"; "attributed to the softening of the elastomer"'
 )
-INDENTATION_SES = 2.0  # standard errors: about 95 % confidence for the many indentations of a window
+INDENTATION_SES = 2.0  # half-width of the interval over a window's indentations, in standard errors (about 95 %)
 ERRORS = {"mse_xy_mm2": ("MSE_xy", "mm²"), "mse_f_N2": ("MSE_F", "N²")}  # MSE_F is absent if forces are unknown
 PER_CONTACTS_N = 10_000
 
 
 class Comparison(NamedTuple):
-    """A quantity compared between pairs of networks; the difference is positive if the paper is right."""
+    """Differences of a quantity between paired networks; they are positive if the paper's statement is right."""
 
     text: str
     over_boards: Stat
-    over_trainings: list[float] | None  # 95 % interval over networks; None for one network
+    over_trainings: list[float] | None  # 95 % interval over training runs; None if there is a single network
 
 
 def compare_networks(
     quantity: str, unit: str, values: Mapping[str, Float[np.ndarray, " u"]], boards: Sequence[str]
 ) -> Comparison:
-    """Compare the networks of two policies in pairs; `values` are by policy, `boards` gives the board of each pair."""
-    (policy, own), (other_policy, other) = values.items()
-    over_boards, over_trainings = mean_over_boards(own - other, boards)
+    """Compare a quantity between the networks of two policies, in pairs of equal skin and seed.
+
+    `values` maps each of the two policies to one value per network; `boards` are the boards of the pairs.
+    """
+    (policy, first), (other_policy, second) = values.items()
+    over_boards, over_trainings = mean_over_boards(first - second, boards)
     text = (
-        f"{quantity}: {policy} {own.mean():.3g}, {other_policy} {other.mean():.3g}, "
+        f"{quantity}: {policy} {first.mean():.3g}, {other_policy} {second.mean():.3g}, "
         f"difference {over_boards['mean']:+.2g}{_show_ends(over_boards, over_trainings)} {unit}"
     )
     return Comparison(text, over_boards, over_trainings)
@@ -540,7 +570,7 @@ def _show_ends(over_boards: Stat, over_trainings: list[float] | None) -> str:
 def mean_over_boards(
     values: Float[np.ndarray, " u"], boards: Sequence[str]
 ) -> tuple[dict[str, Any], list[float] | None]:
-    """Return the statistic of the board means of values, and the 95 % interval of the values over networks."""
+    """Return the statistic over boards of each board's mean value, and the 95 % interval of values over networks."""
     by_board = pd.Series(values, dtype=float).groupby(list(boards)).mean()
     return statistic(by_board, boards=True), interval(values.astype(float))
 
@@ -548,10 +578,10 @@ def mean_over_boards(
 def judge_findings(
     networks: Mapping[str, Errors], *, boards: Sequence[str], contacts_n: Sequence[int], late: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
-    """Test each finding of the paper for which the required policies and quantities are available.
+    """Test each finding of the paper for which the scene has the required policies and quantities.
 
-    `networks` are the errors of the networks by policy; row i of two policies is a pair, for board `boards[i]`.
-    `contacts_n` is the number of contacts before each window.
+    `networks` are the errors of the networks by policy. Row i of two policies is a pair (same skin and seed) on board
+    `boards[i]`. `contacts_n` is the number of contacts before each window. `late` are the numbers of `late_force`.
     """
     frequent = [policy for policy in ("regular", "each") if policy in networks]
     findings = []
@@ -594,9 +624,10 @@ def growth(contacts_n: Sequence[int], errors: Float[np.ndarray, "u w"]) -> Float
 
 
 def late_bias(late: Mapping[str, Any]) -> Comparison:
-    """Judge the bias of late forces against the variation over indentations and over training runs.
+    """Return the force bias after many contacts as a comparison with 0.
 
-    With a single network there is no interval over training runs.
+    The interval over training runs is widened to two standard errors over indentations where these are larger; it is
+    None if there is a single network.
     """
     over_boards, ends_N = mean_over_boards(np.array(late["network_bias_N"]), late["network_board"])
     reach_N = INDENTATION_SES * late["bias_se_N"]
@@ -606,10 +637,10 @@ def late_bias(late: Mapping[str, Any]) -> Comparison:
     return Comparison(f"bias of force: {bias}, slope {late['slope']:.3g}", over_boards, ends_N)
 
 
-def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[str, Any]:
-    """Judge a finding by all of its comparisons, over boards and over training runs on these boards."""
-    judged = combine_verdicts([verdict(part.over_boards) for part in parts])
-    trainings = [part.over_trainings for part in parts]
+def judge_finding(name: str, finding: str, comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """Combine the verdicts of all comparisons of a finding, both over boards and over training runs."""
+    judged = combine_verdicts([verdict(comparison.over_boards) for comparison in comparisons])
+    trainings = [comparison.over_trainings for comparison in comparisons]
     of_trainings = combine_verdicts([UNDECIDED if ends is None else verdict({"ci95": ends}) for ends in trainings])
     return {
         "id": name,
@@ -617,7 +648,7 @@ def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[
         "holds": judged == SUPPORTED,
         "verdict": judged,
         "of_trainings": of_trainings,
-        "measured": "; ".join(part.text for part in parts),
+        "measured": "; ".join(comparison.text for comparison in comparisons),
     }
 
 
@@ -625,8 +656,8 @@ def judge_finding(name: str, finding: str, parts: Sequence[Comparison]) -> dict[
 
 POLICIES = ("initial", "regular", "each", "free")
 WANDER_MEANING = (
-    "The networks of figure 5a, tested again on their last window after a random walk was added to the captures: one "
-    "normally distributed step per contact and channel after the end of training, the same in contact readings and "
+    "The networks of figure 5a, tested again on their last window after a random walk was added to the captures. After "
+    "the training contacts, each contact adds one normally distributed step per channel, to contact readings and to "
     "no-load readings. The row without an added walk is the last window of figure 5a. The table of skins gives the "
     "drift of the field at rest without an added walk, as rms change over 1 to 1,000 contacts."
 )
@@ -660,7 +691,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
         }
         for finding in numbers["findings"]
     ]
-    shown = {
+    result = {
         "drift": tabulate(lines, meaning=meaning, spread=spread),
         "drift_findings": tabulate(findings, meaning=f"{FINDINGS_MEANING} {_possible_reasons(numbers)}"),
     }
@@ -673,12 +704,12 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
                 line[f"no-load reading off by, µT ({title})"] = f"{row['noload_off_uT']:.3g}"
                 line |= {f"{COLUMNS[name]} ({title})": show(_stat(row, name)) for name in ("accuracy_pct", error)}
             walked.append(line)
-        shown["drift_wander"] = tabulate(walked, meaning=WANDER_MEANING, spread=spread)
-    return shown
+        result["drift_wander"] = tabulate(walked, meaning=WANDER_MEANING, spread=spread)
+    return result
 
 
 def _possible_reasons(numbers: Mapping[str, Any]) -> str:
-    """Compare no-load errors with a contact's field, and describe how much of the force bias softening explains."""
+    """Describe two possible reasons for the scores: errors of the no-load reading, and softening of the skin."""
     field, late = numbers["field"], numbers.get("late", {})
     offsets = ", ".join(
         f"{numbers[policy][-1]['noload_off_uT']:.2g} µT ({title})" for policy, (title, _) in _policies(numbers).items()
@@ -698,7 +729,7 @@ def _possible_reasons(numbers: Mapping[str, Any]) -> str:
 
 
 def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mapping[str, Any]]]]:
-    """Return the title and the windows of each policy that was tested."""
+    """Return the title and the rows (one per window) of each policy that was tested."""
     titles = {
         "initial": "once at the start",
         "regular": f"every {numbers.get('regular_n')} indentations",
@@ -709,7 +740,7 @@ def _policies(numbers: Mapping[str, Any]) -> dict[str, tuple[str, Sequence[Mappi
 
 
 def _error(numbers: Mapping[str, Any]) -> str:
-    """Choose the error to show beside accuracy: that of the force, or of places if no force is known."""
+    """Return the name of the error to show beside accuracy: of the force, or of the place if no force is known."""
     [(_, rows), *_] = _policies(numbers).values()
     return "mse_f_N2" if "mse_f_N2" in rows[0] else "mse_xy_mm2"
 
@@ -719,7 +750,7 @@ def _stat(row: Mapping[str, Any], metric: str) -> dict[str, float]:
 
 
 def _spread(numbers: Mapping[str, Any]) -> str:
-    """Describe what ± means in the rows of all policies."""
+    """Return a sentence that says what ± means in the tables."""
     [(_, rows), *_] = _policies(numbers).values()
     seeds_n, skins_n = numbers["seeds_n"], numbers["skins_n"]
     if not rows[0]["spread"]:
@@ -746,11 +777,11 @@ def _protocol(numbers: Mapping[str, Any]) -> str:
 
 # --- Figures ---
 
-MARGIN = 0.05  # of the range of forces
+MARGIN = 0.05  # margin of the axes of figure 5b, as a fraction of the range of forces
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw scores against contacts (figure 5a) and an added walk, and late forces if known (figure 5b)."""
+    """Plot scores against contacts (figure 5a), scores against the added random walk, and late forces (figure 5b)."""
     windows = {policy: rows for policy, (_, rows) in _policies(numbers).items()}
     title = f"Trained on the first contacts, tested on later ones ({source})"
     texts = {"drift.svg": _draw_scores(numbers, windows, "contacts_n", title)}
@@ -766,7 +797,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 def _draw_scores(
     numbers: Mapping[str, Any], lines: Mapping[str, Sequence[Mapping[str, Any]]], x: str, title: str
 ) -> str:
-    """Draw accuracy and an error against `contacts_n` or `step_uT`, one line per policy."""
+    """Plot accuracy and one error against column `x` (`contacts_n` or `step_uT`), with one line per policy."""
     policies, spread = _policies(numbers), _spread(numbers)
     with drawing(7.6, 4.0) as figure:
         for axes, metric in zip(figure.subplots(1, 2), ("accuracy_pct", _error(numbers)), strict=True):

@@ -1,7 +1,7 @@
 """Dynamic presses: readings at the full rate while the force keeps changing (paper section 7, future work).
 
-Place and force are estimated from each reading alone, and from the mean of the last five readings, which is the paper's
-protocol at rest.
+Place and force are estimated from each reading alone, and from the mean of the last five readings. The paper averages
+five readings of a press at rest.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -27,31 +27,31 @@ from reskin.metrics import score
 from reskin.models.trained import networks_held_out
 
 WINDOW_N = 5  # readings that the paper takes at rest (section 3)
-FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, whose contact is hard to locate
-BINS_N = 5
-LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # candidate lags
+FORCE_MIN_N = 0.2  # assumed: excludes the first and last readings of a press, whose place is hard to estimate
+BINS_N = 5  # ranges of the duration of a press
+LAGS_MS = np.arange(-5.0, 20.05, 0.1)  # lags of the predicted force that are tried
 METHODS = ("one", "mean5", "mean5_of_middle")
 
-Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
+Predict = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]  # dB in uT -> x and y in mm, F in N
 
 
 @dataclass(frozen=True)
 class Presses:
-    """Readings of presses in order of time; each row has the index and the duration of its press."""
+    """Readings of all presses in order of time; each reading has the index and the duration of its press."""
 
     db_uT: Float32[np.ndarray, "f ch"]
     true: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N
     t_s: Float64[np.ndarray, " f"]
     press_i: Int64[np.ndarray, " f"]
     duration_s: Float64[np.ndarray, " f"]
-    scored: Bool[np.ndarray, " f"]  # enough force, and four earlier readings of the same press
+    scored: Bool[np.ndarray, " f"]  # force of at least FORCE_MIN_N, and four earlier readings of the same press
 
     def __len__(self) -> int:
         return len(self.t_s)
 
 
 def dynamics(settings: Settings, indentations: Path, models: Path, results: Path) -> None:
-    """Score the networks of train_multi that were trained without the board of the pressed skin."""
+    """Score, on dynamic presses, the networks of stage train_multi that were trained without the pressed board."""
     capture = only(read_captures(indentations), indentations)
     true = np.stack([getattr(capture, name) for name in TARGETS], axis=1)
     presses = find_presses(subtract(capture.b_uT, capture.noload_uT), true, capture.t_s, capture.indentation)
@@ -67,7 +67,10 @@ def find_presses(
     t_s: Float64[np.ndarray, " f"],
     indentation: Int32[np.ndarray, " f"],
 ) -> Presses:
-    """Find the presses; each lasts from half a frame before its first reading to half a frame after its last."""
+    """Group readings into presses by their indentation, and determine which readings are scored.
+
+    A press lasts from half a frame before its first reading to half a frame after its last.
+    """
     _, first_i, press_i, frames_n = np.unique(indentation, return_index=True, return_inverse=True, return_counts=True)
     duration_s = (t_s[first_i + frames_n - 1] - t_s[first_i]) + 1 / rate_of(t_s, press_i)
     position = np.arange(len(t_s)) - first_i[press_i]
@@ -76,7 +79,7 @@ def find_presses(
 
 
 def rate_of(t_s: Float64[np.ndarray, " f"], press_i: Int64[np.ndarray, " f"]) -> float:
-    """Measure the rate in Hz of the readings within presses."""
+    """Return the rate of the readings in Hz, from the median time between successive readings of a press."""
     return float(1 / np.median(np.diff(t_s)[np.diff(press_i) == 0]))
 
 
@@ -91,20 +94,20 @@ def running_mean(values: Float[np.ndarray, "f c"]) -> Float64[np.ndarray, "f c"]
 def score_presses(presses: Presses, networks: Sequence[Predict], *, board: str) -> dict[str, Any]:
     """Score estimates from each reading alone and from the mean of the last five readings.
 
-    The mean is also compared with the truth at its middle reading. All presses are on one skin of this `board`, so
-    `paired`, which compares the first two methods, has no interval.
+    The estimate from the mean is also compared with the true values at the middle one of its five readings. All presses
+    are on one skin of this `board`, so the comparison of the first two methods (`paired`) has no confidence interval.
     """
     mean_uT = running_mean(presses.db_uT).astype(np.float32)
-    single, averaged = ([network(one) for network in networks] for one in (presses.db_uT, mean_uT))
+    single, averaged = ([network(inputs_uT) for network in networks] for inputs_uT in (presses.db_uT, mean_uT))
     predictions = {"one": single, "mean5": averaged, "mean5_of_middle": averaged}
     edges_s = np.geomspace(presses.duration_s.min(), presses.duration_s.max() * (1 + 1e-9), BINS_N + 1)
     by_duration = []
     for low_s, high_s in pairwise(edges_s):
-        own = presses.scored & (presses.duration_s >= low_s) & (presses.duration_s < high_s)
-        if own.any():
-            presses_n = len(np.unique(presses.press_i[own]))
-            keys = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(own.sum()), "presses_n": presses_n}
-            by_duration.append(keys | _scores(presses, predictions, own, board))
+        in_bin = presses.scored & (presses.duration_s >= low_s) & (presses.duration_s < high_s)
+        if in_bin.any():
+            presses_n = len(np.unique(presses.press_i[in_bin]))
+            keys = {"duration_s": float(np.sqrt(low_s * high_s)), "n": int(in_bin.sum()), "presses_n": presses_n}
+            by_duration.append(keys | _scores(presses, predictions, in_bin, board))
     return {
         "readings_n": int(presses.scored.sum()),
         "presses_n": len(np.unique(presses.press_i[presses.scored])),
@@ -113,33 +116,36 @@ def score_presses(presses: Presses, networks: Sequence[Predict], *, board: str) 
         "force_min_N": FORCE_MIN_N,
         "by_duration": by_duration,
         "all": _scores(presses, predictions, presses.scored, board),
-        "lag_ms": {name: lags(presses, [one[:, 2] for one in predictions[name]]) for name in ("one", "mean5")},
+        "lag_ms": {
+            name: lags(presses, [predicted[:, 2] for predicted in predictions[name]]) for name in ("one", "mean5")
+        },
     }
 
 
 def _scores(
     presses: Presses, predictions: Mapping[str, Sequence[Any]], rows: Bool[np.ndarray, " f"], board: str
 ) -> dict[str, Any]:
-    # The middle of the last five readings is two rows before the last; for a scored row, it is in the same press.
+    # The middle one of the last five readings is two rows earlier. It is of the same press if the row is scored.
     middle = np.flatnonzero(rows) - WINDOW_N // 2
     true = {"one": presses.true[rows], "mean5": presses.true[rows], "mean5_of_middle": presses.true[middle]}
     scores = {
         name: pd.DataFrame([score(true[name], predicted[rows]) for predicted in predictions[name]]) for name in METHODS
     }
     methods = (scores[name].assign(board=board, skin="") for name in ("mean5", "one"))
-    return {name: summarise(own) for name, own in scores.items()} | {"paired": {"mean5_minus_one": paired(*methods)}}
+    summaries = {name: summarise(table) for name, table in scores.items()}
+    return summaries | {"paired": {"mean5_minus_one": paired(*methods)}}
 
 
 def lags(presses: Presses, force_N: Sequence[Float[np.ndarray, " f"]]) -> dict[str, float]:
-    """Find by how many ms the predicted forces lag behind the true ones, over presses and networks."""
-    found_ms = [
-        lag_ms(presses.t_s[rows], predicted_N[rows], presses.t_s[own], presses.true[own, 2])
-        for own in (presses.press_i == press_i for press_i in np.unique(presses.press_i[presses.scored]))
-        for rows in [own & presses.scored]
+    """Summarise, over presses and networks, the lag in ms of the predicted force behind the true force."""
+    lags_ms = [
+        lag_ms(presses.t_s[rows], predicted_N[rows], presses.t_s[in_press], presses.true[in_press, 2])
+        for in_press in (presses.press_i == press_i for press_i in np.unique(presses.press_i[presses.scored]))
+        for rows in [in_press & presses.scored]
         if rows.sum() > WINDOW_N
         for predicted_N in force_N
     ]
-    return statistic(found_ms) if found_ms else {"n": 0}
+    return statistic(lags_ms) if lags_ms else {"n": 0}
 
 
 def lag_ms(
@@ -148,7 +154,10 @@ def lag_ms(
     true_t_s: Float64[np.ndarray, " g"],
     true_N: Float64[np.ndarray, " g"],
 ) -> float:
-    """Return the delay at which the true force, times the best factor, fits the predictions best (least squares)."""
+    """Return the delay in ms at which the delayed true force, times a constant, fits the predicted force best.
+
+    For each candidate delay in `LAGS_MS`, the constant is fitted by least squares.
+    """
     delayed_N = np.interp(t_s[None] - LAGS_MS[:, None] / 1e3, true_t_s, true_N)
     explained = (delayed_N @ predicted_N) ** 2 / (delayed_N**2).sum(axis=1)
     return float(LAGS_MS[int(np.argmax(explained))])
@@ -174,7 +183,7 @@ METRICS = {"accuracy_pct": "accuracy / %", "mse_xy_mm2": "MSE_xy / mm²", "mse_f
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the errors of each method by duration of the press, and over all presses; the paper gives no numbers."""
+    """Tabulate the errors of each method by duration of the press, and over all presses."""
     rows = [(f"{result['duration_s']:.2g}", result) for result in numbers["by_duration"]]
     rows.append(("all", numbers["all"] | {"n": numbers["readings_n"], "presses_n": numbers["presses_n"]}))
     table = pd.DataFrame(
@@ -197,21 +206,21 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw errors of force and place against the press's duration."""
+    """Plot the errors of force and place against the duration of the press."""
     with drawing(7.6, 3.8) as figure:
         panels = figure.subplots(1, 2)
         # The place does not change during a press, so the third method has the same place error as the second.
         for axes, name, methods_n in zip(panels, ("mse_f_N2", "mse_xy_mm2"), (3, 2), strict=True):
             for i, (method, title) in enumerate(list(TITLES.items())[:methods_n]):
-                known = [one for one in numbers["by_duration"] if name in one[method]]
-                duration_s = [one["duration_s"] for one in known]
-                mean, sd = ([one[method][name].get(part, 0.0) for one in known] for part in ("mean", "sd"))
+                known = [row for row in numbers["by_duration"] if name in row[method]]
+                duration_s = [row["duration_s"] for row in known]
+                mean, sd = ([row[method][name].get(value, 0.0) for row in known] for value in ("mean", "sd"))
                 axes.errorbar(
                     duration_s, mean, sd, color=COLOURS[i], marker=MARKERS[i], markersize=4.5, linewidth=1.2,
                     capsize=2, label=title,
                 )  # fmt: skip
             axes.set(xscale="log", xlabel="duration of the press / s", ylabel=METRICS[name])
-            axes.set_xticks(TICKS_S, [f"{one:g}" for one in TICKS_S])
+            axes.set_xticks(TICKS_S, [f"{tick_s:g}" for tick_s in TICKS_S])
             axes.minorticks_off()
             axes.set_ylim(bottom=0)
         handles, labels = panels[0].get_legend_handles_labels()
@@ -222,7 +231,7 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
 
 
 def _less(result: Mapping[str, Any]) -> str:
-    """Judge whether the mean of the last five readings has less force error than each reading alone."""
+    """Format the verdict on whether the mean of the last five readings has less force error than single readings."""
     if "paired" not in result or "mse_f_N2" not in result["paired"]["mean5_minus_one"]:
         return "–"  # no force is known, or the results are from an older version
     difference = result["paired"]["mean5_minus_one"]["mse_f_N2"]

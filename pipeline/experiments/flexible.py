@@ -35,14 +35,19 @@ from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
-DEPTH_DECIMALS = 2  # of a commanded depth in mm
+DEPTH_DECIMALS = 2  # commanded depths in mm are rounded to this many decimals
 DRAWN_N = 400  # points in a panel of the figure
-FORCE_DECIMALS = 3  # of a force in N in the figure
-SHAPE = "shape"  # optional recipe whose inputs are direction and length of dB; expected to depend less on the gap
+FORCE_DECIMALS = 3  # forces in N are rounded to this many decimals for the figure
+# Optional recipe whose inputs are the direction and length of dB; expected to depend less on the gap between skin and
+# chips.
+SHAPE = "shape"
 
 
 def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
-    """Adapt the networks of the first fold of lobo to every flexible skin, and test them on its later passes."""
+    """Adapt networks that were trained on rigid boards to each flexible skin; test them on later passes of the skin.
+
+    The networks are those of the first fold of experiment `lobo` (leave one board out).
+    """
     preload_training()
     data = read_data(settings, main, folds)
     starts, captures = read_pretrained(pretrained), read_captures(indentations)
@@ -51,7 +56,7 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
     data = replace(data, rows=stack(data.rows, poked))
     sides = (first.train, np.arange(trained_n, len(data.rows)))
     fold = hold_out_skins(data.rows, "flexible", first.name, sides, data.settings.section(Split, "split"))
-    variants = {HEADLINE: AFTER, CONTROL: CONTROL, SHAPE: SHAPE}  # by recipe
+    variants = {HEADLINE: AFTER, CONTROL: CONTROL, SHAPE: SHAPE}  # name of a recipe -> name of the variant
     recipes = {name: adapting.recipes[name] for name in variants if name in adapting.recipes}
     jobs = [
         (variants[name], job)
@@ -60,25 +65,26 @@ def flexible(settings: Settings, folds: Path, main: Path, indentations: Path, pr
     ]
     skins = [str(skin) for skin in np.unique(data.rows.skin[fold.test])]
     before = {
-        name: [one for skin in skins for one in predict_before(data, fold, recipe, starts, skin)]
+        name: [prediction for skin in skins for prediction in predict_before(data, fold, recipe, starts, skin)]
         for name, recipe in recipes.items()
         if name != CONTROL
     }
     after, trainings = adapt_and_predict(data, jobs, "flexible")
-    own = before[HEADLINE] + [one for one in after if one.variant != SHAPE]
+    of_paper = before[HEADLINE] + [prediction for prediction in after if prediction.variant != SHAPE]
     numbers: dict[str, Any] = {
         "skins_n": len(skins), "boards_n": len(np.unique(data.rows.board[fold.test])),
-        "seeds_n": len({one.seed_i for one in own}), "pokes_n": adapting.pokes_n, "fold": first.name,
+        "seeds_n": len({prediction.seed_i for prediction in of_paper}), "pokes_n": adapting.pokes_n, "fold": first.name,
         "trained_on_skins_n": len(np.unique(data.rows.skin[fold.train])),
         "strength_ratio": strength_ratio(
-            [sizes_by_depth(one) for one in captures], [sizes_by_depth(one) for one in read_captures(main)]
+            [sizes_by_depth(capture) for capture in captures],
+            [sizes_by_depth(capture) for capture in read_captures(main)],
         ),
-    } | gaps(data) | summarise_flexible(own)  # fmt: skip
+    } | gaps(data) | summarise_flexible(of_paper)  # fmt: skip
     if SHAPE in recipes:
         numbers[SHAPE] = summarise_flexible(
-            before[SHAPE] + [replace(one, variant=AFTER) for one in after if one.variant == SHAPE]
+            before[SHAPE] + [replace(prediction, variant=AFTER) for prediction in after if prediction.variant == SHAPE]
         )
-    plot_data = draw_forces(own, rng_for(data.settings.seed, "flexible", "drawn"))
+    plot_data = draw_forces(of_paper, rng_for(data.settings.seed, "flexible", "drawn"))
     write_results(results, numbers, plot_data, read_losses(indentations, poked.dropped), trainings)
 
 
@@ -86,14 +92,14 @@ ByDepth = Mapping[float, Float[np.ndarray, " d"]]  # |dB| in uT by commanded dep
 
 
 def sizes_by_depth(readings: Readings) -> dict[float, np.ndarray]:
-    """Group the sizes |dB| of a capture by commanded depth."""
+    """Return |dB| in uT of the readings of a capture, by commanded depth in mm."""
     size_uT = np.linalg.norm(readings.b_uT - readings.noload_uT, axis=1)
     depth_mm = np.round(readings.depth_mm.astype(float), DEPTH_DECIMALS)
     return {float(depth): size_uT[depth_mm == depth] for depth in np.unique(depth_mm)}
 
 
 def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
-    """Return the ratio of the median |dB| of flexible boards to that of rigid ones, summarised over common depths."""
+    """Return median |dB| of flexible boards / median |dB| of rigid boards, summarised over the depths of both."""
 
     def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
         return float(np.median(np.concatenate([capture[depth_mm] for capture in captures if depth_mm in capture])))
@@ -103,7 +109,7 @@ def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dic
 
 
 def gaps(data: SceneData) -> dict[str, Any]:
-    """Return the gap between skin and chips on rigid and flexible boards, and the difference in percent."""
+    """Return the gaps between skin and chips on rigid and on flexible boards, and the difference in percent."""
     simulation = simulation_settings(data.settings)
     protocols = {"rigid": "grid", "flexible": "flexible"}
     gap_mm = {
@@ -113,7 +119,7 @@ def gaps(data: SceneData) -> dict[str, Any]:
 
 
 def summarise_flexible(predictions: Sequence[VariantPrediction]) -> dict[str, Any]:
-    """Summarise scores and force bias of each variant over boards, and the gain by adaptation."""
+    """Summarise over boards: the scores and the force bias of each variant, and the change of scores by adaptation."""
     differences = {f"{AFTER}_minus_{BEFORE}": compare_variants(predictions, AFTER, BEFORE)}
     return summarise_variants(predictions) | force_biases(predictions) | {"paired": differences}
 
@@ -121,7 +127,7 @@ def summarise_flexible(predictions: Sequence[VariantPrediction]) -> dict[str, An
 def draw_forces(
     predictions: Sequence[VariantPrediction], rng: np.random.Generator
 ) -> dict[str, dict[str, list[float]]]:
-    """Return true and predicted forces in N of random readings, by the networks of the first seed.
+    """Return true forces of random readings, and forces predicted by the networks of the first seed, in N.
 
     The readings are the same before and after adaptation.
     """
@@ -129,15 +135,16 @@ def draw_forces(
         name: [prediction for prediction in predictions if prediction.variant == name and prediction.seed_i == 0]
         for name in (BEFORE, AFTER)
     }
-    shown = rng.permutation(sum(len(prediction.true) for prediction in first[BEFORE]))[:DRAWN_N]
+    chosen = rng.permutation(sum(len(prediction.true) for prediction in first[BEFORE]))[:DRAWN_N]
     return {
         name: {
             f"{side}_N": np.round(
-                np.concatenate([getattr(prediction, side)[:, FORCE] for prediction in own])[shown], FORCE_DECIMALS
+                np.concatenate([getattr(prediction, side)[:, FORCE] for prediction in first[name]])[chosen],
+                FORCE_DECIMALS,
             ).astype(float).round(FORCE_DECIMALS).tolist()
             for side in ("true", "predicted")
         }
-        for name, own in first.items()
+        for name in first
     }  # fmt: skip
 
 
@@ -149,8 +156,12 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the variants of the paper's recipe, and those of recipe `shape` if the scene has it."""
     lines = [_line(title, numbers, name, source) for name, title in VARIANTS.items() if name in numbers]
     if SHAPE in numbers:
-        own = numbers[SHAPE]
-        lines += [_line(OF_SHAPE + title, own, name, source) for name, title in VARIANTS.items() if name in own]
+        shape_numbers = numbers[SHAPE]
+        lines += [
+            _line(OF_SHAPE + title, shape_numbers, name, source)
+            for name, title in VARIANTS.items()
+            if name in shape_numbers
+        ]
     spread = (
         "[low, high] is the 95 % confidence interval over n boards; the score of a skin is the mean over "
         f"{numbers['seeds_n']} networks. The networks of one fold predict all these boards, so the interval does not "
@@ -161,7 +172,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw predicted against true force before and after adaptation, with the diagonal and the bias."""
+    """Plot predicted against true force before and after adaptation, with the diagonal and the bias."""
     every_N = [value for forces in drawn.values() for side in forces.values() for value in side]
     ends_N = [min(every_N), max(every_N)]
     with drawing(6.4, 3.7) as figure:

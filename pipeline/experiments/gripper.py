@@ -1,7 +1,7 @@
 """Gripper: force control by the force estimates of networks or of the universal model (paper section 6).
 
-A simulated gripper squeezes objects of several stiffnesses. The true force is compared with the intended force, with
-and without one press of known force.
+A simulated gripper squeezes objects of several stiffnesses. The true force is compared with the intended force (the
+aim). The force estimates are used without correction, or are corrected with one press of known force.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,18 +31,21 @@ from reskin.seeds import rng_for
 from reskin.simulation.protocols import load_steps_N
 from reskin.universal.model import Universal, load_universal
 
-RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0  # of the controller; forces are scored from SETTLED_S on
-SWING = 3.0  # factor by which an object becomes stiffer and softer than its nominal stiffness
-DEPTH_OF_1_N_MM = 0.8  # assumed, for a round tip (Hertz); affects how fast a force is reached, not its value
-READINGS_N = 5  # of the known press, as many as of each indentation (paper section 3)
-WITHIN = 0.1  # tolerance relative to the aim (in paper section 6 a gripper holds a blueberry; the tolerance is ours)
+# Rate of the controller, duration of a run, and time from which on forces are scored.
+RATE_HZ, SECONDS, SETTLED_S = 50.0, 4.0, 1.0
+SWING = 3.0  # an object's stiffness varies between a third of its nominal value and three times this value
+# Indentation of the skin by 1 N, assumed, for a round tip (Hertz). It affects how fast a force is reached, and not the
+# force that is reached.
+DEPTH_OF_1_N_MM = 0.8
+READINGS_N = 5  # readings averaged for the press of known force, as for each indentation (paper section 3)
+WITHIN = 0.1  # tolerance of the force relative to the aim (ours; the paper's gripper of section 6 holds a blueberry)
 Estimate = Callable[[Float[np.ndarray, "r ch"]], Float[np.ndarray, " r"]]  # readings in uT -> forces in N
-Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # of changes of field: x, y in mm, F in N
+Predict = Callable[[Float32[np.ndarray, "r ch"]], Float[np.ndarray, "r 3"]]  # dB in uT -> x, y in mm, F in N
 Positive = Annotated[float, Field(gt=0, le=100)]
 
 
 class Gripper(Strict):
-    """Settings section `gripper`: forces to hold, stiffnesses of the objects, and the gain of the controller."""
+    """Settings section `gripper`: forces to hold (aims), stiffnesses of the objects, and the gain of the controller."""
 
     aims_N: tuple[Positive, ...]
     stiffness_N_mm: tuple[Positive, ...]
@@ -51,7 +54,7 @@ class Gripper(Strict):
 
 @dataclass(frozen=True)
 class Finger:
-    """Readings and depth of a skin under each force at its middle; the first force is 0."""
+    """The skin on a gripper's finger: depth and change of field for each force at its middle; the first force is 0."""
 
     board: str
     force_N: Float64[np.ndarray, " p"]
@@ -61,14 +64,14 @@ class Finger:
     noise_uT: float
 
     def read(self, force_N: Float64[np.ndarray, " r"], rng: np.random.Generator) -> Float64[np.ndarray, "r ch"]:
-        """Simulate readings of the skin under these forces, with noise."""
+        """Return simulated readings of the skin under these forces, with noise."""
         clean_uT = np.stack([np.interp(force_N, self.force_N, column) for column in self.change_uT.T], axis=1)
         return self.noload_uT + clean_uT + self.noise_uT * rng.standard_normal(clean_uT.shape)
 
     def squeezed_N(
         self, closed_mm: Float64[np.ndarray, " r"], stiffness_N_mm: Float64[np.ndarray, " r"]
     ) -> Float64[np.ndarray, " r"]:
-        """Return the force on skin and object, which are in series, when the gripper has closed by `closed_mm`."""
+        """Return the force on skin and object (in series) of each run, when the gripper has closed by `closed_mm`."""
         return np.array([
             np.interp(closed, self.depth_mm + self.force_N / stiffness, self.force_N)
             for closed, stiffness in zip(closed_mm, stiffness_N_mm, strict=True)
@@ -76,14 +79,14 @@ class Finger:
 
 
 class Press(NamedTuple):
-    """One press whose force is known: the mean of `READINGS_N` readings."""
+    """One press whose force is known; `b_uT` is the mean of `READINGS_N` readings."""
 
     force_N: float
     b_uT: Float64[np.ndarray, " ch"]
 
 
 def gripper(settings: Settings, section: Gripper, indentations: Path, models: Path, results: Path) -> None:
-    """Hold objects by force control, with the force estimated from the skin of a gripper's finger."""
+    """Simulate holding objects by force control, with forces estimated from the readings of a gripper's finger."""
     load = load_protocol(settings, "grip")
     weight_N = load_steps_N(load.force_max_N, load.step_N)
     fingers = [make_finger(capture, weight_N) for capture in read_captures(indentations)]
@@ -98,7 +101,10 @@ def gripper(settings: Settings, section: Gripper, indentations: Path, models: Pa
 
 
 def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finger:
-    """Average a capture's readings under each weight; the noise is their standard deviation from these averages."""
+    """Average the readings of a capture under each weight.
+
+    The noise is the standard deviation of single readings from these averages.
+    """
     change_uT = subtract(capture.b_uT, capture.noload_uT)
     levels_uT = group_by_level(
         change_uT, capture.indentation, capture.Fz_N, levels_n=len(weight_N), where=capture.capture
@@ -111,7 +117,7 @@ def make_finger(capture: Readings, weight_N: Float64[np.ndarray, " p"]) -> Finge
 
 
 def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Iterator[tuple[str, str, Estimate]]:
-    """Yield every force estimator: the model's name, how the known press is used, and the function."""
+    """Yield every force estimator: the name of the model, how it uses the press of known force, and its function."""
     unlabelled = load_universal().zero(finger.noload_uT[None])
     labelled = load_universal().zero(finger.noload_uT[None])
     labelled.label(np.full((1, 2), CENTRE_MM), np.array([press.force_N]), press.b_uT[None])
@@ -132,7 +138,7 @@ def estimators(finger: Finger, networks: Sequence[Predict], press: Press) -> Ite
 
 
 def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
-    """Scale estimates so that the known press is estimated correctly."""
+    """Scale the estimates by a factor that makes the estimate for the press of known force correct."""
     factor = press.force_N / max(float(estimate(press.b_uT[None])[0]), 1e-3)  # networks may predict 0 or less
     return lambda b_uT: factor * estimate(b_uT)
 
@@ -140,7 +146,7 @@ def scale_to_press(estimate: Estimate, press: Press) -> Estimate:
 def hold(
     finger: Finger, estimate: Estimate, aim_N: float, section: Gripper, rng: np.random.Generator
 ) -> Float64[np.ndarray, "f r"]:
-    """Hold objects of all stiffnesses, in one run each; return the true force at each step."""
+    """Simulate one run per object stiffness; return the true force by control step (rows) and run (columns)."""
     nominal_N_mm = np.array(section.stiffness_N_mm)
     closed_mm, force_N = np.zeros(len(nominal_N_mm)), np.zeros(len(nominal_N_mm))
     touch_uT = finger.noise_uT * (np.sqrt(len(finger.noload_uT)) + CONTACT_SDS)
@@ -159,43 +165,50 @@ def hold(
 def hold_all(
     fingers: Sequence[Finger], networks: Mapping[str, Sequence[Predict]], section: Gripper, *, seed: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Hold each force with every estimator on every skin; return the numbers, and the data of the figure."""
+    """Simulate all runs (every aim, skin and estimator); return the numbers, and the data for the figure."""
     rows, plot_rows = [], []
     for aim_N in section.aims_N:
-        runs: dict[tuple[str, str], dict[str, list[Float64[np.ndarray, "f r"]]]] = {}
+        results: dict[tuple[str, str], dict[str, list[Float64[np.ndarray, "f r"]]]] = {}
         for finger in fingers:
             rng = rng_for(seed, "gripper", finger.board, f"{aim_N:g}")
             known_uT = finger.read(np.full(READINGS_N, aim_N), rng).mean(axis=0)
             for model, press, estimate in estimators(finger, networks[finger.board], Press(aim_N, known_uT)):
                 held_N = hold(finger, estimate, aim_N, section, rng)
-                runs.setdefault((model, press), {}).setdefault(finger.board, []).append(held_N)
-        for (model, press), by_board in runs.items():
+                results.setdefault((model, press), {}).setdefault(finger.board, []).append(held_N)
+        for (model, press), by_board in results.items():
             keys = {"aim_N": aim_N, "feedback": model, "press": press}
             rows.append(keys | judge(by_board, aim_N))
             mean_N = np.concatenate(
-                [held_N[round(SETTLED_S * RATE_HZ) :].mean(axis=0) for own in by_board.values() for held_N in own]
+                [held_N[round(SETTLED_S * RATE_HZ) :].mean(axis=0) for runs in by_board.values() for held_N in runs]
             )
             plot_rows.append(keys | {"off_pct": np.round(100 * (mean_N / aim_N - 1), 2).tolist()})
     return {
         "rows": rows,
         "within_pct": 100 * WITHIN,
         "skins_n": len(fingers),
-        "seeds_n": max(len(own) for own in networks.values()),
+        "seeds_n": max(len(board_networks) for board_networks in networks.values()),
         "rate_hz": RATE_HZ,
         **section.model_dump(mode="json"),
     }, {"rows": plot_rows}
 
 
 def judge(runs: Mapping[str, Sequence[Float64[np.ndarray, "f r"]]], aim_N: float) -> dict[str, Any]:
-    """Score how far true forces are from the aim after settling, over the runs of all boards and estimators.
+    """Score the deviations of true forces from the aim after settling.
 
-    `runs` are by board, one array per estimator (network seed); `sd_seeds` is the standard deviation over the
-    estimators of one board, averaged over boards.
+    `runs` maps each board to one array per estimator (network seed), with true forces by step and run. `sd_seeds` is
+    the standard deviation over the estimators of one board, averaged over boards.
     """
-    deviations = {board: [run[round(SETTLED_S * RATE_HZ) :] / aim_N - 1 for run in own] for board, own in runs.items()}
-    all_runs = np.concatenate([run for own in deviations.values() for run in own], axis=1)
+    first_step = round(SETTLED_S * RATE_HZ)
+    deviations = {
+        board: [forces_N[first_step:] / aim_N - 1 for forces_N in board_runs] for board, board_runs in runs.items()
+    }
+    all_runs = np.concatenate([deviation for board_runs in deviations.values() for deviation in board_runs], axis=1)
     rows = pd.DataFrame(
-        [{"board": board, "error_pct": 100 * np.abs(run).mean()} for board, own in deviations.items() for run in own]
+        [
+            {"board": board, "error_pct": 100 * np.abs(deviation).mean()}
+            for board, board_runs in deviations.items()
+            for deviation in board_runs
+        ]
     )
     error = add_seed_sd(summarise(rows.groupby("board").mean(), boards=True), rows, "board")["error_pct"]
     return {
@@ -247,7 +260,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw the deviation of each run's mean force from the aim."""
+    """Plot the deviation of each run's mean force from the aim, one panel per aim."""
     aims_N = list(numbers["aims_N"])
     with drawing(7.6, 3.8) as figure:
         panels = figure.subplots(1, len(aims_N), sharey=True, squeeze=False)[0]

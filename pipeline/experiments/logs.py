@@ -1,7 +1,7 @@
 """Logs: force and place over time from a log on an SD card, as recorded in a dog shoe or a glove (paper section 6).
 
-Networks trained without the board estimate contacts from the log. A simulated log is also scored, once as it is and
-once as if its board rotated in the earth's field.
+Networks that were trained without the log's board estimate the contacts from the log. A simulated log is also scored:
+as it is, and as if its board rotated in the earth's field.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,13 +40,16 @@ from reskin.recordings.ingest import read_header
 from reskin.recordings.readers import sd_card
 from reskin.seeds import rng_for
 
-PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed: how far a shoe leans to either side in each step
-PERIOD_S = 1.0  # assumed, for a log with fewer than two contacts
+PITCHES_DEG = (0.0, 10.0, 20.0, 45.0)  # assumed amplitudes of a shoe's pitch during each step
+PERIOD_S = 1.0  # assumed period of the steps for a log with fewer than two contacts
 SCORES = ("false_readings_n", "missed_readings_n", "mse_f_N2", "accuracy_pct", "spread")
 
 
 def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
-    """Estimate contacts of a log with networks trained without its board; score them if the true contacts are known."""
+    """Estimate the contacts of a log with networks trained without the log's board.
+
+    The estimates are scored if the true contacts are known.
+    """
     folder = only(sorted(child for child in raw.iterdir() if child.is_dir()), raw)
     t_s, b_uT, _, account = sd_card.read_log(folder / LOG_FILE)
     board = read_header(folder).board
@@ -70,19 +73,19 @@ def logs(settings: Settings, raw: Path, models: Path, results: Path) -> None:
 
 @dataclass(frozen=True)
 class Log:
-    """A log of a board that keeps its orientation, the number of rows in its quiet start, and its true contacts."""
+    """A log of a board that does not rotate, with its true contacts."""
 
     t_s: Float64[np.ndarray, " f"]
     b_uT: Float32[np.ndarray, "f ch"]
-    true: Float64[np.ndarray, "f 3"]  # NaN where nothing touches
-    quiet_n: int
+    true: Float64[np.ndarray, "f 3"]  # x_mm, y_mm, F_N; NaN without contact
+    quiet_n: int  # number of rows without contact at the start of the log
 
 
 def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[Estimator]) -> dict[str, Any]:
-    """Score the networks on the log as if its board rotated in the earth's field, with and without a reference chip."""
+    """Score the networks on the log as if its board rotated in the earth's field, without and with a reference chip."""
     simulation, seed = simulation_settings(settings), settings.seed
     chip = simulation.chip
-    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])  # of single readings, not of means
+    noise_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])  # a log has single readings, not means
     instrument = replace(draw_instrument(simulation, board, seed=seed), noise_uT=noise_uT)
     return {
         "turning": score_pitches(log, instrument, networks, rng_for(seed, "logs", board, "aside")),
@@ -94,9 +97,10 @@ def score_turning(log: Log, board: str, settings: Settings, networks: Sequence[E
 def score_pitches(
     log: Log, instrument: Instrument, networks: Sequence[Estimator], rng: np.random.Generator
 ) -> list[dict[str, Any]]:
-    """Score the log with a board that pitches after the quiet start, without and with a reference chip.
+    """Score the networks on a log whose board pitches in the earth's field after the quiet start.
 
-    `instrument.noise_uT` is the noise of one reading of the reference chip.
+    Returns one row per amplitude in `PITCHES_DEG`: the scores as logged, and under `reference_chip` the scores after
+    subtracting the reading of a reference chip. `instrument.noise_uT` is the noise of one reading of that chip.
     """
     period_s = step_period_s(log.t_s, np.isfinite(log.true[:, 2]))
     rows = []
@@ -113,20 +117,21 @@ def score_pitches(
 
 
 def step_period_s(t_s: Float64[np.ndarray, " f"], touched: Bool[np.ndarray, " f"]) -> float:
-    """Return the median time from the start of one contact to the start of the next."""
+    """Return the median time between the starts of successive contacts; `PERIOD_S` if there are fewer than two."""
     starts_s = t_s[np.flatnonzero(np.diff(touched.astype(int), prepend=0) == 1)]
     return float(np.median(np.diff(starts_s))) if len(starts_s) > 1 else PERIOD_S
 
 
 def swing(t_s: Float64[np.ndarray, " f"], *, start_s: float, period_s: float) -> Float64[np.ndarray, " f"]:
-    """Return a sine that begins at `start_s` and is 0 before."""
+    """Return a sine of amplitude 1 that begins at `start_s`, and 0 before that time."""
     return np.sin(2 * np.pi * np.maximum(t_s - start_s, 0) / period_s)
 
 
 def earth_in_board_T(pitch_rad: Float64[np.ndarray, " f"]) -> Float[np.ndarray, "f 3"]:
-    """Return the earth's field in the axes of a board that pitches about its y axis; at rest its x axis points north.
+    """Return the earth's field in the axes of a board that pitches about its y axis.
 
-    Assumed: walking north, so that the whole field is in the plane of the pitch, which is the worst direction.
+    At rest, the board's x axis points north. This is the worst direction, because the whole field is in the plane in
+    which the x axis moves.
     """
     return Rotation.from_euler("y", pitch_rad[:, None]).inv().apply(EARTH_T)
 
@@ -159,7 +164,10 @@ VARIANTS = {"as logged": None, "reference chip subtracted": "reference_chip"}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate contacts of the log, with scores if the truth is known; the paper shows its logs as videos."""
+    """Tabulate the contacts of the log, and scores if the true contacts are known.
+
+    The paper shows its logs only as videos.
+    """
     account = numbers["account"]
     rows = [
         ("rate, Hz", f"{numbers['rate_hz']:.0f}", f"{paper.LOG_RATE_HZ:.0f}"),
@@ -187,21 +195,21 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
-    """Tabulate the scores of a board that rotates, by its largest pitch."""
+    """Tabulate the scores for a board that pitches, by the amplitude of the pitch."""
     rows = []
     for row in numbers["turning"]:
         for title, name in VARIANTS.items():
-            own = row if name is None else row[name]
+            scores = row if name is None else row[name]
             rows.append(
                 {
                     "pitch / °": f"± {row['pitch_deg']:g}",
                     "readings": title,
-                    "contacts found": _show(own, "contacts_n"),
+                    "contacts found": _show(scores, "contacts_n"),
                     "true contacts": _show(numbers, "contacts_true_n"),
-                    "readings without contact detected as contact": _show(own, "false_readings_n"),
-                    "readings in contact that were missed": _show(own, "missed_readings_n"),
-                    "MSE_F / N²": _show(own, "mse_f_N2"),
-                    "accuracy / %": _show(own, "accuracy_pct"),
+                    "readings without contact detected as contact": _show(scores, "false_readings_n"),
+                    "readings in contact that were missed": _show(scores, "missed_readings_n"),
+                    "MSE_F / N²": _show(scores, "mse_f_N2"),
+                    "accuracy / %": _show(scores, "accuracy_pct"),
                     "source": source,
                 }
             )
@@ -211,7 +219,7 @@ def _turning(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw force, x and y over time, in contact only."""
+    """Plot the estimated and the true force, x and y over time, during contacts only."""
     t_s = np.array(drawn["t_s"])
     with drawing(7.0, 5.0) as figure:
         panels = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))

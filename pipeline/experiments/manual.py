@@ -1,7 +1,7 @@
 """Manual: networks adapted with hand pokes, whose places are unknown (paper section 5).
 
-The networks are tested on the robot's grid of the same skin, and compared with networks adapted with as many pokes by
-the robot, and with a control.
+The networks are tested on the robot's grid of the same skin. They are compared with networks adapted with the same
+number of robot pokes, and with networks trained for as long without pokes (the control).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,27 +45,27 @@ from reskin.errors import SchemaError
 from reskin.models.job import TrainingJob
 from reskin.models.recipe import HEADLINE
 
-GRID = "grid"  # adapted with as many pokes by the robot
+GRID = "grid"  # name of the variant that is adapted with robot pokes, as many as there are hand pokes
 
 
 def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pretrained: Path, results: Path) -> None:
-    """Adapt to every skin with its hand pokes, and with as many pokes by the robot; test on the robot's grid."""
+    """Adapt networks to every skin with its hand pokes, and with equally many robot pokes; test on the robot's grid."""
     preload_training()
     data = read_data(settings, main, folds)
     starts = read_pretrained(pretrained)
     adapting = data.settings.section(Adaptations, "adapt")
     poked, lines_by_skin = hand_rows(read_captures(indentations))
-    lines = {skin: shift_rows(own, len(data.rows)) for skin, own in lines_by_skin.items()}
+    lines = {skin: shift_rows(skin_lines, len(data.rows)) for skin, skin_lines in lines_by_skin.items()}
     data = replace(data, rows=stack(data.rows, poked))
     jobs: list[tuple[str, TrainingJob]] = []
     predictions: list[VariantPrediction] = []
-    for skin, own in lines.items():
+    for skin, skin_lines in lines.items():
         fold = fold_without(data, str(poked.board[poked.skin == skin][0]))
         predictions += predict_before(data, fold, adapting.recipes[HEADLINE], starts, skin)
-        jobs += make_jobs(data, fold, adapting, starts, skin, own)
+        jobs += make_jobs(data, fold, adapting, starts, skin, skin_lines)
     after, trainings = adapt_and_predict(data, jobs, "manual")
-    pokes_n = [count_pokes(data, own) for own in lines.values()]
-    lines_n = [len(np.unique(own.line_i)) for own in lines.values()]
+    pokes_n = [count_pokes(data, skin_lines) for skin_lines in lines.values()]
+    lines_n = [len(np.unique(skin_lines.line_i)) for skin_lines in lines.values()]
     numbers = summarise_manual([*predictions, *after], pokes_n=pokes_n, lines_n=lines_n)
     write_results(results, numbers, {}, read_losses(indentations, poked.dropped), trainings)
 
@@ -73,7 +73,10 @@ def manual(settings: Settings, folds: Path, main: Path, indentations: Path, pret
 def make_jobs(
     data: SceneData, fold: Fold, adapting: Adaptations, starts: PretrainedNetworks, skin: str, by_hand: Lines
 ) -> Iterator[tuple[str, TrainingJob]]:
-    """Make the adaptation jobs of one skin: hand pokes, robot pokes, and the control if the scene has its recipe."""
+    """Yield the adaptation jobs of one skin, each with the name of its variant.
+
+    There are jobs with hand pokes, with robot pokes and, if the scene has the control's recipe, without pokes.
+    """
     headline = HEADLINE, adapting.recipes[HEADLINE]
     for seed_i in select_pretrained(starts, headline[1].base, fold):
         by_robot = pool_lines(data, fold, skin, pokes_n=count_pokes(data, by_hand), seed_i=seed_i)
@@ -85,23 +88,26 @@ def make_jobs(
 
 
 def count_pokes(data: SceneData, lines: Lines) -> int:
-    """Count the pokes along these lines."""
+    """Return the number of pokes along these lines."""
     return len(np.unique(data.rows.indentation[lines.row]))
 
 
 def fold_without(data: SceneData, board: str) -> Fold:
-    """Return the fold of `lobo` that holds out a board."""
+    """Return the fold of experiment `lobo` (leave one board out) that holds out `board`."""
     folds = {fold.name: fold for fold in data.folds_of("lobo")}
     if board not in folds:
-        what = f"board {board} is in no fold of lobo ({', '.join(sorted(folds))})"
-        raise SchemaError(f"experiment manual: {what}. Use skins of the main captures for hand pokes.")
+        what = f"board {board} is not held out by any fold of lobo ({', '.join(sorted(folds))})"
+        raise SchemaError(f"experiment manual: {what}. Record hand pokes on skins of the main captures.")
     return folds[board]
 
 
 def summarise_manual(
     predictions: Sequence[VariantPrediction], *, pokes_n: Sequence[int], lines_n: Sequence[int]
 ) -> dict[str, Any]:
-    """Summarise predictions over boards; `pokes_n` and `lines_n` have one value per skin, and are averaged."""
+    """Summarise the scores of each variant over boards, and the differences between variants.
+
+    `pokes_n` and `lines_n` are the numbers of pokes and lines of each skin; their means are reported.
+    """
     variants = summarise_variants(predictions)
     counts = {
         "pokes_n": round(np.mean(pokes_n)),
@@ -133,10 +139,10 @@ PAPER_DIFFERENCES = {"after_minus_before": GAINS["by_hand"]}
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the variants, then their differences on the same skins."""
+    """Tabulate the scores of the variants, and the differences between variants on the same skins."""
 
     def judge(difference: Stat | None, metric: str) -> str:
-        """Return the verdict on whether a difference is a gain, and its size."""
+        """Format the verdict on whether a difference is a gain, and the size of the difference."""
         return "–" if difference is None else f"{verdict(gain(difference, metric))}: {show_difference(difference)}"
 
     lines = []

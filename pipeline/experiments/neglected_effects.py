@@ -1,4 +1,4 @@
-"""Effects that the simulation neglects, and the error of each on the field and the force."""
+"""Effects that the simulation may neglect, and the errors of field and force that neglecting each of them causes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -34,18 +34,22 @@ from reskin.simulation.settings import MAIN, SimulationSettings
 AGEING = Ageing(settling=0.10, ageing=0.01, fading_per_decade=0.005, wandering_uT=0.2)
 RELAXATION = Relaxation(approach_s=0.5, hold_s=0.5)
 MEMORY = Memory(share=(0.11, 0.1), tau_s=(5.0, 60.0), contact_s=5.0, rest_s=1.0)
-WARMER_K = 1.0
-EARTH_T = np.array([20e-6, 0.0, -45e-6])  # at a middle latitude
-PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # indentations for effects inside the skin: flank and edge
-BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # for the powder's own field
-FRICTION = Friction(coefficient=0.8)  # 0.5-1.2, assumed
-FEW = 5  # indentations for effects that take long to compute
-COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # for effects that need every node to be followed separately
+WARMER_K = 1.0  # rise of the skin's temperature
+EARTH_T = np.array([20e-6, 0.0, -45e-6])  # the earth's field at a middle latitude
+PLACES_M = ((4e-3, 2e-3), (-6e-3, 4e-3))  # places of the indentations for effects inside the skin: flank and edge
+BOXES = Quadrature(cell_m=1.5e-3, layers_n=3)  # boxes of powder, for the effect of the powder's own field
+FRICTION = Friction(coefficient=0.8)  # between skin and tip; assumed, within a range of 0.5 to 1.2
+FEW = 5  # number of indentations for effects that take long to compute
+COARSE = Quadrature(cell_m=1.2e-3, layers_n=4)  # nodes for effects whose computation follows every node separately
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect, and the errors of neglecting it: rms in % (dB, force), and largest in uT (no-load field)."""
+    """One effect, and the errors that neglecting it causes.
+
+    The errors of dB (`field_pct`) and force (`force_pct`) are rms in percent; `rest_uT` is the largest error of the
+    no-load field. Errors that do not apply are None.
+    """
 
     term: str
     done: str  # "left out" or "kept" by the main protocol
@@ -53,24 +57,26 @@ class Effect:
     rest_uT: float | None
     force_pct: float | None
     how: str
-    left_out_by: tuple[str, ...] = ()  # protocols; empty for effects that are not a term of a protocol
+    # Names of the protocols that neglect the effect, and of those that compute it. Both are empty if protocols cannot
+    # choose whether the effect is computed.
+    left_out_by: tuple[str, ...] = ()
     computed_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The first skin of the main protocol, on which all effects are measured, and the plan of that protocol."""
+    """The first skin of the main protocol, on which all effects are evaluated, and the plan of that protocol."""
 
     board: Board
     skin: Skin
     coarse: Skin  # the same skin on fewer nodes
     plan: Plan
     tip_m: Float[np.ndarray, "n p 3"]
-    used: tuple[str, ...]
+    used: tuple[str, ...]  # names of the effects that the main protocol computes
 
 
 def measure(simulation: SimulationSettings, *, seed: int) -> list[Effect]:
-    """Measure every neglected effect on a scene."""
+    """Compute the errors of neglecting each effect, with the settings of a scene."""
     subject = _make_subject(simulation, seed)
     plain = _simulate(subject, Terms(), seed)
     protocol_effects = *_over_time(subject, plain, seed), _temperature(subject, plain), _friction(subject)
@@ -82,7 +88,7 @@ def measure(simulation: SimulationSettings, *, seed: int) -> list[Effect]:
 
 
 def _by_protocol(effect: Effect, simulation: SimulationSettings) -> Effect:
-    """Add the protocols that neglect an effect, and those that compute it."""
+    """Return the effect with the names of the protocols that neglect it, and of those that compute it."""
     computed = tuple(name for name, protocol in simulation.protocols.items() if effect.term in protocol.terms)
     return replace(
         effect, left_out_by=tuple(name for name in simulation.protocols if name not in computed), computed_by=computed
@@ -104,7 +110,7 @@ def _make_subject(simulation: SimulationSettings, seed: int) -> Subject:
 
 
 def _over_time(subject: Subject, plain: Response, seed: int) -> list[Effect]:
-    """Compare simulations of the whole protocol with a term and without it."""
+    """Evaluate ageing, relaxation and memory, from simulations of the whole protocol with and without each effect."""
     n, relaxation = len(subject.plan), RELAXATION
     rows = []
     for name, terms, description in (
@@ -143,7 +149,7 @@ def _friction(subject: Subject) -> Effect:
 
 
 def _earth(plain: Response) -> Effect:
-    """Add a steady field to the no-load reading and to the contact, and subtract the former from the latter."""
+    """Evaluate the earth's field, which is added to the no-load reading and to the contact reading."""
     rest_T = plain.rest_T[:, None] + EARTH_T
     measured_T = (rest_T + plain.change_T) - rest_T
     description = "a steady field, as long as the board does not turn; a no-load reading before each contact"
@@ -152,7 +158,7 @@ def _earth(plain: Response) -> Effect:
 
 
 def _hold(subject: Subject) -> list[Effect]:
-    """Compare with an infinite layer that slides freely and whose force is that of linear elasticity."""
+    """Evaluate the base's hold, by comparison with an infinite layer that slides freely and is linearly elastic."""
     if subject.skin.hold is None:
         return []
     free, deepest_m = replace(subject.skin, hold=None), np.array([subject.tip_m[..., 2].max()])
@@ -166,14 +172,17 @@ def _hold(subject: Subject) -> list[Effect]:
 
 
 def _free_edge(subject: Subject) -> list[Effect]:
-    """Compare with a finite skin: a free disc stretches by c r / 3 R^2 on top of the c / r of an infinite layer."""
+    """Evaluate the free edge: compare the simulated infinite layer with a disc of radius R whose edge is free.
+
+    Material at radius r moves outwards by c / r in the infinite layer, and by c / r + c r / (3 R^2) in the disc.
+    """
     if subject.skin.base == "bonded":
         return []
     depth_m = float(subject.tip_m[..., 2].max())
     poke_m = np.array([[*subject.skin.seat_m, depth_m]])
     [(_, before, after)] = moved_dipoles(subject.skin, poke_m)
     edge_m = min(subject.skin.sides_m) / 2
-    offset_m, moved_m = (part[0][:, :2] - subject.skin.seat_m for part in (before, after))
+    offset_m, moved_m = (dipoles[0][:, :2] - subject.skin.seat_m for dipoles in (before, after))
     far = np.argmax(np.hypot(*offset_m.T))
     growth_m2 = float((moved_m[far] ** 2).sum() - (offset_m[far] ** 2).sum())
     stretched_m = np.column_stack(
@@ -188,7 +197,7 @@ def _free_edge(subject: Subject) -> list[Effect]:
 
 
 def _inside(subject: Subject) -> list[Effect]:
-    """Compare the deformation under a few indentations with and without one part of the physics at a time."""
+    """Evaluate parts of the deformation model, by omitting or changing one part at a time under a few indentations."""
     skin, depth_m = subject.skin, float(subject.tip_m[..., 2].max()) + subject.skin.depth_zero_m
     base: layer.Base = "bonded" if skin.base == "slipping" else "slipping"
     press = layer.IndentedLayer(skin.thickness_m, skin.tip_radius_m, skin.base)
@@ -220,7 +229,10 @@ Moved = tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"], Float[np.ndarray
 
 
 def _flow(subject: Subject, depth_m: float, press: layer.IndentedLayer) -> list[Moved]:
-    """Follow the material under all indentations at once, because the contact pressures are the same."""
+    """Return the displaced nodes under each indentation, for an indentation in small steps.
+
+    The nodes of all indentations are followed together, because the contact pressures are the same.
+    """
     r_m = np.concatenate([np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T) for place_m in PLACES_M])
     z_m = np.tile(subject.coarse.nodes_m[:, 2], len(PLACES_M))
     end = deformation.follow(r_m, z_m, deformation.depth_steps((depth_m,), press), press=press)[-1]
@@ -229,13 +241,14 @@ def _flow(subject: Subject, depth_m: float, press: layer.IndentedLayer) -> list[
 
 
 def _one_shot(subject: Subject, place_m: tuple[float, float], depth_m: float, press: layer.IndentedLayer) -> Moved:
+    """Return the displaced nodes under one indentation, for a single linear step to the full depth."""
     r_m, z_m = np.hypot(*(subject.coarse.nodes_m[:, :2] - place_m).T), subject.coarse.nodes_m[:, 2].copy()
     u = layer.displacement(r_m, z_m, layer.waves(press.contact(depth_m), press.thickness_m, press.base))
     return r_m + u.r_m, z_m + u.z_m, (u.r_z - u.z_r) / 2
 
 
 def _change(subject: Subject, moved: Sequence[Moved]) -> Float[np.ndarray, "p k 3"]:
-    """Return dB at the chips for the moved material of each indentation."""
+    """Return dB at the chips for each indentation, from its displaced nodes."""
     skin, changes_T = subject.coarse, []
     for place_m, (moved_r_m, moved_z_m, angle_rad) in zip(PLACES_M, moved, strict=True):
         away_m = skin.nodes_m[:, :2] - place_m
@@ -256,7 +269,10 @@ def _steps(plain: Response, simulation: SimulationSettings) -> Effect:
 
 
 def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
-    """Compare with powder that is also magnetised by its own field, to first order (boxes, magpylib)."""
+    """Evaluate the powder's own field: compare with powder that this field also magnetises, to first order.
+
+    The field of the powder is that of uniformly magnetised boxes (magpylib).
+    """
     rest = midpoints(subject.skin.thickness_m, BOXES)
     b_T = magnet.array_field(rest.nodes_m, subject.skin.thickness_m, simulation.skin.polarity)
     sizes = {"saturation_T": simulation.skin.saturation_T, "half_field_T": simulation.skin.half_field_T}
@@ -267,8 +283,8 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
     with_own_T = magnet.magnetise(b_T + own_T - j_T, **sizes)  # mu0 H = B - J acts on the powder
     pokes_m = np.array([(*place_m, float(subject.tip_m[..., 2].max())) for place_m in PLACES_M])
     nodes_m = rest.nodes_m + np.append(subject.skin.seat_m, 0.0)
-    moments_A_m2 = [magnet.moments(each_T, rest.volumes_m3) for each_T in (j_T, with_own_T)]
-    skins = [replace(subject.skin, nodes_m=nodes_m, moments_A_m2=each_A_m2) for each_A_m2 in moments_A_m2]
+    moments = [magnet.moments(magnetisation_T, rest.volumes_m3) for magnetisation_T in (j_T, with_own_T)]
+    skins = [replace(subject.skin, nodes_m=nodes_m, moments_A_m2=moments_A_m2) for moments_A_m2 in moments]
     changes_T = [changes_of_field(subject.board, skin, pokes_m)[1] for skin in skins]
     description = (
         f"{boxes_n} boxes, first order, {len(PLACES_M)} pokes; of the magnetisation {_error_pct(j_T, with_own_T):.2g} %"
@@ -277,7 +293,10 @@ def _own_field(subject: Subject, simulation: SimulationSettings) -> Effect:
 
 
 def _too_deep(simulation: SimulationSettings, seed: int) -> Effect:
-    """Count, over all skins, the stops that are deeper than published solutions cover."""
+    """Return the effect of depths beyond 0.6 of the thickness, which published solutions do not cover.
+
+    No error is known; the description states the percentage of such stops over all skins.
+    """
     depth_m = milli * simulation.main.plan(rng_for(seed, "left out"), simulation.main_boards.skin_mm).depth_mm.ravel()
     skins = [
         draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin, rule=COARSE)
@@ -304,7 +323,7 @@ def _error_pct(without: Float[np.ndarray, "..."], true: Float[np.ndarray, "..."]
 
 
 def neglected_effects(settings: Settings, results: Path) -> None:
-    """Measure every effect on the scene's first skin, and name the protocols that neglect the effect."""
+    """Evaluate every effect on the scene's first skin, and list the protocols that neglect it."""
     simulation, seed = simulation_settings(settings), settings.seed
     effects = measure(simulation, seed=seed)
     io.write_json(results, [asdict(effect) for effect in effects])
@@ -321,7 +340,7 @@ MEANING = (
 
 
 def neglected_effects_table(rows: Sequence[Mapping[str, Any]], source: str) -> pd.DataFrame:
-    """Tabulate every effect and the protocols that neglect it; those that the main protocol neglects first."""
+    """Tabulate every effect and the protocols that neglect it. Effects that the main protocol neglects come first."""
     ordered = sorted(rows, key=lambda row: row["done"] != "left out")
     table = pd.DataFrame(
         {
@@ -341,10 +360,10 @@ def neglected_effects_table(rows: Sequence[Mapping[str, Any]], source: str) -> p
 
 def _where(row: Mapping[str, Any]) -> str:
     protocols_by_status = {"neglected": row["left_out_by"], "computed": row["computed_by"]}
-    shown = "; ".join(
+    text = "; ".join(
         f"{status}: {', '.join(protocols)}" for status, protocols in protocols_by_status.items() if protocols
     )
-    return shown or row["done"].replace("left out", "neglected")
+    return text or row["done"].replace("left out", "neglected")
 
 
 def _show(value: float | None) -> str:

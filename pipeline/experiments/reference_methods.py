@@ -1,9 +1,12 @@
-"""Reference methods for a board without calibration, on the folds and test rows of experiment labels (ours).
+"""Reference methods for a new board without calibration (not in the paper).
 
-- Regressors and networks of known boards, with inputs aligned by the new board's unlabelled pokes or by a few labels.
-- The universal model and a fitted physical model (inversion), given the skin's own unlabelled pokes, none, or another
-  skin's.
-- Alarms: whether the residual of a fitted model detects a foreign board.
+The methods use the folds and test rows of experiment `labels`:
+
+- Regressors and networks trained on known boards. The inputs are aligned with the new board by its unlabelled pokes,
+  or by a few labelled ones.
+- The universal model, and the inversion of a fitted physical model. Both receive unlabelled pokes of the new skin, no
+  pokes, or pokes of another skin.
+- Alarms: whether the residual of a fitted model detects that readings come from a foreign board.
 """
 
 import time
@@ -58,10 +61,10 @@ from reskin.universal.inversion import Chart, chart, fit_unlabelled, search
 from reskin.universal.law import Setup
 from reskin.universal.model import PriorModel
 
-OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # unlabelled pokes that a method receives
+OWN, NONE, FOREIGN = "its own", "none", "another skin's"  # which unlabelled pokes a method receives
 Key = tuple[str, str, int]  # method, unlabelled pokes, number of labels
 Point = dict[str, Any]  # scores of one method on one fold
-RNG = "rivals"  # name of the random streams, from an earlier name of this experiment
+RNG = "rivals"  # name of the random streams; an earlier name of this experiment
 
 
 class ReferenceMethods(SectionWithRows):
@@ -84,7 +87,7 @@ class ReferenceMethods(SectionWithRows):
 def reference_methods(
     settings: Settings, section: ReferenceMethods, indentations: Path, folds: Path, models: Path, results: Path
 ) -> None:
-    """Score reference methods on every held-out board, on the rows that experiment labels tests."""
+    """Score the reference methods on every held-out board, on the test rows of experiment `labels`."""
     known = read_known_boards(settings, indentations, folds)
     data, of_labels = known.data, known.data.folds_of(EXPERIMENT)
 
@@ -115,26 +118,26 @@ def reference_methods(
         "alarm": alarm,
     }
     write_results(results, numbers, {}, trainings=tally(trainings))
-    io.write_json(SECONDS / settings.scene / "reference_methods.json", [asdict(one) for one in seconds])
+    io.write_json(SECONDS / settings.scene / "reference_methods.json", [asdict(record) for record in seconds])
 
 
 # --- Folds, pokes, points ---
 
 
 def next_board(fold: Fold, folds: Iterable[Fold]) -> Fold:
-    """Return the fold of the next board in the same draw; its pool has the pokes of another skin."""
-    same = [candidate for candidate in folds if candidate.draw_i == fold.draw_i]
-    names = [candidate.name for candidate in same]
-    return same[(names.index(fold.name) + 1) % len(same)]
+    """Return the fold of the next board in the same random draw; it provides the pokes of another skin."""
+    same_draw = [candidate for candidate in folds if candidate.draw_i == fold.draw_i]
+    names = [candidate.name for candidate in same_draw]
+    return same_draw[(names.index(fold.name) + 1) % len(same_draw)]
 
 
 def first_folds(folds: Sequence[Fold]) -> dict[str, Fold]:
-    """Return the first fold of each board."""
+    """Return the first fold of each board, by board name."""
     return dict(sorted({fold.board: fold for fold in reversed(folds)}.items()))
 
 
 def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float[np.ndarray, "m ch"]:
-    """Return the mean change of field of each poke, in the chips' axes."""
+    """Return the mean change of field of each poke, in the chips' axes; `pokes` are row numbers."""
     return np.array([data.rows.db_uT[row].mean(axis=0, dtype=np.float64) for row in pokes])
 
 
@@ -147,7 +150,10 @@ def point(
 
 
 def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict[str, Any]]:
-    """Summarise every method over boards, with its difference to its control, paired by board."""
+    """Summarise the scores of every method over boards.
+
+    Methods that have a control in `controls` also get the difference from this control, paired by board.
+    """
     table = tidy([], {"rivals": points})
     table["labels_n"] = table["labels_n"].astype(int)
     groups: dict[Any, Any] = dict(iter(table.groupby(["method", "recipe", "labels_n"], sort=False)))
@@ -164,17 +170,21 @@ def summarise(points: Sequence[Point], controls: Mapping[Key, Key]) -> list[dict
 
 # --- Models of known boards with aligned inputs ---
 
-EVERY_N = 10  # every tenth reading of a labelled poke is a training row: its readings differ only by noise
-SAME_MM = 0.5  # pokes closer than this are at one place
+EVERY_N = 10  # every tenth reading of a labelled poke is a training row; readings of a poke differ only by noise
+SAME_MM = 0.5  # pokes closer together than this count as pokes at one place
 ALIGNMENTS = {"channels matched": match_channels, "CORAL": coral}
 DIRECT, AS_ROWS = "direct standardisation", "labels as rows"
 ADVERSARIAL, CONTROL = "network, domain-adversarial", "network, trained as long without it"
 
 
 def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Sequence[int]) -> list[Point]:
-    """Score a regressor of known boards without changes, with every alignment, and with labels as training rows."""
+    """Score a regressor that was fitted to known boards on a new board, in several variants.
+
+    The variants are: the regressor as it is; inputs aligned with the new board by its unlabelled pokes; direct
+    standardisation by labelled pokes; and labelled pokes as additional training rows.
+    """
     rows, view, pokes = data.rows, VIEW[method.inputs], pool_rows(data, fold)
-    known, new, test = (view(rows.db_uT[part]) for part in (fold.train, fold.pool, fold.test))
+    known, new, test = (view(rows.db_uT[side]) for side in (fold.train, fold.pool, fold.test))
     target, name = rows.target[fold.train], f"{method.title} ({method.inputs})"
     draws = partial(rng_for, data.settings.seed, RNG, name, fold.name)
     score = partial(point, data, fold)
@@ -187,18 +197,20 @@ def score_regressor(data: SceneData, fold: Fold, method: Classical, labels_n: Se
     for n in labels_n:
         back_uT = standardised_uT(data, fold, pokes[:n])
         points.append(score(plain.predict(view(back_uT)), method=f"{name}, {DIRECT}", pokes=NONE, labels_n=n))
-        own = np.concatenate([row[::EVERY_N] for row in pokes[:n]])
-        weight = np.concatenate([np.ones(len(known)), np.full(len(own), len(known) / len(own))]).astype(np.float32)
-        extended = np.concatenate([known, view(rows.db_uT[own])]), np.concatenate([target, rows.target[own]])
+        added = np.concatenate([row[::EVERY_N] for row in pokes[:n]])
+        weight = np.concatenate([np.ones(len(known)), np.full(len(added), len(known) / len(added))]).astype(np.float32)
+        extended = np.concatenate([known, view(rows.db_uT[added])]), np.concatenate([target, rows.target[added]])
         fitted = fit(method, *extended, draws(AS_ROWS, n), weight=weight)
         points.append(score(fitted.predict(test), method=f"{name}, {AS_ROWS}", pokes=NONE, labels_n=n))
     return points
 
 
 def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) -> Float[np.ndarray, "b ch"]:
-    """Map a new board's test fields to those of known boards, by labelled pokes with a counterpart on known boards.
+    """Map the test fields of a new board to fields that known boards would read (direct standardisation).
 
-    Each pair has the same weight, however strong the poke; the ridge penalty is chosen on the pairs.
+    The linear map is fitted by ridge regression to pairs of fields: the field of a labelled poke of the new board, and
+    the field of known boards at the same place and force. All pairs have the same weight, independent of the strength
+    of the poke. The ridge penalty is chosen on the same pairs.
     """
     new_uT, old_uT = means_uT(data, pokes), pairs_uT(data.rows, fold.train, pokes)
     paired = np.isfinite(old_uT).all(axis=1)
@@ -215,26 +227,27 @@ def standardised_uT(data: SceneData, fold: Fold, pokes: Sequence[np.ndarray]) ->
 def pairs_uT(
     rows: Rows, train: Int64[np.ndarray, " a"], pokes: Sequence[Int64[np.ndarray, " r"]]
 ) -> Float[np.ndarray, "m ch"]:
-    """Return the mean field of the known boards at the place and force of each poke; NaN where there is no pair.
+    """Return the mean field of the known boards at the place and force of each poke of a new board.
 
-    Channels are interpolated linearly in log F between a board's forces at a place, and are constant beyond them.
+    A row is NaN if no known board was poked at this place. Between the forces recorded on a board at the place,
+    channels are interpolated linearly in log F; beyond these forces, they are constant.
     """
     old_uT = np.full((len(pokes), rows.db_uT.shape[1]), np.nan)
     boards = [_poke_means(rows, train[rows.board[train] == board]) for board in np.unique(rows.board[train])]
     for i, row in enumerate(pokes):
         x_mm, y_mm, force_N = rows.target[row].mean(axis=0, dtype=np.float64)
         fields_uT = [_interpolate(*known, (x_mm, y_mm), float(force_N)) for known in boards]
-        if fields_uT := [one for one in fields_uT if one is not None]:
+        if fields_uT := [field_uT for field_uT in fields_uT if field_uT is not None]:
             old_uT[i] = np.mean(fields_uT, axis=0)
     return old_uT
 
 
-def _poke_means(rows: Rows, own: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray]:
-    """Average targets and fields by poke."""
-    _, poke, count = np.unique(rows.indentation[own], return_inverse=True, return_counts=True)
+def _poke_means(rows: Rows, selected: Int64[np.ndarray, " a"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean target and the mean field of each poke; `selected` are row numbers."""
+    _, poke, count = np.unique(rows.indentation[selected], return_inverse=True, return_counts=True)
     sums = [np.zeros((len(count), values.shape[1])) for values in (rows.target, rows.db_uT)]
     for total, values in zip(sums, (rows.target, rows.db_uT), strict=True):
-        np.add.at(total, poke.ravel(), values[own])
+        np.add.at(total, poke.ravel(), values[selected])
     return sums[0] / count[:, None], sums[1] / count[:, None]
 
 
@@ -253,10 +266,13 @@ def _interpolate(
 def score_adversarial(
     data: SceneData, fold: Fold, recipe: Recipe, weight: float
 ) -> tuple[list[Point], list[dict[str, Any]]]:
-    """Score a domain-adversarial network and its control; also return the records of their training."""
+    """Score a domain-adversarial network, and the same network without adversarial training (its control).
+
+    Returns the scores, and for each network whether and how often it collapsed.
+    """
     view, rows = VIEW[recipe.inputs], data.rows
     scaler = FIT[recipe.scaling](view(rows.db_uT[fold.train]), rows.target[fold.train])
-    known, new, test = (scaler.encode(view(rows.db_uT[part])) for part in (fold.train, fold.pool, fold.test))
+    known, new, test = (scaler.encode(view(rows.db_uT[side])) for side in (fold.train, fold.pool, fold.test))
     domains = Domains(known, scaler.encode_target(rows.target[fold.train]), new)
     points, trainings = [], []
     for method, pokes, own_weight in ((CONTROL, NONE, 0.0), (ADVERSARIAL, OWN, weight)):
@@ -270,9 +286,9 @@ def score_adversarial(
 def train_until_converged(
     domains: Domains, recipe: Recipe, weight: float, seed: int, fold: str
 ) -> tuple[Weights, dict[str, Any]]:
-    """Train, and repeat with other random draws while the network collapses, as for all other networks.
+    """Train a network; while it collapses, repeat with other random draws, up to `MAX_ATTEMPTS_N` times.
 
-    The draws do not depend on the weight, so a network and its control differ only in the weight.
+    The draws do not depend on the adversarial `weight`, so a network and its control differ only in this weight.
     """
     for attempt_i in range(MAX_ATTEMPTS_N):
         weights = train_adversarial(domains, recipe, weight, rng_for(seed, RNG, "network", fold, attempt_i))
@@ -284,7 +300,7 @@ def train_until_converged(
 
 
 def alignment_controls(methods: Mapping[str, Classical], labels_n: Sequence[int]) -> dict[Key, Key]:
-    """Name the control of each method with aligned inputs."""
+    """Return the control of each method with aligned inputs: the same method without alignment."""
     controls: dict[Key, Key] = {(ADVERSARIAL, OWN, 0): (CONTROL, NONE, 0)}
     for method in methods.values():
         name = f"{method.title} ({method.inputs})"
@@ -297,13 +313,13 @@ def alignment_controls(methods: Mapping[str, Classical], labels_n: Sequence[int]
 
 INVERSION = "physics inversion"
 CENTRED = f"{INVERSION}, centred"
-UNIVERSAL = ("universal map, ", "universal network, ", "universal, ")  # the map, the network, both
+UNIVERSAL = ("universal map, ", "universal network, ", "universal, ")  # the map, the network, and both combined
 ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 
 @dataclass(frozen=True)
 class Seconds:
-    """Processor seconds for calibrating a method to a skin, and for one reading when many are estimated together."""
+    """Processor time for calibrating a method to a skin, and per reading if many readings are estimated together."""
 
     name: str
     train_s: float
@@ -316,12 +332,15 @@ Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Second
 def score_unlabelled(
     known: KnownBoards, folds: Sequence[Fold], fold: Fold, variants: Variants
 ) -> tuple[list[Point], list[Seconds]]:
-    """Score the universal models and the inversion, given a skin's own pokes, none, and another skin's."""
-    points, own_seconds = [], []
+    """Score the universal models and the inversion with unlabelled pokes of the test skin, none, and another skin's.
+
+    Returns the scores, and the processor times with pokes of the test skin.
+    """
+    points, times = [], []
     test_uT = known.frame.field(known.data.rows.db_uT[fold.test])
     rest_uT = known.presses[fold.board].rest_uT.ravel()
-    own = pool_of(known, fold)
-    pools = {OWN: own, NONE: own[:0], FOREIGN: pool_of(known, next_board(fold, folds))}
+    own_pool = pool_of(known, fold)
+    pools = {OWN: own_pool, NONE: own_pool[:0], FOREIGN: pool_of(known, next_board(fold, folds))}
     for given, pool in pools.items():
         for method, place_mm, force_N, seconds in [
             *estimate_universal(variants.nominal.model, rest_uT, pool, test_uT, WAYS["nominal"]),
@@ -330,15 +349,18 @@ def score_unlabelled(
         ]:
             predicted = np.column_stack([known.frame.label(place_mm), force_N])
             points.append(point(known.data, fold, predicted, method=method, pokes=given))
-            own_seconds += [replace(seconds, name=f"{method}.{fold.name}")] if given == OWN else []
-    return points, own_seconds
+            times += [replace(seconds, name=f"{method}.{fold.name}")] if given == OWN else []
+    return points, times
 
 
 def estimate_universal(
     model: PriorModel, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses, test_uT: Float[np.ndarray, "b ch"],
     way: str,
 ) -> Iterator[Estimated]:  # fmt: skip
-    """Estimate with a map, a network and both, calibrated with a skin's field at rest and some pokes."""
+    """Yield the estimates of the map, of the network and of both combined for the test readings.
+
+    The model is calibrated with the skin's field at rest and the unlabelled pokes of `pool`, which may be empty.
+    """
     start_s = time.process_time()
     calibrated = calibrate(model, rest_uT, pool).with_labels(0)
     ready_s = time.process_time()
@@ -357,7 +379,10 @@ def estimate_universal(
 def estimate_inversion(
     setup: Setup, rest_uT: Float[np.ndarray, " ch"], pool: LabelledPresses, test_uT: Float[np.ndarray, "b ch"]
 ) -> Iterator[Estimated]:
-    """Invert a physical model fitted to some pokes; also with places shifted so that these pokes are centred."""
+    """Yield the estimates of a physical model that is fitted to unlabelled pokes and inverted for the test readings.
+
+    Yields them twice: as they are, and with places shifted so that the mean place of the pokes is the board's middle.
+    """
     start_s = time.process_time()
     known = chart(fit_unlabelled(pool.db_uT, rest_uT, setup), setup)
     ready_s = time.process_time()
@@ -369,26 +394,26 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Name the control of each method without the skin's own pokes: the same method with these pokes."""
+    """Return the control of each method with no pokes or another skin's: the same method with the skin's own pokes."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
 
 # --- Alarms ---
 
-TESTED_EVERY_N = 10  # every tenth test reading is used
+TESTED_EVERY_N = 10  # alarms are evaluated on every tenth test reading
 OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards, simulated by changing the board's own readings as a wrong plug, driver or skin would.
+# Foreign boards, simulated by changing the readings of a board in the same way as a wrong plug, driver or skin.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
     "every chip turned by a quarter": lambda chips: chips @ QUARTER_TURN,
     "north for south": lambda chips: -chips,
 }
-ByBoard = Mapping[str, Float[np.ndarray, "_"]]
+ByBoard = Mapping[str, Float[np.ndarray, "_"]]  # one value per reading, by board
 
 
 @dataclass(frozen=True)
@@ -400,16 +425,16 @@ class Board:
     tested_uT: Float[np.ndarray, "b ch"]
 
     def alter(self, change: Callable[[Chips], Chips]) -> "Board":
-        """Return the board as it would read if its chips were changed."""
-        parts = self.rest_uT, self.pool_uT, self.tested_uT
-        return Board(*(change(part.reshape(len(part), -1, 3)).reshape(part.shape) for part in parts))
+        """Return the readings of the board after `change` has been applied to its chips."""
+        fields_uT = self.rest_uT, self.pool_uT, self.tested_uT
+        return Board(*(change(b_uT.reshape(len(b_uT), -1, 3)).reshape(b_uT.shape) for b_uT in fields_uT))
 
 
 def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Evaluate the residual of inversion as an alarm for foreign boards, and as a flag for wrong estimates.
+    """Evaluate the residual of the inversion, both as an alarm for foreign boards and as a flag for wrong estimates.
 
-    A physical model is fitted to the unlabelled pokes of each board's first fold, and inverted for test readings of the
-    board itself and of foreign boards.
+    A physical model is fitted to the unlabelled pokes of each board's first fold. It is inverted for test readings of
+    this board, and of foreign boards. `fraction` is the fraction of false alarms that the limits are set for.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)
@@ -425,19 +450,19 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
     def residual(fitted: Chart, board: Board) -> Float[np.ndarray, " b"]:
         return search(fitted, frame.field(board.tested_uT)).residual
 
-    charts = {board: fit_board(own) for board, own in boards.items()}
-    inverted = {board: search(charts[board], frame.field(own.tested_uT)) for board, own in boards.items()}
-    residuals = {board: own.residual for board, own in inverted.items()}
+    charts = {name: fit_board(board) for name, board in boards.items()}
+    inverted = {name: search(charts[name], frame.field(board.tested_uT)) for name, board in boards.items()}
+    residuals = {name: estimated.residual for name, estimated in inverted.items()}
     true_mm = {board: data.rows.target[first[board].test[::TESTED_EVERY_N], :2].astype(float) for board in boards}
-    off_mm = {board: own.place_mm - frame.place(true_mm[board]) for board, own in inverted.items()}
+    off_mm = {name: estimated.place_mm - frame.place(true_mm[name]) for name, estimated in inverted.items()}
     limits = limits_of(residuals, fraction)
     strangers: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     names = list(boards)
-    for i, (board, own) in enumerate(boards.items()):
+    for i, (board, readings) in enumerate(boards.items()):
         other = boards[names[(i + 1) % len(names)]]
         strangers.setdefault((ANOTHER, OF_RIGHT), {})[board] = residual(charts[board], other)
         for name, change in STRANGERS.items():
-            stranger = own.alter(change)
+            stranger = readings.alter(change)
             strangers.setdefault((name, OF_RIGHT), {})[board] = residual(charts[board], stranger)
             strangers.setdefault((name, OF_STRANGER), {})[board] = residual(fit_board(stranger), stranger)
     alarm = {
@@ -445,31 +470,39 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
         "limit": statistic(list(limits.values()), boards=True),
         "right": alarm_statistics(residuals, residuals, limits),
         "strangers": [
-            {"stranger": stranger, "law": law} | alarm_statistics(own, residuals, limits)
-            for (stranger, law), own in strangers.items()
+            {"stranger": stranger, "law": law} | alarm_statistics(stranger_residuals, residuals, limits)
+            for (stranger, law), stranger_residuals in strangers.items()
         ],
     }
     return alarm, {"method": INVERSION, "by": "left over"} | score_flagged(residuals, off_mm, fraction)
 
 
 def limits_of(value: ByBoard, fraction: float) -> dict[str, float]:
-    """Return for each board the limit that this fraction of the readings of all other boards exceeds."""
-    other_values = {board: [own for other, own in value.items() if other != board] for board in value}
-    return {board: float(np.quantile(np.concatenate(own), 1 - fraction)) for board, own in other_values.items()}
+    """Return, for each board, the limit that a fraction `fraction` of the readings of all other boards exceeds."""
+    other_values = {board: [values for other, values in value.items() if other != board] for board in value}
+    return {board: float(np.quantile(np.concatenate(values), 1 - fraction)) for board, values in other_values.items()}
 
 
 def alarm_statistics(residuals: ByBoard, own_residuals: ByBoard, limits: Mapping[str, float]) -> dict[str, Any]:
-    """Summarise over boards: readings that raise the alarm, the area under the ROC curve, the median residual."""
+    """Summarise over boards: percentage of alarms, area under the ROC curve, and median residual.
+
+    `residuals` are those of the evaluated readings; `own_residuals` are those of each board's own readings, which are
+    the negatives of the ROC curve.
+    """
     by_board = {
-        "alarm_pct": [100 * float((own > limits[board]).mean()) for board, own in residuals.items()],
-        "auc": [roc_area(own_residuals[board], own) for board, own in residuals.items()],
-        "left_median": [float(np.median(own)) for own in residuals.values()],
+        "alarm_pct": [100 * float((values > limits[board]).mean()) for board, values in residuals.items()],
+        "auc": [roc_area(own_residuals[board], values) for board, values in residuals.items()],
+        "left_median": [float(np.median(values)) for values in residuals.values()],
     }
     return {name: statistic(values, boards=True) for name, values in by_board.items()}
 
 
 def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]], fraction: float) -> dict[str, Any]:
-    """Summarise over boards the errors of flagged readings (over the boards that have any) and of all others."""
+    """Summarise over boards the errors of flagged readings and of all other readings.
+
+    A reading is flagged if its `value` is above the limit. Boards without flagged readings do not contribute to the
+    errors of flagged readings.
+    """
     scores_by_name: dict[str, list[float]] = {}
     for board, limit in limits_of(value, fraction).items():
         flagged = value[board] > limit
@@ -486,7 +519,7 @@ def score_flagged(value: ByBoard, off_mm: Mapping[str, Float[np.ndarray, "_ 2"]]
 def flag_by_universal(
     known: KnownBoards, nominal: Variant, folds: Sequence[Fold], fraction: float
 ) -> list[dict[str, Any]]:
-    """Flag readings by the universal model's standard deviation of the place, and by the misfit of its map."""
+    """Score two flags of the universal model: its standard deviation of the place, and the misfit of its map."""
     sd_mm, misfit, off_mm = {}, {}, {}
     for board, fold in first_folds(folds).items():
         rows, test = known.data.rows, fold.test[::TESTED_EVERY_N]

@@ -9,27 +9,31 @@ from reskin.errors import SchemaError
 from reskin.schema import Readings
 
 Capture = TypeVar("Capture")
-NO_LOSSES: Mapping[str, Any] = {"accounts": [], "left_out": {}}  # for an experiment on the main captures
+# Losses of an experiment without captures of its own: the losses of the main captures are recorded elsewhere.
+NO_LOSSES: Mapping[str, Any] = {"accounts": [], "left_out": {}}
 
 
 def read_captures(indentations: Path, names: tuple[str, ...] = ()) -> list[Readings]:
-    """Read the named captures of a folder, ordered by name; without names, all captures of the folder."""
+    """Read the named captures of the folder `indentations` in alphabetical order; without names, read all of them."""
     files = [indentations / f"{name}.parquet" for name in sorted(names)] or sorted(indentations.glob("*.parquet"))
     if not files:
-        raise SchemaError(f"{indentations}: no captures in this folder. Ingest them again.")
+        raise SchemaError(f"{indentations}: no captures in this folder. Run the ingest stages of this scene again.")
     return [io.read_readings(file) for file in files]
 
 
 def only(captures: Sequence[Capture], folder: Path) -> Capture:
-    """Return the one capture of a folder; raise `SchemaError` if there are several."""
+    """Return the only element of `captures`, which were read from `folder`; raise `SchemaError` unless it has one."""
     if len(captures) != 1:
-        remedy = "Run its protocol on one skin (skins_n: 1), and simulate it again."
+        remedy = "Set skins_n: 1 for the experiment's protocol, and simulate the captures again."
         raise SchemaError(f"{folder}: {len(captures)} captures, but the experiment reads exactly one. {remedy}")
     return captures[0]
 
 
 def read_losses(indentations: Path, left_out: Mapping[str, int]) -> dict[str, Any]:
-    """Read how many readings each capture of a folder lost, and add the numbers of rows left out, by reason."""
+    """Return the ingest counts of each capture in a folder, which include the readings lost, together with `left_out`.
+
+    left_out: the number of rows that the experiment excluded, by reason.
+    """
     accounts = [io.read_ingest_counts(file) for file in sorted(indentations.glob("*.parquet"))]
     return {"accounts": accounts, "left_out": dict(left_out)}
 
@@ -43,8 +47,9 @@ def write_results(
 ) -> None:
     """Write the results of an experiment.
 
-    numbers: part of numbers.json. drawn: data that only figures need. losses: `read_losses` of the experiment's own
-    captures. trainings: how many networks were trained, and how many of them collapsed (`pipeline.statistics.tally`).
+    numbers: the results that are added to numbers.json. drawn: data that only the figures need. losses: the result of
+    `read_losses` if the experiment has captures of its own. trainings: the number of networks trained, and of those
+    that collapsed (see `pipeline.statistics.tally`).
     """
     content = {"numbers": dict(numbers), "drawn": dict(drawn), "losses": dict(losses)}
     io.write_json(results, content if trainings is None else content | {"trainings": dict(trainings)})

@@ -1,4 +1,4 @@
-"""Error and run time of quadratures of the skin, and of integrators of its relaxation."""
+"""Error and run time of quadratures of the magnetised skin, and of integrators of the skin's relaxation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -41,7 +41,7 @@ Changes = Float[np.ndarray, "n k 3"]
 
 @dataclass(frozen=True)
 class Prepared:
-    """A prepared computation of dB; one call computes all indentations of a trial."""
+    """A prepared computation: `call` computes dB of all indentations of a trial; `nodes_n` is its number of nodes."""
 
     nodes_n: int
     call: Callable[[], Changes]
@@ -49,7 +49,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Trial:
-    """One skin on its board, and commanded indentations, depth after depth."""
+    """One skin on its board, and its commanded indentations, sorted by depth."""
 
     board: Board
     design: SkinDesign
@@ -62,21 +62,21 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Indentations(Strict):
-    """Indentations at every place (relative to the skin's centre) and every depth."""
+    """Indentations at all places (relative to the skin's centre), each to all depths."""
 
     places_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1)]
     depths_mm: Annotated[tuple[Positive, ...], Field(min_length=1)]
 
 
-REFERENCE = "reference"  # method name of the row that bounds the error of the reference itself
-CANDIDATES = "Gauss in z"  # method name of the rules of `magnet.place_nodes`
+REFERENCE = "reference"  # name of the method in the row that bounds the error of the reference itself
+CANDIDATES = "Gauss in z"  # name of the method that places nodes by `magnet.place_nodes`, as the simulator does
 ERROR_MAX = 0.02  # largest acceptable error of dB
 Key = tuple[str, str, str]  # study, method, setting
 
 
 @dataclass(frozen=True)
 class Row:
-    """One method with one setting."""
+    """One method with one setting, in one study."""
 
     study: str
     method: str
@@ -89,17 +89,17 @@ class Row:
 
 @dataclass(frozen=True)
 class Precision(Row):
-    """Relative error of one method with one setting, or why it failed."""
+    """Relative error of one method with one setting, or the reason why it failed."""
 
     work_n: int  # number of nodes, or of evaluations of the right-hand side
-    error: float | None  # None: failed
+    error: float | None  # None if the method failed
     failure: str | None = None
-    parts: dict[str, float] = field(default_factory=dict)  # error by depth, if the study has depths
+    parts: dict[str, float] = field(default_factory=dict)  # error by depth; empty if the study has no depths
 
 
 @dataclass(frozen=True)
 class Seconds(Row):
-    """Median time of an indentation."""
+    """Median run time per indentation of one method with one setting."""
 
     median_s: float
     repeats_n: int
@@ -116,7 +116,11 @@ class TimedCall:
 
 @dataclass(frozen=True)
 class Choice:
-    """The cheapest acceptable rule (None if there is none), and the rule in use (None if it was not tried)."""
+    """The cheapest acceptable quadrature rule, and the rule that the scene uses.
+
+    The first three fields are None if no rule is acceptable. `used_nodes_n` and `used_error` are None if the rule in
+    use was not tried. `differs` says whether the two rules differ.
+    """
 
     setting: str | None
     nodes_n: int | None
@@ -128,14 +132,15 @@ class Choice:
 
 
 def rule_name(rule: Quadrature) -> str:
-    """Return the name of a rule in rows and figures."""
+    """Return the name of a quadrature rule in tables and figures: cell size x number of layers."""
     return f"{rule.cell_m / milli:.3g} mm x {rule.layers_n}"
 
 
 def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ERROR_MAX) -> Choice:
     """Choose the rule with the fewest nodes among those whose error at the worst depth is below `error_max`.
 
-    The number of nodes is proportional to the run time, but is the same in every run.
+    The run time is proportional to the number of nodes, which, unlike the run time, is the same whenever the experiment
+    is run.
     """
     candidates = {row.setting: row for row in rows if row.method == CANDIDATES}
     passing = [row for row in candidates.values() if row.error is not None and row.error < error_max]
@@ -153,22 +158,23 @@ def choose(rows: Sequence[Precision], *, used: Quadrature, error_max: float = ER
 
 
 def time_calls(calls: Sequence[TimedCall], repeats_n: int) -> list[Seconds]:
-    """Time all calls in `repeats_n` rounds, so that a busy moment of the machine affects all calls alike.
+    """Time all calls once in each of `repeats_n` rounds; return the median time per indentation of each call.
 
-    Each call has run before, when its error was computed, so compilation and filling of caches are not included.
+    In rounds, a busy period of the machine affects all calls equally. Each call has been run before, to compute its
+    error, so the times include neither compilation nor filling of caches.
     """
     if repeats_n < 1:
         raise ParamsError("runtime", "repeats_n", "1 or more", repeats_n, "Increase it.")
     times_s = np.empty((repeats_n, len(calls)))
     for round_i in range(repeats_n):
-        # Every other round runs backwards, so that no call always follows the same one.
+        # Every second round runs in reverse order, so that a call does not always follow the same other call.
         for i in range(len(calls))[:: -1 if round_i % 2 else 1]:
             start_s = perf_counter()
             calls[i].call()
             times_s[round_i, i] = perf_counter() - start_s
     return [
         Seconds(*call.key, median_s=float(np.median(laps_s)) / call.indentations_n, repeats_n=repeats_n)
-        for call, laps_s in zip(calls, times_s.T, strict=True)
+        for call, laps_s in zip(calls, times_s.T, strict=True)  # one lap per round
     ]
 
 
@@ -179,22 +185,27 @@ Layers = Annotated[int, Field(ge=1, le=100)]
 
 
 class Quadratures(Indentations):
-    """Indentations, number of skins, and the (cell, layers) pairs of the rules of each method."""
+    """Settings of the study of quadratures.
+
+    Besides the indentations: the number of skins, and for each method its rules, as pairs of cell size in mm and number
+    of layers.
+    """
 
     skins_n: Annotated[int, Field(ge=1, le=100)]
     rules: Annotated[dict[str, tuple[tuple[Cell_mm, Layers], ...]], Field(min_length=1)]
 
     def rules_of(self) -> dict[str, list[Quadrature]]:
-        """Return the rules by method, in SI units."""
+        """Return the quadrature rules of each method, in SI units."""
         return {name: [Quadrature(milli * cell, n) for cell, n in rules] for name, rules in self.rules.items()}
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Gauss rules along x, y and z: the finer one is the reference, the coarser one bounds its error.
+    """Gauss rules along x, y and z: the finer rule is the reference, and the coarser rule bounds its error.
 
-    Moved boxes would be an obvious reference, but rigid boxes overlap where the skin is compressed. They converge to
-    this reference with the square of the cell size: 5-9 % off at 0.4 mm x 20 layers, within 1 % when extrapolated.
+    Magnetised boxes that move with the material would be an obvious reference, but rigid boxes overlap where the skin
+    is compressed. The field of such boxes converges to this reference with the square of the cell size: its error is
+    5-9 % at 0.4 mm x 20 layers, and below 1 % when extrapolated to cells of size 0.
     """
 
     coarser: Quadrature
@@ -208,9 +219,10 @@ FINE = Reference(coarser=Quadrature(0.7e-3, 8), finer=Quadrature(0.5e-3, 10), pe
 def study_quadratures(
     trials: Sequence[Trial], rules: Mapping[str, Sequence[Quadrature]], reference: Reference = FINE
 ) -> tuple[list[Precision], list[TimedCall]]:
-    """Compare every rule of every method with the reference on all trials; the first trial is timed.
+    """Compare every rule of every method with the reference on all trials.
 
-    `parts` of a row contains the error by depth, for the worst skin; `error` is the largest of these.
+    Returns one row per rule, and the calls to time, which compute the first trial. `parts` of a row contains, by depth,
+    the error of the skin with the largest error; `error` is the largest of `parts`.
     """
     if not trials or (unknown := set(rules) - set(METHODS)):
         got = unknown if trials else "no trial"
@@ -233,7 +245,7 @@ def errors(
     found_T: Sequence[Float[np.ndarray, "n k 3"]],
     truth_T: Sequence[Float[np.ndarray, "n k 3"]],
 ) -> dict[str, float]:
-    """Return the ratio of rms error to rms dB at each depth (for the worst skin), and over all depths and skins."""
+    """Return rms error / rms dB: by depth, for the skin with the largest ratio, and over all depths and skins."""
     depths_mm = trials[0].depths_mm
     shape = (len(trials), len(depths_mm), -1)
     true_T = np.stack(truth_T).reshape(shape)
@@ -252,43 +264,51 @@ def _reference(trial: Trial, rule: Quadrature, per_cell_n: int) -> Prepared:
 
 
 EXACT, EULER = "exact update", "explicit Euler"
-SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # of scipy.integrate
-IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept the Jacobian, which is constant
-ATOL = 1e-3  # ratio of absolute to relative tolerance; states are a few percent of a force of 1
-DIVERGED = 1.0  # relative error that counts as divergence: as large as the force itself
-PERIOD_S = 1.5  # twenty indentations take 30 s
-DOWN_S, HELD_S = 0.3, 0.7
+SOLVERS = ("Radau", "BDF", "LSODA", "RK45")  # methods of scipy.integrate.solve_ivp
+IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept a Jacobian; here, the Jacobian is constant
+ATOL = 1e-3  # absolute tolerance / relative tolerance; the states are a few percent of the force, which is 1
+DIVERGED = 1.0  # relative error from which on an integrator counts as diverged: the error is as large as the force
+PERIOD_S = 1.5  # time from one press to the next; twenty presses take 30 s
+DOWN_S, HELD_S = 0.3, 0.7  # a press is lowered, held, and released for the rest of the period
 
-Forces = Float[np.ndarray, " u"]  # relaxed forces relative to the peak elastic force, at the ends of linear pieces
-State = Float[np.ndarray, " p"]
-History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]  # times in s, and elastic forces, linear in between
-Rates = Callable[[float, State], State]
-Piece = Callable[[Rates, float, State], State]
-Run = Callable[["Counter"], Forces]
+# Times in s, and the elastic forces at these times. The elastic force is linear between two times (a linear piece).
+History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]
+Forces = Float[np.ndarray, " u"]  # relaxed force / peak elastic force, at the end of each linear piece
+State = Float[np.ndarray, " p"]  # one state per relaxation time
+Rates = Callable[[float, State], State]  # time, state -> derivative of the state
+Piece = Callable[[Rates, float, State], State]  # rates, length of a linear piece in s, first state -> last state
+Run = Callable[["Counter"], Forces]  # an integration of the whole history
 
 
 class Failed(Exception):
-    """An integrator gave up or was stopped."""
+    """An integrator reported a failure, or was stopped after too many evaluations of the right-hand side."""
 
 
 class Integrators(Strict):
-    """Stiffness ratios, relative tolerances of the solvers, and steps of the explicit method."""
+    """Settings of the study of integrators: stiffness ratios, tolerances of the solvers, and steps of explicit Euler.
+
+    A stiffness ratio is the ratio of the slowest to the fastest relaxation time.
+    """
 
     ratios: Annotated[tuple[Annotated[float, Field(gt=1, le=1e12)], ...], Field(min_length=1)]
     tolerances: Annotated[tuple[Positive, ...], Field(min_length=1)]
     euler_steps_s: Annotated[tuple[Positive, ...], Field(min_length=1)]
     pokes_n: Annotated[int, Field(ge=1, le=1000)]
-    calls_per_poke_max_n: Annotated[int, Field(ge=1)]  # evaluations of the right-hand side; more count as a failure
+    # Largest number of evaluations of the right-hand side per poke; an integrator that needs more counts as failed.
+    calls_per_poke_max_n: Annotated[int, Field(ge=1)]
 
 
 class Counter:
-    """Counts evaluations of the right-hand side, and stops an integrator that makes too many."""
+    """Counts evaluations of the right-hand side, and stops an integrator after `calls_max_n` evaluations."""
 
     def __init__(self, calls_max_n: int) -> None:
         self.calls_n, self.calls_max_n = 0, calls_max_n
 
     def rates(self, prony: Prony, speed: float) -> Rates:
-        """Return q' = -q / tau + share e' for one linear piece of e."""
+        """Return the right-hand side q' = -q / tau + share e', for one linear piece of the elastic force e.
+
+        `speed` is e', the constant rate of the elastic force.
+        """
         driven = prony.share * speed
 
         def rates(_: float, state: State) -> State:
@@ -301,7 +321,10 @@ class Counter:
 
 
 def study_integrators(tried: Integrators) -> tuple[list[Precision], list[TimedCall]]:
-    """Compare every integrator with a 50-digit solution at every stiffness ratio; those that did not fail are timed."""
+    """Compare every integrator with a 50-digit solution at every stiffness ratio.
+
+    Returns one row per integrator and ratio, and the calls to time, which are those that did not fail.
+    """
     history, calls_max_n = repeated_presses(tried.pokes_n), tried.pokes_n * tried.calls_per_poke_max_n
     rows, calls = [], []
     for ratio in tried.ratios:
@@ -317,14 +340,14 @@ def study_integrators(tried: Integrators) -> tuple[list[Precision], list[TimedCa
 
 
 def study_name(ratio: float) -> str:
-    """Return the name of the study of one stiffness ratio."""
+    """Return the name of the study, in tables and figures, for one stiffness ratio."""
     return f"relaxation, stiffness {ratio:.0e}"
 
 
 def repeated_presses(pokes_n: int) -> History:
-    """Return the history of repeated presses to a force of 1 that are held and released.
+    """Return the history of identical presses, each to an elastic force of 1, held and then released.
 
-    All presses are the same, so that error and time per press hardly depend on their number.
+    As the presses are identical, error and run time per press hardly depend on the number of presses.
     """
     knots_s = np.array([DOWN_S, DOWN_S + HELD_S, PERIOD_S])
     times_s = (PERIOD_S * np.arange(pokes_n)[:, None] + knots_s).ravel()
@@ -332,10 +355,10 @@ def repeated_presses(pokes_n: int) -> History:
 
 
 def stiff(ratio: float) -> Prony:
-    """Return the skin's relaxation with another ratio of the slowest to the fastest time; the skin's own ratio is 1e7.
+    """Return the skin's relaxation with another ratio of the slowest to the fastest relaxation time.
 
-    The slowest time and the shares are unchanged; at large ratios the fastest time is below any step of an explicit
-    method.
+    The skin's real ratio is 1e7. The slowest time and the shares do not change. At large ratios, the fastest time is
+    shorter than any practical step of an explicit method.
     """
     slowest_s, fastest_s = SKIN_RELAXATION.tau_s.max(), SKIN_RELAXATION.tau_s.min()
     power = np.log(ratio) / np.log(slowest_s / fastest_s)
@@ -343,7 +366,7 @@ def stiff(ratio: float) -> Prony:
 
 
 def integrate(history: History, prony: Prony, piece: Piece, counter: Counter) -> Forces:
-    """Integrate the states over each linear piece of the history; return the relaxed force at the end of each."""
+    """Integrate the states over the linear pieces of a history; return the relaxed force at the end of each piece."""
     (time_s, elastic), state = history, np.zeros_like(prony.tau_s)
     forces = np.empty(len(time_s) - 1)
     for i, (length_s, change) in enumerate(zip(np.diff(time_s), np.diff(elastic), strict=True)):
@@ -353,9 +376,9 @@ def integrate(history: History, prony: Prony, piece: Piece, counter: Counter) ->
 
 
 def euler(rates: Rates, length_s: float, state: State, *, step_s: float) -> State:
-    """Integrate by explicit Euler with equal steps of at most `step_s`.
+    """Integrate one linear piece by explicit Euler, with equal steps of at most `step_s`.
 
-    Stable for steps below twice the shortest relaxation time.
+    The method is stable if the steps are shorter than twice the fastest relaxation time.
     """
     steps_n = ceil(length_s / step_s - 1e-9)
     with np.errstate(over="ignore", invalid="ignore"):  # divergence is detected at the end
@@ -365,7 +388,7 @@ def euler(rates: Rates, length_s: float, state: State, *, step_s: float) -> Stat
 
 
 def solve(rates: Rates, length_s: float, state: State, *, method: str, tolerance: float, prony: Prony) -> State:
-    """Integrate with one of SciPy's adaptive solvers."""
+    """Integrate one linear piece with an adaptive solver of SciPy; raise `Failed` if the solver fails."""
     jacobian = np.diag(-1 / prony.tau_s)
     options = {"jac": lambda _, __: jacobian} if method in IMPLICIT else {}
     span_s = (0.0, length_s)
@@ -391,7 +414,7 @@ def _run_with_new_counter(run: Run, calls_max_n: int) -> Forces:
 
 
 def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str | None]:
-    # Returns the relative rms error, or the reason why there is none.
+    """Return the relative rms error and None, or None and the reason why the integrator failed."""
     try:
         relaxed = run(counter)
     except Failed as failure:
@@ -401,43 +424,46 @@ def _judge(run: Run, counter: Counter, truth: Forces) -> tuple[float | None, str
     return (error, None) if error < DIVERGED else (None, f"diverged: error {error:.0e} of the force")
 
 
-RADII_N, HEIGHTS_N = 56, 16  # knots of the splines of the displacement; twice as many change dB by 0.1 %
+RADII_N, HEIGHTS_N = 56, 16  # knots of the displacement splines; twice as many knots change dB by 0.1 %
 
 
 @dataclass(frozen=True)
 class NodePath:
-    """Position and rotation vector of every node under every indentation."""
+    """Position and rotation vector of every node (second axis) under every indentation (first axis)."""
 
     nodes_m: Float[np.ndarray, "n s 3"]
     turns_rad: Float[np.ndarray, "n s 3"]
 
 
 def prepare(trial: Trial, rest: Nodes) -> Prepared:
-    """Compute dB as the simulator does, on any nodes."""
+    """Prepare the simulator's computation of dB, with the given nodes."""
     skin = with_nodes(trial, rest)
     return Prepared(len(skin.nodes_m), lambda: changes_of_field(trial.board, skin, trial.pokes_m)[1])
 
 
 def gauss_in_z(trial: Trial, rule: Quadrature) -> Prepared:
-    """Compute dB as the simulator does, on its nodes: cells that end at the seams, Gauss nodes over the thickness."""
+    """Prepare the simulator's computation of dB with its own nodes.
+
+    Cells end at the seams of the magnetising array; each cell has Gauss nodes over the thickness.
+    """
     return prepare(trial, place_nodes(trial.skin.thickness_m, rule))
 
 
 def midpoint(trial: Trial, rule: Quadrature) -> Prepared:
-    """Compute dB as the simulator does, on the centres of equal boxes."""
+    """Prepare the simulator's computation of dB, with nodes at the centres of equal boxes."""
     return prepare(trial, midpoints(trial.skin.thickness_m, rule))
 
 
 def gauss_in_xyz(trial: Trial, rule: Quadrature) -> Prepared:
-    """Compute dB as the simulator does, on 2 x 2 Gauss nodes in each cell times the nodes over the thickness."""
+    """Prepare the simulator's computation of dB, with 2 x 2 Gauss nodes per cell in each layer of Gauss nodes."""
     return prepare(trial, gauss_everywhere(trial.skin.thickness_m, rule, per_cell_n=2))
 
 
 def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of already displaced nodes with the compiled kernel, for comparison with magpylib's times.
+    """Prepare the sum over nodes alone, with the compiled kernel and precomputed displacements.
 
-    The kernel computes each node both at rest and moved, which avoids the difference of large sums; for magpylib, the
-    field at rest is computed once.
+    This is comparable with the times of magpylib. The kernel computes the field of each node at rest and displaced,
+    which avoids subtracting two large sums. With magpylib, the field at rest is computed only once.
     """
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
@@ -451,7 +477,7 @@ def kernel_alone(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of the nodes with magpylib.core: all pairs of node and chip in one call per indentation."""
+    """Prepare the sum over nodes with magpylib.core: one call per indentation for all pairs of node and chip."""
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     path = paths(trial, skin)
     moments = _rotated_moments(path, skin.moments_A_m2)
@@ -465,13 +491,13 @@ def magpylib_core(trial: Trial, rule: Quadrature) -> Prepared:
 
 
 def magpylib_dipoles(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of the nodes with magpylib objects: one Dipole per node, with its path through all indentations."""
+    """Prepare the sum over nodes with magpylib objects: one Dipole per node, whose path has all indentations."""
     skin = with_nodes(trial, place_nodes(trial.skin.thickness_m, rule))
     return _by_objects(trial, skin, lambda i: Dipole(moment=skin.moments_A_m2[i]))
 
 
 def magpylib_cuboids(trial: Trial, rule: Quadrature) -> Prepared:
-    """Sum the field of equal boxes with magpylib objects: Cuboids that move and rotate with their centres."""
+    """Prepare the sum over equal boxes with magpylib objects: Cuboids that move and rotate with the material."""
     rest = midpoints(trial.skin.thickness_m, rule)
     skin = with_nodes(trial, rest)
     j_T = mu_0 * skin.moments_A_m2 / rest.volumes_m3[:, None]
@@ -498,7 +524,7 @@ def _by_objects(trial: Trial, skin: Skin, at_origin: Callable[[int], Any]) -> Pr
     chips_m, path = trial.board.chips_m, paths(trial, skin)
     objects = []
     for i, place_m in enumerate(skin.nodes_m):
-        # Each path begins at rest, so that one call gives the field before and during every indentation.
+        # Each path begins at rest, so that one call returns the fields at rest and under every indentation.
         source = at_origin(i)
         source.position = np.vstack([place_m, path.nodes_m[:, i]])
         source.orientation = Rotation.from_rotvec(np.vstack([np.zeros(3), path.turns_rad[:, i]]))
@@ -512,7 +538,7 @@ def _by_objects(trial: Trial, skin: Skin, at_origin: Callable[[int], Any]) -> Pr
 
 
 def paths(trial: Trial, skin: Skin) -> NodePath:
-    """Follow the skin's nodes through every indentation of the trial, with splines of the displacement."""
+    """Return the displaced nodes of the skin under every indentation of the trial, from displacement splines."""
     nodes_m = np.tile(skin.nodes_m, (len(trial.pokes_m), 1, 1))
     turns_rad = np.zeros_like(nodes_m)
     true_m = trial.pokes_m[:, 2] + skin.depth_zero_m
@@ -524,8 +550,8 @@ def paths(trial: Trial, skin: Skin) -> NodePath:
         r_m = np.hypot(*away_m.T)
         outward_m, up_m, angle_rad = np.sqrt(r_m**2 + deformed.grown_m2) - r_m, np.zeros_like(r_m), np.zeros_like(r_m)
         within = r_m < reach_m
-        for part, spline in zip((outward_m, up_m, angle_rad), deformed.splines, strict=True):
-            part[within] = spline.ev(r_m[within], skin.nodes_m[within, 2])
+        for changes, spline in zip((outward_m, up_m, angle_rad), deformed.splines, strict=True):
+            changes[within] = spline.ev(r_m[within], skin.nodes_m[within, 2])
         cos, sin = (away_m / np.where(r_m > 0, r_m, 1.0)[:, None]).T
         nodes_m[poke_i] += np.stack([outward_m * cos, outward_m * sin, up_m], axis=1)
         turns_rad[poke_i] += angle_rad[:, None] * np.stack([-sin, cos, np.zeros_like(cos)], axis=1)
@@ -539,6 +565,7 @@ def _slide(
     nodes_m: Float[np.ndarray, "n s 3"], turns_rad: Float[np.ndarray, "n s 3"], motion: slide.RigidMotion,
     middle_m: Float[np.ndarray, "2"],
 ) -> None:  # fmt: skip
+    """Apply the rigid motion of the skin to its nodes, in place; the skin rotates about `middle_m`."""
     for poke_i, spin_rad in enumerate(motion.spin_rad):
         spin = Rotation.from_rotvec((0.0, 0.0, spin_rad))
         nodes_m[poke_i], _ = slide.apply(motion, poke_i, (nodes_m[poke_i], turns_rad[poke_i]), middle_m)
@@ -547,7 +574,10 @@ def _slide(
 
 @dataclass(frozen=True)
 class _DeformationSplines:
-    """Splines over (r, z) of the changes of r, z and angle; beyond their reach, r^2 grows by a constant."""
+    """Splines over (r, z) of the changes of r, z and rotation angle.
+
+    Beyond the range of the splines, r^2 grows by `grown_m2`, and z and the angle do not change.
+    """
 
     splines: tuple[RectBivariateSpline, ...]
     grown_m2: float
@@ -560,13 +590,13 @@ def _deformation_splines(
     reach_m = press.thickness_m * deformation.reach(press.tip_radius_m / press.thickness_m, press.base)
     r_m = reach_m * np.linspace(0, 1, RADII_N) ** 1.5
     z_m = press.thickness_m * np.linspace(0, 1, HEIGHTS_N)
-    r0_m, z0_m = (part.ravel() for part in np.meshgrid(r_m, z_m, indexing="ij"))
+    r0_m, z0_m = (grid_m.ravel() for grid_m in np.meshgrid(r_m, z_m, indexing="ij"))
     steps_m = deformation.depth_steps(depths_m, press)
     by_depth = {}
     for step_m, end in zip(steps_m, deformation.follow(r0_m, z0_m, steps_m, press=press), strict=True):
         changes = [
-            part.reshape(RADII_N, HEIGHTS_N)
-            for part in (end.r_m - r0_m, end.z_m - z0_m, deformation.rotation_angle(end.f))
+            change.reshape(RADII_N, HEIGHTS_N)
+            for change in (end.r_m - r0_m, end.z_m - z0_m, deformation.rotation_angle(end.f))
         ]
         edge_m = reach_m + float(changes[0][-1].mean())
         grown_m2 = edge_m**2 - reach_m**2 if press.base == "slipping" else 0.0
@@ -576,25 +606,28 @@ def _deformation_splines(
     return by_depth, reach_m
 
 
-COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # only for drawing a skin, whose nodes are then replaced
+COARSEST = Quadrature(cell_m=20e-3, layers_n=1)  # only for drawing a random skin; its nodes are replaced afterwards
 
 
 def draw_trial(
     board: Board, design: SkinDesign, *, spreads: Spreads, seed: int, name: str, pokes: Indentations
 ) -> Trial:
-    """Draw a uniform, unrotated skin, and place the indentations relative to its centre."""
+    """Draw a random skin without rotation and without variation over its area, and its indentations.
+
+    The places of `pokes` are relative to the skin's centre. Raises `ParamsError` if a poke does not reach the skin.
+    """
     even = spreads.model_copy(update=dict.fromkeys(("skin_amplitude", "skin_filler", "skin_rotation_deg"), 0.0))
     skin = draw_skin(design, even, seed=seed, name=name, rule=COARSEST)
     pokes_m = milli * np.array([(*place, depth) for depth, place in product(pokes.depths_mm, pokes.places_mm)])
     pokes_m[:, :2] += skin.seat_m
     if not (pokes_m[:, 2] + skin.depth_zero_m > 0).all():
         got = f"{pokes_m[:, 2].min() + skin.depth_zero_m:.3g} m"
-        raise ParamsError(f"skin {name}", "true depth of every poke", "above 0 m", got, "Poke deeper.")
+        raise ParamsError(f"skin {name}", "true depth of every poke", "above 0 m", got, "Use larger depths.")
     return Trial(board, design, skin, pokes.depths_mm, pokes_m)
 
 
 def with_nodes(trial: Trial, rest: Nodes) -> Skin:
-    """Return the trial's skin with other nodes (relative to its centre and base), magnetised as usual."""
+    """Return the trial's skin with the nodes `rest`, which are relative to its centre and base, magnetised as usual."""
     b_T = magnet.array_field(rest.nodes_m, trial.skin.thickness_m, trial.design.polarity)
     j_T = magnet.magnetise(b_T, saturation_T=trial.design.saturation_T, half_field_T=trial.design.half_field_T)
     nodes_m = rest.nodes_m + np.append(trial.skin.seat_m, 0.0)
@@ -602,7 +635,7 @@ def with_nodes(trial: Trial, rest: Nodes) -> Skin:
 
 
 def midpoints(thickness_m: float, rule: Quadrature) -> Nodes:
-    """Place nodes at the centres of equal boxes, regardless of the seams."""
+    """Return nodes at the centres of equal boxes; the boxes are not aligned with the seams of the magnetising array."""
     side_m, _, high_m = box_m(thickness_m, rule)
     side_n = round(SKIN_SIDE_M / side_m)
     x_m = side_m * (np.arange(side_n) + 0.5) - SKIN_SIDE_M / 2
@@ -611,13 +644,13 @@ def midpoints(thickness_m: float, rule: Quadrature) -> Nodes:
 
 
 def box_m(thickness_m: float, rule: Quadrature) -> tuple[float, float, float]:
-    """Return the sides of the boxes of `midpoints`."""
+    """Return the side lengths in m, along x, y and z, of the boxes of `midpoints`."""
     side_m = SKIN_SIDE_M / ceil(SKIN_SIDE_M / rule.cell_m - 1e-9)
     return side_m, side_m, thickness_m / rule.layers_n
 
 
 def gauss_everywhere(thickness_m: float, rule: Quadrature, *, per_cell_n: int) -> Nodes:
-    """Place nodes in cells that end at the seams, with Gauss nodes also along x and y, for a higher order."""
+    """Return Gauss nodes along x, y and z, in cells that end at the seams of the magnetising array."""
     spans_m = pairwise((-SKIN_SIDE_M / 2, *SEAMS_M, SKIN_SIDE_M / 2))
     edges_m = [np.linspace(a, b, ceil((b - a) / rule.cell_m - 1e-9) + 1) for a, b in spans_m]
     starts_m, widths_m = np.concatenate([e[:-1] for e in edges_m]), np.concatenate([np.diff(e) for e in edges_m])
@@ -628,6 +661,7 @@ def gauss_everywhere(thickness_m: float, rule: Quadrature, *, per_cell_n: int) -
 
 
 def _gauss(points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " q"]]:
+    """Return the nodes and weights of Gauss-Legendre quadrature on [0, 1]."""
     x, w = np.polynomial.legendre.leggauss(points_n)
     return (1 + x) / 2, w / 2
 
@@ -638,13 +672,13 @@ def _product(
     z_m: Float[np.ndarray, " j"],
     z_weight_m: Float[np.ndarray, " j"],
 ) -> Nodes:
-    # The same nodes along x and y, because the skin is square.
+    """Return the tensor product of nodes along x, y and z; those along y equal those along x (the skin is square)."""
     nodes_m = np.stack(np.meshgrid(x_m, x_m, z_m, indexing="ij"), axis=-1).reshape(-1, 3)
     return Nodes(nodes_m, np.einsum("i,j,k->ijk", x_weight_m, x_weight_m, z_weight_m).ravel())
 
 
 class RunTime(Strict):
-    """Settings section `runtime`: both studies, and the number of timings of each call."""
+    """Settings section `runtime`: the studies of quadratures and integrators, and how often each call is timed."""
 
     quadratures: Quadratures
     integrators: Integrators
@@ -652,7 +686,10 @@ class RunTime(Strict):
 
 
 def runtime(settings: Settings, section: RunTime, results: Path) -> None:
-    """Compare quadratures and integrators; times differ between equal runs, so they are not an output of DVC."""
+    """Compare quadratures and integrators by error and run time.
+
+    Run times are not an output of the DVC stage, because they differ each time the stage is run.
+    """
     simulation = simulation_settings(settings)
     rows, calls = study_quadratures(
         _trials(simulation, section.quadratures, settings.seed), section.quadratures.rules_of()
@@ -672,7 +709,7 @@ def runtime(settings: Settings, section: RunTime, results: Path) -> None:
 
 
 def _trials(simulation: SimulationSettings, tried: Quadratures, seed: int) -> list[Trial]:
-    """Return the skins on the boards with the nearest chips, which need the finest quadrature."""
+    """Draw the trials for the skins whose chips are nearest to the skin; these need the finest quadrature."""
     boards_and_skins = [
         (draw_board(simulation.main_boards.design, simulation.spreads, seed=seed, name=board), skin)
         for board, skin in list_captures(simulation, MAIN)

@@ -32,7 +32,11 @@ def group_by_level(
     levels_n: int,
     where: str,
 ) -> Float32[np.ndarray, "n p r ch"]:
-    """Group readings by filling, weight and reading; a stop is a run of readings with equal force in the log."""
+    """Reshape readings by filling of the glass, weight level and reading.
+
+    Successive readings with equal logged force form a stop, at one weight level. Raises `SchemaError` unless every
+    filling has `levels_n` stops, all with the same number of readings.
+    """
     starts = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
     stops = np.split(np.arange(len(force_N)), starts)
     fillings_n = len(np.unique(indentation))
@@ -47,7 +51,7 @@ def group_by_level(
 def analyse_levels(
     db_uT: Float32[np.ndarray, "n p r ch"], weight_N: Float64[np.ndarray, " p"]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Analyse the readings under weights that increase in equal steps; return numbers, and data for the figures."""
+    """Analyse readings under weights that increase in equal steps; return the numbers, and the data for the figures."""
     fitted, held_out = np.split(db_uT.astype(np.float64), [len(db_uT) // 2])
     along_uT = held_out @ direction(fitted)
     response_uT, step_N = along_uT.mean(axis=(0, 2)), float(weight_N[1] - weight_N[0])
@@ -90,15 +94,16 @@ def _known(steps_N: dict[str, float | None]) -> dict[str, float]:
 
 
 def direction(db_uT: Float64[np.ndarray, "n p r ch"]) -> Float64[np.ndarray, " ch"]:
-    """Return the unit vector along the mean dB."""
+    """Return the unit vector in the direction of the mean dB."""
     mean_uT = db_uT.mean(axis=(0, 1, 2))
     return mean_uT / np.linalg.norm(mean_uT)
 
 
 def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarray, " d"]:
-    """Return the fraction of reading pairs in the order of their weights, for differences of 1 step, 2 steps, ...
+    """Return the fraction of correctly ordered pairs of readings, for weight differences of 1 step, 2 steps, ...
 
-    A pair is two readings of the same filling, which share a no-load reading; equal responses count half.
+    A pair is correctly ordered if the reading under the larger weight has the larger response; equal responses count
+    half. Both readings of a pair are of the same filling, and so have the same no-load reading.
     """
     levels_n = response_uT.shape[1]
     shares = []
@@ -109,23 +114,27 @@ def ordered_share(response_uT: Float64[np.ndarray, "n p r"]) -> Float64[np.ndarr
 
 
 def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | None:
-    """Return the smallest difference that is resolved together with all larger ones; None if the largest is not."""
+    """Return the smallest weight difference such that this and all larger differences are resolved.
+
+    `share` is the fraction of correctly ordered pairs by difference (see `ordered_share`). Returns None if even the
+    largest difference is not resolved.
+    """
     unresolved_i = np.flatnonzero(share < RESOLVED_SHARE)  # index 0 is one step
     last_i = int(unresolved_i.max(initial=-1))
     return None if last_i == len(share) - 1 else step_N * (last_i + 2)
 
 
 def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndarray, " p"]) -> dict[str, Any]:
-    """Test whether the mean response over fillings increases from every weight to the one `step_N` above it.
+    """Test whether the mean response over fillings increases from every weight to the weight that is `step_N` larger.
 
-    `step_N` is the smallest multiple of the weights' step whose mean rise exceeds the noise of one filling in 95 % of
-    cases; at finer steps, noise alone would make the response fall. `step_N` is computed from noise and gain, not from
-    the observed order: otherwise an observed fall would lengthen the step until the fall disappears. If no step is
-    large enough, `step_N` is missing.
+    `step_N` is the smallest multiple of the step between weights at which the mean rise exceeds the noise of one
+    filling in 95 % of cases. With smaller steps, noise alone would make the response fall. `step_N` is computed from
+    noise and gain, and not from the observed responses: otherwise an observed fall would increase `step_N` until the
+    fall disappears. If no step is large enough, the result has no `step_N`.
     """
     mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
-    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # of one rise
-    gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # per step
+    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # noise of one rise
+    gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # mean rise per step between weights
     result: dict[str, Any] = {
         "holds": False,
         "falls_n": 0,
@@ -139,14 +148,14 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
         falls_n, pairs_n = int((mean_uT[steps_n:] <= mean_uT[:-steps_n]).sum()), len(mean_uT) - steps_n
         step_N = steps_n * float(weight_N[1] - weight_N[0])
         result |= {"holds": falls_n == 0, "falls_n": falls_n, "pairs_n": pairs_n, "step_N": step_N}
-    if noise_uT > 0:  # for a linear rise, with the standard error of the mean
+    if noise_uT > 0:  # number of falls expected from noise, for a linear response and the standard error of the mean
         z = -gain_uT / (noise_uT / np.sqrt(len(rise_uT)))
         result["neighbours"]["expected_falls_n"] = float(rise_uT.shape[1] * ndtr(z))
     return result
 
 
 def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
-    """Find the smallest difference of weight that the loaded skin resolves."""
+    """Find the smallest weight difference that readings of the loaded skin resolve."""
     load = load_protocol(settings, "glass")
     capture = only(read_captures(indentations), indentations)
     weight_N = load_steps_N(load.force_max_N, load.step_N)

@@ -1,6 +1,6 @@
 """Shear: place and all three force components of dragged lines (paper section 4).
 
-Every skin is split in two ways: random readings are held out, or whole lines are held out.
+The readings of every skin are split in two ways: random readings are held out, or whole lines are held out.
 """
 
 from collections.abc import Hashable, Mapping, Sequence
@@ -27,11 +27,11 @@ from reskin.seeds import rng_for, seed_for
 PLACE, SIDEWAYS, NORMAL = slice(0, 2), slice(2, 4), slice(4, 5)
 PARTS = {"xy": (PLACE, "mse_xy_mm2"), "fxy": (SIDEWAYS, "mse_fxy_N2"), "fz": (NORMAL, "mse_fz_N2")}
 DRAWN_N = 400  # points in a panel of the figure
-FORCE_DECIMALS = 3  # of a force in N in the figure
+FORCE_DECIMALS = 3  # forces in N are rounded to this many decimals for the figure
 
 
 class Shear(SectionWithTraining):
-    """Settings section `shear`: the splits of dragged lines, and the training."""
+    """Settings section `shear`: held-out fraction and number of the random splits, and the training settings."""
 
     test_fraction: Annotated[float, Field(gt=0, lt=1)]
     repeats_n: Annotated[int, Field(ge=1)]
@@ -70,16 +70,17 @@ def shear(settings: Settings, section: Shear, indentations: Path, results: Path)
 
 
 def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
-    """Draw the folds of every skin; rows of equal `group` stay together."""
+    """Draw the random splits of every skin; rows with equal values of `group` are on the same side."""
     folds = []
     for skin in np.unique(rows.skin):
-        own = np.flatnonzero(rows.skin == skin)
+        skin_rows = np.flatnonzero(rows.skin == skin)
         splits = draw_sides(
-            group[own], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
+            group[skin_rows], test_fraction=section.test_fraction, repeats_n=section.repeats_n,
             state=seed_for(seed, "shear", by, str(skin)), what=f"{by}s of skin {skin}", where="experiment shear",
         )  # fmt: skip
         folds += [
-            Fold("shear", f"{skin}-{by}{i}", own[train], own[test], NO_POOL) for i, (train, test) in enumerate(splits)
+            Fold("shear", f"{skin}-{by}{i}", skin_rows[train], skin_rows[test], NO_POOL)
+            for i, (train, test) in enumerate(splits)
         ]
     return folds
 
@@ -87,8 +88,8 @@ def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int
 def score5(true: Float[np.ndarray, "f 5"], predicted: Float[np.ndarray, "f 5"]) -> dict[str, float]:
     """Score predictions of (x_mm, y_mm, Fx_N, Fy_N, Fz_N).
 
-    `explained_*` is 1 - MSE / variance of the truth: 1 is perfect, 0 is no better than the mean. Unlike the errors, it
-    does not grow with the size of the forces.
+    `explained_*` is 1 - MSE / variance of the true values: 1 is perfect, 0 is no better than predicting the mean.
+    Unlike an MSE, it does not grow with the size of the forces.
     """
     error = predicted.astype(float) - true
     near = np.abs(error[:, PLACE]) <= ACCURACY_LIMIT_MM
@@ -108,10 +109,11 @@ def summarise_shear(
     passes_n: int,
     seeds_n: int,
 ) -> dict[str, Any]:
-    """Summarise the (fold, scores) pairs of both splits over folds, and add the rms forces.
+    """Summarise the scores of both splits over folds, and add the rms forces.
 
-    The score of a fold is the mean over its seeds; `sd_seeds` is the standard deviation over the `seeds_n` networks of
-    one fold, averaged over folds. `lines_n` counts dragged lines over all passes; each pass drags along the same lines.
+    `by_reading` and `by_line` have one pair (fold, scores) per network. The score of a fold is the mean over its seeds;
+    `sd_seeds` is the standard deviation over the `seeds_n` networks of one fold, averaged over folds. `lines_n` is the
+    number of dragged lines over all passes; each pass drags along the same lines.
     """
 
     def over_folds(scored: Sequence[tuple[Hashable, Mapping[str, float]]]) -> dict[str, Any]:
@@ -133,19 +135,19 @@ FORCES = ("Fx", "Fy", "Fz")
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate both splits beside the paper's numbers; the paper does not say which split it used."""
+    """Tabulate the scores of both splits and the paper's numbers. The paper does not say how it split the readings."""
     splits = {
         "random readings held out (ours; the paper does not state its split)": numbers,
         "whole lines held out": numbers["by_line"],
     }
     lines = []
-    for split, own in splits.items():
+    for split, scores in splits.items():
         line = {"split": split, "source": source}
         for metric, title in TITLES.items():
-            line[f"{title} (ours)"] = show(own[metric])
+            line[f"{title} (ours)"] = show(scores[metric])
             if metric in SHEAR:
                 line[f"{title} (paper)"] = "{:g} ± {:g}".format(*SHEAR[metric])
-        lines.append(line | {"n": str(own["accuracy_pct"]["n"])})
+        lines.append(line | {"n": str(scores["accuracy_pct"]["n"])})
     rms_N = ", ".join(f"{numbers[f'{axis}_rms_N']:.2g} N (F{axis[1]})" for axis in ("fx", "fy", "fz"))
     meaning = (
         f"{numbers['readings_n']} readings of {numbers['lines_n']} dragged lines in {numbers['passes_n']} passes: the "
@@ -163,7 +165,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw predicted against true force for held-out lines, one panel per component."""
+    """Plot predicted against true force for held-out lines, one panel per force component."""
     with drawing(7.6, 3.1) as figure:
         panels = figure.subplots(1, len(FORCES))
         for axes, name, true_N, predicted_N in zip(panels, FORCES, drawn["true"], drawn["predicted"], strict=True):

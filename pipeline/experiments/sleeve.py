@@ -1,6 +1,6 @@
 """Sleeve: place estimates over the whole area of many boards under one skin (paper section 6).
 
-Networks and nearest neighbours are trained on the first pokes and tested on the last ones.
+Networks and nearest neighbours are trained on the first pokes of a skin, and tested on its last pokes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,37 +31,38 @@ from reskin.models.job import TrainingData, TrainingJob
 from reskin.models.recipe import HEADLINE
 from reskin.schema import Readings
 
-NEAR_MM = 4.0  # a place closer to a border between boards is near it: about twice the skin's thickness, assumed
-Stats = dict[str, dict[str, float]]
+NEAR_MM = 4.0  # places within this distance of a border between boards are near it (assumed: twice the thickness)
+Stats = dict[str, dict[str, float]]  # by metric: mean, n and, for several training runs, sd
 
 
 class Sleeve(SectionWithTraining):
-    """Settings section `sleeve`: the fraction of pokes held out, k nearest neighbours, and the training."""
+    """Settings section `sleeve`: held-out fraction of the pokes, number of nearest neighbours, and training."""
 
-    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # the last pokes of each capture
+    test_fraction: Annotated[float, Field(gt=0, lt=1)]  # the last pokes of each capture are held out
     neighbours_n: Annotated[int, Field(ge=1)]
     training: Training
 
 
 @dataclass(frozen=True)
 class Area:
-    """A skin, and the chips and borders of boards under it, in the labels' coordinates (mm from the skin's corner)."""
+    """A skin, and the boards under it, in the coordinates of the labels (mm from the skin's corner)."""
 
     sides_mm: tuple[float, float]
     chips_mm: Float[np.ndarray, "k 2"]
-    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]  # x of the borders along y, and y of the borders along x
+    # Borders between boards: x of the borders that are parallel to the y axis, and y of those parallel to the x axis.
+    borders_mm: tuple[tuple[float, ...], tuple[float, ...]]
 
     def near_border(self, place_mm: Float[np.ndarray, "f 2"]) -> Bool[np.ndarray, " f"]:
-        """Mark places closer than `NEAR_MM` to a border between two boards."""
+        """Return which places are closer than `NEAR_MM` to a border between two boards."""
         near = np.zeros(len(place_mm), bool)
-        for along_mm, borders_mm in zip(place_mm.T, self.borders_mm, strict=True):
+        for coordinate_mm, borders_mm in zip(place_mm.T, self.borders_mm, strict=True):
             for border_mm in borders_mm:
-                near |= np.abs(along_mm - border_mm) < NEAR_MM
+                near |= np.abs(coordinate_mm - border_mm) < NEAR_MM
         return near
 
 
 def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Path) -> None:
-    """Train the recipes of section sleeve on the first pokes, score them and nearest neighbours on the last."""
+    """Train the networks on the first pokes of each capture; score them and nearest neighbours on the last pokes."""
     preload_training()
     captures, area = read_captures(indentations), area_of(settings)
     data = SceneData(settings.scene, settings, gather(captures, settings.section(Selection, "selection")), [])
@@ -79,8 +80,8 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Pat
     }
     predictions |= predict_by_neighbours(data, section, train, test)
     true, indentation = data.rows.target[test], data.rows.indentation[test]
-    scored = {name: score_places(true, own, indentation, area) for name, own in predictions.items()}
-    trained_n, tested_n = (len(np.unique(data.rows.indentation[part])) for part in (train, test))
+    scored = {name: score_places(true, by_seed, indentation, area) for name, by_seed in predictions.items()}
+    trained_n, tested_n = (len(np.unique(data.rows.indentation[side])) for side in (train, test))
     numbers = {
         "chips_n": captures[0].chips_n, "rate_hz": rate_hz(captures), "area_mm": list(area.sides_mm),
         "pokes_n": trained_n + tested_n, "trained_n": trained_n, "tested_n": tested_n, "near_mm": NEAR_MM,
@@ -92,7 +93,7 @@ def sleeve(settings: Settings, section: Sleeve, indentations: Path, results: Pat
 
 
 def area_of(settings: Settings) -> Area:
-    """Return the area of the simulated sleeve."""
+    """Return the skin and boards of the simulated sleeve, from a scene's settings."""
     simulation = simulation_settings(settings)
     kind = simulation.boards[simulation.protocols["sleeve"].boards]
     tiles = kind.design.tiles
@@ -107,7 +108,11 @@ def lay_out(
     boards_n: tuple[int, int],
     pitch_mm: float,
 ) -> Area:
-    """Convert chip positions (from the skin's middle) to the labels' coordinates; compute borders between boards."""
+    """Return an area in the coordinates of the labels.
+
+    `chips_mm` are relative to the skin's middle. `boards_n` are the numbers of boards along x and y, whose centres are
+    `pitch_mm` apart.
+    """
     middle_mm = np.array(sides_mm) / 2
     x_mm, y_mm = (
         tuple(float(m + pitch_mm * (i - n / 2)) for i in range(1, n)) for m, n in zip(middle_mm, boards_n, strict=True)
@@ -116,23 +121,26 @@ def lay_out(
 
 
 def hold_out_last(rows: Rows, test_fraction: float) -> tuple[Int64[np.ndarray, " a"], Int64[np.ndarray, " b"]]:
-    """Split rows into those of the first indentations of each capture and those of the last ones."""
+    """Return the row numbers of the first indentations of each capture (training) and of the last ones (test)."""
     held_out = np.zeros(len(rows), bool)
     for capture in np.unique(rows.capture):
-        own = rows.capture == capture
-        indentations = np.unique(rows.indentation[own])  # in order of time
+        in_capture = rows.capture == capture
+        indentations = np.unique(rows.indentation[in_capture])  # in order of time
         test_n = round(test_fraction * len(indentations))
         if not 0 < test_n < len(indentations):
             what = f"{test_n} of the {len(indentations)} pokes of {capture} would be held out: one side is empty"
-            raise ParamsError(f"experiment sleeve: {what}. Poke more often.")
-        held_out |= own & (rows.indentation >= indentations[-test_n])
+            raise ParamsError(f"experiment sleeve: {what}. Use a capture with more pokes.")
+        held_out |= in_capture & (rows.indentation >= indentations[-test_n])
     return np.flatnonzero(~held_out), np.flatnonzero(held_out)
 
 
 def predict_by_neighbours(
     data: SceneData, section: Sleeve, train: np.ndarray, test: np.ndarray
 ) -> dict[str, list[np.ndarray]]:
-    """Predict the test rows by k nearest neighbours, with fields and with their shape as inputs."""
+    """Predict the test rows by k nearest neighbours, with two kinds of inputs: dB, and the shape of dB.
+
+    The keys of the result are `knn-raw` and `knn-shape`.
+    """
     none = np.zeros(0, np.int64)
     tasks = [
         ClassicalJob(f"knn-{inputs}", Neighbours(method="knn", inputs=inputs, neighbours_n=section.neighbours_n),
@@ -145,20 +153,20 @@ def predict_by_neighbours(
 
 
 def rate_hz(captures: Sequence[Readings]) -> float:
-    """Measure the frame rate from the times of successive readings of an indentation."""
+    """Return the frame rate, from the times between successive readings of an indentation."""
     steps_n, steps_s = 0, 0.0
     for capture in captures:
         same = (np.diff(capture.indentation) == 0) & (np.diff(capture.reading_i) == 1)
         steps_n += int(same.sum())
         steps_s += float(np.diff(capture.t_s)[same].sum())
     if not steps_s > 0:
-        what = "two or more readings of an indentation at known times are needed"
-        raise ParamsError(f"experiment sleeve: {what}; got {steps_n} steps of time. Record more than one reading.")
+        what = "the frame rate needs two or more readings of an indentation, with times"
+        raise ParamsError(f"experiment sleeve: {what}; got {steps_n} such pairs. Record more readings per indentation.")
     return steps_n / steps_s
 
 
 def errors_mm(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, " f"]:
-    """Return the distance between true and predicted place of each reading."""
+    """Return the distance in mm between the true and the predicted place of each reading."""
     return np.linalg.norm(predicted[:, :2].astype(float) - true[:, :2], axis=1)
 
 
@@ -168,9 +176,12 @@ def score_places(
     indentation: Int[np.ndarray, " f"],
     area: Area,
 ) -> dict[str, Any]:
-    """Score a method's predictions (one array per seed): overall, near borders between boards, and elsewhere."""
+    """Score the predictions of a method: over all places, near borders between boards, and elsewhere.
+
+    `predictions` has one array per network seed.
+    """
     near = area.near_border(true[:, :2])
-    each_mm = [errors_mm(true, predicted) for predicted in predictions]
+    seed_errors_mm = [errors_mm(true, predicted) for predicted in predictions]
     scores: dict[str, Any] = over_seeds(
         [
             {
@@ -178,18 +189,18 @@ def score_places(
                 "median_error_mm": float(np.median(error_mm)),
                 "p95_error_mm": float(np.percentile(error_mm, 95)),
             }
-            for predicted, error_mm in zip(predictions, each_mm, strict=True)
+            for predicted, error_mm in zip(predictions, seed_errors_mm, strict=True)
         ]
     )
-    for name, part in (("near_seam", near), ("inside", ~near)):
-        if part.any():
-            medians = [{"median_error_mm": float(np.median(error_mm[part]))} for error_mm in each_mm]
-            scores[name] = {**over_seeds(medians), "pokes_n": len(np.unique(indentation[part]))}
+    for name, rows in (("near_seam", near), ("inside", ~near)):
+        if rows.any():
+            medians = [{"median_error_mm": float(np.median(error_mm[rows]))} for error_mm in seed_errors_mm]
+            scores[name] = {**over_seeds(medians), "pokes_n": len(np.unique(indentation[rows]))}
     return scores
 
 
 def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
-    """Return the mean, standard deviation (absent for one run) and number of each metric over training runs."""
+    """Return the mean and number of values of each metric over training runs, and the sd if there are several runs."""
     stats: Stats = {}
     for name in scores[0]:
         values = np.array([of_seed[name] for of_seed in scores])
@@ -202,7 +213,10 @@ def over_seeds(scores: Sequence[Mapping[str, float]]) -> Stats:
 def draw_errors(
     area: Area, true: Float[np.ndarray, "f 3"], error_mm: Shaped[np.ndarray, " f"], indentation: Int[np.ndarray, " f"]
 ) -> dict[str, Any]:
-    """List every test indentation with the mean error of its readings, and the chips and borders under the skin."""
+    """Return the data for the figure.
+
+    Contains place and mean error of every test indentation, and the chips and the borders between boards.
+    """
     _, first, indentation_i = np.unique(indentation, return_index=True, return_inverse=True)
     mean_mm = np.bincount(indentation_i, error_mm) / np.bincount(indentation_i)
     (x_mm, y_mm), (chips_x_mm, chips_y_mm) = true[first, :2].T, area.chips_mm.T
@@ -220,10 +234,11 @@ NAMES = {"knn-raw": "k nearest neighbours (dB)", "knn-shape": "k nearest neighbo
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the scores of every method, and the set-up beside the paper's."""
+    """Tabulate the scores of every method, and the set-up of the sleeve compared with the paper's."""
     lines = [_line("the paper's network", numbers, source)]
     lines += [
-        _line(NAMES.get(name, f"network, recipe {name}"), one, source) for name, one in numbers["variants"].items()
+        _line(NAMES.get(name, f"network, recipe {name}"), variant_scores, source)
+        for name, variant_scores in numbers["variants"].items()
     ]
     near_n, inside_n = (numbers[part]["pokes_n"] if part in numbers else 0 for part in PARTS)
     meaning = (
@@ -235,13 +250,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw a map of the skin: every tested poke, coloured by its error, over chips and borders between boards."""
+    """Draw a map of the skin: every tested poke, coloured by its error, with chips and borders between boards."""
     with drawing(6.2, 3.5) as figure:
         axes = figure.subplots()
         _draw_boards(axes, drawn)
         most_mm = numbers["p95_error_mm"]["mean"]
         size = float(np.clip(12_000 / len(drawn["x_mm"]), 10, 60))
-        # The long side is horizontal: y runs to the right.
+        # The y axis of the skin points to the right, so that the skin's long side is horizontal.
         points = axes.scatter(
             drawn["y_mm"], drawn["x_mm"], c=drawn["error_mm"], s=size, cmap="viridis", vmin=0.0, vmax=most_mm,
             edgecolors="white", linewidths=0.3, zorder=3,
@@ -285,5 +300,5 @@ def _set_up(numbers: Mapping[str, Any], source: str) -> pd.DataFrame:
         "skin, mm": "{:g} x {:g}".format(*numbers["area_mm"]),
     }
     return tabulate(
-        [{"what": what, "ours": one, "paper": printed[what], "source": source} for what, one in ours.items()]
+        [{"what": what, "ours": value, "paper": printed[what], "source": source} for what, value in ours.items()]
     )

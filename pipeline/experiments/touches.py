@@ -1,8 +1,8 @@
 """Recorded touches at numbered places of a real pad, one or two at once (paper section 7, future work).
 
-Estimates the place and force of a touch, tests whether the field of two touches is a sum of two single ones, and
-whether two touches can be detected. A recording is cut by time into known rows, rows that set thresholds, and test
-rows.
+Estimates the place and force of a touch. Tests whether the change of field by two touches is the sum of the changes by
+two single touches, and whether two touches can be detected. Each recording of single touches is split by time into
+training rows, rows that set thresholds, and test rows.
 """
 
 import re
@@ -43,17 +43,17 @@ from reskin.models.inputs import shape
 from reskin.schema import Readings
 from reskin.seeds import rng_for
 
-PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # key in a capture's account, for layouts with numbered places
-ROWS_MIN_N = 20  # touched rows that a recording needs
-LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # model of force
-SUMS_N = 100  # sums of two single touches that are drawn for each pair of places
+PLACE_COUNT = re.compile(r"place_(\d+)_rows_n")  # key in the ingest counts of captures with numbered places
+ROWS_MIN_N = 20  # smallest number of touched rows in a usable recording
+LINEAR = Ridge(inputs="raw", method="ridge", alpha=1.0)  # model that predicts the force
+SUMS_N = 100  # random sums of two single touches for each pair of places
 
 Fraction = Annotated[float, Field(gt=0, lt=1)]
-Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # by place
+Directions = Mapping[int, Float64[np.ndarray, " ch"]]  # mean direction of dB by place number
 
 
 class Touches(Strict):
-    """Settings section `touches`: how a recording is cut by time, and the accepted fraction of false alarms."""
+    """Settings section `touches`: how a recording is split by time, and the intended fraction of false alarms."""
 
     train_fraction: Fraction
     aside_fraction: Fraction
@@ -62,12 +62,12 @@ class Touches(Strict):
     @model_validator(mode="after")
     def _check_test_rows_are_left(self) -> "Touches":
         if self.train_fraction + self.aside_fraction >= 1:
-            raise ValueError("train_fraction plus aside_fraction must be less than 1, so that rows are left to test")
+            raise ValueError("train_fraction + aside_fraction must be less than 1; the rest are the test rows")
         return self
 
 
 def touches(settings: Settings, section: Touches, indentations: Path, results: Path) -> None:
-    """Evaluate touches at numbered places."""
+    """Evaluate all recordings of touches at numbered places, of one or two touches at once."""
     selection = settings.section(Selection, "selection")
     sources = [indentations / f"{name}.parquet" for name in settings.captures_in(indentations)]
     recordings = sort_recordings(
@@ -103,7 +103,7 @@ def touches(settings: Settings, section: Touches, indentations: Path, results: P
 
 @dataclass(frozen=True)
 class Touched:
-    """The touched rows of one recording, in order of time: changes of field, forces, and the place or places."""
+    """The rows of one recording with enough force, in order of time; `places` has one place number or two."""
 
     name: str
     places: tuple[int, ...]
@@ -111,13 +111,13 @@ class Touched:
     force_N: Float32[np.ndarray, " f"]
 
     def __getitem__(self, rows: slice) -> "Touched":
-        """Return some of the rows."""
+        """Return the recording with only these rows."""
         return Touched(self.name, self.places, self.db_uT[rows], self.force_N[rows])
 
 
 @dataclass(frozen=True)
 class Split:
-    """A recording's rows by time, in this order: known rows, rows that set thresholds, test rows."""
+    """The rows of a recording split by time: training rows, rows that set thresholds (`aside`), and test rows."""
 
     train: Touched
     aside: Touched
@@ -125,7 +125,10 @@ class Split:
 
 
 def touched_rows(readings: Readings, account: Mapping[str, int], selection: Selection) -> Touched:
-    """Select the rows with enough force; raise `ParamsError` for a recording whose places have no numbers."""
+    """Return the rows of a recording with enough force; raise `ParamsError` unless it has one or two numbered places.
+
+    `account` are the ingest counts of the recording, which name its places.
+    """
     places = tuple(sorted(int(match[1]) for name in account if (match := PLACE_COUNT.fullmatch(name))))
     if len(places) not in (1, 2):
         what = f"one or two numbered places are needed; got {list(places)}"
@@ -137,7 +140,7 @@ def touched_rows(readings: Readings, account: Mapping[str, int], selection: Sele
 
 
 def split_by_time(recording: Touched, section: Touches) -> Split:
-    """Split a recording's rows in three by time."""
+    """Split the rows of a recording by time, in the fractions of the settings."""
     rows_n = len(recording.db_uT)
     fractions = (section.train_fraction, section.train_fraction + section.aside_fraction)
     first, second = (round(fraction * rows_n) for fraction in fractions)
@@ -146,9 +149,9 @@ def split_by_time(recording: Touched, section: Touches) -> Split:
 
 @dataclass(frozen=True)
 class Sorted:
-    """Recordings of one place and of two, and the reasons why others are left out.
+    """Usable recordings of one place and of two places, and the reason for each recording that is left out.
 
-    `problem` is the reason why nothing can be computed, if so.
+    `problem` is the reason why the experiment cannot be computed, or None.
     """
 
     single: list[Touched]
@@ -163,7 +166,7 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
     A recording needs `ROWS_MIN_N` touched rows; each place of a pair must also have been recorded alone. If a place was
     recorded alone twice, only the first recording is used, so that two periods of time are not mixed.
     """
-    # Single places come first.
+    # Recordings of a single place come first.
     ordered = sorted(recordings, key=lambda recording: (len(recording.places), recording.places, recording.name))
     left_out = {
         recording.name: f"{len(recording.db_uT)} touched rows, fewer than {ROWS_MIN_N}"
@@ -191,25 +194,26 @@ def sort_recordings(recordings: Iterable[Touched]) -> Sorted:
     return Sorted(list(single.values()), double, left_out, problem)
 
 
-def stack_touches(parts: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
-    """Stack single touches: their changes of field, and the place number of each row."""
-    place_numbers = np.repeat(np.array([float(part.places[0]) for part in parts]), [len(part.db_uT) for part in parts])
-    return np.concatenate([part.db_uT for part in parts]), place_numbers
+def stack_touches(recordings: Sequence[Touched]) -> tuple[Float32[np.ndarray, "f ch"], Float64[np.ndarray, " f"]]:
+    """Concatenate recordings of single touches; return the changes of field, and the place number of each row."""
+    numbers = np.array([float(recording.places[0]) for recording in recordings])
+    place_numbers = np.repeat(numbers, [len(recording.db_uT) for recording in recordings])
+    return np.concatenate([recording.db_uT for recording in recordings]), place_numbers
 
 
 # --- Fields of touches ---
 
 
 def unit_directions(db_uT: Float32[np.ndarray, "f ch"]) -> Float64[np.ndarray, "f ch"]:
-    """Return directions dB / (|dB| + noise), which are short vectors for weak readings."""
+    """Return dB / (|dB| + noise): a vector of length nearly 1 for strong readings, and shorter for weak readings."""
     return np.asarray(db_uT / (np.linalg.norm(db_uT.astype(np.float64), axis=1, keepdims=True) + NOISE_uT))
 
 
 def predict_places(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"], tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
-    """Predict the place by majority of the nearest known directions."""
-    from sklearn.neighbors import KNeighborsClassifier  # imported here because it takes a second
+    """Predict place numbers, by a majority vote among the known rows whose directions of dB are nearest."""
+    from sklearn.neighbors import KNeighborsClassifier  # imported here because importing scikit-learn takes a second
 
     voters = KNeighborsClassifier(min(NEIGHBOURS_N, len(known_uT))).fit(unit_directions(known_uT), places)
     return np.asarray(voters.predict(unit_directions(tested_uT)))
@@ -218,7 +222,7 @@ def predict_places(
 def directions(
     known_uT: Float32[np.ndarray, "a ch"], places: Float64[np.ndarray, " a"]
 ) -> dict[int, Float64[np.ndarray, " ch"]]:
-    """Return the mean direction of each place's rows."""
+    """Return the mean direction of dB of each place (see `unit_directions`)."""
     units = unit_directions(known_uT)
     return {int(place): units[places == place].mean(axis=0) for place in np.unique(places)}
 
@@ -226,9 +230,9 @@ def directions(
 def relative_residual(
     known: Directions, places: Sequence[int], db_uT: Float32[np.ndarray, "f ch"]
 ) -> Float64[np.ndarray, " f"]:
-    """Fit non-negative amplitudes of these places' directions to each row; return the residual relative to |dB|.
+    """Fit each row by a non-negative combination of the directions of these places; return residual / |dB|.
 
-    How hard each place was pressed is not recorded, so this is the smallest residual over all possible strengths.
+    The force at each place was not recorded, so the amplitudes that give the smallest residual are used.
     """
     basis = np.stack([known[place] for place in places], axis=1)
     rows_uT = db_uT.astype(np.float64)
@@ -238,7 +242,11 @@ def relative_residual(
 def score_unlike_one(
     known_uT: Float32[np.ndarray, "a ch"], known: Directions, tested_uT: Float32[np.ndarray, "f ch"]
 ) -> Scores:
-    """Score rows by the detectors of experiment contacts that need no network, and by the residual of one place."""
+    """Score how unlike a single touch each tested row is.
+
+    The detectors are those of experiment `contacts` that do not use a network, and the smallest residual of a fit by
+    one place.
+    """
     residuals = [relative_residual(known, (place,), tested_uT) for place in known]
     return {
         "direction and length": neighbour_distance(shape(known_uT), shape(tested_uT)),
@@ -251,14 +259,14 @@ def score_unlike_one(
 
 
 def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
-    """Predict the place of later single touches.
+    """Return how often the place of later single touches is predicted correctly.
 
-    Also test whether the place predicted for two touches is one of their two places.
+    Also returns how often the place that is predicted for two touches is one of their two places.
     """
     known_uT, place_numbers = stack_touches([block.train for block in blocks])
     right_pct = [
-        100 * float(np.isin(predict_places(known_uT, place_numbers, part.db_uT), part.places).mean())
-        for part in [*(block.test for block in blocks), *double]
+        100 * float(np.isin(predict_places(known_uT, place_numbers, tested.db_uT), tested.places).mean())
+        for tested in [*(block.test for block in blocks), *double]
     ]
     singles_n = len(blocks)
     result = {
@@ -271,7 +279,10 @@ def evaluate_places(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[
 
 
 def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[str, Any]:
-    """Fit force to fields of single touches; test on later rows of the same recordings, and on recordings held out."""
+    """Return squared force errors of ridge regression on dB of single touches, and the variance of the force.
+
+    `by_time` is tested on later rows of the training recordings, `place_left_out` on recordings of other places.
+    """
     by_time = [_force_error(blocks, block.test, rng) for block in blocks]
     left_out = [
         _force_error([other_block for other_block in blocks if other_block is not block], block.test, rng)
@@ -284,19 +295,24 @@ def evaluate_forces(blocks: Sequence[Split], rng: np.random.Generator) -> dict[s
 
 def _force_error(known: Sequence[Split], tested: Touched, rng: np.random.Generator) -> dict[str, float]:
     train = [block.train for block in known]
-    target = np.full((sum(len(part.force_N) for part in train), 3), np.nan, np.float32)
-    target[:, 2] = np.concatenate([part.force_N for part in train])
-    fitted = fit(LINEAR, np.concatenate([part.db_uT for part in train]), target, rng, weight=None)
+    target = np.full((sum(len(recording.force_N) for recording in train), 3), np.nan, np.float32)
+    target[:, 2] = np.concatenate([recording.force_N for recording in train])
+    fitted = fit(LINEAR, np.concatenate([recording.db_uT for recording in train]), target, rng, weight=None)
     error_N = fitted.predict(tested.db_uT)[:, 2].astype(np.float64) - tested.force_N
     return {"mse_f_N2": float((error_N**2).mean())}
 
 
 def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -> dict[str, Any]:
-    """Fit two touches by the directions of single ones, and compare with the residual of single touches."""
-    known = directions(*stack_touches([one.train for one in blocks]))
-    own_pct = [100 * float(np.median(relative_residual(known, one.test.places, one.test.db_uT))) for one in blocks]
-    pairs = [explain_pair(known, (one.places[0], one.places[1]), one.db_uT) for one in double]
-    return {"single_touches_pct": statistic(own_pct), "pairs": pairs} | {
+    """Return the residuals of two touches after a fit by the directions of single touches.
+
+    For comparison, `single_touches_pct` is the residual of single touches after a fit by their own direction.
+    """
+    known = directions(*stack_touches([block.train for block in blocks]))
+    single_pct = [
+        100 * float(np.median(relative_residual(known, block.test.places, block.test.db_uT))) for block in blocks
+    ]
+    pairs = [explain_pair(known, (recording.places[0], recording.places[1]), recording.db_uT) for recording in double]
+    return {"single_touches_pct": statistic(single_pct), "pairs": pairs} | {
         f"mean_{name}": statistic([pair[name] for pair in pairs])
         for name in ("left_over_pct", "stronger_alone_pct", "other_pairs_pct")
         if pairs
@@ -304,7 +320,10 @@ def evaluate_superposition(blocks: Sequence[Split], double: Sequence[Touched]) -
 
 
 def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.ndarray, "f ch"]) -> dict[str, Any]:
-    """Return the residual of two touches after a fit by their two places, by one place, and by all other pairs."""
+    """Return the median residuals of two touches, after fits by their two places, by single places, and by other pairs.
+
+    `rank` is the rank of the true pair among all pairs of places, where 1 is the pair with the smallest residual.
+    """
     residuals = {
         places: float(np.median(relative_residual(known, places, db_uT))) for places in combinations(sorted(known), 2)
     }
@@ -324,15 +343,19 @@ def explain_pair(known: Directions, pair: tuple[int, int], db_uT: Float32[np.nda
 def evaluate_detection(
     blocks: Sequence[Split], double: Sequence[Touched], section: Touches, seed: int
 ) -> dict[str, Any]:
-    """Detect two touches at a given fraction of false alarms; controls are sums, and touches at unknown places."""
-    known_uT, place_numbers = stack_touches([one.train for one in blocks])
+    """Return how often each detector calls a touch double, with thresholds set for a fraction of false alarms.
+
+    Besides recordings of two touches, the detectors are tested on sums of two single touches, and on single touches at
+    a place that they do not know.
+    """
+    known_uT, place_numbers = stack_touches([block.train for block in blocks])
     known = directions(known_uT, place_numbers)
 
-    def scored(parts: Sequence[Float32[np.ndarray, "_ ch"]]) -> Scores:
-        return score_unlike_one(known_uT, known, np.concatenate(parts))
+    def scored(blocks_uT: Sequence[Float32[np.ndarray, "_ ch"]]) -> Scores:
+        return score_unlike_one(known_uT, known, np.concatenate(blocks_uT))
 
-    limits = thresholds(scored([one.aside.db_uT for one in blocks]), section.false_alarm_fraction)
-    single = scored([one.test.db_uT for one in blocks])
+    limits = thresholds(scored([block.aside.db_uT for block in blocks]), section.false_alarm_fraction)
+    single = scored([block.test.db_uT for block in blocks])
     sums = scored(sum_pairs(blocks, rng_for(seed, "touches", "sums")))
     result = {
         "false_alarm_asked_pct": 100 * section.false_alarm_fraction,
@@ -342,12 +365,12 @@ def evaluate_detection(
     }
     if not double:
         return result
-    double_scores = scored([one.db_uT for one in double])
+    double_scores = scored([recording.db_uT for recording in double])
     return result | {"detected_pct": above_pct(double_scores, limits), "auc": roc_areas(single, double_scores)}
 
 
 def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32[np.ndarray, "_ ch"]]:
-    """Add test rows of single touches for every pair of places, as experiment contacts does."""
+    """Return random sums of two test rows of single touches, for every pair of places, as in experiment `contacts`."""
     tested = [block.test.db_uT for block in blocks]
     pairs = [
         (a_uT[rng.integers(len(a_uT), size=SUMS_N)], b_uT[rng.integers(len(b_uT), size=SUMS_N)])
@@ -358,7 +381,10 @@ def sum_pairs(blocks: Sequence[Split], rng: np.random.Generator) -> list[Float32
 
 
 def unseen_places_called_two(blocks: Sequence[Split], false_alarm_fraction: float) -> dict[str, float]:
-    """Return the percentage of single touches that are called two if their place is unknown; mean over places."""
+    """Return, for each detector, the percentage of single touches at an unknown place that are called two touches.
+
+    Each place in turn is left out of the known rows; the percentages are means over places.
+    """
     called = []
     for block in blocks:
         others = [other_block for other_block in blocks if other_block is not block]
@@ -382,15 +408,15 @@ NO_MM = "The spacing of the 3 x 3 places is not documented, so nothing is given 
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate places and forces of one touch, the superposition of two, and their detection."""
+    """Tabulate place and force of one touch, the superposition of two touches, and the detection of two touches."""
     if "not_computed" in numbers:
         return {"touches": _not_computed(numbers, source)}
-    shown = {"touches": _single(numbers), "touches_detection": _detection(numbers["detection"])}
+    result = {"touches": _single(numbers), "touches_detection": _detection(numbers["detection"])}
     if numbers["superposition"]["pairs"]:
-        shown["touches_superposition"] = _superposition(numbers["superposition"])
-    for table in shown.values():
+        result["touches_superposition"] = _superposition(numbers["superposition"])
+    for table in result.values():
         table["source"] = source
-    return shown
+    return result
 
 
 def _single(numbers: Mapping[str, Any]) -> pd.DataFrame:

@@ -24,30 +24,34 @@ from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-SAME_MM = 1e-3  # tolerance of labels, which are commanded values in float32
-LISTED_N = 8  # places or depths that an error message names
-LINES_MAX_N = 40  # visits drawn in a panel of the figure
-DECIMALS = 1  # of a field in uT in the figures
+SAME_MM = 1e-3  # labels (commanded values in float32) that differ by less are equal
+LISTED_N = 8  # places or depths listed in an error message
+LINES_MAX_N = 40  # lines (visits of a place) in a panel of the figure
+DECIMALS = 1  # fields in uT are rounded to this many decimals for the figures
 
 Count = Annotated[int, Field(ge=1)]
 Place_mm = tuple[float, float]
 
 
 class Variation(Strict):
-    """Settings section `variation`: the places and the depth to compare, and the numbers of skins and contacts."""
+    """Settings section `variation`: places and depth of the compared indentations, number of skins and of contacts."""
 
     places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
     depth_mm: Annotated[float, Field(gt=0)]
     skins_n: Count
-    contacts_n: Count  # contacts of the worn skin
+    contacts_n: Count  # contacts of the worn skin within which indentations are compared
 
 
 def variation(settings: Settings, section: Variation, main: Path, indentations: Path, results: Path) -> None:
-    """Compare visits of the same places: over time on the worn skin in `indentations`, and between skins in `main`."""
+    """Compare the fields of equal indentations, over time and between skins.
+
+    The worn skin, which is compared over time, is in `indentations`; the skins that are compared with one another are
+    in `main`.
+    """
     worn_capture = read_captures(indentations)[0]
     boards: dict[str, str] = {}
     visits: dict[str, list[Visits]] = {}
-    for name in settings.captures_in(main):  # one capture in memory at a time
+    for name in settings.captures_in(main):  # captures are read one by one, to limit the use of memory
         capture = io.read_readings(main / f"{name}.parquet")
         boards[capture.skin] = capture.board
         visits[capture.skin] = [find_visits(capture, place_mm, section.depth_mm) for place_mm in section.places_mm]
@@ -67,7 +71,7 @@ def variation(settings: Settings, section: Variation, main: Path, indentations: 
 
 @dataclass(frozen=True)
 class Visits:
-    """The visits of one place at one depth in order of time, each the mean of its readings, in uT."""
+    """All visits (indentations) at one place and depth in order of time, each averaged over its readings."""
 
     contacts_n: Int[np.ndarray, " n"]  # contacts of the skin before each visit
     b_uT: Float[np.ndarray, "n ch"]
@@ -75,7 +79,7 @@ class Visits:
 
 
 def find_visits(readings: Readings, place_mm: tuple[float, float], depth_mm: float) -> Visits:
-    """Average the readings of each indentation at one place and depth; raise `ParamsError` if there are none."""
+    """Return the visits of one place at one depth; raise `ParamsError` if there are none."""
     selected = _at(readings, place_mm, depth_mm)
     if not selected.any():
         what = f"{place_mm[0]:g}, {place_mm[1]:g} mm is never visited at a depth of {depth_mm:g} mm"
@@ -97,7 +101,7 @@ def _at(readings: Readings, place_mm: tuple[float, float], depth_mm: float | Non
 
 
 def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
-    """List the depths visited at a place or, if there are none, all visited depths and some places."""
+    """Describe, for an error message, the depths visited at a place; if there are none, all depths and some places."""
 
     def join(values_mm: np.ndarray) -> str:
         return ", ".join(f"{value:g}" for value in values_mm[:LISTED_N])
@@ -112,9 +116,10 @@ def _visited(readings: Readings, place_mm: tuple[float, float]) -> str:
 
 
 def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Compare the visits within a skin's first contacts with the first visit: field as read, and change of field.
+    """Compare the visits within a skin's first `contacts_n` contacts with the first of these visits.
 
-    Returns rms differences over channels at the last visit, and the lines to draw: fields minus the first visit's.
+    Returns the rms differences over channels between the last and the first visit, of the field as read and of the
+    change of field. Also returns the lines to draw: the fields minus the field of the first visit.
     """
     early = visits.contacts_n - visits.contacts_n[0] < contacts_n
     before_n, b_uT, db_uT = visits.contacts_n[early], visits.b_uT[early], visits.db_uT[early]
@@ -128,13 +133,16 @@ def over_time(visits: Visits, contacts_n: int) -> tuple[dict[str, Any], dict[str
         "db_change_uT": change_uT,
         "db_change_pct": 100 * change_uT / size_uT,
     }
-    shown = np.unique(np.linspace(0, len(before_n) - 1, LINES_MAX_N).round().astype(int))
-    lines = np.round(b_uT[shown] - b_uT[0], DECIMALS)
-    return numbers, {"contacts_n": before_n[shown].tolist(), "b_uT": lines.tolist()}
+    chosen = np.unique(np.linspace(0, len(before_n) - 1, LINES_MAX_N).round().astype(int))
+    lines = np.round(b_uT[chosen] - b_uT[0], DECIMALS)
+    return numbers, {"contacts_n": before_n[chosen].tolist(), "b_uT": lines.tolist()}
 
 
 def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Compare the mean changes of field of several skins: rms difference over channels and pairs, also in percent."""
+    """Compare the mean changes of field of several skins; return the numbers, and the lines to draw.
+
+    `spread_uT` is the rms difference over channels and pairs of skins; `spread_pct` is relative to the rms change.
+    """
     mean_uT = {skin: skin_visits.db_uT.mean(axis=0) for skin, skin_visits in visits.items()}
     size_uT = rms(np.array(list(mean_uT.values())))
     numbers: dict[str, Any] = {"skins": list(mean_uT), "mean_db_uT": size_uT}
@@ -145,7 +153,10 @@ def over_skins(visits: Mapping[str, Visits]) -> tuple[dict[str, Any], dict[str, 
 
 
 def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float]:
-    """Return the duration of a skin's first contacts, and how much warmer its chips become, as far as known."""
+    """Return the duration of a skin's first `contacts_n` contacts, and the rise of the chips' temperature meanwhile.
+
+    Values that were not recorded are left out.
+    """
     early = readings.n_contacts - readings.n_contacts[0] < contacts_n
     t_s, temperature_degC = readings.t_s[early], readings.temperature_degC[early].astype(float)
     order = rank(readings.indentation[early])
@@ -155,7 +166,10 @@ def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float
 
 
 def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
-    """Choose skins, the first of each board before the second of any; `boards` maps skins to boards."""
+    """Choose `skins_n` skins: first the first skin of each board, then the second skins, and so on.
+
+    `boards` maps the names of skins to the names of their boards.
+    """
     order: dict[str, int] = {}
     ranked = []
     for skin in sorted(boards):
@@ -175,7 +189,7 @@ MEANING = (
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
-    """Tabulate the differences of equal indentations over time and between skins; the paper gives no numbers."""
+    """Tabulate the differences between the fields of equal indentations, over time and between skins."""
     lines = []
     for place in numbers["places"]:
         time, skins = place["time"], place["skins"]
@@ -201,7 +215,7 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Draw how the field varies over time (figure 4a) and between skins (figure 4b), one panel per place."""
+    """Plot how the field varies over time (figure 4a) and between skins (figure 4b), with one panel per place."""
     return {
         "variation_time.svg": _draw_time(numbers, drawn["places"], source),
         "variation_skins.svg": _draw_skins(numbers, drawn["places"], source),
@@ -214,7 +228,7 @@ def _draw_time(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]], 
     most_n = max(place["time"]["contacts_n"][-1] for place in places)
     title = f"Field over time at {numbers['depth_mm']:g} mm depth, first visit subtracted ({source})"
     with _panels(places, title, "field minus that of the first visit / µT") as (figure, panels):
-        # Without the upper end of the colour map: its yellow is pale on white.
+        # The upper 15 % of the colour map are left out, because yellow is hard to see on white.
         colours = mpl.colors.ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.85, 256)))
         scale = mpl.colors.Normalize(0, most_n)
         for axes, place in zip(panels, places, strict=True):
@@ -241,7 +255,7 @@ def _draw_skins(numbers: Mapping[str, Any], places: Sequence[Mapping[str, Any]],
 
 @contextmanager
 def _panels(places: Sequence[Mapping[str, Any]], title: str, ylabel: str) -> Iterator[tuple[Any, Any]]:
-    """Set up a panel for each place, one below the other."""
+    """Yield a figure with one panel per place, arranged in a column."""
     with drawing(7.2, 0.8 + 2.5 * len(places)) as figure:
         panels = figure.subplots(len(places), 1, squeeze=False)[:, 0]
         for axes, place in zip(panels, places, strict=True):
@@ -254,6 +268,6 @@ def _panels(places: Sequence[Mapping[str, Any]], title: str, ylabel: str) -> Ite
 
 
 def _name_channels(axes: Any, channels_n: int) -> None:
-    """Label the ticks by axis and chip: Bx of chip 0 is Bx0."""
+    """Label the ticks of the x axis with the names of the channels: Bx0 is Bx of chip 0."""
     names = [f"B{'xyz'[i % 3]}{i // 3}" for i in range(channels_n)]
     axes.set_xticks(range(channels_n), names, rotation=90 if channels_n > 15 else 0)

@@ -1,6 +1,7 @@
-"""What decides table 2: its rows for simulated skins with different spreads and model errors.
+"""Which properties of simulated skins decide the scores of table 2 (not in the paper).
 
-A world is a simulation that differs from the scene in one factor.
+The networks of table 2 are trained and tested in several worlds. A world is a simulation whose settings differ from
+those of the scene in one factor, for example a spread between skins, or an error of the simulation.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -45,34 +46,39 @@ from reskin.simulation.capture import list_captures
 from reskin.simulation.rig import actual_positions, read_force
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-WAVES_N = 48  # cosines in the smooth error
+WAVES_N = 48  # random cosines whose sum is a smooth error
 DEFAULT = "default"
 Size = Annotated[float, Field(ge=0, le=2)]
 Sizes = Annotated[tuple[Size, ...], Field(min_length=1)]
-EXPERIMENTS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}  # rows of table 2
+# Row of table 2 -> experiment whose networks it scores.
+EXPERIMENTS = {"single": "transfer", "multi": "lobo", "triplet": "triplet", "adapted": "adapt"}
 
 
 class Residual(Strict):
-    """Error of the simulation: rms sizes relative to |dB|, correlation lengths, and fraction specific to each skin."""
+    """A smooth random error that is added to the simulated changes of field: sizes, and correlation lengths."""
 
-    sizes: Sizes
-    length_mm: Annotated[float, Field(gt=0, le=50)]
-    length_log_N: Annotated[float, Field(gt=0, le=10)]
-    own_share: Annotated[float, Field(ge=0, le=1)]  # fraction of its variance; the rest is the same on all skins
+    sizes: Sizes  # rms sizes relative to |dB|, one world per size
+    length_mm: Annotated[float, Field(gt=0, le=50)]  # along x and y
+    length_log_N: Annotated[float, Field(gt=0, le=10)]  # along the logarithm of the force
+    # Fraction of the error's variance that is specific to each skin; the rest of the error is the same on all skins.
+    own_share: Annotated[float, Field(ge=0, le=1)]
 
 
 class Worlds(Strict):
-    """Settings section `worlds`: the values of each factor; the other factors keep the scene's values."""
+    """Settings section `worlds`: values of each factor; in each world, the other factors have the scene's values."""
 
     residual: Residual
-    skin_modulus: Sizes  # spreads.skin_modulus
-    amplitude_and_gap: Sizes  # factor on spreads.skin_amplitude and spreads.board_gap
-    friction: Sizes  # skin.hold.friction: between skin and tip, which limits how far a tip slides a skin
+    skin_modulus: Sizes  # values of spreads.skin_modulus
+    amplitude_and_gap: Sizes  # factors by which spreads.skin_amplitude and spreads.board_gap are multiplied
+    friction: Sizes  # values of skin.hold.friction, the friction between skin and tip
 
 
 @dataclass(frozen=True)
 class World:
-    """One world: a factor and its value, the settings, and the size of the simulation's error."""
+    """One world: the factor that differs from the scene, its value, and the settings of the simulation.
+
+    `residual` is the rms size, relative to |dB|, of the error that is added to the simulation.
+    """
 
     factor: str
     value: float
@@ -81,12 +87,12 @@ class World:
 
     @property
     def name(self) -> str:
-        """Name used in files and folds."""
+        """Name of the world in the names of folds and files."""
         return f"{self.factor}-{self.value:g}"
 
 
 def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
-    """List the worlds, beginning with the default (the scene's settings)."""
+    """Return all worlds. The first is the default world, which has the scene's settings."""
     spreads, hold = simulation.spreads, simulation.skin.hold
     listed = [World(DEFAULT, 1.0, simulation)]
     listed += [World("residual", size, simulation, size) for size in section.residual.sizes if size > 0]
@@ -109,7 +115,10 @@ def worlds_of(simulation: SimulationSettings, section: Worlds) -> list[World]:
 def draw_smooth_error(
     points: Float[np.ndarray, "n 3"], channels_n: int, residual: Residual, rng: np.random.Generator
 ) -> Float[np.ndarray, "n ch"]:
-    """Draw a smooth random function of each channel with variance 1, over x and y in mm and log force."""
+    """Draw a smooth random function of variance 1 for each channel, and evaluate it at `points`.
+
+    The columns of `points` are x and y in mm, and the logarithm of the force in N.
+    """
     lengths = np.array([residual.length_mm, residual.length_mm, residual.length_log_N])
     waves = rng.standard_normal((3, WAVES_N)) / lengths[:, None]
     phase = rng.uniform(0, 2 * np.pi, WAVES_N)
@@ -125,33 +134,33 @@ def with_residual(
     seed: int,
     skin: str,
 ) -> Float[np.ndarray, "n ch"]:
-    """Add the simulation's error to a skin's changes of field; its rms over indentations is `size` times |dB|.
+    """Return a skin's changes of field plus a smooth random error whose rms is `size` times |dB|.
 
-    Part of the error is the same for all skins; the rest is drawn for this skin.
+    One component of the error is the same for all skins, the other is drawn for this skin (`residual.own_share`).
     """
     if size == 0:
         return change_uT
     channels_n = change_uT.shape[1]
     shared = draw_smooth_error(points, channels_n, residual, rng_for(seed, "worlds", "residual"))
-    own = draw_smooth_error(points, channels_n, residual, rng_for(seed, "worlds", "residual", skin))
-    unit = np.sqrt(1 - residual.own_share) * shared + np.sqrt(residual.own_share) * own
+    specific = draw_smooth_error(points, channels_n, residual, rng_for(seed, "worlds", "residual", skin))
+    unit = np.sqrt(1 - residual.own_share) * shared + np.sqrt(residual.own_share) * specific
     length_uT = np.linalg.norm(change_uT, axis=1, keepdims=True)
     return change_uT + size * length_uT / np.sqrt(channels_n) * unit
 
 
 def rows_of(world: World, section: Worlds, seed: int) -> Rows:
-    """Simulate the main protocol on every skin of a world, with readings of its chips and of the force sensor."""
-    parts = [_skin_rows(world, section, seed, board, skin) for board, skin in list_captures(world.simulation, MAIN)]
-    rows = parts[0]
-    for part in parts[1:]:
-        rows = stack(rows, part)
+    """Simulate the main protocol on every skin of a world; return the input rows and labels of all skins."""
+    by_skin = [_skin_rows(world, section, seed, board, skin) for board, skin in list_captures(world.simulation, MAIN)]
+    rows = by_skin[0]
+    for skin_rows in by_skin[1:]:
+        rows = stack(rows, skin_rows)
     return rows
 
 
 def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_name: str) -> Rows:
     simulation, rig, chip = world.simulation, world.simulation.rig, world.simulation.chip
     kind = simulation.main_boards
-    rng = rng_for(seed, "worlds", board_name, skin_name)  # the same presses and noise in every world
+    rng = rng_for(seed, "worlds", board_name, skin_name)  # every world has the same presses and noise
     board = draw_board(kind.design, simulation.spreads, seed=seed, name=board_name)
     rule = kind.quadrature.in_si()
     skin = draw_skin(simulation.skin, simulation.spreads, seed=seed, name=skin_name, rule=rule, sides_m=kind.skin_m)
@@ -173,7 +182,7 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
     tip_N = np.column_stack([np.zeros((n, 2)), force_N])
     read_N, _ = read_force(tip_N, noise_N=rig.force_noise_N, rng=rng)
     target = np.column_stack([plan.x_mm[:, 0], plan.y_mm[:, 0], read_N[:, 2]]).astype(np.float32)
-    kept = np.repeat(read_N[:, 2] >= 0, rig.readings_n)  # as `Selection` of a scene does
+    kept = np.repeat(read_N[:, 2] >= 0, rig.readings_n)  # excludes negative forces, as `Selection` does
     rows_n = n * rig.readings_n
     return Rows(
         capture=np.full(rows_n, skin_name)[kept], board=np.full(rows_n, board_name)[kept],
@@ -185,22 +194,26 @@ def _skin_rows(world: World, section: Worlds, seed: int, board_name: str, skin_n
 
 
 def folds_of(rows: Rows, split: Split, seed: int, world: str, before_n: int) -> Iterator[Fold]:
-    """Draw a world's folds; they index the rows of all worlds and are named after the world."""
+    """Draw the folds of one world, whose names begin with the name of the world.
+
+    `rows` are the rows of this world, which follow the `before_n` rows of the previous worlds; the folds contain row
+    numbers in the rows of all worlds.
+    """
     for fold in draw_folds(rows, ("transfer", "lobo"), split, seed):
         sides = [side + before_n for side in (fold.train, fold.test, fold.pool)]
         yield Fold(fold.experiment, f"{world}.{fold.name}", *sides)
 
 
 def worlds(settings: Settings, section: Worlds, results: Path) -> None:
-    """Train the networks of table 2's rows in every world, and score them there."""
+    """Train the networks of table 2 in every world, and score them in the same world."""
     preload_training()
     split = settings.section(Split, "split")
     listed = worlds_of(simulation_settings(settings), section)
     rows, folds = None, []
     for i, world in enumerate(listed):
-        own = rows_of(world, section, settings.seed)
-        folds += list(folds_of(own, split, settings.seed, world.name, 0 if rows is None else len(rows)))
-        rows = own if rows is None else stack(rows, own)
+        world_rows = rows_of(world, section, settings.seed)
+        folds += list(folds_of(world_rows, split, settings.seed, world.name, 0 if rows is None else len(rows)))
+        rows = world_rows if rows is None else stack(rows, world_rows)
         say(f"{settings.scene} worlds: {i + 1} of {len(listed)} worlds simulated ({world.name})")
     assert rows is not None, "the default world always exists"
     data = SceneData(settings.scene, settings, rows, folds)
@@ -210,7 +223,10 @@ def worlds(settings: Settings, section: Worlds, results: Path) -> None:
 
 
 def _train(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
-    """Train single, multi and triplet networks, adapt the triplet ones, and return the cards of all."""
+    """Train the networks of all rows of table 2, and return their cards.
+
+    Single, multi and triplet networks are trained; the triplet networks are then adapted.
+    """
     lobo = data.folds_of("lobo")
     jobs = make_jobs(data, data.settings.section(Training, "train_single"), data.folds_of("transfer"))
     jobs += make_jobs(data, data.settings.section(Training, "train_multi"), lobo)
@@ -235,13 +251,13 @@ def _train(data: SceneData, listed: Sequence[World]) -> list[dict[str, Any]]:
 
 
 def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
-    """Score the rows of table 2 in one world."""
-    own = [
+    """Return the scores of the rows of table 2 in one world."""
+    world_cards = [
         card | {"fold": card["fold"].removeprefix(f"{world.name}.")}
         for card in cards
         if card["fold"].startswith(f"{world.name}.") and card["recipe_name"] == HEADLINE
     ]
-    table, scores = tidy(own), {}
+    table, scores = tidy(world_cards), {}
     for row, experiment in EXPERIMENTS.items():
         rows = select(table, question=experiment)
         boards = by_skin(rows).groupby("board")[list(METRICS)].mean() if row == "single" else None
@@ -252,7 +268,7 @@ def _scored(cards: Sequence[dict[str, Any]], world: World) -> dict[str, Any]:
 
 
 def _constants(section: Worlds, data: SceneData, listed: Sequence[World]) -> dict[str, Any]:
-    """Return the settings of the default world, and the size of the training runs."""
+    """Return the settings of the default world, and the numbers of rows, folds and training steps."""
     first = listed[0].simulation
     return {
         "residual_length_mm": section.residual.length_mm, "residual_own_share": section.residual.own_share,
@@ -277,7 +293,7 @@ MEANING = (
     "{residual_own_share:.0%} of its variance is specific to a skin. Simulated skins of all other scenes have no such "
     "error. {folds_n} boards are held out in turn; one network per row, fold and world, trained for {steps_n} steps."
 )
-DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # the defaults of the other factors are in the numbers
+DEFAULTS = {"residual": 0.0, "amplitude_and_gap": 1.0}  # default values; those of the other factors are in the numbers
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
@@ -292,13 +308,13 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
 
 
 def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -> dict[str, str]:
-    """Plot the rows of table 2 against each factor."""
+    """Plot the scores of the rows of table 2 against each factor, with the paper's values as dashed lines."""
     with drawing(11.0, 7.6) as figure:
         panels = figure.subplots(len(DRAWN), len(FACTORS), sharey="row", squeeze=False)
         for column, (factor, label) in enumerate(FACTORS.items()):
-            found = _along(numbers, factor)
+            results = _along(numbers, factor)
             for row, metric in enumerate(DRAWN):
-                _draw(panels[row][column], found, metric, default=_default(numbers, factor))
+                _draw(panels[row][column], results, metric, default=_default(numbers, factor))
             panels[-1][column].set_xlabel(label, fontsize=8)
         for row, metric in enumerate(DRAWN):
             panels[row][0].set_ylabel(COLUMNS[metric].replace(", ", " / "))
@@ -309,10 +325,10 @@ def figures(numbers: Mapping[str, Any], drawn: Mapping[str, Any], source: str) -
         return {"worlds.svg": svg(figure)}
 
 
-def _draw(axes: Any, found: Sequence[tuple[float, Mapping[str, Any]]], metric: str, *, default: float) -> None:
-    values = [value for value, _ in found]
+def _draw(axes: Any, results: Sequence[tuple[float, Mapping[str, Any]]], metric: str, *, default: float) -> None:
+    values = [value for value, _ in results]
     for (row, paper), colour, marker in zip(TABLE_2.items(), COLOURS, MARKERS, strict=False):
-        means = [world[row][metric]["mean"] for _, world in found]
+        means = [world[row][metric]["mean"] for _, world in results]
         axes.plot(values, means, color=colour, marker=marker, markersize=5, linewidth=1.2, label=SHORT[row])
         axes.axhline(paper[metric][0], color=colour, linestyle="--", linewidth=0.8)
     axes.axvline(default, color="0.5", linestyle=":", linewidth=1, label="default")
@@ -322,9 +338,10 @@ def _draw(axes: Any, found: Sequence[tuple[float, Mapping[str, Any]]], metric: s
 
 
 def _along(numbers: Mapping[str, Any], factor: str) -> list[tuple[float, Mapping[str, Any]]]:
+    """Return the values of a factor in ascending order, including the default, each with the results of its world."""
     worlds = [(world["value"], world) for world in numbers["by_world"] if world["factor"] == factor]
-    own = next(world for world in numbers["by_world"] if world["factor"] == DEFAULT_WORLD)
-    return sorted([*worlds, (_default(numbers, factor), own)], key=lambda pair: pair[0])
+    default_world = next(world for world in numbers["by_world"] if world["factor"] == DEFAULT_WORLD)
+    return sorted([*worlds, (_default(numbers, factor), default_world)], key=lambda pair: pair[0])
 
 
 def _default(numbers: Mapping[str, Any], factor: str) -> float:

@@ -140,7 +140,7 @@ def test_pokes_above_the_skin_are_marked():
 def test_networks_of_another_skin_are_an_error(tmp_path):
     card = {"question": NETWORK, "recipe_name": "paper", "train_skins": ["b0_s1"]}
     io.write_json(tmp_path / "one.json", card)
-    with pytest.raises(SchemaError, match="networks of single_pass are trained on .*, not on b0_s0"):
+    with pytest.raises(SchemaError, match="networks of single_pass were trained on .*, not on b0_s0"):
         score_network(tmp_path, "b0_s0")
 
 

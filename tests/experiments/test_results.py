@@ -35,7 +35,7 @@ def test_only_returns_the_single_capture():
 @pytest.mark.parametrize("captures", [[], ["b0_s0-glass", "b1_s0-glass"]])
 def test_only_raises_for_none_or_several(captures):
     with pytest.raises(
-        SchemaError, match=f"ci-glass: {len(captures)} captures, but .* reads exactly one. Run its"
+        SchemaError, match=f"ci-glass: {len(captures)} captures, but .* reads exactly one. Set skins_n: 1"
     ) as no:
         only(captures, Path("ci-glass"))
     assert "\n" not in str(no.value)

@@ -132,7 +132,7 @@ def test_recordings_of_only_pairs_are_skipped_with_a_reason():
 
 
 def test_fractions_that_leave_no_test_rows_are_an_error():
-    with pytest.raises(ValidationError, match="rows are left to test"):
+    with pytest.raises(ValidationError, match="the rest are the test rows"):
         Touches(train_fraction=0.8, aside_fraction=0.2, false_alarm_fraction=0.05)
 
 

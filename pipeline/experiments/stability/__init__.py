@@ -1,4 +1,4 @@
-"""Stability: behaviour in stiff, extreme and faulty cases of physics, chips, wire formats and learning."""
+"""Stability: behaviour of physics, chips, wire formats and learning in stiff, extreme and faulty cases."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +18,7 @@ from reskin.simulation.settings import SimulationSettings
 
 
 def survey(simulation: SimulationSettings, seed: int) -> list[Case]:
-    """Run every case of physics, chips and wire formats with the settings of a scene."""
+    """Run all cases of physics, chips and wire formats with the settings of a scene."""
     board = simulation.main_boards.design
     chips_n = len(board.places_mm)
     return [
@@ -33,7 +33,7 @@ def survey(simulation: SimulationSettings, seed: int) -> list[Case]:
 
 
 def stability(settings: Settings, results: Path) -> None:
-    """Run every case on the scene's skins and chips and on small training runs, and write the table."""
+    """Run all cases, with the scene's skins and chips and with small training runs, and write the results."""
     with make_executor(imports="pipeline.experiments.stability.learning") as executor:
         learning = executor.submit(_learning_cases, settings.seed)  # in parallel with the physics
         cases = [*survey(simulation_settings(settings), settings.seed), *learning.result()]
@@ -45,6 +45,6 @@ def stability(settings: Settings, results: Path) -> None:
 
 
 def _learning_cases(seed: int) -> list[Case]:
-    from pipeline.experiments.stability.learning import learning_cases  # imports torch: only in the worker
+    from pipeline.experiments.stability.learning import learning_cases  # imports torch, which only the worker needs
 
     return learning_cases(seed)

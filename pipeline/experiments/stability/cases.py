@@ -1,6 +1,7 @@
-"""A row of the stability table: an extreme case, with the expected and the actual behaviour.
+"""Cases of the stability experiment: each is a row of its table, with the expected and the observed behaviour.
 
-The other modules of this package run cases on any inputs: the experiment uses those of a scene, tests use random ones.
+The other modules of this package run cases with given inputs. The experiment passes the inputs of a scene; the tests
+pass random inputs.
 """
 
 import tracemalloc
@@ -12,29 +13,29 @@ from reskin.errors import ReskinError
 
 @dataclass(frozen=True)
 class Case:
-    """A case: expected and actual behaviour, and the error if the case has one."""
+    """The result of a case: expected and observed behaviour, and the error with its limit if the case has an error."""
 
     area: str
     case: str
-    should: str
-    happened: str  # composed from measured values
+    should: str  # expected behaviour
+    happened: str  # observed behaviour, described with measured values
     error: float | None
     limit: float | None
     holds: bool
 
 
 def error_case(area: str, case: str, *, should: str, happened: str, error: float, limit: float) -> Case:
-    """Return a case that holds if its error is at most `limit`; it does not hold for NaN."""
+    """Return a case that holds if its error is at most `limit`; a case whose error is NaN does not hold."""
     return Case(area, case, should, happened, error, limit, holds=bool(error <= limit))
 
 
 def condition_case(area: str, case: str, *, should: str, happened: str, holds: bool) -> Case:
-    """Return a case that holds if a condition is true."""
+    """Return a case without an error, which holds if the condition `holds` is true."""
     return Case(area, case, should, happened, None, None, holds=bool(holds))
 
 
 def rejection_case(area: str, case: str, *, should: str, attempt: Callable[[], object]) -> Case:
-    """Return a case that holds if `attempt` raises `ReskinError`; other exceptions are bugs and propagate."""
+    """Return a case that holds if calling `attempt` raises `ReskinError`; other exceptions are bugs and propagate."""
     try:
         attempt()
     except ReskinError as error:
@@ -43,7 +44,7 @@ def rejection_case(area: str, case: str, *, should: str, attempt: Callable[[], o
 
 
 def peak_bytes(work: Callable[[], object]) -> int:
-    """Return the peak memory in bytes that Python and NumPy allocate during `work`."""
+    """Return the peak memory in bytes that Python and NumPy allocate while `work` is called."""
     tracemalloc.start()
     try:
         work()

@@ -1,4 +1,4 @@
-"""Cases of fields beyond a chip's range, and of broken chips; the faults occur in real recordings."""
+"""Cases of fields beyond the range of a chip, and of chips with faults that occur in real recordings."""
 
 from functools import partial
 
@@ -16,12 +16,12 @@ from reskin.seeds import rng_for
 
 AREA = "chip"
 FRAMES_N = 800
-BROKEN_I = 3  # the chip that breaks
+BROKEN_I = 3  # index of the faulty chip
 WRAP_COUNTS_N = 2**16  # an int16 wraps by this number of counts
 
 
 def chip_cases(chip: ChipDesign, chips_n: int, seed: int) -> list[Case]:
-    """Run cases of fields beyond int16 and 50 mT, and of boards with a failed, a stuck or a reset chip."""
+    """Run cases of fields beyond int16 and 50 mT, and of boards with a chip that fails, is stuck or was reset."""
     intact_uT = _still_board(chip, chips_n, seed)
     broken_i = min(BROKEN_I, chips_n - 1)
     return [
@@ -41,7 +41,10 @@ def _range() -> list[Case]:
 
 
 def out_of_range(b_uT: Float[np.ndarray, "n 3"], case: str, should: str, *, wrapped_n: int, clipped_n: int) -> Case:
-    """Read a field with a noiseless chip at GAIN_SEL 7: clipped at 50 mT, wrapped as int16."""
+    """Read fields with a noiseless chip at GAIN_SEL 7, which clips at 50 mT and wraps as int16.
+
+    `wrapped_n` and `clipped_n` are the numbers of values that the chip must count as wrapped and as clipped.
+    """
     read_uT, overruns = read_bare(b_uT * micro, quiet(7), rng_for(0, "stability", "range"))
     step_uT = steps_uT(7)
     truth_uT = b_uT.clip(-50e3, 50e3)
@@ -92,7 +95,8 @@ def _marked(case: str, marked: Bool[np.ndarray, "f k"], expected: Bool[np.ndarra
 
 
 def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int) -> list[Case]:
-    lsb_uT = np.array([faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT])  # at power-on
+    # Resolution of a chip with the settings that it has after power-on.
+    lsb_uT = np.array([faults.RESET_LSB_XY_uT, faults.RESET_LSB_XY_uT, faults.RESET_LSB_Z_uT])
     reset_uT, axes = intact_uT.copy(), _axes(broken_i)
     reset_uT[:, axes] = np.rint(intact_uT[:, axes] / lsb_uT) * lsb_uT
     found_uT = faults.find_lsb(reset_uT)[broken_i]
@@ -117,7 +121,7 @@ def _reset(intact_uT: Float32[np.ndarray, "f ch"], broken_i: int, gain_sel: int)
 
 
 def _detect(b_uT: Float32[np.ndarray, "f ch"], gain_sel: int | None) -> None:
-    """Look for faults as ingestion does, and raise for any."""
+    """Look for faults in readings in the same way as ingestion; raise an error for any fault."""
     frames_n, chips_n, expected_lsb_uT = len(b_uT), b_uT.shape[1] // 3, None
     if gain_sel is not None:
         xy_uT, _, z_uT = steps_uT(gain_sel).tolist()
@@ -133,7 +137,7 @@ def _axes(chip_i: int) -> slice:
 
 
 def _still_board(chip: ChipDesign, chips_n: int, seed: int) -> Float32[np.ndarray, "f ch"]:
-    """Simulate readings of faultless chips in constant fields, which vary only by noise; cases add faults to them."""
+    """Simulate readings of a board without faults in a constant field; the readings vary only by noise."""
     rng = rng_for(seed, "stability", "board")
     rest_T = rng.uniform(-2, 2, (chips_n, 3)) * milli
     return np.concatenate([read_bare(np.tile(chip_T, (FRAMES_N, 1)), chip, rng)[0] for chip_T in rest_T], axis=1)

@@ -1,7 +1,7 @@
 """Cases of skins and indentations at the limits of what is allowed, compared with references.
 
-References: steps four times as fine and without tables; rings of pressure with the textbook compliance of a layer;
-magpylib's closed form of a magnetised box; and the exact scaling of lengths.
+The references are: indentations in steps four times as fine and without tables of displacements; rings of pressure on
+a layer with the textbook compliance; magpylib's closed form of a magnetised box; and the exact scaling of lengths.
 """
 
 from dataclasses import asdict, replace
@@ -21,21 +21,21 @@ from reskin.physics.magnet import Quadrature, change_of_field, place_nodes
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, forces
 
 AREA = "physics"
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # also for the reference, so that errors of quadrature cancel
-PLACE_M = np.array([2.3, -1.1]) * milli  # on no node's axis
-DEPTHS = (0.6, 0.66, slide.DEEPEST)  # of the thickness
-FINER = 4  # factor on the number of the simulator's steps
-STEPS_N = 40  # of the simulator, over a depth of one thickness
-RINGS_N, KEPT_WAVES = 160, 400.0  # rings of pressure; largest wave number times the contact radius
-SIZES = (0.1, 1.0, 10.0)  # tip radius over thickness
-PRESSED = 0.4  # depth relative to the smaller of thickness and tip radius
-GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # gaps between skin and chips, and cell size relative to the gap
-SLID_M = 0.1 * milli
-THICKNESSES_MM = (0.2, 20.0)
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes of simulation and reference, so that quadrature errors cancel
+PLACE_M = np.array([2.3, -1.1]) * milli  # place of the indentation; the tip's axis passes through no node
+DEPTHS = (0.6, 0.66, slide.DEEPEST)  # depths / thickness
+FINER = 4  # number of steps of the reference / number of steps of the simulator
+STEPS_N = 40  # steps of the simulator over a depth of one thickness
+RINGS_N, KEPT_WAVES = 160, 400.0  # number of rings of pressure; largest wave number times contact radius
+SIZES = (0.1, 1.0, 10.0)  # tip radius / thickness
+PRESSED = 0.4  # depth / the smaller of thickness and tip radius
+GAPS_MM, CELL_SHARE = (1.1, 0.4, 0.2), 0.5  # gaps between skin and chips; cell size / gap
+SLID_M = 0.1 * milli  # displacement of the sliding skin
+THICKNESSES_MM = (0.2, 20.0)  # thicknesses of the scaled skins
 
 
 def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Run cases of deep indentations, sharp and blunt tips, near chips, and thin and thick skins."""
+    """Run cases of deep indentations, sharp and blunt tips, chips close to the skin, and thin and thick skins."""
     spread_free = no_spread(spreads)
     drawn_board = draw_board(board, spread_free, seed=seed, name="b0")
     drawn_skin = draw_skin(skin, spread_free, seed=seed, name="b0_s0", rule=COARSE)
@@ -43,7 +43,7 @@ def extreme_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def deep(board: Board, skin: Skin) -> list[Case]:
-    """Run cases of the deepest indentations: compare dB from tables with dB from finer steps without tables."""
+    """Run cases of deep indentations: compare the simulator's dB with dB from finer steps without tables."""
     cases = []
     for share in DEPTHS:
         depth_m = share * skin.thickness_m
@@ -61,7 +61,7 @@ def deep(board: Board, skin: Skin) -> list[Case]:
 
 
 def tips(base: layer.Base) -> list[Case]:
-    """Run cases of sharp and blunt tips: compare the force with that of rings of pressure on a layer."""
+    """Run cases of sharp and blunt tips: compare the simulator's force with that of rings of pressure on a layer."""
     cases = []
     for size in SIZES:
         thickness_m, tip_m = 2 * milli, 2 * milli * size
@@ -82,10 +82,12 @@ def tips(base: layer.Base) -> list[Case]:
 def ring_force_N(
     depth_m: float, thickness_m: float, tip_radius_m: float, modulus_Pa: float, base: layer.Base, *, reach_m: float
 ) -> float:
-    """Return the force of a sphere on a layer, by rings of uniform pressure that touch the sphere or carry no pressure.
+    """Return the force of a sphere pressed into a layer, approximated by rings of uniform pressure up to `reach_m`.
 
-    The deflection by a ring is the Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8):
-    (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on a bonded base.
+    The surface under a ring touches the sphere, or the pressure of the ring is zero. The deflection by a ring is the
+    Hankel integral of its pressure times the layer's compliance (Johnson 1985, 5.8). With A = wave number * thickness,
+    the compliance is (cosh 2A - 1) / (sinh 2A + 2A) on a sliding base, and
+    (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1) on a bonded base.
     """
     edges_m = np.linspace(0, reach_m, RINGS_N + 1)
     middles_m = (edges_m[1:] + edges_m[:-1]) / 2
@@ -113,7 +115,7 @@ def ring_force_N(
 
 
 def near(skin: SkinDesign) -> list[Case]:
-    """Run cases of a uniformly magnetised skin that slides over near chips: compare its dipoles with a box."""
+    """Run cases of a uniformly magnetised skin that slides over close chips: compare dB of dipoles with dB of a box."""
     cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
     j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
     box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
@@ -135,7 +137,7 @@ def near(skin: SkinDesign) -> list[Case]:
 
 
 def scaled(board: Board, skin: Skin) -> list[Case]:
-    """Run cases with all lengths scaled: fields stay equal, and forces scale as the square of the lengths."""
+    """Run cases in which all lengths are scaled: fields must not change, and forces must scale as lengths squared."""
     poke_m = np.array([[*PLACE_M, 0.45 * skin.thickness_m]])
     (force_N,), (_, (change_T,)) = forces(skin, poke_m[:, 2]), changes_of_field(board, skin, poke_m)
     cases = []
@@ -154,7 +156,7 @@ def scaled(board: Board, skin: Skin) -> list[Case]:
 
 
 def scale_skin(skin: Skin, scale: float) -> Skin:
-    """Scale every length of a skin; its material is unchanged, so springs scale as lengths."""
+    """Return a skin of the same material with all lengths scaled; the stiffness of its springs scales as lengths."""
     hold = skin.hold
     if hold is not None:
         x_m, y_m = hold.give_m

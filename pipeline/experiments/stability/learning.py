@@ -1,4 +1,4 @@
-"""Extreme cases of learning, in small training runs on random data in uT, mm and N."""
+"""Extreme cases of learning: small training runs on random data in uT, mm and N."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,13 +19,15 @@ from reskin.seeds import rng_for
 AREA = "learning"
 ROWS_N, TRAIN_N, CHANNELS_N = 240, 160, 15
 SIGNAL_uT = 50.0
-MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])  # mm, mm, N: 0.6 to 9.4 N, as recorded
-STEPS_N = BLOCK_STEPS_N  # the training loop checks its loss once
+# Middle and half range of the targets (x in mm, y in mm, force in N); forces are 0.6 to 9.4 N, as in recordings.
+MIDDLE, REACH = np.array([8.0, 8.0, 5.0]), np.array([8.0, 8.0, 4.4])
+STEPS_N = BLOCK_STEPS_N  # number of steps after which the training loop checks the loss for the first time
 CONSTANT_uT = 12.3
 BOTTLENECK = "layer3.weight"
-ROUNDING = 1e-4  # of weights near 0.1: float32 sums in another order differ by 6e-8, which 50 steps amplify
+# Tolerance of weights, which are near 0.1. Float32 sums in another order differ by 6e-8; 50 steps amplify this.
+ROUNDING = 1e-4
 NEGLIGIBLE_RATE = 1e-12  # learning rate at which the weights hardly change
-SCALE_POWERS = (-20, -10, 10, 20)  # of two, about 1e-6 to 1e6: float32 labels are scaled by these without rounding
+SCALE_POWERS = (-20, -10, 10, 20)  # labels are multiplied by 2^power (1e-6 to 1e6), which causes no rounding errors
 RECIPE = Recipe(
     architecture="paper", inputs="raw", scaling="standard", triplet_weight=0.0, steps_n=STEPS_N, batch_n=32,
     rate_max=3e-3, gradient_norm_max=1.0, weight_decay=0.0,
@@ -33,12 +35,12 @@ RECIPE = Recipe(
 
 
 def learning_cases(seed: int) -> list[Case]:
-    """Run every extreme case of scalers, triplets, the training loop and folds."""
+    """Run all cases of learning: scalers, triplets, the training loop and folds."""
     return [*scaling_cases(seed), *triplet_cases(seed), *loop_cases(seed), *fold_cases()]
 
 
 def scaling_cases(seed: int) -> list[Case]:
-    """Run cases of constant channels, and of labels of other scales."""
+    """Run cases of constant channels, and of labels multiplied by large and small factors."""
     job, rows = _job(seed), _rows(seed)
     return [
         _constant(job, rows, [7], "a channel that never moves"),
@@ -48,13 +50,13 @@ def scaling_cases(seed: int) -> list[Case]:
 
 
 def triplet_cases(seed: int) -> list[Case]:
-    """Run cases of triplets of identical readings, and of equidistant places."""
+    """Run cases of the triplet loss with identical readings, and with places at equal distances."""
     job, rows = _job(seed), _rows(seed)
     return [_identical(job, rows), *_equidistant(job, rows)]
 
 
 def loop_cases(seed: int) -> list[Case]:
-    """Run cases of overflowing rates and weights, a dead network, very few rows, and two runs from one seed."""
+    """Run cases of the training loop: overflow, a collapsed network, very few rows, and two runs from one seed."""
     job, rows = _job(seed), _rows(seed)
     overflow = [
         _exploding_weights(job, rows, 1e1),
@@ -65,7 +67,7 @@ def loop_cases(seed: int) -> list[Case]:
 
 
 def fold_cases() -> list[Case]:
-    """Run cases of folds that need more boards or skins than there are."""
+    """Run cases of folds that need more boards or skins than the data have."""
     boards = ["b1", "b2", "b3"]
     folds = {
         "one board, to be left out": ("lobo", boards[:1], Split()),
@@ -223,7 +225,7 @@ def _with(job: TrainingJob, **settings: float | int) -> TrainingJob:
 
 
 def _start(job: TrainingJob, rows: TrainingData, scale: float) -> Pretrained:
-    """Train a network, and scale the weights of its bottleneck."""
+    """Return a trained network whose bottleneck weights are multiplied by `scale`, as the start of fine-tuning."""
     trained = _train(job, rows)
     weights = {**trained.weights, BOTTLENECK: trained.weights[BOTTLENECK] * np.float32(scale)}
     return Pretrained("", weights, trained.scaler)

@@ -1,4 +1,4 @@
-"""Cases of extreme skins, indentations, drags and times."""
+"""Cases of extreme skins, indentations, drags and time steps."""
 
 from dataclasses import asdict, replace
 from functools import partial
@@ -25,17 +25,17 @@ from reskin.simulation.rig import FORCE_RANGE_N, read_force
 AREA = "physics"
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)
 PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7]]) * milli
-DEPTH = 0.3  # of the thickness
-FLAGGED_DEPTH = 0.6  # of the thickness
+DEPTH = 0.3  # depth / thickness of the indentations
+FLAGGED_DEPTH = 0.6  # depth / thickness from which on depths are flagged as not covered by published solutions
 POKES_N = 2000
-BYTES_MAX_N = 1000  # per poke, so that 1e6 pokes need at most 1 GB; the result takes 120 of these bytes
-PATH_MM = (0.0, 0.1, 0.5, 4.0)  # of a drag
-STICKY = 1e6  # friction coefficient at which nothing slips
-STIFF = signals.stiff(1e8)
+BYTES_MAX_N = 1000  # memory limit per poke: 1 GB for 1e6 pokes; the result alone takes 120 bytes per poke
+PATH_MM = (0.0, 0.1, 0.5, 4.0)  # stops of a drag along a line
+STICKY = 1e6  # friction coefficient at which the tip never slips
+STIFF = signals.stiff(1e8)  # relaxation whose slowest time is 1e8 times the fastest
 
 
 def time_cases() -> list[Case]:
-    """Run cases of steps at which explicit integrators diverge, steps of zero length, and impossible times."""
+    """Run cases of time steps: steps at which explicit integrators diverge, steps of zero length, and invalid steps."""
     state = np.array([1 / 3, -2e-308, 7e15, 0.0, -0.1])
     same_n = int(np.count_nonzero(advance(state, 0.0, 0.0, SKIN_RELAXATION).view(np.int64) == state.view(np.int64)))
     return [
@@ -59,7 +59,7 @@ def _step(case: str, dt_over_fastest: float, should: str) -> Case:
 
 
 def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Run cases on extreme variants of a scene's first skin on its first board."""
+    """Run cases with extreme variants of a scene's first skin, on the scene's first board."""
     drawn_board = draw_board(board, spreads, seed=seed, name="b0")
 
     def skin_of(spread: Spreads = spreads, name: str = "b0_s0", **changes: float) -> Skin:
@@ -79,7 +79,7 @@ def physics_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def poke(board: Board, skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n k 3"]:
-    """Return dB of indentations to a share of the thickness."""
+    """Return dB in tesla of the indentations at `PLACES_M`, to the depth `share` * thickness."""
     return changes_of_field(board, skin, _pokes_m(skin, share))[1]
 
 
@@ -88,9 +88,9 @@ def _pokes_m(skin: Skin, share: float = DEPTH) -> Float[np.ndarray, "n 3"]:
 
 
 def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
-    """Run cases of skins without stiffness and with very high stiffness.
+    """Run cases of skins with a Young's modulus of zero and with a very high modulus.
 
-    The depth is prescribed, so the modulus affects only the friction.
+    The depth is prescribed, so the modulus affects dB only through the friction under the tip.
     """
     free = replace(usual, hold=None)
     firm = usual if usual.hold is None else replace(usual, hold=replace(usual.hold, friction=1e12))
@@ -114,6 +114,7 @@ def modulus(board: Board, usual: Skin, soft: Skin, hard: Skin) -> list[Case]:
 
 
 def thickness(usual: Skin) -> list[Case]:
+    """Run cases of skins whose thickness is zero or negative."""
     return [
         rejection_case(AREA, f"a thickness of {skin.thickness_m / milli:.2g} mm", should="refused",
                        attempt=partial(forces, skin, np.array([1e-4])))
@@ -122,6 +123,7 @@ def thickness(usual: Skin) -> list[Case]:
 
 
 def depth(board: Board, skin: Skin) -> list[Case]:
+    """Run cases of a tip above the skin, of deep indentations, and of an indentation through the skin."""
     lifted_T = float(np.abs(poke(board, skin, -0.2)).max())
     lifted_N = float(np.abs(forces(skin, np.array([-0.2 * skin.thickness_m]))).max())
     shares = np.array([0.2, 0.59, FLAGGED_DEPTH, 0.8])
@@ -155,6 +157,7 @@ def _almost_through(board: Board, skin: Skin) -> Case:
 
 
 def place(board: Board, skin: Skin) -> list[Case]:
+    """Run cases of a poke beside the skin, a place inside a magnet, and a chip at the position of a dipole."""
     inside_m = CUBE_SIDE_M * rng_for(0, "stability", "inside").uniform(-0.5, 0.5, (500, 3))
     error = inside_a_box(inside_m, CUBE_SIDE_M)
     beside_m = np.array([[skin.seat_m[0] + 0.51 * skin.sides_m[0], skin.seat_m[1], DEPTH * skin.thickness_m]])
@@ -170,6 +173,7 @@ def place(board: Board, skin: Skin) -> list[Case]:
 
 
 def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]:
+    """Run cases of a skin without magnetisation, and of a skin with five times the usual magnetisation."""
     once_T, bare_T, strong_T = (poke(board, skin) for skin in (usual, bare, strong))
     error, left_T = scaled_error(strong_T, 5 * once_T), float(np.abs(bare_T).max())
     return [
@@ -181,12 +185,13 @@ def amplitude(board: Board, usual: Skin, bare: Skin, strong: Skin) -> list[Case]
 
 
 def single_precision(board: Board, fine: Skin) -> Case:
+    """Run a case of dB computed in float32, compared with float64."""
     rest = fine.nodes_m, fine.moments_A_m2
     depths_m = mechanics.descent(0.5 * fine.thickness_m + fine.depth_zero_m, 1)
     moved = mechanics.follow_dipoles(fine, PLACES_M[0], depths_m)
     double_T = change_of_field(rest, moved, board.chips_m)
-    x, m, moved_x, moved_m, chips = (part.astype(np.float32) for part in (*rest, *moved, board.chips_m))
-    # Subtract node by node, as the simulator does: the difference of two large sums would lose more digits.
+    x, m, moved_x, moved_m, chips = (array.astype(np.float32) for array in (*rest, *moved, board.chips_m))
+    # Fields are subtracted node by node, as in the simulator. The difference of two large sums would lose more digits.
     each_T = magnet.field_of_each(moved_x, moved_m, chips) - magnet.field_of_each(x, m, chips)
     single_T = each_T.sum(axis=1)
     error_uT = float(np.abs(single_T - double_T).max() / micro)
@@ -196,6 +201,7 @@ def single_precision(board: Board, fine: Skin) -> Case:
 
 
 def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
+    """Run a case of skins drawn from one seed: two with the same name, and one with another name."""
     bytes_of = [skin.nodes_m.tobytes() + skin.moments_A_m2.tobytes() for skin in (first, again, renamed)]
     same, differs = bytes_of[0] == bytes_of[1], bytes_of[0] != bytes_of[2]
     words = {True: "the same bytes", False: "other bytes"}
@@ -205,11 +211,12 @@ def same_seed(first: Skin, again: Skin, renamed: Skin) -> Case:
 
 
 def memory(board: Board, skin: Skin) -> Case:
+    """Run a case of the memory use per poke, from the peak memory for `POKES_N` and for four times as many pokes."""
     rng = rng_for(0, "stability", "memory")
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, skin, pokes_m[:1])  # computes the cached table, so that it is not measured below
+    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory is not to be measured below
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
     per_poke_n = (many_n - few_n) / (3 * POKES_N)
     observed = (
@@ -221,7 +228,7 @@ def memory(board: Board, skin: Skin) -> Case:
 
 
 def drag_cases(skin: SkinDesign) -> list[Case]:
-    """Run cases of drags along a line without friction, and without slip."""
+    """Run cases of drags along a line: without friction, and with so much friction that the tip never slips."""
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     depth_m, modulus_Pa = DEPTH * press.thickness_m, skin.modulus_kPa * kilo
     stiffness = modulus_Pa / 3 * shear.tabulate_depth(depth_m, **asdict(press)).stiffness_m

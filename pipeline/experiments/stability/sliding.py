@@ -1,7 +1,7 @@
 """Extreme cases of a skin that slides on its base.
 
-Drags with almost no and with very high friction, a tip that lifts while it drags, indentations at the free edge, and
-force control.
+There are cases of drags with almost no and with very high friction, of a tip that is lifted after dragging, of
+indentations at the free edge, and of force control.
 """
 
 from dataclasses import replace
@@ -20,19 +20,22 @@ from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, f
 from reskin.simulation.contact import TangentialResponse, drag_tip
 
 AREA = "physics"
-DEPTH = 0.35  # of the thickness: the deepest drag of a scene, and the steepest shear
-PLACE_M = np.array([5.0, -3.0]) * milli  # from the skin's centre; a drag at this place also rotates the skin
-WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli
-HELD_M = 0.1 * milli  # displacement of a tip that then lifts
-LIFTS_N = (3, 30)  # stops on the way up
-EDGE_M = 0.1 * milli  # inside the skin's edge
-STICKY, SMOOTH = 10.0, 1e-9
+DEPTH = 0.35  # depth / thickness of the deepest drag of a scene, which has the largest shear
+PLACE_M = np.array([5.0, -3.0]) * milli  # relative to the skin's centre; a drag at this place also rotates the skin
+WAY_M = np.array([0.0, 0.05, 0.2, 0.5]) * milli  # stops of a drag, as displacements along x
+HELD_M = 0.1 * milli  # displacement of the tip before it is lifted
+LIFTS_N = (3, 30)  # numbers of stops while the tip is lifted
+EDGE_M = 0.1 * milli  # distance of the indentations from the skin's edge
+STICKY, SMOOTH = 10.0, 1e-9  # friction coefficients
 ROUNDING = 1e-12
-PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # of the thickness
+PRESSES = np.concatenate([[0.0], np.geomspace(1e-6, slide.DEEPEST, 400)])  # depth / thickness
 
 
 def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, seed: int) -> list[Case]:
-    """Run cases of a skin without spreads on the first board; none if the skin is not held by springs."""
+    """Run cases on a skin and a board without spreads.
+
+    Returns no cases if the skin is not held on its base by springs (`skin.hold`).
+    """
     if skin.hold is None:
         return []
     spread_free = no_spread(spreads)
@@ -47,17 +50,18 @@ def sliding_cases(board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, see
 
 
 def stick_slip(board: Board, skin: Skin) -> list[Case]:
-    """Run cases of drags with almost no friction, which slip at once, and of drags without slip."""
+    """Run cases of drags with almost no friction, in which the tip slips at once, and with very high friction."""
     path_m = _path(skin, skin.seat_m + PLACE_M, WAY_M, np.full(len(WAY_M), DEPTH))
     normal_N = forces(skin, path_m[:, 2])
     smooth, sticky = (_drag(board, skin, path_m, mu) for mu in (SMOOTH, STICKY))
     assert skin.hold is not None
-    slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))  # a press, like a drag, hardly slides this skin
+    # On a skin with this friction, neither a press nor a drag slides the skin noticeably.
+    slippery = replace(skin, hold=replace(skin.hold, friction=SMOOTH))
     _, pressed_T = changes_of_field(board, slippery, path_m)
     drawn_N = np.linalg.norm(smooth.force_N[0], axis=1)
     off_N = float(np.abs(drawn_N[1:] / (SMOOTH * normal_N[1:]) - 1).max())
     off_T = float(np.abs(smooth.change_T[0] - pressed_T).max() / np.abs(pressed_T).max())
-    # Without slip, layer and springs (in series) take up the whole path.
+    # Without slip, the displacements of layer and springs, which are in series, add up to the path of the tip.
     pulled_N = sticky.force_N[0]
     slides_m_per_N = slide.compliance_m_per_N(path_m[:, :2] - skin.seat_m, skin.sides_m, _springs(skin))
     taken_m = pulled_N / _layer_N_per_m(skin, DEPTH) + (slides_m_per_N @ pulled_N[:, :, None])[:, :, 0]
@@ -76,7 +80,10 @@ def stick_slip(board: Board, skin: Skin) -> list[Case]:
 
 
 def lift(board: Board, skin: Skin) -> Case:
-    """Drag a skin at its centre, then lift the tip: the friction force decreases with the normal force."""
+    """Run a case of a drag at the skin's centre with a tip that is then lifted.
+
+    The tangential force must decrease with the normal force, which limits the friction.
+    """
     mu, errors, last_N = 1.0, [], []
     for stops_n in LIFTS_N:
         share = np.append(DEPTH, np.linspace(DEPTH, 0, stops_n + 1))
@@ -84,8 +91,8 @@ def lift(board: Board, skin: Skin) -> Case:
         path_m = _path(skin, skin.seat_m, way_m, share)
         pulled_N = _drag(board, skin, path_m, mu).force_N[0]
         limit_N = mu * forces(skin, path_m[:, 2])
-        layers_N_per_m = np.array([_layer_N_per_m(skin, part) for part in share[1:-1]])
-        give_m_per_N = 1 / layers_N_per_m + 1 / _springs(skin)  # at the centre a drag does not rotate the skin
+        layers_N_per_m = np.array([_layer_N_per_m(skin, depth_share) for depth_share in share[1:-1]])
+        give_m_per_N = 1 / layers_N_per_m + 1 / _springs(skin)  # a drag at the centre does not rotate the skin
         reach_m = np.minimum.accumulate(np.minimum(HELD_M, limit_N[1:-1] * give_m_per_N))
         errors.append(np.abs(pulled_N[1:-1, 0] - reach_m / give_m_per_N).max() / limit_N[0])
         last_N.append(np.abs(pulled_N[-1]).max())
@@ -131,7 +138,7 @@ def edge(board: Board, skin: Skin) -> list[Case]:
 
 
 def force_control(skin: Skin) -> list[Case]:
-    """Run cases of force control: the depth for a force is the same on loading and unloading."""
+    """Run cases of force control: the depth for a force must be the same on loading and unloading."""
     assert skin.hold is not None
     sizes = {"modulus_Pa": skin.modulus_Pa, "thickness_m": skin.thickness_m, "tip_radius_m": skin.tip_radius_m}
     depth_m = skin.thickness_m * np.concatenate([PRESSES, PRESSES[::-1]])
@@ -158,7 +165,7 @@ def _drag(board: Board, skin: Skin, path_m: Float[np.ndarray, "p 3"], mu: float)
 def _path(
     skin: Skin, start_m: Float[np.ndarray, "2"], way_m: Float[np.ndarray, " p"], share: Float[np.ndarray, " p"]
 ) -> Float[np.ndarray, "p 3"]:
-    """Return stops along x, at depths given as shares of the thickness."""
+    """Return the stops of a drag along x, at displacements `way_m` and depths `share` * thickness."""
     return np.column_stack([start_m[0] + way_m, np.full(len(way_m), start_m[1]), share * skin.thickness_m])
 
 
@@ -168,6 +175,7 @@ def _springs(skin: Skin) -> float:
 
 
 def _layer_N_per_m(skin: Skin, share: float) -> float:
+    """Return the tangential stiffness of the layer under a tip at the depth `share` * thickness."""
     depth_m = share * skin.thickness_m
     table = shear.at_depth(depth_m, thickness_m=skin.thickness_m, tip_radius_m=skin.tip_radius_m, base=skin.base)
     shear_Pa = shear_moduli_Pa(skin, np.array([depth_m]))[0]

@@ -1,4 +1,4 @@
-"""Cases of damaged streams of every wire format, compared with the intact stream."""
+"""Cases of damaged byte streams in every wire format; the decoded frames are compared with the intact stream."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -18,23 +18,26 @@ AREA = "wire"
 FRAMES_N = 40
 CUT_I = 20  # the frame in which a stream is damaged
 GARBAGE = b"\r\n\0\xff9.99\t\n" * 5
-BLOCKS_N = 3  # the memory for this number of blocks is compared with that for four times as many
+BLOCKS_N = 3  # memory use is compared between streams of this number of blocks and of four times as many blocks
 
 
 @dataclass(frozen=True)
 class Damage:
-    """A damaged stream, and the losses that are allowed; all bytes must always be accounted for."""
+    """A damaged stream, and the allowed numbers of lost, false and non-finite frames.
+
+    Every byte of the stream must be counted, either as part of a frame or as skipped.
+    """
 
     case: str
     should: str
     portions: Sequence[bytes]
     lost_n: int = 0
     false_n: int = 0
-    not_finite_n: int | None = 0  # exact number; None if garbage may look like a frame with NaN
+    not_finite_n: int | None = 0  # required number of frames with NaN or Inf; None for any number
 
 
 def wire_cases(gain_sel: int, chips_n: int, seed: int) -> list[Case]:
-    """Damage a stream in every way, in every wire format, and count the decoded frames."""
+    """Run all cases of damaged streams, in every wire format."""
     frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "stability", "wire"))
     full = replace(frames, temperature_degC=np.full_like(frames.temperature_degC, CRLF_degC))
     wires = get_args(Wire)
@@ -67,7 +70,7 @@ def _damages(frames: Frames, wire: Wire) -> list[Damage]:
 
 
 def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
-    """Start reading a stream inside its first frame."""
+    """Return a stream that begins inside its first frame, at the fraction `where` of the frame."""
     data = encode(frames, wire)
     first_end = _clean(data, wire, frames).end_byte.tolist()[0]
     case, should = "CR LF inside every temperature, joined in the middle", "in step again: that frame lost, no other"
@@ -75,7 +78,7 @@ def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
 
 
 def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
-    """Decode a damaged stream, and count lost frames, false frames and bytes."""
+    """Decode a damaged stream; compare lost frames, false frames and uncounted bytes with what is allowed."""
     decoded_frames, account = decode_portions(damage.portions, wire, frames.temperature_degC.shape[1])
     sent, got = (Counter(records(decoded)) for decoded in (_clean(encode(frames, wire), wire, frames), decoded_frames))
     missing_n, false_n = (sent - got).total(), (got - sent).total()
@@ -94,7 +97,7 @@ def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
 
 def _refusals(frames: Frames) -> list[Case]:
     chips_n = frames.temperature_degC.shape[1]
-    # At room temperature no float contains CR LF; otherwise, a frame of another length could end there by chance.
+    # At room temperature, no float contains the bytes CR LF. If one did, a frame of another length could end there.
     data = encode(replace(frames, temperature_degC=np.full_like(frames.temperature_degC, 25.0)), "binary")
     attempts: dict[str, tuple[bytes, Wire, int, str]] = {
         "a stream without a byte": (b"", "binary", chips_n, "refused"),
@@ -143,12 +146,12 @@ def _clean(data: bytes, wire: Wire, frames: Frames) -> Frames:
 
 
 def decode_portions(portions: Sequence[bytes], wire: Wire, chips_n: int) -> tuple[Frames, dict[str, int]]:
-    """Decode a stream in portions; return frames and counts."""
+    """Decode a stream that arrives in portions; return the frames, and the stream's counts of bytes and frames."""
     stream = FrameStream(wire, chips_n)
-    parts = [stream.feed(portion) for portion in portions]
-    return concatenate([*parts, stream.close()], chips_n), stream.account()
+    decoded = [stream.feed(portion) for portion in portions]
+    return concatenate([*decoded, stream.close()], chips_n), stream.account()
 
 
 def records(frames: Frames) -> list[bytes]:
-    """Return the values of each frame as bytes, so that frames can be compared."""
+    """Return the values of each frame as bytes, so that frames can be compared bit for bit."""
     return [row.tobytes() for row in np.hstack([frames.temperature_degC, frames.b_uT])]

@@ -1,4 +1,4 @@
-"""Verification of the simulator: each part is compared with a reference that shares no code with it."""
+"""Verification of the simulator: each part is compared with a reference that shares no code with the simulator."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -22,7 +22,10 @@ from reskin.simulation.settings import SimulationSettings
 
 
 def verify(simulation: SimulationSettings, *, depths_m: tuple[float, ...], seed: int) -> list[Check]:
-    """Compare every part of the simulator with its reference, for the settings of a scene."""
+    """Compare every part of the simulator with a reference, for the settings of a scene.
+
+    depths_m: the commanded depths of the indentations to check.
+    """
     board, skin = simulation.main_boards, simulation.skin
     press = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, skin.base)
     rule = board.quadrature.in_si()
@@ -39,7 +42,7 @@ def verify(simulation: SimulationSettings, *, depths_m: tuple[float, ...], seed:
 
 
 def verification(settings: Settings, results: Path) -> None:
-    """Check the scene's own skins, indentations and chips, and write the table."""
+    """Run all checks with a scene's skins, indentations and chips, and write the results."""
     simulation = simulation_settings(settings)
     checks = verify(
         simulation, depths_m=tuple(milli * depth_mm for depth_mm in simulation.main.depths_mm), seed=settings.seed

@@ -1,6 +1,7 @@
-"""A row of the verification table, and the error measures that its checks use.
+"""Checks of the verification experiment: each is a row of its table. Also the error measures that checks use.
 
-The other modules of this package run checks on any inputs: the experiment uses those of a scene, tests use random ones.
+The other modules of this package run checks with given inputs. The experiment passes the inputs of a scene; the tests
+pass random inputs.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,10 @@ from reskin.physics.board import Spreads
 
 @dataclass(frozen=True)
 class Check:
-    """A property of `subject` compared with a reference: measured error, tolerance and the reason for the tolerance."""
+    """The result of a check: a property (`law`) of `subject`, compared with the reference `against`.
+
+    `reason` explains the tolerance.
+    """
 
     subject: str
     law: str
@@ -30,26 +34,26 @@ class Check:
 
 
 def max_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"] | float) -> float:
-    """Return the largest absolute error."""
+    """Return the largest absolute error over all elements."""
     return float(np.abs(found - truth).max())
 
 
 def relative_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Return the largest relative error."""
+    """Return the largest relative error over all elements."""
     return float(np.abs(found / truth - 1).max())
 
 
 def scaled_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Return the ratio of the largest absolute error to the largest absolute true value."""
+    """Return largest absolute error / largest absolute true value."""
     return float(np.abs(found - truth).max() / np.abs(truth).max())
 
 
 def norm_error(found: Float[np.ndarray, "*any"], truth: Float[np.ndarray, "*any"]) -> float:
-    """Return the ratio of the Euclidean norm of the errors to that of the true values."""
+    """Return Euclidean norm of the errors / Euclidean norm of the true values."""
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
 def no_spread(spreads: Spreads) -> Spreads:
-    """Return spreads of zero: boards and skins as designed, for checks of symmetry."""
+    """Return spreads of zero, so that all boards and skins equal their design; used in checks of symmetry."""
     length = "skin_filler_length_mm"
     return spreads.model_copy(update={name: 0.0 for name in Spreads.model_fields if name != length})

@@ -1,6 +1,6 @@
 """Checks of contact, force, friction, deformation and dB of indentations.
 
-References: closed forms, published fits, rings of pressure, finite differences, finer steps, and symmetries.
+The references are closed forms, published fits, rings of pressure, finite differences, finer steps, and symmetries.
 """
 
 from collections.abc import Callable
@@ -30,17 +30,17 @@ from reskin.physics.layer import IndentedLayer
 from reskin.physics.magnet import Dipoles, Polarity, Quadrature
 from reskin.physics.skin import Skin, SkinDesign, changes_of_field, draw_skin, press_motion
 
-HALF_SPACE_M = 100.0  # thickness of a layer whose base has no influence under a tip of a few millimetres
-A0 = 1.770  # integral of 1 - compliance (Dimitriadis et al. 2002 fit 1.780)
+HALF_SPACE_M = 100.0  # a layer of this thickness acts as a half-space under a tip of a few millimetres
+A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fit 1.780)
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
-RINGS_N = 40
+RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
-FRICTION = 0.8
-BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)
+FRICTION = 0.8  # coefficient
+BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)  # wave number * thickness
 
 
 def check_contact(skin: SkinDesign) -> list[Check]:
-    """Check the layer's compliance, and the force for depths up to 0.6 of the thickness, as in published solutions."""
+    """Check the compliance of a layer, and the force up to 0.6 of the thickness, which published solutions cover."""
     bonded = IndentedLayer(skin.thickness_mm * milli, skin.tip_radius_mm * milli, "bonded")
     sliding = IndentedLayer(bonded.thickness_m, bonded.tip_radius_m, "slipping")
     depth_m = layer.VERIFIED_DEPTH * bonded.thickness_m * np.arange(1, 7) / 6
@@ -55,12 +55,12 @@ def check_contact(skin: SkinDesign) -> list[Check]:
 
 
 def force_N(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: float = 1.0) -> Float[np.ndarray, " n"]:
-    """Return the simulator's force, by default for 1 Pa."""
+    """Return the simulator's force in N, by default for a modulus of 1 Pa."""
     return layer.force(depth_m, **asdict(press), modulus_Pa=modulus_Pa)
 
 
 def hertz_N(depth_m: Float[np.ndarray, " n"], tip_m: float) -> Float[np.ndarray, " n"]:
-    """Return Hertz's force on an incompressible half-space of 1 Pa: 16/9 E sqrt(R) d^1.5."""
+    """Return the force on an incompressible half-space with E = 1 Pa (Hertz): 16/9 E sqrt(R) d^1.5."""
     return 16 / 9 * np.sqrt(tip_m) * depth_m**1.5
 
 
@@ -90,7 +90,10 @@ def sliding_compliance(kh: Float[np.ndarray, " w"] = SLIDING_KH) -> Check:
 
 
 def dense_profile(kh: Any) -> Callable[[Any], Any]:
-    """Solve for W under a pressure of 2 G k: W'' + W = 0 at both faces, W = 0 below, 3 W' - W''' = 2 above."""
+    """Return W(z), the vertical displacement profile of a sliding layer under a pressure wave of amplitude 2 G k.
+
+    W solves four boundary conditions: W'' + W = 0 on both faces, W = 0 below, and 3 W' - W''' = 2 above.
+    """
     basis = (mpmath.sinh, mpmath.cosh, lambda z: z * mpmath.sinh(z), lambda z: z * mpmath.cosh(z))
     conditions = (({0: 1}, 0), ({2: 1, 0: 1}, 0), ({2: 1, 0: 1}, kh), ({1: 1.5, 3: -0.5}, kh))
     rows = [
@@ -158,7 +161,10 @@ def rings(depth_m: float, press: IndentedLayer) -> Check:
 
 
 def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, " p"]]:
-    """Return the edges of rings over the simulator's contact, and their pressures for 1 Pa, by collocation."""
+    """Return the edges of rings that cover the simulator's contact, and their pressures for a modulus of 1 Pa.
+
+    The pressures are found by collocation at the middle of each ring.
+    """
     h_m, tip_m, radius_m = press.thickness_m, press.tip_radius_m, press.contact(depth_m).radius_m
     edges_m = radius_m * np.linspace(0, 1, RINGS_N + 1)
     middles_m = (edges_m[1:] + edges_m[:-1]) / 2
@@ -168,7 +174,10 @@ def ring_pressures(depth_m: float, press: IndentedLayer) -> tuple[Float[np.ndarr
 
 
 def _disc_deflection_m(r_m: float, disc_m: float, h_m: float, base: layer.Base) -> float:
-    # Deflection under unit pressure / 2G on a disc: that of a half-space (elliptic integrals) minus the base's effect.
+    """Return the deflection at radius `r_m` for unit pressure / 2G on a disc.
+
+    This is the deflection of a half-space (elliptic integrals) minus the effect of the base.
+    """
     m = (min(r_m, disc_m) / max(r_m, disc_m)) ** 2
     free = 2 / np.pi * max(r_m, disc_m) * (ellipe(m) if r_m <= disc_m else ellipe(m) - (1 - m) * ellipk(m))
     k = np.linspace(1e-3, 25, 1500) / h_m
@@ -193,7 +202,7 @@ def scaling(depth_m: Float[np.ndarray, " n"], press: IndentedLayer, modulus_Pa: 
 
 
 def check_sideways(skin: SkinDesign) -> list[Check]:
-    """Check the tangential stiffness of a thick layer and the friction along a straight drag."""
+    """Check the tangential stiffness of a thick layer, and the friction force along a straight drag."""
     tip_m, modulus_Pa = skin.tip_radius_mm * milli, skin.modulus_kPa * kilo
     radius_m = 0.1 * tip_m
     limit_N, stiffness = FRICTION * modulus_Pa * radius_m**2, modulus_Pa * radius_m
@@ -228,21 +237,21 @@ def straight_drag(
                  )  # fmt: skip
 
 
-STEPS_N = 12  # of 0.1 mm each for a depth of 1.2 mm
-STEP_M = 1e-7  # of finite differences
+STEPS_N = 12  # steps of an indentation; for a depth of 1.2 mm, each step is 0.1 mm
+STEP_M = 1e-7  # step of finite differences
 HELD = {"bonded": "stays", "slipping": "keeps its height"}
 
 
 def check_kinematics(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check one linear step, and the finite deformation down to a depth."""
+    """Check the deformation of a layer: in one linear step, and in an indentation to a depth in small steps."""
     far = far_field(press, depth_m) if press.base == "slipping" else []
     return [*one_small_step(press, depth_m), *finite_deformation(press, depth_m), *sunken_surface(press, depth_m), *far]
 
 
 def descent(depth_m: float, steps_n: int = STEPS_N) -> Float[np.ndarray, " d"]:
-    """List depths from 0 in equal steps, with added stops at a quarter and half of the first step.
+    """Return depths from 0 to `depth_m` in equal steps, with additional stops at a quarter and half of the first step.
 
-    These are needed because the contact radius grows as a square root at small depths.
+    The additional stops are needed because the contact radius grows as the square root of the depth.
     """
     even = np.linspace(0, depth_m, steps_n + 1)
     return np.concatenate([[0.0, even[1] / 4, even[1] / 2], even[1:]])
@@ -282,7 +291,7 @@ def finite_deformation(press: layer.IndentedLayer, depth_m: float) -> list[Check
     h_m = press.thickness_m
     r_m, z_m = _places(h_m, 25, 11)
     inside = len(r_m)
-    # The places, their neighbours for finite differences, and the base are followed together.
+    # One call follows the places, the neighbouring points for finite differences, and points on the base.
     shifts = [(0.0, 0.0), (STEP_M, 0.0), (-STEP_M, 0.0), (0.0, STEP_M), (0.0, -STEP_M)]
     base_m = np.linspace(0, 4 * h_m, 40)
     all_r_m = np.concatenate([*(r_m + dr_m for dr_m, _ in shifts), base_m])
@@ -290,7 +299,7 @@ def finite_deformation(press: layer.IndentedLayer, depth_m: float) -> list[Check
     depths_m = descent(depth_m)
     end = deformation.follow(all_r_m, all_z_m, depths_m, press=press)[-1]
     _, right, left, above, below, base = np.split(np.stack([end.r_m, end.z_m]), inside * np.arange(1, 6), axis=1)
-    # Axes: r and z, derivative with respect to r0 and z0, place.
+    # Axes of `numeric`: displaced r or z; derivative with respect to initial r or z; place.
     numeric = np.stack([right - left, above - below], axis=1) / (2 * STEP_M)
     f, hoop = end.f[:inside], end.hoop[:inside]
     gradient = max(max_error(f, numeric.transpose(2, 0, 1)), max_error(hoop, end.r_m[:inside] / r_m))
@@ -318,9 +327,12 @@ def sunken_surface(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
 
 
 def far_field(press: layer.IndentedLayer, depth_m: float) -> list[Check]:
-    """Check that, on a slipping base, the displaced volume passes through every circle around the tip."""
+    """Check that, far from the tip on a slipping base, r^2 grows equally at all heights and distances.
+
+    This is required by conservation of volume.
+    """
     h_m = press.thickness_m
-    r_m, z_m = (part.ravel() for part in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
+    r_m, z_m = (grid_m.ravel() for grid_m in np.meshgrid(np.array([4.0, 5.0, 6.0]) * h_m, np.linspace(0, h_m, 7)))
     end = deformation.follow(r_m, z_m, descent(depth_m), press=press)[-1]
     grown_m2 = end.r_m**2 - r_m**2
     return [
@@ -336,9 +348,10 @@ def _places(h_m: float, r_n: int, z_n: int) -> tuple[Float[np.ndarray, " s"], Fl
 
 
 def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[np.ndarray, " d"]) -> Dipoles:
-    """Follow all dipoles of a skin through an indentation to true depths, without a table, then slide the skin.
+    """Return the dipoles of a skin after an indentation in the steps `depths_m` (true depths), and after its slide.
 
-    Each moment rotates by R of F = R U, from a singular value decomposition. No dipole may be on the tip's axis.
+    Dipoles are followed without tables. Each moment is rotated by R, where F = R U is the polar decomposition of its
+    deformation gradient, from a singular value decomposition. No dipole may be on the tip's axis.
     """
     away_m = skin.nodes_m[:, :2] - place_m
     r_m = np.linalg.norm(away_m, axis=1)
@@ -357,19 +370,20 @@ def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[
     return slide.apply(slides, 0, after, skin.seat_m)
 
 
-COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # for checks that hold for any rule
-DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # for the errors of the table and of the steps
-EVERY_PLACE = 5  # every fifth of the protocol's 65 places
-REFERENCE_STEPS_N = 16
-UNSEEN_uT = 1.0  # a third of a chip's noise; added in quadrature, it increases the noise by 5 %
-PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # on no node's axis
+COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes for checks that hold for any quadrature rule
+DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for the errors of tables and steps
+PLACE_STRIDE = 5  # every fifth of the protocol's 65 places is checked
+REFERENCE_STEPS_N = 16  # steps of an indentation in the reference
+# Errors of this size are not visible in readings: a third of a chip's noise, which increases the rms noise by 5 %.
+UNSEEN_uT = 1.0
+PLACES_M = np.array([[1.1, -2.3], [-4.2, 0.7], [5.3, 6.1]]) * milli  # no node is on the tip's axis at these places
 Places = Float[np.ndarray, "p 2"]
 
 
 def check_indentations(
     board: BoardDesign, spreads: Spreads, *, skin: SkinDesign, rule: Quadrature, depths_m: tuple[float, ...], seed: int
 ) -> list[Check]:
-    """Check dB of indentations on a scene's first skin, and the symmetries of the design without spreads."""
+    """Check dB of indentations on a scene's first skin, and the symmetries of dB on a skin without spreads."""
     first_board, exact = draw_board(board, spreads, seed=seed, name="b0"), no_spread(spreads)
 
     def skin_of(rule: Quadrature, design: SkinDesign = skin, spreads: Spreads = spreads) -> Skin:
@@ -381,7 +395,7 @@ def check_indentations(
         skin.model_copy(update={"saturation_T": 2.5 * skin.saturation_T}),
     )
     dense = skin_of(DENSE)
-    # The rig's compliance depends on direction, so the symmetries hold only for a rigid rig.
+    # The compliance of the rig depends on direction, so dB has the symmetries only with a rigid rig.
     rigid = (
         skin
         if skin.hold is None
@@ -407,8 +421,12 @@ def quadrature(
     pokes_m: Float[np.ndarray, "n 3"],
     unseen_uT: float = UNSEEN_uT,
 ) -> list[Check]:
-    """Compare dB with that of the same skin with narrower cells, and with more layers."""
-    found_T, cells_T, layers_T = (changes_of_field(board, each, pokes_m)[1] for each in (skin, *fine))
+    """Compare dB of a skin with dB of the same skin with narrower cells, and with more layers.
+
+    `fine` are the skins with narrower cells and with more layers; `rules` are the quadrature rules of all three skins.
+    Differences of a channel below `unseen_uT` are not visible in readings.
+    """
+    found_T, cells_T, layers_T = (changes_of_field(board, variant, pokes_m)[1] for variant in (skin, *fine))
     size_T = np.linalg.norm(cells_T, axis=(1, 2), keepdims=True)
     allowed_T = np.maximum(0.02 * size_T, unseen_uT * micro)
     used, cells, layers = rules
@@ -426,7 +444,7 @@ def quadrature(
 
 
 def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m: Places = PLACES_M) -> Check:
-    """Compare dB with that of magpylib's dipoles, each followed without a table."""
+    """Compare the simulator's dB with dB from magpylib's dipoles, which are followed without tables in fine steps."""
     pokes_m = each_depth(places_m, (depth_m,))
     _, found_T = changes_of_field(board, skin, pokes_m)
     before_T = field_of((skin.nodes_m, skin.moments_A_m2), board.chips_m)
@@ -440,11 +458,11 @@ def approximations(board: Board, skin: Skin, depth_m: float, kind: str, places_m
 
 
 def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = PLACES_M) -> list[Check]:
-    """Check that dB rotates and mirrors with board, skin and indentations, and is unchanged if all are shifted.
+    """Check three symmetries of dB on a skin without spreads.
 
-    Rotation and mirror hold only without spreads, the shift for any skin.
+    dB must rotate and mirror together with board, skin and indentations, and must not change if all are shifted.
     """
-    sign = -1 if polarity == "checkerboard" else 1  # a quarter turn, or a mirror in x, swaps a checkerboard's poles
+    sign = -1 if polarity == "checkerboard" else 1  # a quarter turn or mirroring x swaps the poles of a checkerboard
     mirror, shift_m = np.diag([-1.0, 1.0, 1.0]), np.array([0.4, -0.7, 0.0]) * milli
     pokes_m = each_depth(places_m, (0.3 * skin.thickness_m,))
     here_T = _change(board.chips_m, skin, pokes_m)
@@ -467,8 +485,8 @@ def symmetries(board: Board, skin: Skin, polarity: Polarity, places_m: Places = 
 def amplitude(
     board: Board, skin: Skin, stronger: Skin, *, pokes_m: Float[np.ndarray, "n 3"], factor: float = 2.5
 ) -> Check:
-    """Check that dB is `factor` times as large if the skin is magnetised `factor` times as strongly."""
-    once_T, more_T = (_change(board.chips_m, each, pokes_m) for each in (skin, stronger))
+    """Check that dB of skin `stronger`, which is magnetised `factor` times as strongly, is `factor` times as large."""
+    once_T, more_T = (_change(board.chips_m, variant, pokes_m) for variant in (skin, stronger))
     return Check("dB of pokes", "proportional to the magnetisation", f"itself, {factor:g} times",
                  scaled_error(more_T, factor * once_T), "1", 1e-12, "rounding")  # fmt: skip
 
@@ -482,9 +500,9 @@ def _change(
 
 def _grid_m() -> Places:
     plan = protocol((1.0,), 1)
-    return (np.column_stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM]) * milli)[::EVERY_PLACE]
+    return (np.column_stack([plan.x_mm - CENTRE_MM, plan.y_mm - CENTRE_MM]) * milli)[::PLACE_STRIDE]
 
 
 def each_depth(places_m: Places, depths_m: tuple[float, ...]) -> Float[np.ndarray, "n 3"]:
-    """List every place at every depth, depth after depth."""
+    """Return pokes (x, y, depth) at every place to every depth, sorted by depth."""
     return np.column_stack([np.tile(places_m, (len(depths_m), 1)), np.repeat(depths_m, len(places_m))])

@@ -1,6 +1,7 @@
 """Checks of magnetic fields, chips, wire formats and relaxation.
 
-References: magpylib, Maxwell's equations, the data sheet, recorded noise, struct, and mpmath with 50 digits.
+The references are magpylib, Maxwell's equations, the chip's data sheet, recorded noise, Python's `struct`, and mpmath
+with 50 digits.
 """
 
 import struct
@@ -26,14 +27,14 @@ from reskin.physics.magnet import Dipoles, Quadrature, change_of_field, place_no
 from reskin.physics.skin import SkinDesign
 from reskin.seeds import rng_for
 
-NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # distances, in units of a cell's side
+NEAR_CELLS, FAR_CELLS = 0.6, 50.0  # range of distances from a box's centre, in units of its side
 COARSE = Quadrature(cell_m=1.5e-3, layers_n=3)
-MU_0_DIGITS = 1e-8  # mu_0 differs by 1e-10 to 1e-9 between CODATA years
-TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # a quarter turn about z
+MU_0_DIGITS = 1e-8  # tolerance for other values of mu_0, which differ by 1e-10 to 1e-9 between CODATA years
+TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation by a quarter turn about z
 
 
 def check_field(skin: SkinDesign, seed: int) -> list[Check]:
-    """Check cuboids, the magnetising array and dipoles, at rest and moved."""
+    """Check the fields of cuboids, of the magnetising array, and of dipoles at rest and displaced."""
     return [*boxes(seed), octupole(), *array(skin.polarity, skin.thickness_mm * milli, seed), *dipoles(seed)]
 
 
@@ -55,12 +56,12 @@ def boxes(seed: int, side_m: float = 0.5 * milli) -> list[Check]:
 
 
 def inside_a_box(places_m: Float[np.ndarray, "o 3"], side_m: float) -> float:
-    """Return the relative error of the field inside a cube."""
+    """Return the relative error of the field at places inside a cube, compared with magpylib."""
     return scaled_error(magnet.cuboid_field(places_m, 1.0, sides_m=(side_m,) * 3), cuboid(side_m).getB(places_m))
 
 
 def cuboid(side_m: float, j_T: float = 1.0, place_m: tuple[float, ...] = (0, 0, 0)) -> magpylib.magnet.Cuboid:
-    """Return magpylib's cube, magnetised along z."""
+    """Return a magpylib cube with the polarisation `j_T` along z."""
     return magpylib.magnet.Cuboid(polarization=(0, 0, j_T), dimension=(side_m,) * 3, position=place_m)
 
 
@@ -77,7 +78,7 @@ def octupole() -> Check:
 
 
 def cuboids(polarity: magnet.Polarity, thickness_m: float, cubes_n: tuple[int, int]) -> list[magpylib.magnet.Cuboid]:
-    """Return the magnetising array as magpylib's cubes."""
+    """Return the cubes of the magnetising array, above and below the skin, as magpylib objects."""
     side_m, swaps = magnet.CUBE_SIDE_M, -1 if polarity == "checkerboard" else 1
     heights_m = (-magnet.ARRAY_BELOW_M - side_m / 2, thickness_m + magnet.ARRAY_ABOVE_M + side_m / 2)
     return [
@@ -106,7 +107,10 @@ def array(polarity: magnet.Polarity, thickness_m: float, seed: int) -> list[Chec
 
 
 def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polarity) -> tuple[float, float]:
-    """Return the largest divergence and curl, relative to the largest derivative of the field at the same place."""
+    """Return the largest divergence and the largest curl of the array's field at random places in the skin.
+
+    Both are relative to the largest derivative of the field at the same place.
+    """
     step_m = 1e-6
     low, high = np.array([-9e-3, -9e-3, 0.05 * thickness_m]), np.array([9e-3, 9e-3, 0.95 * thickness_m])
     places_m = rng.uniform(low, high, (200, 3))
@@ -122,7 +126,7 @@ def _slopes(rng: np.random.Generator, thickness_m: float, polarity: magnet.Polar
 
 def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
     rng = rng_for(seed, "verification", "dipoles")
-    # Not centred at the origin, because a wrong sign of the separation could then go unnoticed.
+    # The dipoles are not centred at the origin; otherwise a wrong sign of the separation could go unnoticed.
     nodes_m = rng.uniform((2e-3, -9e-3, 1e-3), (9e-3, 4e-3, 3e-3), (60, 3))
     moments = 1e-5 * rng.standard_normal((60, 3))
     moved_m, turned = nodes_m + 1e-4 * rng.standard_normal((60, 3)), moments + 1e-6 * rng.standard_normal((60, 3))
@@ -147,21 +151,21 @@ def dipoles(seed: int, factor: float = 2.5) -> list[Check]:
 
 
 def field_of(sources: Dipoles, observers_m: Float[np.ndarray, "o 3"]) -> Float[np.ndarray, "o 3"]:
-    """Return magpylib.core's field of dipoles at observers in T, in one call over all pairs."""
+    """Return the field of dipoles at observers in T, from one call of magpylib.core for all pairs."""
     places_m, moments = sources
     separation_m = (observers_m[:, None] - places_m).reshape(-1, 3)
     h_A_m = dipole_Hfield(observers=separation_m, moments=np.tile(moments, (len(observers_m), 1)))
     return mu_0 * h_A_m.reshape(len(observers_m), -1, 3).sum(axis=1)
 
 
-PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # by GAIN_SEL; RES 0
-PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # GAIN_SEL 0 to 7
-RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))  # sd on x, y and on z, of three recorded data sets
-STILL_FRAMES_N = 20_000
+PUBLISHED_STEPS_uT = {7: (0.150, 0.150, 0.242), 6: (0.200, 0.200, 0.3227)}  # uT per count by GAIN_SEL, for RES 0
+PUBLISHED_GAINS = (5.0, 4.0, 3.0, 2.5, 2.0, 1.667, 1.333, 1.0)  # for GAIN_SEL 0 to 7
+RECORDED_NOISE_uT = ((3.0, 3.7), (4.5, 7.0))  # ranges of the sd on x and y, and on z, in three recorded data sets
+STILL_FRAMES_N = 20_000  # readings of a board at rest
 
 
 def check_electronics(chip: ChipDesign, seed: int) -> list[Check]:
-    """Check conversion, int16 wrap, temperature and noise of a scene's chip."""
+    """Check the conversion to counts, the wrap of int16, the temperature and the noise of a scene's chip."""
     return [*steps(), *conversion(chip.gain_sel, seed), *noise(chip, seed), temperature(seed)]
 
 
@@ -173,7 +177,7 @@ def quiet(gain_sel: int) -> ChipDesign:
 def read_bare(
     b_T: Float[np.ndarray, "f 3"], design: ChipDesign, rng: np.random.Generator
 ) -> tuple[Float32[np.ndarray, "f 3"], Overruns]:
-    """Read a field with one ideal chip: no rotation, gain one, no offset."""
+    """Return the readings of the fields `b_T` by one ideal chip (no rotation, gain one, no offset)."""
     eye = np.eye(3)[None]
     return read_field(b_T[:, None], Board("bare", np.zeros((1, 3)), eye, eye, np.zeros((1, 3))), design=design, rng=rng)
 
@@ -210,7 +214,7 @@ def conversion(gain_sel: int, seed: int) -> list[Check]:
 def noise(chip: ChipDesign, seed: int) -> list[Check]:
     read_uT, _ = read_bare(np.zeros((STILL_FRAMES_N, 3)), chip, rng_for(seed, "verification", "noise"))
     sd_uT = read_uT.std(axis=0)
-    # Noise of the design plus rounding to counts.
+    # The expected sd combines the noise of the chip's design and the rounding to counts.
     design_uT = np.array([chip.noise_xy_uT, chip.noise_xy_uT, chip.noise_z_uT])
     expected_uT = np.sqrt(design_uT**2 + steps_uT(chip.gain_sel) ** 2 / 12)
     low_uT, high_uT = np.array([RECORDED_NOISE_uT[axis == 2] for axis in range(3)]).T
@@ -227,19 +231,19 @@ def noise(chip: ChipDesign, seed: int) -> list[Check]:
 def temperature(seed: int) -> Check:
     rng = rng_for(seed, "verification", "temperature")
     true_degC = rng.uniform(0, 60, (500, 5))
-    raw = np.rint((true_degC - 25) * 45.2 + 46244)  # counts by the data sheet's formula, which the next line inverts
+    raw = np.rint((true_degC - 25) * 45.2 + 46244)  # counts, by the inverse of the data sheet's formula
     error_degC = max_error(read_temperature(true_degC, quiet(7), rng), 25 + (raw - 46244) / 45.2)
     return Check("chip", "temperature", "25 + (raw - 46244) / 45.2, data sheet", error_degC, "degC", 4e-6,
                  "rounding of float32 near 60")  # fmt: skip
 
 
 FRAMES_N = 300
-CRLF_degC = 34.513275  # the bytes of its float32 contain CR LF
-CRLF_SHARE = 0.05
+CRLF_degC = 34.513275  # temperature whose float32 bytes contain CR LF
+CRLF_SHARE = 0.05  # fraction of temperatures with this value
 
 
 def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
-    """Check encoding and decoding of each wire format; the error is the largest difference between any two values."""
+    """Check encoding and decoding in each wire format, against independent encoders and decoders."""
     frames = make_frames(FRAMES_N, chips_n, gain_sel=gain_sel, rng=rng_for(seed, "verification", "frames"))
     laws: dict[Wire, Callable[[Frames, Wire], list[Check]]] = {
         "binary": binary,
@@ -251,7 +255,7 @@ def check_frames(gain_sel: int, chips_n: int, seed: int) -> list[Check]:
 
 
 def make_frames(frames_n: int, chips_n: int, *, gain_sel: int, rng: np.random.Generator) -> Frames:
-    """Make readings that are whole counts of the chip; the bytes of some temperatures contain CR LF."""
+    """Return random frames whose fields are whole counts of the chip; the bytes of some temperatures contain CR LF."""
     counts = rng.integers(-20_000, 20_000, (frames_n, chips_n, 3))
     b_uT = (counts * steps_uT(gain_sel)).reshape(frames_n, -1).astype(np.float32)
     usual_degC = (rng.integers(2000, 4000, (frames_n, chips_n)) / 100).astype(np.float32)
@@ -282,7 +286,7 @@ def text(frames: Frames, layout: Wire) -> list[Check]:
     values = _txyz(frames)
     numbers = values.reshape(len(frames), -1, 4)
     ordered = numbers if layout == "text-txyz" else np.roll(numbers, -1, axis=2)
-    # AnySkin's firmware omits the tab between two chips.
+    # Layout text-txyz is that of AnySkin's firmware, which omits the tab between two chips.
     gap = "" if layout == "text-txyz" else "\t"
     lines = [gap.join("\t".join(f"{value:.2f}" for value in chip) for chip in row) + gap for row in ordered.tolist()]
     theirs = "".join(line + "\r\n" for line in lines).encode()
@@ -310,16 +314,16 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
     return float(np.abs(decoded_values - values).max()) if decoded_values.shape == values.shape else np.inf
 
 
-POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 indentations in 30 s
+POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 indentations, each lowered and held, in 30 s
 NAME = "relaxation of the force"
-STATE = np.array([0.7, -0.2, 0.4])
-RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # of the slowest to the fastest relaxation time, which is 1 ms
-STEPS = (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)  # time steps over the fastest relaxation time
-ROUNDING = 1e-14  # a few dozen operations on doubles
+STATE = np.array([0.7, -0.2, 0.4])  # state before a time step, one value per relaxation time
+RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # slowest relaxation time / fastest relaxation time, which is 1 ms
+STEPS = (1e-16, 1e-9, 1e-3, 1.0, 40.0, 1e8)  # time step / fastest relaxation time
+ROUNDING = 1e-14  # relative rounding error of a few dozen operations on doubles
 
 
 def check_relaxation() -> list[Check]:
-    """Check relaxation in repeated indentations, in single steps of any stiffness, and in a held indentation."""
+    """Check the relaxation of the force: in repeated indentations, in single time steps, and in a held indentation."""
     steps = [step_error(1e-3 * dt, stiff(ratio)) for ratio, dt in product(RATIOS, STEPS)]
     return [
         many_pokes(),
@@ -330,7 +334,7 @@ def check_relaxation() -> list[Check]:
 
 
 def stiff(ratio: float) -> Prony:
-    """Return a relaxation with three times: 1 ms, `ratio` times 1 ms, and their geometric mean."""
+    """Return a relaxation with three times: 1 ms, `ratio` times 1 ms, and the geometric mean of these two."""
     return Prony(np.array([1e-3, 1e-3 * np.sqrt(ratio), 1e-3 * ratio]), np.array([0.3, 0.2, 0.1]))
 
 
@@ -351,7 +355,7 @@ def held(time_s: Float[np.ndarray, " t"]) -> Check:
 
 
 def step_error(dt_s: float, prony: Prony) -> float:
-    """Return the error of a step of `aging.advance` against its formula evaluated with 50 digits."""
+    """Return the relative error of one time step by `aging.advance`, compared with its formula in 50 digits."""
     with mpmath.workdps(50):
         truth = []
         for q, tau, share in zip(STATE.tolist(), prony.tau_s.tolist(), prony.share.tolist(), strict=True):
@@ -364,9 +368,10 @@ def step_error(dt_s: float, prony: Prony) -> float:
 def hereditary(
     time_s: Float[np.ndarray, " t"], elastic: Float[np.ndarray, " t"], prony: Prony
 ) -> Float[np.ndarray, " t"]:
-    """Return Lee & Radok's integral of relaxation(t - s) d elastic(s) with 50 digits, summed over all ramps.
+    """Return the relaxed force at each time, from the hereditary integral of Lee & Radok with 50 digits.
 
-    Unlike `aging.relax`, it does not carry a state from ramp to ramp.
+    The integral of relaxation(t - s) d elastic(s) is summed over all linear pieces of `elastic`. Unlike `aging.relax`,
+    this does not propagate a state from piece to piece.
     """
     with mpmath.workdps(50):
         t, e, tau, share = (
