@@ -96,13 +96,14 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
         raise SchemaError(where, what, rule, str(got[tuple(wrong)]), "Omit this value.")
 
 
-FORMAT = "reskin-skin-1"
+FORMAT, FORMAT_1 = "reskin-skin-2", "reskin-skin-1"  # files of the first format do not tell which forces are known
 SHAPES: Mapping[str, tuple[int, ...]] = {  # shapes of the arrays, without the first axis (presses)
     "pokes_uT": (CHANNELS_N,),
     "even_uT": (CHANNELS_N,),
     "labelled_mm": (2,),
     "labelled_N": (),
     "labelled_uT": (CHANNELS_N,),
+    "force_known": (),
 }
 FILE_BYTES_MAX_N = 2**20  # three times the size of a file with a full set of presses and LABELS_MAX_N labels
 REMEDY = "Use a file that `save` wrote."
@@ -110,18 +111,32 @@ REMEDY = "Use a file that `save` wrote."
 
 @dataclass(frozen=True)
 class LabelledPresses:
-    """Presses with known places (relative to the board's centre) and forces, and their field changes."""
+    """Presses with known places (relative to the board's centre), their forces and their field changes.
+
+    force_known: which forces are true; the others are estimates. The default is that all are true.
+    """
 
     place_mm: Float[np.ndarray, "m 2"]
     force_N: Float[np.ndarray, " m"]
     db_uT: Float[np.ndarray, "m ch"]
+    force_known: Bool[np.ndarray, " m"] | None = None
 
     def __len__(self) -> int:
         return len(self.force_N)
 
     def __getitem__(self, which: slice | Int64[np.ndarray, " k"]) -> "LabelledPresses":
         """Select presses."""
-        return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which])
+        known = None if self.force_known is None else self.force_known[which]
+        return LabelledPresses(self.place_mm[which], self.force_N[which], self.db_uT[which], known)
+
+
+def join_labels(one: LabelledPresses, other: LabelledPresses) -> LabelledPresses:
+    """Append labelled presses to others."""
+    known = [np.ones(len(part), bool) if part.force_known is None else part.force_known for part in (one, other)]
+    return LabelledPresses(
+        np.concatenate([one.place_mm, other.place_mm]), np.concatenate([one.force_N, other.force_N]),
+        np.concatenate([one.db_uT, other.db_uT]), np.concatenate(known),
+    )  # fmt: skip
 
 
 def no_presses() -> Float[np.ndarray, "0 ch"]:
@@ -149,13 +164,14 @@ class CalibrationData:
 def write_calibration(data: CalibrationData, file: Path) -> None:
     """Write calibration data, without the model, as safetensors."""
     labels = data.labels
-    values = (data.presses_uT, data.even_uT, labels.place_mm, labels.force_N, labels.db_uT)
+    known = np.ones(len(labels)) if labels.force_known is None else labels.force_known.astype(float)
+    values = (data.presses_uT, data.even_uT, labels.place_mm, labels.force_N, labels.db_uT, known)
     io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
 
 
 def is_calibration(file: Path) -> bool:
     """Return whether a file is one of `write_calibration`; raise SchemaError if a file of such a size is damaged."""
-    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") == FORMAT
+    return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (FORMAT, FORMAT_1)
 
 
 def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> CalibrationData:
@@ -165,7 +181,9 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
             f"{file}: {bytes_n:,} bytes are too many for a saved skin (at most {FILE_BYTES_MAX_N:,}). {REMEDY}"
         )
     tensors, metadata = io.read_tensors(file, digest_needed=True)
-    if metadata.get("format") != FORMAT:
+    if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
+        tensors = dict(tensors) | {"force_known": np.ones(len(tensors["labelled_N"]))}
+    elif metadata.get("format") != FORMAT:
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
     got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
@@ -179,7 +197,7 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
         tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, reach_mm
     )
     rest_uT = check_readings(tensors["rest_uT"])[0]
-    labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"])
+    labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"], tensors["force_known"] != 0)
     return CalibrationData(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], labels)
 
 

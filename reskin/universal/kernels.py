@@ -220,6 +220,9 @@ def _clear(value):
 CELL_SD_MM = 0.2  # least standard deviation of a place: positions within a cell of the lattice are not distinguished
 TINY = float(np.finfo(np.float32).tiny)  # least probability of a place or force in the map
 LEAST = math.log(TINY)
+# Power of the map's probabilities of forces if the map alone estimates forces. It is small, because the map is too sure
+# of forces that the law hardly distinguishes. Chosen on both boards of scene lab.
+FORCE_POWER = 0.3
 FARTHEST = 200.0  # log likelihoods further below the largest one than this are raised to this distance
 
 
@@ -249,14 +252,15 @@ def means(
 def products(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
     map_power: float, power: float,
-) -> Moments:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Return moments of the map's marginal probabilities of places and of forces, each times normal distributions.
 
+    The fourth array has the mean log forces of the map alone, weighted by a power `FORCE_POWER` of its probabilities.
     map_power: power of the map's likelihoods. power: power of the product; it affects standard deviations only.
     """
-    moments = np.empty((len(deviance), 5))
+    moments = np.empty((len(deviance), 6))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), moments)
-    return moments[:, :2], moments[:, 2:4], moments[:, 4]
+    return moments[:, :2], moments[:, 2:4], moments[:, 4], moments[:, 5]
 
 
 @njit(cache=True, error_model="numpy")
@@ -287,6 +291,7 @@ def _means(deviance, best, at, half_power, found):
 def _products(deviance, best, at, normals, powers, found):
     place_mm, log_N = at
     likely, of_place, of_force = np.empty(deviance.shape[1]), np.empty(len(place_mm)), np.empty(len(log_N))
+    combined = np.empty(len(log_N))
     for r in range(len(deviance)):
         mean_x, mean_y, sd_x, sd_y, mean_log_N, sd_log_N = normals[r]
         _likelihoods(deviance[r], deviance[r, best[r]], powers[0], likely)
@@ -295,11 +300,12 @@ def _products(deviance, best, at, normals, powers, found):
             off_x, off_y = place_mm[p, 0] - mean_x, place_mm[p, 1] - mean_y
             of_place[p] -= 0.5 * ((off_x / sd_x) ** 2 + (off_y / sd_y) ** 2)
         for q in range(len(of_force)):
-            of_force[q] -= 0.5 * ((log_N[q] - mean_log_N) / sd_log_N) ** 2
+            combined[q] = of_force[q] - 0.5 * ((log_N[q] - mean_log_N) / sd_log_N) ** 2
+            of_force[q] *= FORCE_POWER
         x, y, _, _ = _moments(of_place, place_mm, (0.0, 0.0), 1.0, likely)
         _, _, xx, yy = _moments(of_place, place_mm, (x, y), powers[1], likely)
         found[r, 0], found[r, 1], found[r, 2], found[r, 3] = x, y, _sd_mm(xx), _sd_mm(yy)
-        found[r, 4] = math.exp(_mean(of_force, log_N))
+        found[r, 4], found[r, 5] = math.exp(_mean(combined, log_N)), _mean(of_force, log_N)
 
 
 @njit(cache=True, error_model="numpy")

@@ -237,12 +237,16 @@ WEIGHT_MIN = 1e-9  # relative to the largest weight; hypotheses with less weight
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimates for readings: places with standard deviations, forces, and misfits of the most likely hypotheses."""
+    """Estimates for readings: places and forces with standard deviations, and misfits of the most likely hypotheses.
+
+    sd_log_N: standard deviation of the logarithm of the force; NaN if forces are not calibrated.
+    """
 
     place_mm: Float[np.ndarray, "n 2"]
     sd_mm: Float[np.ndarray, "n 2"]
     force_N: Float[np.ndarray, " n"]
     misfit: Float[np.ndarray, " n"]  # chi^2 per channel: about 1 for a press on this skin
+    sd_log_N: Float[np.ndarray, " n"]
 
 
 def concatenate(parts: Sequence[Estimate]) -> Estimate:
@@ -341,7 +345,7 @@ class MapEvaluator:
     def mean(self, likelihoods: Likelihoods, power: float) -> Estimate:
         """Estimate places and forces as means over all hypotheses, weighted by a power of their likelihoods."""
         moments = means(likelihoods.deviance, likelihoods.best, self.lattice, power)
-        return Estimate(*moments, likelihoods.misfit())
+        return Estimate(*moments, likelihoods.misfit(), np.full(len(likelihoods.best), np.nan))
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], block_n: int = 200) -> Estimate:
         """Estimate places and forces of readings as means over all hypotheses."""

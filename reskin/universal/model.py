@@ -9,11 +9,11 @@ recorded boards. It takes readings along the chips' axes, and its places are in 
 board's centre is at (8, 8) mm.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -33,12 +33,14 @@ from reskin.universal.calibration import (
     check_readings,
     check_shape,
     folds_of_labels,
+    join_labels,
     lower_by_misfit,
     lower_by_residuals,
     read_calibration,
     variance_inflations,
     write_calibration,
 )
+from reskin.universal.force import ESTIMATORS, LOG_CENTRE_N, ForceLine, fit_line, prior_line
 from reskin.universal.kernels import products
 from reskin.universal.law import to_board, to_chips
 from reskin.universal.map import (
@@ -83,6 +85,7 @@ class Evaluation:
     evaluator: MapEvaluator
     likelihoods: Likelihoods
     network: NetworkEstimate
+    line: ForceLine
 
     __repr__ = one_line
 
@@ -92,38 +95,53 @@ class Evaluation:
 
     def by_network(self, power: float) -> Estimate:
         """Estimate with the networks alone; their misfit is NaN."""
-        own = self.network
-        return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), np.full(len(own.log_N), np.nan))
+        own, unknown = self.network, np.full(len(self.network.log_N), np.nan)
+        return Estimate(own.place_mm, own.sd_mm / np.sqrt(power), np.exp(own.log_N), unknown, unknown)
 
     def combined(self, power: float) -> Estimate:
         """Multiply the map's marginal probabilities of places and forces by the networks' normal distributions.
 
         The errors of both are correlated, because both use the same field changes. Therefore the standard deviations
-        are computed from a power of the product.
+        are computed from a power of the product. Forces are calibrated by the skin's line.
         """
+        place_mm, sd_mm, by_estimator = self._products(power)
+        log_N, sd_log_N = self.line.apply(by_estimator[ESTIMATORS.index(self.line.estimator)])
+        return Estimate(place_mm, sd_mm, np.exp(log_N), self.likelihoods.misfit(), sd_log_N)
+
+    def log_forces(self) -> Sequence[Float[np.ndarray, " n"]]:
+        """Return the log forces of each of `ESTIMATORS` before their calibration."""
+        return self._products(1.0)[2]
+
+    def _products(self, power: float) -> tuple[np.ndarray, np.ndarray, Sequence[Float[np.ndarray, " n"]]]:
         normals = np.empty((len(self.network.log_N), 6))
         normals[:, :2], normals[:, 4] = self.network.place_mm, self.network.log_N
         np.maximum(self.network.sd_mm, SD_MIN_MM, out=normals[:, 2:4])
         np.maximum(self.network.sd_log_N, SD_MIN_LOG_N, out=normals[:, 5])
         likelihoods = self.likelihoods
-        moments = products(likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power)
-        return Estimate(*moments, likelihoods.misfit())
+        place_mm, sd_mm, force_N, map_log_N = products(
+            likelihoods.deviance, likelihoods.best, self.evaluator.lattice, normals, MAP_POWER, power
+        )
+        return place_mm, sd_mm, (np.log(force_N), map_log_N, np.full(len(map_log_N), LOG_CENTRE_N))
 
 
 @dataclass(frozen=True)
 class CalibratedModel:
-    """Map and networks, calibrated to one skin; `offsets_mm` are added to the networks' places one after the other."""
+    """Map and networks, calibrated to one skin.
+
+    offsets_mm: corrections that are added to the networks' places, one after the other. line: calibration of forces.
+    """
 
     skin: SkinMap
     networks: Sequence[Layers]
     offsets_mm: Sequence[Float[np.ndarray, "2"]]
+    line: ForceLine = field(default_factory=prior_line)
 
     __repr__ = one_line
 
     def with_offsets_in_biases(self) -> "CalibratedModel":
         """Return the model with its offsets added to the networks' last biases: faster, but in single precision."""
         offset_mm = sum(self.offsets_mm, np.zeros(2))
-        return CalibratedModel(self.skin, [shift_places(layers, offset_mm) for layers in self.networks], ())
+        return replace(self, networks=[shift_places(layers, offset_mm) for layers in self.networks], offsets_mm=())
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], powers: Sequence[float]) -> list[Estimate]:
         """Estimate places and forces with map and networks, once for each likelihood power."""
@@ -140,7 +158,7 @@ class CalibratedModel:
     def evaluate(self, db_uT: Float[np.ndarray, "n ch"]) -> Evaluation:
         """Evaluate map and networks on a block of readings."""
         evaluator = self.skin.evaluator
-        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT))
+        return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line)
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
         """Estimate with the networks alone."""
@@ -148,6 +166,27 @@ class CalibratedModel:
         for offset_mm in self.offsets_mm:
             estimate = replace(estimate, place_mm=estimate.place_mm + offset_mm)
         return estimate
+
+
+class HeldOutLabels(NamedTuple):
+    """Labelled presses, and their evaluation by a model that was calibrated without them."""
+
+    labels: LabelledPresses
+    evaluation: Evaluation
+
+
+def line_of_labels(folds: Sequence[HeldOutLabels]) -> ForceLine:
+    """Fit the calibration of forces to the labels whose force is known."""
+    pairs = [(fold.labels, fold.evaluation.log_forces()) for fold in folds]
+    known = [slice(None) if labels.force_known is None else labels.force_known for labels, _ in pairs]
+    true_N = [labels.force_N[which] for (labels, _), which in zip(pairs, known, strict=True)]
+    if not sum(map(len, true_N)):
+        return prior_line()
+    by_estimator = [
+        np.concatenate([log_N[i][which] for (_, log_N), which in zip(pairs, known, strict=True)])
+        for i in range(len(ESTIMATORS))
+    ]
+    return fit_line(by_estimator, np.log(np.concatenate(true_N)))
 
 
 @dataclass(frozen=True)
@@ -175,6 +214,12 @@ class PressCalibration:
         skin = condition_on_labels(self.skin, labels.place_mm, labels.force_N, labels.db_uT)
         estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
         return CalibratedModel(skin, self.layers, network_offsets_mm(self.even_mm, estimated_mm, labels.place_mm))
+
+    def held_out(self, labels: LabelledPresses) -> Iterator[HeldOutLabels]:
+        """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""
+        for kept, held_out in folds_of_labels(len(labels)):
+            model = self.with_labels(labels[kept]).with_offsets_in_biases()
+            yield HeldOutLabels(labels[held_out], model.evaluate(labels.db_uT[held_out]))
 
 
 @dataclass(frozen=True)
@@ -243,7 +288,9 @@ class Universal:
         self._misfits: np.ndarray  # of the unlabelled presses
         self._calibration: PressCalibration
         self._model: CalibratedModel
-        self._power: float | None  # None: not computed yet
+        self._folds: list[HeldOutLabels] | None  # of the labels; None: not computed yet
+        self._power: float | None
+        self._line: ForceLine | None
         self._restart(self._prior_map, CalibrationData(self.tables.rest_uT))
 
     def __repr__(self) -> str:
@@ -292,7 +339,7 @@ class Universal:
 
         With a power of 1, map and networks are trusted fully; a smaller power gives larger standard deviations.
         """
-        if self._power is None:  # cross-validation is slow, so it runs only when needed, and once per data set
+        if self._power is None:
             data = self._data
             tabulated = self.powers.power_for(len(data.presses_uT), len(data.labels), even=len(data.even_uT) > 0)
             power = lower_by_misfit(tabulated, self.misfit)
@@ -300,6 +347,13 @@ class Universal:
                 power = lower_by_residuals(power, *self.variance_inflations([power]))
             self._power = power
         return self._power
+
+    @property
+    def line(self) -> ForceLine:
+        """Calibration of forces, from the labelled presses whose force is known."""
+        if self._line is None:
+            self._line = line_of_labels(self._held_out())
+        return self._line
 
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
         """Take the mean of readings without contact as the no-load field, and condition the map on it.
@@ -342,10 +396,13 @@ class Universal:
         b_uT: Float[np.ndarray, "*m ch"],
         *,
         keep: bool = False,
+        force_known: bool = True,
     ) -> "Universal":
         """Calibrate to one or several presses at known places with known forces.
 
-        Earlier labels are discarded, unless `keep` is set.
+        Earlier labels are discarded, unless `keep` is set. If only the places are known, pass estimated forces and
+        `force_known=False`: forces are then not calibrated to these presses. A single press of known force, such as a
+        weight on the middle of the skin, calibrates the forces of the whole skin.
 
         Raises
         ------
@@ -359,12 +416,9 @@ class Universal:
         )
         check_range(forces_N, self.tables.force_N)
         db_uT, before = check_presses(self._change(readings_uT)), self._data.labels
-        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT)
+        labels = LabelledPresses(places_mm - CENTRE_MM, forces_N, db_uT, np.full(len(forces_N), force_known))
         if keep:
-            labels = LabelledPresses(
-                np.concatenate([before.place_mm, labels.place_mm]), np.concatenate([before.force_N, labels.force_N]),
-                np.concatenate([before.db_uT, labels.db_uT]),
-            )  # fmt: skip
+            labels = join_labels(before, labels)
             check_labels(labels.place_mm, labels.force_N, len(labels), REACH_MM)  # all labels together may be too many
         data, press_map = replace(self._data, labels=labels), self._calibration.skin
         if len(before):  # start again from the unlabelled presses, so that the order of calls does not matter
@@ -397,17 +451,21 @@ class Universal:
         return self.estimates(b_uT, [self.power])[0]
 
     def estimates(self, b_uT: Float[np.ndarray, "*f ch"], powers: Sequence[float]) -> list[Estimate]:
-        """Return the result of `estimate` for each likelihood power; only the standard deviations differ."""
-        estimates = self._model.estimate(self._change(b_uT), powers)
+        """Return the result of `estimate` for each likelihood power; only the places' standard deviations differ."""
+        estimates = replace(self._model, line=self.line).estimate(self._change(b_uT), powers)
         return [replace(estimate, place_mm=estimate.place_mm + CENTRE_MM) for estimate in estimates]
 
     def variance_inflations(self, powers: Sequence[float]) -> list[float]:
         """Estimate the variance inflation for each likelihood power by cross-validation over the labelled presses."""
-        labels, folds = self._data.labels, []
-        for kept, held_out in folds_of_labels(len(labels)):
-            model = self._calibration.with_labels(labels[kept]).with_offsets_in_biases()
-            folds.append((model.estimate(labels.db_uT[held_out], powers), labels.place_mm[held_out]))
+        folds = [
+            ([fold.evaluation.combined(power) for power in powers], fold.labels.place_mm) for fold in self._held_out()
+        ]
         return variance_inflations(len(powers), folds)
+
+    def _held_out(self) -> list[HeldOutLabels]:
+        if self._folds is None:  # cross-validation is slow, so it runs only when needed, and once per set of labels
+            self._folds = list(self._calibration.held_out(self._data.labels))
+        return self._folds
 
     def save(self, file: Path | str) -> None:
         """Write this skin's calibration data to a file for `load_universal(file)`; raise SchemaError before `zero`."""
@@ -446,7 +504,7 @@ class Universal:
             self._misfits[missing] = press_map.evaluator.evaluate(data.presses_uT[missing]).misfit()
         self._calibration = PressCalibration(press_map, self.networks, data)
         self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
-        self._power = None
+        self._folds = self._power = self._line = None
         return self
 
 
