@@ -44,7 +44,7 @@ FORCE_MIN_N = float(FORCES_N[0])  # lower limit for labelled presses; the map is
 MIDDLE_MM = 1.0  # presses with |x| and |y| below this are in the middle of the skin
 CHECKERBOARD, HALVES = "other colour of a checkerboard", "other half of the skin"
 WEIGHT = "weight"
-NEAREST, CONSTANT = "nearest label", "mean force of the labels"
+NEAREST = "nearest label"
 
 
 class RandomPresses(Strict):
@@ -70,18 +70,21 @@ class BoardPresses:
         """Which presses are in the middle of the skin."""
         return (np.abs(self.presses.place_mm) < MIDDLE_MM).all(axis=1)
 
-    def part(self, split: str, draw_i: int) -> Bool[np.ndarray, " m"]:
-        """Return which presses are in the part of the places that labels are drawn from; it alternates with the draw."""
+    def part(self, split: str, draw_i: int) -> Int64[np.ndarray, " m"]:
+        """Return 1 for presses in the part of the places for labels, -1 in the other part, and 0 between the parts.
+
+        The parts alternate from draw to draw.
+        """
         if split == CHECKERBOARD:
-            steps = np.rint(self.presses.place_mm / SPACING_MM).astype(int).sum(axis=1)
-            return np.array(steps % 2 == draw_i % 2)
+            colour = np.rint(self.presses.place_mm / SPACING_MM).astype(int).sum(axis=1) % 2
+            return np.array((-1) ** (colour + draw_i))
         along_mm = self.presses.place_mm[:, draw_i // 2 % 2] * (-1) ** draw_i
-        return np.array(along_mm > SPACING_MM / 2)  # presses on the line between the halves are in neither
+        return np.where(np.abs(along_mm) < SPACING_MM / 2, 0, np.sign(along_mm)).astype(int)
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Indices of the presses of one draw: unlabelled, labels in random order, the weight; and of the tested readings."""
+    """Indices of the unlabelled presses, of the labels in random order, of the weight, and of the tested readings."""
 
     unlabelled: Int64[np.ndarray, " n"]
     labels: Int64[np.ndarray, " m"]
@@ -133,15 +136,13 @@ def draw_presses(board: BoardPresses, split: str, presses_n: int, seed: int, dra
         )
     unlabelled, weight = rng.permutation(n)[:presses_n], rng.choice(middle, 1)
     part = board.part(split, draw_i)
-    tested = ~part & ~np.isin(np.arange(n), [*unlabelled, *weight])
-    if split == HALVES:
-        tested &= board.part(split, draw_i + 1)
-    if not tested.any() or not part.any():
+    tested = (part == -1) & ~np.isin(np.arange(n), [*unlabelled, *weight])
+    if not tested.any() or not (part == 1).any():
         raise SchemaError(
             f"random_presses: board {board.board} has too few presses ({n}) to be split by {split}. "
             "Remove the experiment from the scene."
         )
-    return Draw(unlabelled, rng.permutation(np.flatnonzero(part)), weight, np.flatnonzero(tested[board.press_i]))
+    return Draw(unlabelled, rng.permutation(np.flatnonzero(part == 1)), weight, np.flatnonzero(tested[board.press_i]))
 
 
 def score_draw(
@@ -279,14 +280,13 @@ GROUP = ("tested", "presses_n", "method", "labels")
 def summarise_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Average the scores over draws, then summarise them over boards."""
     frame = pd.DataFrame(rows)
-    metrics = [name for name in frame if name not in (*GROUP, "board", "draw_i")]
-    summary = []
+    metrics = [str(name) for name in frame if name not in (*GROUP, "board", "draw_i")]
+    summary: list[dict[str, Any]] = []
     for key, group in frame.groupby(list(GROUP), sort=False):
         by_board = group.groupby("board")[metrics].mean()
-        scores = {
-            name: statistic(by_board[name].to_numpy(), boards=True) for name in metrics if by_board[name].notna().all()
-        }
-        summary.append(dict(zip(GROUP, key, strict=True)) | scores)
+        known = [name for name in metrics if by_board[name].notna().all()]
+        scores: dict[str, Any] = {name: statistic(by_board[name].to_numpy(), boards=True) for name in known}
+        summary.append({**dict(zip(GROUP, key, strict=True)), **scores})
     return summary
 
 
@@ -294,14 +294,16 @@ TITLES = {
     "accuracy_pct": "within 1 mm, %", "median_mm": "median error, mm", "mse_xy_mm2": "MSE_xy, mm²", "r2_f": "R² of F",
     "coverage_pct": "place in 90 % interval, %", "half_width_mm": "half-width, mm",
     "interval_score_mm": "interval score, mm", "coverage_f_pct": "force in 90 % interval, %",
-    "half_width_f_factor": "half-width of force, factor", "r2_line_f": "R² of F, line", "r2_raw_f": "R² of F, uncalibrated",
+    "half_width_f_factor": "half-width of force, factor", "r2_line_f": "R² of F, line",
+    "r2_raw_f": "R² of F, uncalibrated",
 }  # fmt: skip
 MEANING = (
-    "Means over {draws_n} draws of presses and labels, then over boards; (a; b) are the values of the boards. The model "
-    "is calibrated to unlabelled presses at random places and forces. Labels are drawn from one part of the places; the "
-    "tested presses are in the other part and were not used in any way. Label `weight`: one press with a known force in "
-    "the middle of the skin. Force: the estimator and its line are chosen by cross-validation on the labels; `line` "
-    "always calibrates the combined force of map and networks. For `nearest label`, `line` is the mean force of the labels."
+    "Means over {draws_n} draws of presses and labels, then over boards; (a; b) are the values of the boards. The "
+    "model is calibrated to unlabelled presses at random places and forces. Labels are drawn from one part of the "
+    "places; the tested presses are in the other part and were not used in any way. Label `weight`: one press with a "
+    "known force in the middle of the skin. Forces: the estimator and its line are selected by cross-validation over "
+    "the labels. `line` always calibrates the combined force of map and networks; for `nearest label`, it is the mean "
+    "force of the labels."
 )
 
 
@@ -309,12 +311,8 @@ def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:
     """Tabulate the scores for each split, number of presses, method and number of labels."""
     lines = []
     for row in numbers["rows"]:
-        line = {
-            "tested places": row["tested"],
-            "presses": row["presses_n"],
-            "method": row["method"],
-            "labels": row["labels"],
-        }
+        line = {"tested places": row["tested"], "presses": row["presses_n"]}
+        line |= {name: row[name] for name in ("method", "labels")}
         scores = {title: show(row[name]) if name in row else "–" for name, title in TITLES.items()}
         lines.append(line | scores | {"source": source})
     return {"random_presses": tabulate(lines, meaning=MEANING.format(draws_n=numbers["draws_n"]))}

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 LOG_CENTRE_N = math.log(2.0)  # log force at which the line's intercept is defined
-# Standard deviations of intercept and slope about the identity, and of single log forces about the line. On 24 simulated
-# skins with errors of the law as in training, they are 0.33, 0.10 and 0.36; with errors twice as large, they are 0.70,
-# 0.23 and 0.55. The values are between these.
+# Standard deviations of intercept and slope about the identity, and of single log forces about the line. On 24
+# simulated skins with errors of the law as in training, they are 0.33, 0.10 and 0.36; with errors twice as large, they
+# are 0.70, 0.23 and 0.55. The values below are between these.
 INTERCEPT_SD, SLOPE_SD, SCATTER_SD = 0.5, 0.3, 0.4
 SCATTER_LABELS_N = 20  # weight of SCATTER_SD, as a number of labels
 NORMAL_90 = 1.645  # half width of a 90 % interval, in standard deviations

@@ -21,7 +21,7 @@ from reskin.universal.force import (
 from reskin.universal.law import to_chips
 from reskin.universal.model import load_universal
 
-SKINS_N, LABELS_N = 8, 20
+SKINS_N, LABELS_N = 5, 20
 
 
 def draw_log_forces(labels_n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +110,7 @@ def test_labels_improve_forces(calibrated):
 
 
 def test_estimated_forces_of_labels_do_not_calibrate_forces():
-    model, presses_uT = load_universal(), np.zeros((1, 15))
+    model = load_universal()
     rest_uT = to_chips(model.tables.rest_uT[None])
     presses_uT = to_chips(model.tables.mean_uT[11:13, 11, 4])
     model.zero(rest_uT).label([[8.4, 8.4], [9.2, 8.4]], [3.0, 3.0], rest_uT + presses_uT, force_known=False)
