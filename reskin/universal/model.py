@@ -64,22 +64,22 @@ from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weight
 # of channels are correlated, and is not fitted to any board.
 MAP_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
-FADES_PER_LABEL = 0.15  # each label weakens the centring of the networks' places, because labels determine it better
-OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of single errors about it
-MISFIT_MAX = 4.0  # chi^2 per channel, assumed; skins like those in training have about 1
-BLOCK_N = 200  # readings per block, to bound memory
+FADES_PER_LABEL = 0.15  # weakens the centring in `network_offsets_mm`, because labels determine places better
+OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
+MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
+BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT = "reskin-universal-3"
-REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # least and largest x and y, relative to the centre
-CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next press
+REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # rows: least and largest x and y, relative to the board's centre
+CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Readings evaluated by map and networks; estimates with any likelihood power are computed from it.
+    """Outputs of map and networks for some readings, from which estimates with any likelihood power are computed.
 
-    The power affects standard deviations and, in `by_map`, also places and forces.
+    The likelihood power affects standard deviations and, in `by_map`, also places and forces.
     """
 
     evaluator: MapEvaluator
@@ -238,7 +238,7 @@ class PriorModel:
 
 
 def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinMap:
-    """Condition a map on presses at unknown places, then on the evenly spread ones."""
+    """Condition a map on presses at unknown places, then on the presses that are evenly spread over the skin."""
     skin = noload_map
     if len(data.presses_uT):
         skin = condition_on_presses(skin, data.presses_uT)
@@ -250,11 +250,11 @@ def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinM
 def network_offsets_mm(
     even_mm: Float[np.ndarray, "e 2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """Return two corrections to add to the networks' places.
+    """Return two corrections to add to the places that the networks estimate.
 
-    The first moves the mean of the evenly spread presses (`even_mm`) towards the centre, by less the more labels there
-    are. The second is the mean error that then remains for labelled presses, which the networks estimate at
-    `estimated_mm`; it is shrunk by a Gaussian prior with mean zero.
+    The first correction moves the mean of `even_mm`, the estimated places of evenly spread presses, towards the centre.
+    Its size decreases with the number of labels. The second correction is the mean error that then remains for labelled
+    presses (estimated at `estimated_mm`, truly at `place_mm`), shrunk by a Gaussian prior with mean zero.
     """
     centre_mm = -even_mm.mean(axis=0) / (1 + FADES_PER_LABEL * len(place_mm)) if len(even_mm) else np.zeros(2)
     off_mm = place_mm - (estimated_mm + centre_mm)
@@ -285,7 +285,7 @@ class Universal:
         self._noload_uT: np.ndarray | None = None
         self._prior_map = new_map(self.tables)
         self._noload_map: SkinMap
-        self._misfits: np.ndarray  # of the unlabelled presses
+        self._misfits: np.ndarray  # misfit of each unlabelled press
         self._calibration: PressCalibration
         self._model: CalibratedModel
         self._folds: list[HeldOutLabels] | None  # of the labels; None: not computed yet
@@ -330,7 +330,10 @@ class Universal:
 
     @property
     def misfit(self) -> float:
-        """Median chi^2 per channel of unlabelled presses: about 1 for skins as in training; 1 if there are too few."""
+        """Median chi^2 per channel of unlabelled presses: about 1 for skins like those in training.
+
+        The value is 1 if there are too few presses.
+        """
         return float(np.median(self._misfits)) if self.powers.are_enough(len(self._misfits)) else 1.0
 
     @property
@@ -356,10 +359,10 @@ class Universal:
         return self._line
 
     def zero(self, b_uT: Float[np.ndarray, "*f ch"], *, keep: bool = False) -> "Universal":
-        """Take the mean of readings without contact as the no-load field, and condition the map on it.
+        """Set the no-load field to the mean of readings without contact, and condition the map on it.
 
-        Earlier presses are discarded, unless `keep` is set, as it should be for the same skin after drift. The model
-        is changed in place and returned.
+        Earlier presses are discarded, unless `keep` is set. Set `keep` to correct the drift of a skin that the model is
+        already calibrated to. The model is changed in place and returned.
 
         Raises
         ------
@@ -376,9 +379,10 @@ class Universal:
     def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
-        Use dozens of presses all over the skin, in one or several calls. The first set is used in several rounds of
-        estimation, later sets in one. Set `even` if these and all earlier presses together are evenly spread over the
-        skin (for example a grid with one press per place), so that their mean place is the skin's centre.
+        Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
+        expectation maximisation with its presses, each later call one round. Set `even` if these and all earlier
+        presses together are evenly spread over the skin (for example a grid with one press per place), so that their
+        mean place is the skin's centre.
         """
         db_uT, data = check_presses(self._change(check_readings(b_uT))), self._data
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
@@ -500,7 +504,7 @@ class Universal:
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
         """Set the map that is conditioned on the unlabelled presses, and condition it on the labels."""
         missing = np.isnan(self._misfits)
-        if missing.any():  # a press keeps the misfit that it has in the first map conditioned on it
+        if missing.any():  # each press keeps its misfit under the first map that was conditioned on it
             self._misfits[missing] = press_map.evaluator.evaluate(data.presses_uT[missing]).misfit()
         self._calibration = PressCalibration(press_map, self.networks, data)
         self._model = self._calibration.with_labels(data.labels).with_offsets_in_biases()
