@@ -188,7 +188,7 @@ def _cached(designed: DesignedSkins, what: str, make: Callable[[], np.ndarray]) 
 
 
 def _skins_array(designed: DesignedSkins, which: slice) -> np.ndarray:
-    """Draw skins for training, as one array for the cache."""
+    """Draw skins for training; return all values of each press in one row, so that the cache needs only one array."""
     skins = designed.draw("taught", which)
     rest_uT = np.repeat(skins.rest_uT[:, None], skins.db_uT.shape[1], axis=1)
     return np.concatenate([skins.db_uT, rest_uT, skins.place_mm, skins.force_N[..., None]], axis=2)
@@ -433,7 +433,7 @@ def over_boards(rows: pd.DataFrame, *keys: str) -> list[dict[str, Any]]:
 
 
 def population(settings: Settings, section: PopulationSettings, folds: Path, indentations: Path, results: Path) -> None:
-    """Score the universal model, built from simulated skins, on every held-out skin of a simulated scene."""
+    """Score the universal model, built from simulated skins alone, on every held-out skin of a simulated scene."""
     data, simulation = read_data(settings, indentations, folds), simulation_settings(settings)
     kind, design = simulation.main_boards, settings.shared_section(SkinDesign, "skin")
     designed = designed_skins(design, kind, simulation.main.depths_mm, settings.seed)

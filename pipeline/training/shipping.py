@@ -1,4 +1,4 @@
-"""Train the universal model that is part of `reskin`: `python -m pipeline.training.shipping` (minutes on one core).
+"""Train the universal model that is part of `reskin`: `python -m pipeline.training.shipping` (a few minutes).
 
 Writes reskin/universal/universal.safetensors and its card. The network has the training settings and the seed of scene
 lab, where it is tested as `universal, simulated alone`. The likelihood powers are calibrated on simulated skins.
@@ -36,7 +36,7 @@ from reskin.universal.population import Population
 from reskin.universal.training import NOMINAL_NAME, SkinPrior, TrainingSettings, train_networks
 
 PRESSES_N = (0, 12, FULL_SET_N)  # tabulated numbers of unlabelled presses; `reskin live` asks users for 12
-PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses, and whether evenly spread
+PRESS_SETS = (*((n, False) for n in PRESSES_N), (FULL_SET_N, True))  # number of presses; evenly spread or not
 NO_POWERS = LikelihoodPowers({n: {0: 1.0} for n in PRESSES_N}, {0: 1.0})
 CARD = {
     "name": "universal, simulated alone",

@@ -89,7 +89,7 @@ class PoolCalibration:
         return Powers(*(lower_by_misfit(power, self.misfit) for power in powers))
 
     def reordered(self, first: Int64[np.ndarray, " k"]) -> "PoolCalibration":
-        """Return this calibration with the given presses first in the pool."""
+        """Return this calibration with the pool reordered: the presses with indices `first` come first."""
         order = np.concatenate([first, np.setdiff1d(np.arange(len(self.pool)), first)])
         pool = self.pool[order]
         # Condition the networks again, because their sums over the pool depend on its order in the last bits.
@@ -196,7 +196,7 @@ def score_estimates(known: KnownBoards, test: Int64[np.ndarray, " b"], estimate:
 
 
 def pool_rows(data: SceneData, fold: Fold) -> list[Int64[np.ndarray, " r"]]:
-    """Return the rows of each press of the pool, in the order in which experiment `labels` labels the presses."""
+    """Return the rows of each press in a fold's pool; the order is that in which experiment `labels` adds labels."""
     indentation = data.rows.indentation[fold.pool]
     return [fold.pool[indentation == press] for press in labelling_order(data.rows, fold, data.settings.seed)]
 
@@ -243,7 +243,7 @@ def calibrate_on_boards(benchmark: Benchmark, labels_n: Sequence[int]) -> dict[s
 
 
 def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int) -> dict[int, Powers]:
-    """Choose powers for a misfit of 1 on simulated skins, by number of labels.
+    """Choose likelihood powers for a misfit of 1, by number of labels, from coverage on simulated skins.
 
     For a board, these powers are divided by the board's misfit (Birge's ratio) and by the variance inflation of its
     labels. The law's errors on the simulated skins are as large as in training. If there are labels, skins with errors
@@ -260,7 +260,7 @@ def calibrate_on_simulated(nominal: Variant, labels_n: Sequence[int], seed: int)
 
 
 def best_powers(candidates: Sequence[float], of_skins: Sequence[Coverages]) -> Powers:
-    """Choose the powers whose 90 % intervals have a coverage closest to 90 %, averaged over skins."""
+    """Choose the powers for which the coverage of 90 % intervals, averaged over skins, is closest to 90 %."""
     map_i, combined_i = np.abs(np.mean(of_skins, axis=0) - 0.9).argmin(axis=0)
     return Powers(candidates[map_i], candidates[combined_i])
 

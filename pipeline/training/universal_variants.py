@@ -54,11 +54,11 @@ class Frame:
         return np.einsum("kij,nkj->nki", self.turn, of_chips).reshape(len(b_uT), -1)
 
     def place(self, label_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Convert labels to places in the board's frame."""
+        """Convert label coordinates to places in the board's frame."""
         return (label_mm - self.middle_mm) * (1, -1 if self.mirrored else 1)
 
     def label(self, place_mm: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Convert places in the board's frame to labels."""
+        """Convert places in the board's frame to label coordinates."""
         return place_mm * (1, -1 if self.mirrored else 1) + self.middle_mm
 
 
@@ -147,7 +147,7 @@ def residual_of(presses: Mapping[str, AlignedPresses], laws: Mapping[str, Law], 
 
 
 def recorded_board(rows: Rows, frame: Frame, board: str, rest_uT: Float[np.ndarray, " ch"]) -> RecordedBoard:
-    """Select a board's readings for training: the same number for each press with a force."""
+    """Select a board's readings for training: `READINGS_N` of each press with a force, repeated if it has fewer."""
     own = np.flatnonzero((rows.board == board) & (rows.target[:, 2] > 0))
     _, first, counts = np.unique(rows.indentation[own], return_index=True, return_counts=True)
     rows_by_press = own[

@@ -71,7 +71,7 @@ def _search(known: Chart, db_uT: Float[np.ndarray, "n ch"]) -> SearchResult:
     nearest = distance_uT2.argmin(axis=1)
     off_uT, slope_uT = db_uT - known.field_uT[nearest], known.slope_uT[nearest]
     square = slope_uT.transpose(0, 2, 1) @ slope_uT
-    damping = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # if a coordinate has no effect
+    damping = 1e-6 * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # in case a coordinate has no effect
     steps = np.linalg.solve(square + damping, np.einsum("nci,nc->ni", slope_uT, off_uT)[..., None])[..., 0]
     steps = np.clip(steps, -CELL, CELL)
     residual_uT = off_uT - np.einsum("nci,ni->nc", slope_uT, steps)

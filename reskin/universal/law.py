@@ -193,8 +193,8 @@ def with_parameters(law: Law, names: tuple[str, ...], values: Float[np.ndarray, 
     return Law(**(asdict(law) | dict(zip(names, map(float, values), strict=True))))
 
 
-# Settings of fits, all assumed. START: start values, which are also the means of the priors. PRIOR: standard deviations
-# of the priors. STEP: scales of the parameters.
+# Assumed values for fits. START: start values, which are also the means of the priors. PRIOR: standard deviations of
+# the priors. STEP: scales of the parameters.
 START = Law(0.0, 0.0, 0.0, 1.5, 1.5, 0.0, 0.0, 0.2, 5.0, 0.0, 0.0)
 PRIOR = Law(1.0, 1.0, 3.0, 0.4, 0.5, 1.0, 1.0, 0.25, 10.0, 60.0, 60.0)
 STEP = Law(0.3, 0.3, 1.0, 0.2, 0.2, 0.4, 0.4, 0.07, 4.0, 20.0, 20.0)
@@ -203,8 +203,8 @@ TEN = (*OF_BOARD, "modulus_MPa", "away_um_mm", "give_x_um", "give_y_um")
 # Parameters that may differ between boards. When only these are fitted, the others come from a fit to another board.
 SEVEN = (*OF_BOARD, "rotation_deg")
 PRIOR_WEIGHT = 0.25  # chosen on both boards of scene lab; with 0.5, one of four fits explains only 79.6 % of |dB|^2
-# Weight of the residuals for the growth of |dB| with force: mean error of log|dB| in each group of presses, minus the
-# mean over all groups.
+# Weight of the residuals that compare the growth of |dB| with force. Each group of presses has one such residual: the
+# group's mean error of log|dB|, minus the mean over all groups.
 GROWTH_WEIGHT = 10.0
 OFFSET_uT = 200.0  # standard deviation of the no-load field due to chips' offsets (spreads.chip_offset_uT)
 # Maximum number of least-squares steps. The fits of scene lab need 5. A tenfold smaller ftol changes the cosine between

@@ -240,7 +240,7 @@ def with_noise(cov_uT2: Float[np.ndarray, "h ch ch"]) -> Float[np.ndarray, "h ch
 OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (200) and error of the law (250)
 SHARE_MIN = 0.03  # least fraction of the law's error variance that remains, however many labels there are
 PRESS_WEIGHT = 0.2  # weight of an unlabelled press; below 1, because the law's errors at nearby places are correlated
-ROUNDS_N = 3  # rounds of expectation maximisation
+ROUNDS_N = 3  # default number of rounds of expectation maximisation
 EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses from the centre of the labels' frame
 WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
 
@@ -337,7 +337,10 @@ class MapEvaluator:
             raise SchemaError(f"map of a skin: {what}. Repeat the no-load reading.")
 
     def _errors(self, skin: SkinMap) -> tuple[Float32[np.ndarray, "h ch"], Float32[np.ndarray, " h"]]:
-        """Return, for each hypothesis, the law's expected error, and the fraction of variance that labels leave."""
+        """Return, for each hypothesis, the law's expected relative error, and how much of its variance remains.
+
+        The second value is the fraction of the error's variance that remains after conditioning on the labels.
+        """
         expected, labelled = skin.hypotheses.residual, skin.labelled
         if labelled is None:
             return expected, np.ones(len(expected), np.float32)
@@ -358,7 +361,7 @@ class MapEvaluator:
         return Estimate(*moments, likelihoods.misfit(), np.full(len(likelihoods.best), np.nan))
 
     def estimate(self, db_uT: Float[np.ndarray, "n ch"], block_n: int = 200) -> Estimate:
-        """Estimate places and forces of readings as means over all hypotheses."""
+        """Estimate places and forces of readings as means over all hypotheses, weighted by their likelihoods."""
         starts = range(0, len(db_uT), block_n)
         return concatenate([self.mean(self.evaluate(db_uT[i : i + block_n]), 1.0) for i in starts])
 
@@ -380,7 +383,7 @@ def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds
     information, expected_uT, posterior = skin.hypotheses.information, skin.hypotheses.expected_uT, skin
     for _ in range(rounds_n):
         weight = PRESS_WEIGHT * posterior.evaluator.evaluate(db_uT).probabilities()
-        total = weight.sum(axis=0)  # over presses, for each hypothesis
+        total = weight.sum(axis=0)  # sum over presses for each hypothesis
         kept = np.flatnonzero(total > WEIGHT_MIN * total.max())
         off_uT = weight[:, kept].T @ db_uT.astype(np.float32) - total[kept][:, None] * expected_uT[kept]
         matrix = (total[kept] @ information.matrix[kept]).reshape(skin.cov.shape)

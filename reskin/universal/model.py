@@ -64,7 +64,7 @@ from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weight
 # of channels are correlated, and is not fitted to any board.
 MAP_POWER = 0.6
 SD_MIN_MM, SD_MIN_LOG_N = 0.5, 0.3  # least standard deviations of the networks' estimates
-FADES_PER_LABEL = 0.15  # weakens the centring in `network_offsets_mm`, because labels determine places better
+FADES_PER_LABEL = 0.15  # how much each label reduces the first correction in `network_offsets_mm`
 OFFSET_SD_MM, LABEL_SD_MM = 0.3, 1.0  # sd of the networks' constant error in place; sd of a single press's error
 MISFIT_MAX = 4.0  # assumed limit of chi^2 per channel, for a warning; skins like those in training have about 1
 BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
@@ -161,7 +161,7 @@ class CalibratedModel:
         return Evaluation(evaluator, evaluator.evaluate(db_uT), self.evaluate_networks(db_uT), self.line)
 
     def evaluate_networks(self, db_uT: Float[np.ndarray, "n ch"]) -> NetworkEstimate:
-        """Estimate with the networks alone."""
+        """Estimate places and forces with the networks alone, with the offsets added to the places."""
         estimate = network.evaluate(self.networks, db_uT)
         for offset_mm in self.offsets_mm:
             estimate = replace(estimate, place_mm=estimate.place_mm + offset_mm)
@@ -201,7 +201,7 @@ class PressCalibration:
 
     @cached_property
     def layers(self) -> list[Layers]:
-        """The conditioned networks."""
+        """The networks, conditioned on the skin's no-load field and its presses at unknown places."""
         return [network.condition(weights, self.data.rest_uT, self.data.presses_uT) for weights in self.networks]
 
     @cached_property
@@ -210,7 +210,7 @@ class PressCalibration:
         return network.evaluate(self.layers, self.data.even_uT).place_mm
 
     def with_labels(self, labels: LabelledPresses) -> CalibratedModel:
-        """Condition on labelled presses."""
+        """Condition the map on labelled presses, and compute the offsets of the networks' places from them."""
         skin = condition_on_labels(self.skin, labels.place_mm, labels.force_N, labels.db_uT)
         estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
         return CalibratedModel(skin, self.layers, network_offsets_mm(self.even_mm, estimated_mm, labels.place_mm))
@@ -263,7 +263,7 @@ def network_offsets_mm(
 
 @dataclass
 class Universal:
-    """The model for the paper's board that comes with the project; it can be calibrated during use.
+    """The universal model that comes with the project, for the paper's board; it can be calibrated during use.
 
     First call `zero` with readings without contact. Then call `see` with presses at unknown places and `label` with
     presses at known places, in any order and any number of times. Each of these three methods changes the model in
@@ -496,13 +496,13 @@ class Universal:
         return to_board(check_shape(b_uT) - self.noload_uT)
 
     def _restart(self, noload_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Calibrate to all data, given the map that is conditioned on the no-load field only."""
+        """Calibrate to `data` from scratch, starting with a map that is conditioned on the no-load field only."""
         self._noload_map = noload_map
         self._misfits = np.full(len(data.presses_uT), np.nan)
         return self._set(condition_on_unlabelled(noload_map, data), data)
 
     def _set(self, press_map: SkinMap, data: CalibrationData) -> "Universal":
-        """Set the map that is conditioned on the unlabelled presses, and condition it on the labels."""
+        """Replace the calibration: `press_map` is conditioned on the unlabelled presses, and now on the labels."""
         missing = np.isnan(self._misfits)
         if missing.any():  # each press keeps its misfit under the first map that was conditioned on it
             self._misfits[missing] = press_map.evaluator.evaluate(data.presses_uT[missing]).misfit()

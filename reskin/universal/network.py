@@ -20,7 +20,7 @@ DIRECTION_GAIN, LOG_uT, REST_uT = 4.0, 6.5, 1500.0  # scale the inputs dB/|dB|, 
 LENGTH_MIN_uT = 1.0  # if |dB| is smaller, dB is divided by this value instead, so that tiny changes have no direction
 PLACE_MM, LOG_N = 8.0, 3.0  # scales of the outputs: place in mm, log force
 LOG_SD = (-5.0, 2.0)  # bounds of the log standard deviations of scaled outputs
-FULL_SET_N = 65  # maximum number of unlabelled presses for conditioning, in training and use
+FULL_SET_N = 65  # a network is conditioned on at most this number of unlabelled presses
 
 
 class Layers(NamedTuple):
@@ -76,7 +76,7 @@ def predict(
     rest_uT: Float[np.ndarray, " ch"],
     presses_uT: Float[np.ndarray, "c ch"],
 ) -> NetworkEstimate:
-    """Condition networks on a skin and evaluate them."""
+    """Condition networks on a skin, and estimate places and forces of readings with them."""
     return evaluate([condition(weights, rest_uT, presses_uT) for weights in networks], db_uT)
 
 
@@ -94,7 +94,7 @@ def to_tensors(networks: Sequence[Weights]) -> dict[str, np.ndarray]:
 
 
 def from_tensors(tensors: Mapping[str, np.ndarray]) -> list[Weights]:
-    """Return the networks' weights, in order, from the arrays of a file."""
+    """Return the weights of each network from the named arrays of a file, in the networks' order."""
     networks: dict[int, dict[str, np.ndarray]] = {}
     for key, value in tensors.items():
         i, _, name = key.partition(".")

@@ -19,7 +19,7 @@ from reskin.universal.map import LOGARITHMIC, perturb
 COARSE = Quadrature(cell_m=1.0e-3, layers_n=4)  # coarser than `law.RULE`; the law itself has larger errors
 PLACES_N = 65  # places of the paper's grid; a network is conditioned on at most this number of presses
 PRESSES_N = 2 * PLACES_N  # presses per skin: half for conditioning, half for training
-PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of a press about its grid place
+PITCH_MM, JITTER_MM = 2.0, 0.05  # pitch of the grid; standard deviation of a press from its grid place
 ANYWHERE_SHARE = 0.5  # fraction of the presses for training that are anywhere on the skin; the others are on the grid
 
 # Variation of boards and skins in addition to that of the law's parameters. These values and the parameters' spreads
@@ -127,14 +127,17 @@ def draw_skin(
 
 
 def draw_places(rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:
-    """Draw places of presses in mm from the board's centre: the whole grid, then half of it, then places anywhere."""
+    """Draw places of presses in mm from the board's centre.
+
+    The order is: all places of the grid, half of them again, and places anywhere on the skin.
+    """
     grid_mm = grid()
     anywhere_n = int(PLACES_N * ANYWHERE_SHARE)
     repeated_mm = grid_mm[rng.permutation(PLACES_N)[anywhere_n:]]
     near_mm = np.concatenate([grid_mm, repeated_mm])
     near_mm = near_mm + JITTER_MM * rng.standard_normal(near_mm.shape)
     limit_mm = np.abs(grid_mm).max() + 0.3
-    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))  # about 85 % of them are inside
+    anywhere_mm = rng.uniform(-limit_mm, limit_mm, (8 * anywhere_n, 2))  # about 85 % of these are on the skin
     return np.concatenate([near_mm, anywhere_mm[inside(anywhere_mm)][:anywhere_n]])
 
 

@@ -34,7 +34,7 @@ class RecordedPresses:
     force_N: Float[np.ndarray, " n"]
     db_uT: Float[np.ndarray, "n k 3"]
     noload_uT: Float[np.ndarray, "n k 3"]
-    noise_uT: Float[np.ndarray, "3"]  # standard deviation of readings about the mean of their press, by axis
+    noise_uT: Float[np.ndarray, "3"]  # standard deviation of readings from the mean of their press, along x, y and z
     excluded_n: int  # number of excluded presses: unknown place, or force unknown or not above 0 N
 
     def __len__(self) -> int:
@@ -125,7 +125,7 @@ def memory(
         own = np.flatnonzero(presses.capture_i == capture_i)
         rest = noload_uT[own].reshape(len(own), -1)
         if len(own) < SERIES_MIN_N or (np.diff(rest, axis=0) == 0).all(axis=1).any():
-            continue  # too short, or no-load readings were not taken before each press
+            continue  # too short, or without a no-load reading before each press
         drift = np.polynomial.legendre.legvander(np.linspace(-1, 1, len(own) - 1), DRIFT_DEGREE)
         db = db_uT[own].reshape(len(own), -1)
         residuals = [part - drift @ np.linalg.lstsq(drift, part)[0] for part in (rest[1:], db[:-1], db[1:])]

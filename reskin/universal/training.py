@@ -41,7 +41,7 @@ OUTPUTS_N = 6  # x, y, log F, and the log standard deviation of each
 
 
 class Network(nn.Module):
-    """Set encoder and regressor in PyTorch; the weights have the names of `draw_weights`."""
+    """Set encoder and regressor in PyTorch; the names of the weights are those from `draw_weights`."""
 
     def __init__(self, weights: Weights) -> None:
         super().__init__()
@@ -77,8 +77,8 @@ class Network(nn.Module):
 def inputs(db_uT: Float[torch.Tensor, "b n ch"], rest_uT: Float[torch.Tensor, "b ch"]) -> Float[torch.Tensor, "b n i"]:
     """Return direction and log magnitude of each field change, and the skin's no-load field, scaled to about 1.
 
-    NumPy is used because the results of `torch.log` differ between processors. This breaks no gradient that training
-    needs, because inputs depend only on readings.
+    NumPy is used because the results of `torch.log` differ between processors. The result has no gradients; training
+    needs none, because inputs do not depend on weights.
     """
     db, rest = db_uT.numpy(), rest_uT.numpy() / np.float32(REST_uT)
     length_uT = np.maximum(np.linalg.norm(db, axis=-1, keepdims=True), np.float32(LENGTH_MIN_uT))
@@ -107,8 +107,8 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
 SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # skins per step; recorded ones among them, if any
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
-NO_PRESSES_SHARE = 0.25  # fraction of skins without presses for conditioning; the others have 1 to 65
-NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading, by axis
+NO_PRESSES_SHARE = 0.25  # fraction of skins on which the network is conditioned without presses; else with 1 to 65
+NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading's noise along x, y and z
 RESIDUAL_SCALE_MAX = 2.0  # the residual from recorded boards is multiplied by a random factor between 0 and this value
 # Ranges from which the law's relative rms error is drawn: for simulated skins of a prior made with known boards, for
 # simulated skins of the nominal prior, and for recorded boards.
@@ -127,7 +127,7 @@ class TrainingSettings(Strict):
 
 @dataclass(frozen=True)
 class RecordedBoard:
-    """Readings of a recorded board in its frame and axes, the same number for each press."""
+    """Readings of a recorded board in the board's frame and axes, with the same number of readings for each press."""
 
     db_uT: Float32[np.ndarray, "m r ch"]
     rest_uT: Float32[np.ndarray, " ch"]
@@ -242,7 +242,7 @@ class Batches:
 
 
 def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Draw one reading for each of 130 presses of a recorded board; if it has fewer presses, some repeat."""
+    """Draw 130 presses of a recorded board (some repeatedly if it has fewer), and one reading of each."""
     press = np.resize(rng.permutation(len(board.db_uT)), PRESSES_N)
     reading = rng.integers(board.db_uT.shape[1], size=PRESSES_N)
     return board.db_uT[press, reading], board.rest_uT, board.place_mm[press], np.log(board.force_N[press, reading])
@@ -275,7 +275,7 @@ def add_error(
     coordinates = np.concatenate([place_mm, log_N[..., None]], axis=-1)
     phase = rng.uniform(0, 2 * np.pi, (skins_n, 1, ERROR_WAVES_N)).astype(np.float32)
     amplitude = rng.standard_normal((skins_n, ERROR_WAVES_N, channels_n), np.float32)
-    unit = np.cos(coordinates @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # its variance is 1
+    unit = np.cos(coordinates @ wave + phase) @ amplitude * np.float32(np.sqrt(2 / ERROR_WAVES_N))  # unit variance
     chips = db_uT.reshape(*db_uT.shape[:2], -1, len(NOISE_uT))
     chip_scale = np.repeat(np.linalg.norm(chips, axis=-1), len(NOISE_uT), axis=-1) / np.sqrt(np.float32(len(NOISE_uT)))
     total_scale = np.linalg.norm(db_uT, axis=-1, keepdims=True) / np.sqrt(np.float32(channels_n))
