@@ -107,7 +107,10 @@ class DesignedSkins:
     seed: int
 
     def draw(self, name: str, which: slice, weight_N: float | None = None) -> Population:
-        """Draw the skins `which` of the population `name`; if `weight_N` is given, each skin's last press is by it."""
+        """Draw the skins `which` of the population `name`.
+
+        If `weight_N` is given, the last press on each skin is by a weight of this force.
+        """
         prior, rng = self.prior, rng_for(self.seed, "population", name)
         return draw_population(prior.centre, prior.spreads, prior.setup, which, rng, Forces(*self.forces_N, weight_N))
 
@@ -267,7 +270,7 @@ def find_weight(data: SceneData, own: np.ndarray, frame: Frame, rng: np.random.G
 
 
 def known_weight(db_uT: Float[np.ndarray, " ch"], force_N: float, rng: np.random.Generator) -> KnownWeight:
-    """Return a press as one by a known weight; the assumed force is drawn around the true force."""
+    """Return a press as a press by a known weight; its assumed force is drawn around the true force."""
     return KnownWeight(db_uT, force_N * float(np.exp(WEIGHT_SD * rng.standard_normal())))
 
 

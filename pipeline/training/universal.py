@@ -117,7 +117,10 @@ def estimate(model: CalibratedModel, db_uT: Float[np.ndarray, "n ch"], powers: S
 
 
 def with_deviation_of(estimate: Estimate, other: Estimate) -> Estimate:
-    """Return `estimate` with new standard deviations: its rms error if the true place is distributed as in `other`."""
+    """Return `estimate` with other standard deviations.
+
+    They are the rms errors of `estimate` if the true place is distributed as in `other`.
+    """
     return replace(estimate, sd_mm=np.hypot(other.sd_mm, other.place_mm - estimate.place_mm))
 
 

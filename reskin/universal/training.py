@@ -51,7 +51,10 @@ class Network(nn.Module):
         self, db_uT: Float[torch.Tensor, "b c ch"], rest_uT: Float[torch.Tensor, "b ch"],
         kept: Float[torch.Tensor, "b c"],
     ) -> Float[torch.Tensor, "b 64"]:  # fmt: skip
-        """Compute the code of each skin from the presses for which `kept` is 1; without them, pooled features are 0."""
+        """Compute the code of each skin from the presses for which `kept` is 1.
+
+        If there are no such presses, the pooled features are 0.
+        """
         features = torch.relu(self._linear("set1", inputs(db_uT, rest_uT)))
         features = torch.relu(self._linear("set2", features)) * kept[..., None]
         kept_n = kept.sum(1, keepdim=True)
@@ -107,7 +110,7 @@ def draw_weights(channels_n: int, rng: np.random.Generator) -> dict[str, np.ndar
 SKINS_PER_STEP_N, RECORDED_PER_STEP_N = 10, 2  # skins per step; recorded ones among them, if any
 RATE_MAX, WEIGHT_DECAY, WARM_UP, GRADIENT_NORM_MAX = 2.5e-3, 1e-4, 0.15, 1.0
 HUBER_DELTA, HUBER_WEIGHT, SD_WEIGHT = 0.1, 4.0, 0.02
-NO_PRESSES_SHARE = 0.25  # fraction of skins on which the network is conditioned without presses; else with 1 to 65
+NO_PRESSES_SHARE = 0.25  # fraction of skins for which the network is conditioned on no press; else 1 to 65 presses
 NOISE_uT = (3.3, 3.3, 5.0)  # standard deviation of a reading's noise along x, y and z
 RESIDUAL_SCALE_MAX = 2.0  # the residual from recorded boards is multiplied by a random factor between 0 and this value
 # Ranges from which the law's relative rms error is drawn: for simulated skins of a prior made with known boards, for
@@ -249,7 +252,10 @@ def draw_recorded(board: RecordedBoard, rng: np.random.Generator) -> tuple[np.nd
 
 
 def draw_kept(n: int, rng: np.random.Generator) -> Float32[np.ndarray, "n c"]:
-    """Draw the presses that the network is conditioned on (1 in the result): none for some skins, else 1 to 65."""
+    """Draw which presses of each skin the network is conditioned on (1: yes, 0: no).
+
+    A fraction `NO_PRESSES_SHARE` of the skins has no such press; the others have 1 to 65.
+    """
     kept_n = np.where(rng.random(n) < NO_PRESSES_SHARE, 0, rng.integers(1, PLACES_N + 1, n))
     rank = rng.random((n, PLACES_N)).argsort(axis=1).argsort(axis=1)
     return (rank < kept_n[:, None]).astype(np.float32)
