@@ -98,7 +98,7 @@ def _need(where: str, what: str, rule: str, got: np.ndarray, valid: Bool[np.ndar
 
 
 FORMAT, FORMAT_1 = "reskin-skin-2", "reskin-skin-1"  # files of the first format do not tell which forces are known
-SHAPES: Mapping[str, tuple[int, ...]] = {  # shapes of the arrays, without the first axis (presses)
+SHAPES: Mapping[str, tuple[int, ...]] = {  # arrays in the file, with their shapes after the first axis (presses)
     "pokes_uT": (CHANNELS_N,),
     "even_uT": (CHANNELS_N,),
     "labelled_mm": (2,),
@@ -171,7 +171,10 @@ def write_calibration(data: CalibrationData, file: Path) -> None:
 
 
 def is_calibration(file: Path) -> bool:
-    """Return whether a file is one of `write_calibration`; raise SchemaError if a file of such a size is damaged."""
+    """Return whether `write_calibration` wrote this file.
+
+    Raises SchemaError if the file is damaged, unless it is too large for a file of calibration data.
+    """
     return file.stat().st_size <= FILE_BYTES_MAX_N and io.read_tensors(file)[1].get("format") in (FORMAT, FORMAT_1)
 
 

@@ -232,7 +232,7 @@ LEAST = math.log(TINY)
 # Power of the map's probabilities of forces if the map alone estimates forces. It is small, because the map is too sure
 # of forces that the law hardly distinguishes. Chosen on both boards of scene lab.
 FORCE_POWER = 0.3
-FARTHEST = 200.0  # log likelihoods further below the largest one than this are raised to this distance
+FARTHEST = 200.0  # log likelihoods are clipped at this distance below the largest one
 
 
 class Lattice(NamedTuple):
@@ -262,10 +262,11 @@ def products(
     deviance: Float32[np.ndarray, "n h"], best: Int64[np.ndarray, " n"], lattice: Lattice, normals: Normals,
     map_power: float, power: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Return moments of the map's marginal probabilities of places and of forces, each times normal distributions.
+    """Multiply the map's marginal probabilities of place and of force by normal distributions; return the moments.
 
-    The fourth array has the mean log forces of the map alone, weighted by a power `FORCE_POWER` of its probabilities.
-    map_power: power of the map's likelihoods. power: power of the product; it affects standard deviations only.
+    The fourth array contains the mean log forces of the map alone, weighted by the power `FORCE_POWER` of its
+    probabilities. normals: normal distributions of x, y and log F for each reading. map_power: power of the map's
+    likelihoods. power: power of the product; it affects standard deviations only.
     """
     moments = np.empty((len(deviance), 6))
     _products(deviance, best, tuple(lattice), normals, (0.5 * map_power, power), moments)
