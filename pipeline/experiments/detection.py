@@ -26,7 +26,7 @@ def direction_distance(
 ) -> Float[np.ndarray, " f"]:
     """Return, for each row of `tested_uT`, the mean distance to its `NEIGHBOURS_N` nearest rows of `known_uT`.
 
-    Distances are between the vectors dB / (|dB| + noise), which depend on direction; they are short for weak fields.
+    Distances are between the vectors dB / (|dB| + noise): they compare directions, and count little if fields are weak.
     """
     known, tested = (
         db_uT / (np.linalg.norm(db_uT, axis=1, keepdims=True) + NOISE_uT) for db_uT in (known_uT, tested_uT)

@@ -99,7 +99,7 @@ def sizes_by_depth(readings: Readings) -> dict[float, np.ndarray]:
 
 
 def strength_ratio(flexible: Sequence[ByDepth], rigid: Sequence[ByDepth]) -> dict[str, float]:
-    """Return median |dB| of flexible boards / median |dB| of rigid boards, summarised over the depths of both."""
+    """Return median |dB| of flexible boards / median |dB| of rigid boards, summarised over their common depths."""
 
     def median_uT(captures: Sequence[ByDepth], depth_mm: float) -> float:
         return float(np.median(np.concatenate([capture[depth_mm] for capture in captures if depth_mm in capture])))
