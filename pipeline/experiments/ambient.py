@@ -110,7 +110,8 @@ class Instrument:
     board: Board
     aside: Board
     turn: Float[np.ndarray, "k 3 3"]
-    noise_uT: Float[np.ndarray, " 3"]  # standard deviation, per axis, of the noise of the reference chip's change of field
+    # Noise of the reference chip's change of field: standard deviation per axis.
+    noise_uT: Float[np.ndarray, " 3"]
 
 
 @dataclass(frozen=True)

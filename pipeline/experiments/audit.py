@@ -383,7 +383,7 @@ def audit_scaler(
     sides: Sides,
     fit: Callable[[np.ndarray, np.ndarray], Arrays],
 ) -> Check:
-    """Check that a network's scaler was fitted to the training rows only, and not to training and test rows together."""
+    """Check that a network's scaler was fitted to the training rows only, and not to training and test rows."""
     both_sides = np.concatenate([sides.train, sides.test])
     train_gap, both_gap = (
         _relative_gap(where, arrays, fit(db_uT[side], target[side])) for side in (sides.train, both_sides)

@@ -276,7 +276,10 @@ AS_SAID = "Labels, chips and skin lie as the scene says."
 
 @dataclass(frozen=True)
 class Turn:
-    """Orientation of axes (of a chip or the labels) relative to the scene's: sign changes, then quarter turns about z."""
+    """Orientation of axes (of a chip or the labels) relative to the scene's.
+
+    The axes of the scene first change their signs, and are then rotated by quarter turns about z.
+    """
 
     quarters: int
     signs: tuple[int, int, int]

@@ -319,7 +319,7 @@ ASSUMED = [Powers(ASSUMED_POWER, ASSUMED_POWER)]
 
 @dataclass(frozen=True)
 class Seconds:
-    """Processor time for calibrating a method to a skin, and per reading if many readings are estimated together."""
+    """Processor times in s: to calibrate a method to a skin, and to estimate one of many readings in one call."""
 
     name: str
     train_s: float
@@ -332,9 +332,10 @@ Estimated = tuple[str, Float[np.ndarray, "b 2"], Float[np.ndarray, " b"], Second
 def score_unlabelled(
     known: KnownBoards, folds: Sequence[Fold], fold: Fold, variants: Variants
 ) -> tuple[list[Point], list[Seconds]]:
-    """Score the universal models and the inversion with unlabelled pokes of the test skin, none, and another skin's.
+    """Score the universal models and the inversion with three sets of unlabelled pokes.
 
-    Returns the scores, and the processor times with pokes of the test skin.
+    The sets are: pokes of the test skin, no pokes, and pokes of another skin. Returns the scores with all sets, and the
+    processor times with pokes of the test skin.
     """
     points, times = [], []
     test_uT = known.frame.field(known.data.rows.db_uT[fold.test])
@@ -394,7 +395,7 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Return the control of each method with no pokes or another skin's: the same method with the skin's own pokes."""
+    """Return the controls of methods without pokes or with another skin's: the same method with the skin's own pokes."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
@@ -425,7 +426,7 @@ class Board:
     tested_uT: Float[np.ndarray, "b ch"]
 
     def alter(self, change: Callable[[Chips], Chips]) -> "Board":
-        """Return the readings of the board after `change` has been applied to its chips."""
+        """Return the board with `change` applied to the fields of its chips."""
         fields_uT = self.rest_uT, self.pool_uT, self.tested_uT
         return Board(*(change(b_uT.reshape(len(b_uT), -1, 3)).reshape(b_uT.shape) for b_uT in fields_uT))
 

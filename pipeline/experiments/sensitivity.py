@@ -32,9 +32,9 @@ def group_by_level(
     levels_n: int,
     where: str,
 ) -> Float32[np.ndarray, "n p r ch"]:
-    """Reshape readings by filling of the glass, weight level and reading.
+    """Reshape readings to axes (filling of the glass, weight level, reading, channel).
 
-    Successive readings with equal logged force form a stop, at one weight level. Raises `SchemaError` unless every
+    Successive readings with the same logged force form a stop, at one weight level. Raises `SchemaError` unless every
     filling has `levels_n` stops, all with the same number of readings.
     """
     starts = np.flatnonzero((np.diff(indentation) != 0) | (np.diff(force_N) != 0)) + 1
@@ -119,7 +119,7 @@ def smallest_step_N(share: Float[np.ndarray, " d"], step_N: float) -> float | No
     `share` is the fraction of correctly ordered pairs by difference (see `ordered_share`). Returns None if even the
     largest difference is not resolved.
     """
-    unresolved_i = np.flatnonzero(share < RESOLVED_SHARE)  # index 0 is one step
+    unresolved_i = np.flatnonzero(share < RESOLVED_SHARE)  # index 0 is a difference of one step
     last_i = int(unresolved_i.max(initial=-1))
     return None if last_i == len(share) - 1 else step_N * (last_i + 2)
 
@@ -169,7 +169,7 @@ def sensitivity(settings: Settings, indentations: Path, results: Path) -> None:
     say(f"{settings.scene}: smallest resolved step: {resolved or 'none'}; {numbers['fillings_n']} fillings")
 
 
-MEANING = (  # {told_pct} comes from the numbers
+MEANING = (  # the experiment's numbers are inserted by `str.format`
     "The weight on the skin's centre increases step by step; the flat foot of the glass is simulated as the rig's "
     "round tip. A difference of weight is resolved if, for this and all larger differences, at least {told_pct:g} % of "
     "the pairs of readings within a held-out filling are in the order of their weights. The response is the component "

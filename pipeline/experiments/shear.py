@@ -70,7 +70,7 @@ def shear(settings: Settings, section: Shear, indentations: Path, results: Path)
 
 
 def make_folds(rows: Rows, group: np.ndarray, by: str, section: Shear, seed: int) -> list[Fold]:
-    """Draw the random splits of every skin; rows with equal values of `group` are on the same side."""
+    """Draw the random splits of every skin; rows with equal values of `group` are on the same side of a split."""
     folds = []
     for skin in np.unique(rows.skin):
         skin_rows = np.flatnonzero(rows.skin == skin)

@@ -24,7 +24,7 @@ from reskin.data.baseline import rank, subtract
 from reskin.errors import ParamsError
 from reskin.schema import Readings
 
-SAME_MM = 1e-3  # labels (commanded values in float32) that differ by less are equal
+SAME_MM = 1e-3  # labels (commanded values in float32) count as equal if they differ by less than this
 LISTED_N = 8  # places or depths listed in an error message
 LINES_MAX_N = 40  # lines (visits of a place) in a panel of the figure
 DECIMALS = 1  # fields in uT are rounded to this many decimals for the figures
@@ -39,7 +39,7 @@ class Variation(Strict):
     places_mm: Annotated[tuple[Place_mm, ...], Field(min_length=1, max_length=4)]
     depth_mm: Annotated[float, Field(gt=0)]
     skins_n: Count
-    contacts_n: Count  # contacts of the worn skin within which indentations are compared
+    contacts_n: Count  # indentations of the worn skin are compared within its first `contacts_n` contacts
 
 
 def variation(settings: Settings, section: Variation, main: Path, indentations: Path, results: Path) -> None:
@@ -166,7 +166,7 @@ def duration_and_warming(readings: Readings, contacts_n: int) -> dict[str, float
 
 
 def first_of_each_board(boards: Mapping[str, str], skins_n: int) -> list[str]:
-    """Choose `skins_n` skins: first the first skin of each board, then the second skins, and so on.
+    """Choose `skins_n` skins: the first skin of every board, then the second skin of every board, and so on.
 
     `boards` maps the names of skins to the names of their boards.
     """

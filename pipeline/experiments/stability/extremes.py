@@ -116,7 +116,7 @@ def ring_force_N(
 
 
 def near(skin: SkinDesign) -> list[Case]:
-    """Run cases of a uniformly magnetised skin sliding over chips close below it; compare dB of dipoles and of a box."""
+    """Run cases of a uniformly magnetised skin that slides over close chips: compare dB of dipoles and of a box."""
     cases, side_m, thickness_m = [], 20 * milli, skin.thickness_mm * milli
     j_T = np.array([0.6, -0.3, 1.0]) * skin.saturation_T
     box = magpylib.magnet.Cuboid(polarization=j_T, dimension=(side_m, side_m, thickness_m))
@@ -157,7 +157,7 @@ def scaled(board: Board, skin: Skin) -> list[Case]:
 
 
 def scale_skin(skin: Skin, scale: float) -> Skin:
-    """Multiply all lengths of a skin by `scale`; the material stays the same, so spring stiffness scales with length."""
+    """Multiply all lengths of a skin by `scale`. The material is unchanged, so spring stiffness scales with length."""
     hold = skin.hold
     if hold is not None:
         x_m, y_m = hold.give_m

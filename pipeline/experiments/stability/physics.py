@@ -216,7 +216,7 @@ def memory(board: Board, skin: Skin) -> Case:
     pokes_m = np.column_stack(
         [rng.uniform(-8e-3, 8e-3, (4 * POKES_N, 2)), np.full(4 * POKES_N, DEPTH * skin.thickness_m)]
     )
-    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, so that its memory is not part of the measurement
+    changes_of_field(board, skin, pokes_m[:1])  # fills the cache of tables, whose memory must not be counted below
     few_n, many_n = (peak_bytes(partial(changes_of_field, board, skin, pokes_m[:n])) for n in (POKES_N, 4 * POKES_N))
     per_poke_n = (many_n - few_n) / (3 * POKES_N)
     observed = (

@@ -78,7 +78,7 @@ def join_mid_frame(frames: Frames, wire: Wire, where: float) -> Damage:
 
 
 def decode_damaged(damage: Damage, frames: Frames, wire: Wire) -> Case:
-    """Decode a damaged stream; compare the numbers of lost frames, false frames and uncounted bytes with their limits."""
+    """Decode a damaged stream; compare the numbers of lost frames, false frames and uncounted bytes with the limits."""
     decoded_frames, account = decode_portions(damage.portions, wire, frames.temperature_degC.shape[1])
     sent, got = (Counter(records(decoded)) for decoded in (_clean(encode(frames, wire), wire, frames), decoded_frames))
     missing_n, false_n = (sent - got).total(), (got - sent).total()
