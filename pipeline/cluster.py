@@ -138,11 +138,14 @@ def _compare(expected: Mapping[str, str], properties: Mapping[str, str], worker:
 
 
 def _copy_outcome(future: Future[Any], address: str, submitted: Future[Any]) -> None:
-    """Copy the result or error of a Dask future to `future`; a dead worker gives `BrokenExecutor`, as locally."""
+    """Copy the result or error of a Dask future to `future`.
+
+    If the worker died, the error is `BrokenExecutor`, as it would be on this machine.
+    """
     from distributed import KilledWorker
 
-    # Dask cancels calls if it loses the scheduler. Calls that this executor cancels need no other error: nobody waits
-    # for their results.
+    # Dask cancels calls if it loses the scheduler. Calls that `shutdown` cancelled get the same error, because nobody
+    # waits for their results.
     if submitted.cancelled():
         remedy = "Finished training runs are cached: start the scheduler again, then repeat the command."
         future.set_exception(ParamsError(f"Lost the Dask scheduler at {address}. {remedy}"))

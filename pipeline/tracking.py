@@ -243,7 +243,7 @@ class Publisher:
             self.client.set_terminated(run_id)
 
     def write_report(self, reports: Path) -> None:
-        """Write the report's numbers and files to a run, whose key covers numbers, figures and tables, but not costs.
+        """Write the report's numbers and files to a run; its key depends on numbers, figures and tables, not on costs.
 
         Tag `inputs` identifies the results that a report shows. If earlier results were restored without their report
         (`dvc checkout` does not restore reports), the run of their report becomes the current one again.
@@ -355,9 +355,10 @@ def _datasets(card: Mapping[str, Any]) -> list[Any]:
 
 
 def metrics_of(numbers: Mapping[str, Any]) -> list[tuple[str, float, int]]:
-    """Flatten numbers.json to (name, value, step); a list of rows that begin with a count is a curve over that count.
+    """Flatten numbers.json to rows (name, value, step).
 
-    Other lists, texts, costs and the content of training runs are left out.
+    A list of rows whose first key is a count becomes a curve over this count. Other lists, texts, costs and the content
+    of training runs are left out.
     """
     published = {name: value for name, value in numbers.items() if name not in NOT_METRICS}
     return [(re.sub(r"[^A-Za-z0-9_.\- ]", "_", name), value, step) for name, value, step in _flatten(published, "", 0)]

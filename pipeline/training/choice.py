@@ -147,7 +147,7 @@ def _budget(card: Card) -> tuple[int, int]:
 
 
 def _candidates(cards: Cards) -> list[dict[str, Any]]:
-    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # first card by recipe
+    settings = {card["recipe_name"]: settings_of(card) for card in reversed(cards)}  # the first card of each recipe
     return [
         {
             "recipe_name": name,
