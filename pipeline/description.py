@@ -118,7 +118,7 @@ def _forces(force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
 
 
 def _changes(change_uT: Float[np.ndarray, "f ch"], force_N: Float[np.ndarray, " f"]) -> dict[str, float]:
-    """Return the median field change at each force in `FORCES_N`, and the ratio of weakest to strongest chip."""
+    """Return the median field change at each force in `FORCES_N`, and the median ratio of weakest to strongest chip."""
     size_uT = np.linalg.norm(change_uT, axis=1)
     numbers = {}
     for level_N in FORCES_N:

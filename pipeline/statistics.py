@@ -318,7 +318,7 @@ def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
     Rows are training skins and columns are test boards; cells may be missing. The squared error is the variance of the
     row means divided by the number of rows, plus the variance of the column means divided by the number of columns. It
     is slightly too large, because the residual variance of cells is counted twice. The second return value is the
-    number of degrees of freedom (Satterthwaite). Return None for fewer than two rows or fewer than `BOARDS_MIN` columns.
+    number of degrees of freedom (Satterthwaite). Returns None for fewer than two rows or `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None

@@ -395,7 +395,7 @@ def estimate_inversion(
 
 
 def unlabelled_controls() -> dict[Key, Key]:
-    """Return the controls of methods without pokes or with another skin's: the same method with the skin's own pokes."""
+    """Return the controls of methods without pokes or with another skin's: the same methods with the skin's pokes."""
     names = [f"{name}{way}" for way in WAYS.values() for name in UNIVERSAL]
     return {(name, given, 0): (name, OWN, 0) for name in (*names, INVERSION, CENTRED) for given in (NONE, FOREIGN)}
 
