@@ -313,12 +313,12 @@ def over_pairs(rows: pd.DataFrame) -> dict[str, dict[str, Any]]:
 
 
 def two_way_error(table: pd.DataFrame) -> tuple[float, float] | None:
-    """Compute the standard error of the mean of a table whose rows and columns are both samples; None for few of them.
+    """Compute the standard error, and its degrees of freedom, of the mean of a table with random rows and columns.
 
     Rows are training skins and columns are test boards; cells may be missing. The squared error is the variance of the
     row means divided by the number of rows, plus the variance of the column means divided by the number of columns. It
-    is slightly too large, because the residual variance of cells is counted twice. The second return value is the
-    number of degrees of freedom (Satterthwaite). Returns None for fewer than two rows or `BOARDS_MIN` columns.
+    is slightly too large, because the residual variance of cells is counted twice. The degrees of freedom are
+    Satterthwaite's. Returns None for fewer than two rows or fewer than `BOARDS_MIN` columns.
     """
     if len(table) < 2 or len(table.columns) < BOARDS_MIN:
         return None

@@ -30,8 +30,8 @@ LOADER = "pipeline.pyfunc"
 PARENT = "mlflow.parentRunId"
 LAYOUT = 2  # version of the content of MLflow runs; runs of older versions are written again
 METRICS_MAX_N = 1000  # largest number of metrics in one call to MLflow
-TIMEOUT_S = 2.0  # for the answer of an HTTP server
-LOCK_TIMEOUT_S = 5.0  # for a locked SQLite store; UIs and other writers lock it for a much shorter time
+TIMEOUT_S = 2.0  # time in which an HTTP server must answer
+LOCK_TIMEOUT_S = 5.0  # how long to wait for a locked SQLite store; UIs and other writers lock it for much shorter
 PATIENCE_S, PATIENCE_PER_RUN_S = 60.0, 2.0  # time limit for writing all runs; a local server takes 0.1 s per run
 # Keys of numbers.json that are not metrics of the report's run: run times, provenance, and values that other MLflow
 # runs contain.

@@ -1,8 +1,8 @@
 """Ambient fields and nearby iron that appear after the no-load reading (paper section 7, future work).
 
 Measures how much these disturbances degrade the scores on held-out boards, and how much of the loss is recovered by
-two methods. One subtracts the reading of a separate reference chip. The other subtracts the common part: the uniform
-field that best fits the readings of all chips of the board.
+two methods. The first method subtracts the reading of a separate reference chip. The second method subtracts the common
+part: the uniform field that best fits the readings of all chips of the board.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -328,7 +328,7 @@ def iron_fields(
 COLUMNS = {
     "accuracy_pct": ("accuracy, %", 1), "mse_xy_mm2": ("MSE_xy, mm²", 2), "mse_f_N2": ("MSE_F, N²", 3),
 }  # fmt: skip
-DASHES = ("-", "--", "-.")  # distinguishes the lines of methods that have equal accuracy
+DASHES = ("-", "--", "-.")  # line styles of the methods, so that overlapping lines can be distinguished
 
 
 def tables(numbers: Mapping[str, Any], source: str) -> dict[str, pd.DataFrame]:

@@ -246,7 +246,7 @@ COPIED_SHARE_MAX = 0.3
 # more pairs.
 PAIRS_MAX_N = 100_000_000
 SAMPLE_MIN_N = 100  # smallest number of indentations sampled from a capture, if it has as many
-CHUNK_PAIRS_N = 4_000_000  # pairs compared at once, in 16 MB of memory
+CHUNK_PAIRS_N = 4_000_000  # number of pairs that are compared at once, which takes 16 MB of memory
 
 
 @dataclass(frozen=True)
@@ -427,7 +427,7 @@ def audit_tuning(
 
 
 def audit_collapse(variant: str, cards: Sequence[Mapping[str, Any]]) -> Check:
-    """Count the networks of a variant that collapsed (nearly constant predictions), and the repeated training runs."""
+    """Count a variant's collapsed networks (nearly constant predictions), and how often training was repeated."""
     collapsed = [
         f"{card['question']}.{card['recipe_name']}.{card['fold']}.seed{card['seed_i']}"
         for card in cards

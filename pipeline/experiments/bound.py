@@ -1,6 +1,6 @@
 """Smallest error that the noise of the chips allows, compared with a network's scores (paper section 4).
 
-Computes the Cramér-Rao bound of place and force, estimated from one input row. The skin is simulated, and its
+Computes the Cramér-Rao bound for estimates of place and force from one input row. The skin is simulated, and its
 properties are assumed to be known.
 """
 
@@ -40,7 +40,7 @@ Measure = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n ch"]]  # x, 
 
 
 def bound(settings: Settings, models: Path, results: Path) -> None:
-    """Bound the errors of estimates from one input row, and compare them with the errors of the paper's network."""
+    """Compute lower bounds of the errors of estimates from one input row; compare them with the paper's network."""
     numbers = bound_errors(simulation_settings(settings), seed=settings.seed)
     write_results(results, numbers | {"network": score_network(models, numbers["skin"])}, {})
     overall = numbers["all"]["with_label_errors"]

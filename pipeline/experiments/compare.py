@@ -36,7 +36,7 @@ from reskin.seeds import rng_for
 from reskin.universal.law import SEVEN, START, TEN, AlignedPresses, Law, Setup, beyond_n, fit, nominal_uT, simulate_uT
 from reskin.universal.presses import RecordedPresses, cosines, explained, growth, magnitudes_uT, memory, pool
 
-ARROWS_N = 4  # places per board in the figure of arrows
+ARROWS_N = 4  # number of places per board in the figure of arrows
 WALK_uT = 0.5  # assumed step of the random walk of the simulated no-load field, from one poke to the next
 NOLOAD_READINGS_N = 10
 CURVE_N = np.geomspace(3e-4, 10.0, 46)  # forces of the curve of |dB| against force, from a light touch to a firm press
@@ -151,7 +151,7 @@ def _of_simulation(board: Mapping[str, Any], simulation: str) -> Mapping[str, An
 def _plot_data(aligned: AlignedPresses, simulated_uT: Float[np.ndarray, "n k 3"]) -> dict[str, Any]:
     """Return the data for the figures: changes of field at a few places, and |dB| against force.
 
-    The places are those of the group of pokes in the middle of the board's list of groups.
+    All places are from one group of pokes: the middle one in the board's list of groups.
     """
     in_group = np.flatnonzero(aligned.recorded.group_i == len(aligned.recorded.groups) // 2)
     order = in_group[np.argsort(np.hypot(*aligned.place_mm[in_group].T), kind="stable")]

@@ -48,9 +48,9 @@ from reskin.seeds import rng_for
 from reskin.simulation.capture import list_captures
 from reskin.simulation.settings import MAIN, SimulationSettings
 
-KNOWN_ROWS_N = 6000  # training rows, drawn at random, in which detectors search for nearest neighbours
+KNOWN_ROWS_N = 6000  # number of training rows, drawn at random, in which detectors search for nearest neighbours
 SINGLES_N = 1000  # number of single contacts that set the thresholds, and of other single contacts that test them
-DRAWN_N = 60  # pairs per board and separation in the figure
+DRAWN_N = 60  # number of pairs in the figure, for each board and separation
 SAME_PLACE = 0.0  # separation in mm: two pokes at one place show the effect of signal strength and noise alone
 TOLERANCE_MM = 0.5  # tolerance of a pair's separation, assumed; needed because places are on a grid
 PLACE_DECIMALS = 2  # places in mm are rounded to this many decimals before they are compared
@@ -323,9 +323,9 @@ def summarise_nested(boards: Sequence[Any]) -> Any:
 
 # --- Superposition of simulated fields ---
 
-PAIRS_N = 6  # pairs drawn for each separation
+PAIRS_N = 6  # number of pairs drawn for each separation
 MIDDLE_MM = 2.0  # largest distance of a pair's midpoint from the skin's middle, along each axis
-HEIGHTS_N = 9  # heights in the table of displacements, between which the second contact is interpolated linearly
+HEIGHTS_N = 9  # number of heights in the table of displacements, which is interpolated linearly between heights
 
 
 def superposition(

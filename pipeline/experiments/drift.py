@@ -54,7 +54,7 @@ from reskin.seeds import rng_for
 
 LATE_CONTACTS_N = 45_000  # paper figure 5b: "after 45,000 interactions"
 FORCE = 2  # column of the force in a target (x_mm, y_mm, F_N)
-POINTS_MAX_N = 2000  # points in the scatter plot
+POINTS_MAX_N = 2000  # largest number of points in the scatter plot
 DECIMALS = 3  # forces in N and places in mm are rounded to this many decimals
 
 Count = Annotated[int, Field(ge=1)]
@@ -105,7 +105,7 @@ class WindowPredictions:
     skin: str
     seed_i: int
     window_i: int
-    contacts_n: int  # contacts of the skin before the window
+    contacts_n: int  # number of contacts of the skin before the window
     noload_off_uT: float  # rms difference between the policy's no-load field and the one read just before each contact
     indentation: Int[np.ndarray, " f"]
     true: Float[np.ndarray, "f 3"]
@@ -320,7 +320,7 @@ class ContactForces:
 def contact_forces(predictions: Sequence[WindowPredictions]) -> ContactForces:
     """Average true and predicted forces over the readings of each indentation, because readings are not independent.
 
-    All `predictions` must be for the same window, and each for another skin.
+    All `predictions` must be for the same window, and no two of them for the same skin.
     """
     skin = np.concatenate([np.full(len(window.indentation), window.skin) for window in predictions])
     indentation = np.concatenate([window.indentation for window in predictions])
@@ -445,7 +445,7 @@ def pace(captures: Sequence[Readings]) -> dict[str, float]:
 
 
 def describe_pace(numbers: Mapping[str, Any], source: str) -> str:
-    """Describe the times in `numbers` (see `pace`) in a sentence; add a remark on temperature if they are simulated."""
+    """Describe the times in `numbers` (see `pace`); for simulated captures, add a remark on temperature."""
     if "lasts_s" not in numbers:
         return "The times of the contacts are not known."
     every = f"The median time from one contact to the next is {numbers['contact_every_s']:.3g} s"

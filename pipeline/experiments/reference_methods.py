@@ -137,7 +137,7 @@ def first_folds(folds: Sequence[Fold]) -> dict[str, Fold]:
 
 
 def means_uT(data: SceneData, pokes: Sequence[Int64[np.ndarray, " r"]]) -> Float[np.ndarray, "m ch"]:
-    """Return the mean change of field of each poke, in the chips' axes; `pokes` are row numbers."""
+    """Return the mean change of field of each poke, in the chips' axes; `pokes` has the row numbers of each poke."""
     return np.array([data.rows.db_uT[row].mean(axis=0, dtype=np.float64) for row in pokes])
 
 
@@ -370,7 +370,8 @@ def estimate_universal(
     by_network = calibrated.evaluate_networks(test_uT)
     network_s = time.process_time()
     map_seconds = Seconds("", ready_s - start_s, (both_s - ready_s) / len(test_uT))
-    network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))  # calibrated together with the map
+    # The time of calibration is 0, because the network is calibrated together with the map.
+    network_seconds = Seconds("", 0.0, (network_s - both_s) / len(test_uT))
     places = by_map.place_mm, by_network.place_mm, combined.place_mm
     forces = by_map.force_N, np.exp(by_network.log_N), combined.force_N
     names = [f"{name}{way}" for name in UNIVERSAL]
@@ -407,7 +408,7 @@ OF_RIGHT, OF_STRANGER = "the right skin's", "fitted anew to the stranger"
 ANOTHER = "another skin of the rig"
 QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Chips = Float[np.ndarray, "n k 3"]
-# Foreign boards, simulated by changing the readings of a board in the same way as a wrong plug, driver or skin.
+# Foreign boards, simulated by changing the readings of a board as a wrong plug, driver or skin would change them.
 STRANGERS: Mapping[str, Callable[[Chips], Chips]] = {
     "x axis of every chip mirrored": lambda chips: chips * (-1.0, 1.0, 1.0),
     "two chips exchanged": lambda chips: chips[:, [0, 2, 1, *range(3, chips.shape[1])]],
@@ -435,7 +436,7 @@ def evaluate_alarm(known: KnownBoards, folds: Sequence[Fold], fraction: float) -
     """Evaluate the residual of the inversion, both as an alarm for foreign boards and as a flag for wrong estimates.
 
     A physical model is fitted to the unlabelled pokes of each board's first fold. It is inverted for test readings of
-    this board, and of foreign boards. `fraction` is the fraction of false alarms that the limits are set for.
+    this board, and of foreign boards. The limits are set for the fraction `fraction` of false alarms.
     """
     data, frame, setup = known.data, known.frame, known.setup
     first = first_folds(folds)

@@ -269,7 +269,7 @@ IMPLICIT = ("Radau", "BDF", "LSODA")  # solvers that accept a Jacobian; here, th
 ATOL = 1e-3  # absolute tolerance / relative tolerance; the states are a few percent of the force, which is 1
 DIVERGED = 1.0  # an integrator with at least this relative error (as large as the force) counts as diverged
 PERIOD_S = 1.5  # time from one press to the next; twenty presses take 30 s
-DOWN_S, HELD_S = 0.3, 0.7  # a press is lowered, held, and released for the rest of the period
+DOWN_S, HELD_S = 0.3, 0.7  # times of lowering and holding the tip; the tip is lifted in the rest of the period
 
 # Times in s, and the elastic forces at these times. The elastic force is linear between two times (a linear piece).
 History = tuple[Float[np.ndarray, " t"], Float[np.ndarray, " t"]]

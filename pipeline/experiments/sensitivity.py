@@ -21,7 +21,7 @@ from reskin.errors import SchemaError
 from reskin.simulation.protocols import load_steps_N
 
 RESOLVED_SHARE = 0.95  # a difference is resolved if this fraction of reading pairs is correctly ordered
-WATER_N_PER_ML = 9.81e-3  # 1 g at 9.81 m/s^2
+WATER_N_PER_ML = 9.81e-3  # weight of 1 mL (1 g) of water at 9.81 m/s^2
 
 
 def group_by_level(
@@ -133,7 +133,8 @@ def monotonic(response_uT: Float64[np.ndarray, "n p"], weight_N: Float64[np.ndar
     fall disappears. If no step is large enough, the result has no `step_N`.
     """
     mean_uT, rise_uT = response_uT.mean(axis=0), np.diff(response_uT, axis=1)
-    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan  # noise of one rise
+    # `noise_uT` is the noise of a rise in one filling.
+    noise_uT = float(np.sqrt(rise_uT.var(axis=0, ddof=1).mean())) if len(rise_uT) > 1 else np.nan
     gain_uT = float(np.polyfit(np.arange(len(mean_uT)), mean_uT, 1)[0])  # mean rise per step between weights
     result: dict[str, Any] = {
         "holds": False,

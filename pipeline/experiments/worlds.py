@@ -58,8 +58,8 @@ class Residual(Strict):
     """A smooth random error that is added to the simulated changes of field: sizes, and correlation lengths."""
 
     sizes: Sizes  # rms sizes relative to |dB|, one world per size
-    length_mm: Annotated[float, Field(gt=0, le=50)]  # along x and y
-    length_log_N: Annotated[float, Field(gt=0, le=10)]  # along the logarithm of the force
+    length_mm: Annotated[float, Field(gt=0, le=50)]  # correlation length along x and y
+    length_log_N: Annotated[float, Field(gt=0, le=10)]  # correlation length along the logarithm of the force
     # Fraction of the error's variance that is specific to each skin; the rest of the error is the same on all skins.
     own_share: Annotated[float, Field(ge=0, le=1)]
 

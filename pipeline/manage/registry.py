@@ -71,7 +71,7 @@ def with_entry(registry: Registry, scene: str, capture: str, entry: Entry, *, al
 
 
 def without_capture(registry: Registry, scene: str, capture: str) -> Registry:
-    """Return the registry without a capture, and without its scene if that has no other capture."""
+    """Return the registry without a capture, and without the scene if the scene has no other capture."""
     if scene not in registry.captures:
         guess, known = did_you_mean(scene, registry.captures), ", ".join(sorted(registry.captures)) or "none"
         raise CaptureError(f"scene {scene} has no recorded captures.{guess} Scenes with recorded captures: {known}.")

@@ -35,7 +35,7 @@ A0 = 1.770  # integral of 1 - compliance over kh (Dimitriadis et al. 2002 fit 1.
 BONDED = (1.0, 1.133, 1.283, 0.769, 0.0975)  # Dimitriadis et al. 2002: coefficients of chi^n, chi = sqrt(R d) / h
 RINGS_N = 40  # number of rings of pressure that cover a contact
 SKIN_FORCE = "force of the skin"
-FRICTION = 0.8  # coefficient
+FRICTION = 0.8  # coefficient of friction
 BONDED_KH, SLIDING_KH = np.geomspace(1e-3, 300, 60), np.geomspace(0.01, 30, 12)  # wave number * thickness
 
 
@@ -374,7 +374,7 @@ def follow_dipoles(skin: Skin, place_m: Float[np.ndarray, "2"], depths_m: Float[
 
 
 COARSE = Quadrature(cell_m=2.2e-3, layers_n=4)  # nodes for checks that hold for any quadrature rule
-DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for the errors of tables and steps
+DENSE = Quadrature(cell_m=1.5e-3, layers_n=4)  # nodes for checks of the errors of tables and steps
 PLACE_STRIDE = 5  # every fifth of the protocol's 65 places is checked
 REFERENCE_STEPS_N = 16  # number of depth steps of an indentation in the reference
 # Errors of this size are not visible in readings: they are a third of a chip's noise, and increase the rms by only 5 %.

@@ -315,7 +315,8 @@ def _missed(decoded: Frames, values: np.ndarray) -> float:
     return float(np.abs(decoded_values - values).max()) if decoded_values.shape == values.shape else np.inf
 
 
-POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7  # 20 indentations, each lowered and held, in 30 s
+# Number of indentations, time from one to the next, and times of lowering and of holding the tip.
+POKES_N, CYCLE_S, RAMP_S, HOLD_S = 20, 1.5, 0.3, 0.7
 NAME = "relaxation of the force"
 STATE = np.array([0.7, -0.2, 0.4])  # state before a time step, one value per relaxation time
 RATIOS = (1e3, 1e4, 1e5, 1e6, 1e7, 1e8)  # slowest relaxation time / fastest relaxation time, which is 1 ms
