@@ -176,7 +176,7 @@ def interval(values: Values, metric: str = "") -> list[float] | None:
     >>> [round(float(end), 2) for end in interval([1.0, 3.0])]  # t is 12.71 with one degree of freedom
     [-10.71, 14.71]
     >>> [round(float(end), 1) for end in interval([60.0, 90.0, 99.0, 95.0], "accuracy_pct")]
-    [46.2, 97.8]
+    [37.1, 98.5]
     """
     n = len(values)
     if n < 2:
