@@ -59,8 +59,8 @@ def tidy(cards: Cards, points: Mapping[str, Cards] | None = None) -> pd.DataFram
     Parameters
     ----------
     cards
-        Cards of models. If networks are adapted to one skin each, the networks of a fold and seed also get a joint row
-        for all skins.
+        Model cards. If networks are adapted to one skin each, the networks of a fold and seed also get a joint row for
+        all skins.
     points
         Points of sweeps, by experiment; each point has the scores of one training run.
 

@@ -99,7 +99,7 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
     Parameters
     ----------
     models
-        Folders of models and cards, by stage.
+        Folders of models and model cards, by stage.
     curves
         Points of sweeps and experiments, by stage.
     reports
@@ -135,7 +135,7 @@ def publish(models: Mapping[str, Path], curves: Curves, reports: Path, *, scene:
 
 
 class Publisher:
-    """Writes the MLflow runs of one scene, each once, and remembers the keys of the runs of current results.
+    """Writes the MLflow runs of one scene, each once, and remembers the keys of runs that contain current results.
 
     The tag `run_key`, a digest of a run's content, identifies the run.
     """
@@ -289,7 +289,7 @@ class Publisher:
 
 
 def run_key(card: Mapping[str, Any]) -> str:
-    """Return a digest of a card without its commit, so that equal results of two commits are the same run."""
+    """Return a digest of a model card without its commit, so that equal results of two commits are the same run."""
     return _digest({name: value for name, value in card.items() if name != "git"} | {"published_as": LAYOUT})
 
 

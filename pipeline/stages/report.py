@@ -215,5 +215,5 @@ def planned_scene(settings: Settings) -> Scene:
 
 
 def read_cards(models: Path, stages: Iterable[str]) -> list[dict[str, Any]]:
-    """Read the cards of all models of these stages."""
+    """Read the model cards of these stages."""
     return [io.read_json(file) for stage in stages for file in sorted((models / stage).glob("*.json"))]

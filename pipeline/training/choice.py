@@ -1,4 +1,4 @@
-"""Choose settings from the cards of a scene's models, which were trained with each board held out in turn.
+"""Choose settings from the model cards of a scene, whose models were trained with each board held out in turn.
 
 The criterion is the mean squared error of places on the held-out boards, for networks with the paper's inputs. The
 number of steps, the budget, is not chosen, because each scene sets it. Every candidate is tried with the same budgets,
