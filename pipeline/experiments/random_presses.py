@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int64
 from pydantic import Field
+from scipy.spatial import cKDTree
 
 from pipeline.experiments.known_boards import read_known_boards
 from pipeline.experiments.results import write_results
@@ -226,11 +227,13 @@ def calibrate(model: PriorModel, board: BoardPresses, draw: Draw) -> CalibratedB
 def score_nearest(labels: LabelledPresses, tested: LabelledPresses) -> dict[str, float]:
     """Score the reference method: place and force of the label with the most similar field change.
 
-    Similarity is the distance between field changes divided by their magnitudes. `r2_line_f` is that of the constant
-    force, the mean of the labels.
+    Similarity is the Euclidean distance between features: the direction of the field change, and the logarithm of its
+    magnitude. `r2_line_f` is that of a constant, the mean force of the labels.
     """
-    unit = [part.db_uT / np.linalg.norm(part.db_uT, axis=1, keepdims=True) for part in (labels, tested)]
-    nearest = (unit[1] @ unit[0].T).argmax(axis=1)
+    magnitude_uT = [np.linalg.norm(part.db_uT, axis=1, keepdims=True) for part in (labels, tested)]
+    pairs = zip((labels, tested), magnitude_uT, strict=True)
+    features = [np.hstack([part.db_uT / length_uT, np.log(length_uT)]) for part, length_uT in pairs]
+    nearest = cKDTree(features[0]).query(features[1])[1]
     error_mm = labels.place_mm[nearest] - tested.place_mm
     constant = np.full(len(tested), labels.force_N.mean())
     return place_scores(error_mm) | {
