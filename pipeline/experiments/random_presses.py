@@ -220,7 +220,7 @@ def line_of_combined(folds: Sequence[HeldOutLabels]) -> Any:
 def calibrate(model: PriorModel, board: BoardPresses, draw: Draw) -> CalibratedBoard:
     """Calibrate a variant to the no-load field and the unlabelled presses."""
     db_uT = board.presses.db_uT[draw.unlabelled]
-    calibration = model.calibrate(CalibrationData(board.rest_uT, db_uT))
+    calibration = model.calibrate(CalibrationData(board.rest_uT, db_uT, area_uT=db_uT))
     return CalibratedBoard(calibration, float(np.median(calibration.skin.evaluator.evaluate(db_uT).misfit())))
 
 

@@ -81,7 +81,8 @@ class PoolCalibration:
         labels = self.pool[:labels_n]
         force_N = np.maximum(labels.force_N, FORCE_MIN_N)
         skin = condition_on_labels(self.presses.skin, labels.place_mm, force_N, labels.db_uT)
-        offsets_mm = network_offsets_mm(self.pool_mm, self.pool_mm[:labels_n], labels.place_mm)
+        centre_mm = -self.pool_mm.mean(axis=0) if len(self.pool) else np.zeros(2)
+        offsets_mm = network_offsets_mm(centre_mm, self.pool_mm[:labels_n], labels.place_mm)
         return CalibratedModel(skin, self.presses.layers, offsets_mm)
 
     def nominal_powers(self, powers: Powers) -> Powers:

@@ -101,11 +101,13 @@ FORMAT, FORMAT_1 = "reskin-skin-2", "reskin-skin-1"  # files of the first format
 SHAPES: Mapping[str, tuple[int, ...]] = {  # arrays in the file, with their shapes after the first axis (presses)
     "pokes_uT": (CHANNELS_N,),
     "even_uT": (CHANNELS_N,),
+    "area_uT": (CHANNELS_N,),
     "labelled_mm": (2,),
     "labelled_N": (),
     "labelled_uT": (CHANNELS_N,),
     "force_known": (),
 }
+UNLABELLED = ("pokes_uT", "even_uT", "area_uT")
 FILE_BYTES_MAX_N = 2**20  # three times the size of a file with a full set of presses and LABELS_MAX_N labels
 REMEDY = "Use a file that `save` wrote."
 
@@ -153,12 +155,14 @@ class CalibrationData:
     """All calibration data of one skin, in the board's frame and axes.
 
     rest_uT: no-load field. presses_uT: field changes of at most `FULL_SET_N` presses at unknown places. even_uT: field
-    changes of presses that are evenly spread over the skin. labels: presses at known places.
+    changes of presses that are evenly spread over the skin. area_uT: field changes of presses at random places all over
+    the area of the labels' grid. labels: presses at known places.
     """
 
     rest_uT: Float[np.ndarray, " ch"]
     presses_uT: Float[np.ndarray, "c ch"] = field(default_factory=no_presses)
     even_uT: Float[np.ndarray, "e ch"] = field(default_factory=no_presses)
+    area_uT: Float[np.ndarray, "a ch"] = field(default_factory=no_presses)
     labels: LabelledPresses = field(default_factory=no_labels)
 
 
@@ -166,7 +170,7 @@ def write_calibration(data: CalibrationData, file: Path) -> None:
     """Write calibration data to a safetensors file, which does not contain the model."""
     labels = data.labels
     known = np.ones(len(labels)) if labels.force_known is None else labels.force_known.astype(float)
-    values = (data.presses_uT, data.even_uT, labels.place_mm, labels.force_N, labels.db_uT, known)
+    values = (data.presses_uT, data.even_uT, data.area_uT, labels.place_mm, labels.force_N, labels.db_uT, known)
     io.write_tensors(file, {"rest_uT": data.rest_uT, **dict(zip(SHAPES, values, strict=True))}, {"format": FORMAT})
 
 
@@ -190,13 +194,14 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
         )
     tensors, metadata = io.read_tensors(file, digest_needed=True)
     if metadata.get("format") == FORMAT_1 and "labelled_N" in tensors:
-        tensors = dict(tensors) | {"force_known": np.ones(len(tensors["labelled_N"]))}
+        added = {"force_known": np.ones(len(tensors["labelled_N"])), "area_uT": no_presses()}
+        tensors = {**tensors, **added}
     elif metadata.get("format") != FORMAT:
         raise SchemaError(file, "format", FORMAT, metadata.get("format"), REMEDY)
     got = {name: values.shape for name, values in sorted(tensors.items())}
     counts_n = {name: shape[0] for name, shape in got.items() if shape and name != "rest_uT"}
     expected = {"rest_uT": (CHANNELS_N,)} | {name: (counts_n.get(name, 0), *shape) for name, shape in SHAPES.items()}
-    if got != expected or max(counts_n["pokes_uT"], counts_n["even_uT"]) > FULL_SET_N:
+    if got != expected or max(counts_n[name] for name in UNLABELLED) > FULL_SET_N:
         rule = f"rest_uT, {', '.join(SHAPES)} of {CHANNELS_N} channels and at most {FULL_SET_N} unlabelled presses"
         raise SchemaError(file, "arrays", rule, got, REMEDY)
     fields_uT = {name: check_readings(values) for name, values in tensors.items() if values.shape[1:] == (CHANNELS_N,)}
@@ -204,9 +209,13 @@ def read_calibration(file: Path, reach_mm: Float[np.ndarray, "2 2"]) -> Calibrat
     place_mm, force_N = check_labels(
         tensors["labelled_mm"].astype(float), tensors["labelled_N"].astype(float), labels_n, reach_mm
     )
+    if counts_n["force_known"] != labels_n:
+        known = f"{counts_n['force_known']} values for {labels_n} labels"
+        raise SchemaError(file, "force_known", "one value per label", known, REMEDY)
     rest_uT = check_readings(tensors["rest_uT"])[0]
     labels = LabelledPresses(place_mm, force_N, fields_uT["labelled_uT"], tensors["force_known"] != 0)
-    return CalibrationData(rest_uT, fields_uT["pokes_uT"], fields_uT["even_uT"], labels)
+    presses_uT, even_uT, area_uT = (fields_uT[name] for name in UNLABELLED)
+    return CalibrationData(rest_uT, presses_uT, even_uT, area_uT, labels)
 
 
 FOLDS_N = 5  # folds of the cross-validation over labels

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 from scipy.linalg import solve_triangular
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from reskin.display import one_line
 from reskin.errors import SchemaError
@@ -241,6 +242,10 @@ OFFSET_uT = 320.0  # standard deviation of the no-load field: chips' offsets (20
 SHARE_MIN = 0.03  # least fraction of the law's error variance that remains, however many labels there are
 PRESS_WEIGHT = 0.2  # weight of an unlabelled press; below 1, because the law's errors at nearby places are correlated
 ROUNDS_N = 3  # default number of rounds of expectation maximisation
+LABEL_OFFSETS = ("label_x_mm", "label_y_mm")
+# Lattice on which the shift of presses onto the grid's area is computed: half width, step, and largest shift.
+AREA_REACH_MM, AREA_STEP_MM, SHIFT_MAX_MM = 12.0, 0.2, 2.0
+DENSITY_MIN = 1e-3  # least density of a place relative to that inside the area, so that single outliers are tolerated
 EVEN_MM = 0.15  # standard deviation of the mean place of evenly spread presses from the centre of the labels' frame
 WEIGHT_MIN = 1e-9  # hypotheses with less than this fraction of the largest weight have no effect in single precision
 
@@ -394,7 +399,7 @@ def condition_on_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"], rounds
 
 def condition_on_even_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -> SkinMap:
     """Condition the map on evenly spread presses; their mean place is assumed to be the centre of the labels' frame."""
-    label_i = [skin.tables.names.index(name) for name in ("label_x_mm", "label_y_mm")]
+    label_i = [skin.tables.names.index(name) for name in LABEL_OFFSETS]
     spread_mm = skin.tables.spreads[label_i]
     row = np.zeros((2, len(skin.mean)))
     row[[0, 1], label_i] = 1.0
@@ -403,6 +408,33 @@ def condition_on_even_presses(skin: SkinMap, db_uT: Float[np.ndarray, "n ch"]) -
         off_mm = posterior.evaluator.estimate(db_uT).place_mm.mean(axis=0)
         posterior = _condition(skin, row, posterior.mean[label_i] + off_mm / spread_mm, (EVEN_MM / spread_mm) ** 2)
     return posterior
+
+
+def move_places(skin: SkinMap, by_mm: Float[np.ndarray, "2"]) -> SkinMap:
+    """Move all places that the map estimates, by changing the means of the labels' offsets."""
+    label_i = [skin.tables.names.index(name) for name in LABEL_OFFSETS]
+    mean = skin.mean.copy()
+    mean[label_i] -= by_mm / skin.tables.spreads[label_i]
+    return replace(skin, mean=mean)
+
+
+def shift_onto_area(estimate: Estimate, sd_mm: float) -> Float[np.ndarray, "2"]:
+    """Return the shift that moves places of presses onto the area of the paper's grid, as a posterior mean.
+
+    The true places are assumed to be uniformly distributed over this octagon. sd_mm: standard deviation of the shift's
+    prior, a normal distribution with mean zero.
+    """
+    axis_mm = np.arange(-AREA_REACH_MM, AREA_REACH_MM + AREA_STEP_MM / 2, AREA_STEP_MM)
+    place_mm = np.stack(np.meshgrid(axis_mm, axis_mm, indexing="ij"), axis=-1)
+    area = inside(place_mm.reshape(-1, 2)).reshape(place_mm.shape[:2]).astype(float)
+    density = gaussian_filter(area, float(estimate.sd_mm.mean()) / AREA_STEP_MM) + DENSITY_MIN
+    steps_mm = np.arange(-SHIFT_MAX_MM, SHIFT_MAX_MM + AREA_STEP_MM / 2, AREA_STEP_MM)
+    shift_mm = np.stack(np.meshgrid(steps_mm, steps_mm, indexing="ij"), axis=-1).reshape(-1, 2)
+    at = (estimate.place_mm[:, None] + shift_mm + AREA_REACH_MM) / AREA_STEP_MM
+    log_density = np.log(map_coordinates(density, at.reshape(-1, 2).T, order=1, mode="nearest"))
+    log_p = log_density.reshape(len(at), -1).sum(axis=0) - (shift_mm**2).sum(axis=1) / (2 * sd_mm**2)
+    p = np.exp(log_p - log_p.max())
+    return p @ shift_mm / p.sum()
 
 
 def condition_on_labels(

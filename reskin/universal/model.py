@@ -9,6 +9,7 @@ recorded boards. It takes readings along the chips' axes, and its places are in 
 board's centre is at (8, 8) mm.
 """
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -36,6 +37,7 @@ from reskin.universal.calibration import (
     join_labels,
     lower_by_misfit,
     lower_by_residuals,
+    no_presses,
     read_calibration,
     variance_inflations,
     write_calibration,
@@ -56,7 +58,9 @@ from reskin.universal.map import (
     condition_on_noload,
     condition_on_presses,
     expected_gain,
+    move_places,
     new_map,
+    shift_onto_area,
 )
 from reskin.universal.network import FULL_SET_N, Layers, NetworkEstimate, Weights, shift_places
 
@@ -72,6 +76,7 @@ BLOCK_N = 200  # readings are evaluated in blocks of this size, to bound memory
 FILE = Path(__file__).with_name("universal.safetensors")  # its card is universal.json
 FORMAT = "reskin-universal-3"
 REACH_MM = np.array([[-0.5], [0.5]]) * SKIN_MM  # rows: least and largest x and y, relative to the board's centre
+OFFSETS_ALONG_X = ("seat_x_mm", "label_x_mm")  # their spreads are the prior of a shift of all places
 CHOICE_EVERY_N = 3  # only every third place of the lattice is a candidate for the next labelled press
 
 
@@ -209,11 +214,22 @@ class PressCalibration:
         """Places that the networks estimate for the evenly spread presses."""
         return network.evaluate(self.layers, self.data.even_uT).place_mm
 
+    @cached_property
+    def centre_mm(self) -> Float[np.ndarray, "2"]:
+        """Shift of the networks' places that follows from unlabelled presses."""
+        if len(self.data.area_uT):
+            estimate = CalibratedModel(self.skin, self.layers, ()).estimate(self.data.area_uT, [MAP_POWER])[0]
+            pairs = zip(self.skin.tables.names, self.skin.tables.spreads, strict=True)
+            sd_mm = math.hypot(*(float(sd) for name, sd in pairs if name in OFFSETS_ALONG_X))
+            return shift_onto_area(estimate, sd_mm)
+        return -self.even_mm.mean(axis=0) if len(self.even_mm) else np.zeros(2)
+
     def with_labels(self, labels: LabelledPresses) -> CalibratedModel:
         """Condition the map on labelled presses, and compute the offsets of the networks' places from them."""
-        skin = condition_on_labels(self.skin, labels.place_mm, labels.force_N, labels.db_uT)
+        skin = move_places(self.skin, self.centre_mm) if len(self.data.area_uT) else self.skin
+        skin = condition_on_labels(skin, labels.place_mm, labels.force_N, labels.db_uT)
         estimated_mm = network.evaluate(self.layers, labels.db_uT).place_mm
-        return CalibratedModel(skin, self.layers, network_offsets_mm(self.even_mm, estimated_mm, labels.place_mm))
+        return CalibratedModel(skin, self.layers, network_offsets_mm(self.centre_mm, estimated_mm, labels.place_mm))
 
     def held_out(self, labels: LabelledPresses) -> Iterator[HeldOutLabels]:
         """Evaluate each labelled press with the model that is calibrated to the labels of the other folds."""
@@ -248,15 +264,15 @@ def condition_on_unlabelled(noload_map: SkinMap, data: CalibrationData) -> SkinM
 
 
 def network_offsets_mm(
-    even_mm: Float[np.ndarray, "e 2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
+    centre_mm: Float[np.ndarray, "2"], estimated_mm: Float[np.ndarray, "m 2"], place_mm: Float[np.ndarray, "m 2"]
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
     """Return two corrections to add to the places that the networks estimate.
 
-    The first correction moves the mean of `even_mm`, the estimated places of evenly spread presses, towards the centre.
-    Its size decreases with the number of labels. The second correction is the mean error that then remains for labelled
-    presses (estimated at `estimated_mm`, truly at `place_mm`), shrunk by a Gaussian prior with mean zero.
+    The first correction is `centre_mm`, which follows from unlabelled presses; its size decreases with the number of
+    labels. The second correction is the mean error that then remains for labelled presses (estimated at `estimated_mm`,
+    truly at `place_mm`), shrunk by a Gaussian prior with mean zero.
     """
-    centre_mm = -even_mm.mean(axis=0) / (1 + FADES_PER_LABEL * len(place_mm)) if len(even_mm) else np.zeros(2)
+    centre_mm = centre_mm / (1 + FADES_PER_LABEL * len(place_mm))
     off_mm = place_mm - (estimated_mm + centre_mm)
     return centre_mm, off_mm.sum(axis=0) / (len(off_mm) + (LABEL_SD_MM / OFFSET_SD_MM) ** 2)
 
@@ -376,18 +392,20 @@ class Universal:
         data = replace(self._data, rest_uT=rest_uT) if keep else CalibrationData(rest_uT)
         return self._restart(condition_on_noload(self._prior_map, rest_uT), data)
 
-    def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False) -> "Universal":
+    def see(self, b_uT: Float[np.ndarray, "*n ch"], *, even: bool = False, area: bool = False) -> "Universal":
         """Calibrate to presses at unknown places, given as one reading per press.
 
         Use dozens of presses all over the skin, in one or several calls. The first call makes several rounds of
         expectation maximisation with its presses, each later call one round. Set `even` if these and all earlier
         presses together are evenly spread over the skin (for example a grid with one press per place), so that their
-        mean place is the skin's centre.
+        mean place is the skin's centre. Set `area` if they all are at random places all over the area of the paper's
+        grid, an octagon 16 mm wide: places are then moved onto this area.
         """
         db_uT, data = check_presses(self._change(check_readings(b_uT))), self._data
         presses_uT = np.concatenate([data.presses_uT, db_uT])[-FULL_SET_N:]
         if even:
             return self._restart(self._noload_map, replace(data, presses_uT=presses_uT, even_uT=presses_uT))
+        data = replace(data, area_uT=presses_uT if area else no_presses())
         rounds_n = 1 if len(data.presses_uT) else ROUNDS_N
         press_map = condition_on_presses(self._calibration.skin, db_uT, rounds_n)
         self._misfits = np.concatenate([self._misfits, np.full(len(db_uT), np.nan)])[-FULL_SET_N:]

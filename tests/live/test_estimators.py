@@ -163,8 +163,9 @@ def test_guided_presses_add_to_the_labels_of_a_calibration(guided_pokes):
     kept, rest_uT = GuidedPresses().held_out, noload_uT.mean(axis=0)
     calibrated = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
     # Presses at places shown by the page have no measured force.
-    all_force_N = np.where(kept, force_N, calibrated.estimate(b_uT).force_N)
-    expected = load_universal().zero(noload_uT).label(place_mm, all_force_N, b_uT).predict(b_uT)
+    model = load_universal().zero(noload_uT).label(place_mm[kept], force_N[kept], b_uT[kept])
+    shown_N = calibrated.estimate(b_uT[~kept]).force_N
+    expected = model.label(place_mm[~kept], shown_N, b_uT[~kept], keep=True, force_known=False).predict(b_uT)
     estimator = UniversalEstimator(calibrated)
     estimator.set_noload(noload_uT)
     estimator.label(place_mm, b_uT - rest_uT, kept)

@@ -5,7 +5,8 @@ import pytest
 
 from reskin.seeds import rng_for
 from reskin.universal.force import prior_line
-from reskin.universal.map import SkinMap, new_map
+from reskin.universal.law import inside
+from reskin.universal.map import Estimate, SkinMap, move_places, new_map, shift_onto_area
 from reskin.universal.model import LABEL_SD_MM, OFFSET_SD_MM, Evaluation, network_offsets_mm
 from reskin.universal.network import NetworkEstimate
 from tests.universal.skins import fields_uT, make_tables
@@ -26,9 +27,9 @@ def evaluation(skin: SkinMap, db_uT: np.ndarray, place_mm: np.ndarray, sd_mm: fl
 
 def test_places_of_evenly_spread_presses_are_centred():
     even_mm, place_mm = RNG.normal(0.7, 3, (65, 2)), np.zeros((10, 2))
-    centre_mm, _ = network_offsets_mm(even_mm, place_mm[:0], place_mm[:0])
+    centre_mm, _ = network_offsets_mm(-even_mm.mean(axis=0), place_mm[:0], place_mm[:0])
     np.testing.assert_allclose((even_mm + centre_mm).mean(axis=0), 0, atol=1e-12)
-    faded_mm, _ = network_offsets_mm(even_mm, place_mm, place_mm)
+    faded_mm, _ = network_offsets_mm(-even_mm.mean(axis=0), place_mm, place_mm)
     assert (0 < np.abs(faded_mm)).all()
     assert (np.abs(faded_mm) < np.abs(centre_mm)).all()
 
@@ -38,7 +39,7 @@ def test_labels_shift_places_as_with_a_gaussian_prior(labels_n):
     estimated_mm, true_mm = RNG.normal(0, 3, (labels_n, 2)), RNG.normal(0, 3, (labels_n, 2))
     cov = OFFSET_SD_MM**2 * np.ones((labels_n, labels_n)) + LABEL_SD_MM**2 * np.eye(labels_n)
     expected_mm = OFFSET_SD_MM**2 * np.ones(labels_n) @ np.linalg.solve(cov, true_mm - estimated_mm)
-    centre_mm, shift_mm = network_offsets_mm(np.zeros((0, 2)), estimated_mm, true_mm)
+    centre_mm, shift_mm = network_offsets_mm(np.zeros(2), estimated_mm, true_mm)
     np.testing.assert_allclose(shift_mm, expected_mm)
     assert (centre_mm == 0).all()
 
@@ -61,3 +62,26 @@ def test_lower_power_widens_intervals_without_changing_estimates(skin):
     full, lower = of.combined(1.0), of.combined(0.25)
     np.testing.assert_array_equal(full.place_mm, lower.place_mm)
     assert (lower.sd_mm > full.sd_mm).all()
+
+
+def test_places_are_moved_onto_the_area_of_the_grid():
+    octagon_mm = RNG.uniform(-8, 8, (2000, 2))
+    octagon_mm = octagon_mm[inside(octagon_mm)]
+    errors = []
+    for shift_mm in ((0.0, 0.0), (0.9, -0.6), (-1.2, 0.4)):
+        for _ in range(5):
+            place_mm = RNG.permutation(octagon_mm)[:65] + shift_mm + 0.5 * RNG.standard_normal((65, 2))
+            nan = np.full(65, np.nan)
+            moved_mm = shift_onto_area(Estimate(place_mm, np.full((65, 2), 0.5), nan, nan, nan), sd_mm=1.0)
+            errors.append(moved_mm + shift_mm)
+    rms_mm = np.sqrt(np.mean(np.square(errors)))
+    mean_mm = 4.4 / np.sqrt(65)  # standard deviation of the mean of 65 places in the octagon
+    assert rms_mm < 0.8 * mean_mm
+
+
+def test_map_moves_all_places_by_the_shift(skin):
+    place_mm, by_mm = np.array([[3.0, 2.0], [-4.0, 1.0], [0.0, -3.0]]), np.array([0.3, -0.2])
+    db_uT = fields_uT(place_mm, np.full(3, 2.0))
+    before = skin.evaluator.estimate(db_uT)
+    after = move_places(skin, by_mm).evaluator.estimate(db_uT)
+    np.testing.assert_allclose(after.place_mm - before.place_mm, np.tile(by_mm, (3, 1)), atol=0.15)

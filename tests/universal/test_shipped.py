@@ -270,6 +270,30 @@ def repeated_labels(labels_n):
     return {"labelled_mm": np.zeros((labels_n, 2)), "labelled_N": np.ones(labels_n)}
 
 
+def test_saved_skin_keeps_the_area_and_which_forces_are_known(skin, tmp_path):
+    rest_uT, read_uT = to_chips(skin.tables.rest_uT[None]), pokes(skin)
+    skin.zero(rest_uT).see(rest_uT + np.tile(read_uT, (4, 1)), area=True)
+    skin.label(PLACES_MM[:2], [1.0, 2.0], rest_uT + read_uT[:2], force_known=False)
+    skin.label(PLACES_MM[2:], [1.5, 2.5], rest_uT + read_uT[2:], keep=True).save(tmp_path / "s0.safetensors")
+    loaded = load_universal(tmp_path / "s0.safetensors")
+    for before, after in zip(
+        *(vars(each.estimate(rest_uT + read_uT)).values() for each in (skin, loaded)), strict=True
+    ):
+        np.testing.assert_allclose(after, before, rtol=1e-5)
+    assert loaded.line.mean[0] == pytest.approx(skin.line.mean[0], rel=1e-5)
+
+
+def test_skin_file_of_the_first_format_is_read(skin, tmp_path):
+    rest_uT, read_uT, file = to_chips(skin.tables.rest_uT[None]), pokes(skin), tmp_path / "s0.safetensors"
+    skin.zero(rest_uT).see(rest_uT + read_uT).label(PLACES_MM, [1.0, 2.0, 3.0, 4.0], rest_uT + read_uT).save(file)
+    tensors, _ = io.read_tensors(file)
+    old = {name: values for name, values in tensors.items() if name not in ("area_uT", "force_known")}
+    io.write_tensors(file, old, {"format": "reskin-skin-1"})
+    np.testing.assert_allclose(
+        load_universal(file).predict(rest_uT + read_uT), skin.predict(rest_uT + read_uT), rtol=1e-5
+    )
+
+
 def test_invalid_skin_files_are_refused(skin, tmp_path):
     file = tmp_path / "s0.safetensors"
     with pytest.raises(SchemaError, match="save: the model has no no-load reading"):
@@ -287,6 +311,7 @@ def test_invalid_skin_files_are_refused(skin, tmp_path):
         ({"even_uT": one_uT[:, :12]}, "arrays must be"),
         ({"labelled_mm": np.full((1, 2), 40.0), "labelled_N": np.ones(1), "labelled_uT": one_uT}, "places must be on"),
         ({"labelled_mm": np.full((1, 2), 8.0)}, "each press needs x and y"),
+        ({"force_known": np.ones(1)}, "force_known must be one value per label"),
         ({"labelled_uT": np.ones((2001, CHANNELS_N))} | repeated_labels(2001), "2001 are too many, at most 2000"),
         ({"pokes_uT": np.ones((9000, CHANNELS_N))}, "1,08.* bytes are too many for a saved skin .at most 1,048,576"),
     ]:
