@@ -217,7 +217,7 @@ def read_table(path: Path) -> pa.Table:
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block, and then `counts`, which iterating over `blocks` may update."""
+    """Write the readings of one capture block by block, then `counts`. Iterating over `blocks` may update `counts`."""
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:

@@ -23,13 +23,13 @@ RESET_LSB_Z_uT = 1.58
 LSB_TOLERANCE = 0.1  # gains of the MLX90393 differ by 20 % or more (data sheet, table 17)
 
 # The values of a channel are multiples of the chip's LSB: they are on a grid. Gaps are the differences between
-# neighbouring distinct values. A grid is detected if a fraction STEP_SHARE_MIN of the gaps, and at least STEPS_MIN_N
-# gaps, are one step: in the first 200 frames of 14 real recordings, 5 % or more are. Without a grid, only one or two
-# gaps are close to the smallest gap, by chance.
+# neighbouring distinct values. A grid is detected if at least the fraction STEP_SHARE_MIN of the gaps, and at least
+# STEPS_MIN_N gaps, equal one step. In the first 200 frames of 14 real recordings, 5 % or more of the gaps equal one
+# step. Without a grid, only one or two gaps are close to the smallest gap, by chance.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
-# Maximum relative standard deviation of the gaps that count as one step, those below 1.5 times the smallest gap. It is
-# 0.02 for an LSB of 0.242 uT written with two decimals, and 0.12 for random gaps.
+# Maximum relative standard deviation of the gaps that count as one step (gaps below 1.5 times the smallest gap). This
+# deviation is 0.02 for an LSB of 0.242 uT written with two decimals, and 0.12 for random gaps.
 STEP_SPREAD_MAX = 0.06
 SURE_STEPS_MIN_N = 20  # even with few values and no noise, this many equal gaps do not occur by chance
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
@@ -38,8 +38,8 @@ SAME_VALUE_uT = 1e-3  # a smaller gap is a rounding error of float32 arithmetic
 # Because of noise, successive readings of a working chip differ. They are equal only if the chip is read again before
 # its next conversion (1.84 ms), or if its LSB is coarse. In 14 real recordings, at most 3 successive frames are equal.
 STUCK_FRAMES_MIN_N = 20
-# A chip is stuck only if another chip changes in at least this fraction of the frames in which the chip does not. The
-# value is below 1 because, in data without noise, readings change only while the board is pressed or released.
+# A chip whose reading stays the same is stuck only if another chip changes in at least this fraction of these frames.
+# The value is below 1 because, in data without noise, readings change only while the board is pressed or released.
 OTHERS_MOVE_MIN = 0.5
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
@@ -54,7 +54,7 @@ SILENCE_STEPS = 50.0
 GARBAGE_FRAMES_N = 10  # more stray bytes than this many frames have suggest a wrong baud rate, not a torn frame
 LONG_LINE = 1.5  # a line of text that exceeds the median length by this factor contains stray bytes
 
-SCALE_FRAMES_N = 400  # enough to find the LSB of every good chip in real recordings; 200 may be too few
+SCALE_FRAMES_N = 400  # enough to find the LSB of every working chip in real recordings; 200 may be too few
 GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of this many rows
 
 
@@ -291,7 +291,7 @@ class ReadingFaults(NamedTuple):
 
 
 def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]) -> ReadingFaults:
-    """Mark the faults that can be detected in each reading by itself."""
+    """Mark the faults that can be detected from a single reading."""
     failed = failed_reads(b_uT, temperature_degC)
     return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, saturated(b_uT) & ~failed)
 
@@ -300,8 +300,8 @@ class ScaleWindow(NamedTuple):
     """The LSB of each chip, estimated from `SCALE_FRAMES_N` successive frames.
 
     `first_frame` is the number of the first of these frames, counted from 1; `t_s` are the times of all of them.
-    `unusual` marks chips whose LSB is not the expected one or differs from that of the other chips. `changed` marks
-    chips whose LSB differs from the first one that was found for this chip.
+    `unusual` marks chips whose LSB is not the expected one or differs from the LSB of the other chips. `changed` marks
+    chips whose LSB differs from the LSB that was first found for the same chip.
     """
 
     first_frame: int
@@ -323,7 +323,7 @@ class Faults(NamedTuple):
     unplug: Bool[np.ndarray, " f"]
     missing_frames_n: Int[np.ndarray, " f"]  # before each frame, according to the board's clock
     torn_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame, or 0 if they are garbage
-    garbage_bytes_n: Int[np.ndarray, " f"]  # so many stray bytes that the baud rate may be wrong, or 0
+    garbage_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame if very many (wrong baud rate?), or 0
     scale: tuple[ScaleWindow, ...]  # the windows that this portion completed
 
 

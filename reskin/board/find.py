@@ -19,7 +19,7 @@ BAUD = 115200  # USB ports ignore the baud rate
 LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the LSB of its chips
 REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
-BOARDS_MAX_N = 16  # opened at the same time
+BOARDS_MAX_N = 16  # largest number of boards that are opened at the same time
 LSB_TOLERANCE = 0.05  # relative; the LSBs of two gains differ by 20 % or more
 Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
@@ -162,7 +162,7 @@ def _wait(find_ports: Callable[[], set[str]], pause: Callable[[float], None], ti
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:
-    """Raise `ParamsError` if a port is named twice, or unless there are 1 to `BOARDS_MAX_N` ports."""
+    """Raise `ParamsError` if a port is named twice, or if there are no ports or more than `BOARDS_MAX_N`."""
     if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
         rule = f"1 to {BOARDS_MAX_N}, each named once"
         raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Name each port once.")

@@ -307,7 +307,7 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            self._link.unlink(missing_ok=True)  # first: another emulator may create this link after the close
+            self._link.unlink(missing_ok=True)  # before the close, after which another emulator may create the same link
         for descriptor in self._open_ends:
             os.close(descriptor)
         self._open_ends = ()
@@ -317,7 +317,7 @@ class Terminal(EmulatedPort):
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
-                if readable:  # data that the reader sends are ignored, except for the first byte, the packet status
+                if readable:  # use only the first byte, the packet status; ignore the data that the reader sends
                     self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
                     sent_n += os.write(self._far, data[sent_n:])

@@ -13,7 +13,7 @@ from reskin.recordings.fault_policy import Action, FaultPolicy
 BATCH_FRAMES_N = 40  # frames per check for faults that span several frames; 0.1 s for a board with five chips
 RATE_WINDOW_S = 1.0
 SLOW_FRACTION = 0.7  # assumed: frames are missing if the frame rate is below this fraction of the usual rate
-USUAL_GAIN = 1e-4  # weight of a new rate in the running mean that is the usual rate: time constant 25 s at 400 Hz
+USUAL_GAIN = 1e-4  # weight of a new rate in the running mean, the usual rate; time constant 25 s at 400 Hz
 ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrence
 # A field change is external if the fraction of |dB|^2 that is not common to all chips is below this limit. For all
 # presses of scenes `quick` and `lab`, the fraction is 0.45 or more.
@@ -47,7 +47,8 @@ class Health:
         self.alarms: dict[str, Alarm] = {}
         self.rate_hz = self._usual_hz = np.nan
         self._chips_n = chips_n
-        # Fewer steps are required than for the rejection of a recorded capture, because an alarm has no lasting effect.
+        # A chip's LSB is accepted from fewer equal steps than in ingestion: ingestion rejects a whole capture if the
+        # LSB is wrong, but an alarm has no lasting effect.
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
         self._stuck = False  # whether frames are dropped because a chip was stuck at the end of the last batch
