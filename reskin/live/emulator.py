@@ -307,7 +307,8 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            self._link.unlink(missing_ok=True)  # before the close, after which another emulator may create the same link
+            # Remove the link first: after the close, another emulator may create the same link.
+            self._link.unlink(missing_ok=True)
         for descriptor in self._open_ends:
             os.close(descriptor)
         self._open_ends = ()

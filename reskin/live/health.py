@@ -104,11 +104,11 @@ class Health:
         stuck = self._note_chips("stuck", faults.stuck, now_s, "stuck")
         self._stuck = bool(stuck[-1])
         self.note("frames repeat", int(faults.repeated.sum()), now_s, "repeated")
-        self._note_chips("past int16", faults.int16_wrap, now_s, "int16_wrap")
+        self._note_chips("int16 overflow", faults.int16_wrap, now_s, "int16_wrap")
         self.note("the board's clock jumps", int(faults.clock_jump.sum()), now_s, "clock_jump")
         for window in faults.scale:
             reset = np.repeat(window.unusual[None], len(window.t_s), axis=0)
-            self._note_chips("step differs from the other chips: reset", reset, now_s, "chip_reset")
+            self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_chips(self, name: str, mask: Bool[np.ndarray, "f k"], now_s: float, fault: str) -> Bool[np.ndarray, " f"]:
         """Add a fault to the alarm of each affected chip; return the mask of the frames that the policy drops."""

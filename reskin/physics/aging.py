@@ -46,7 +46,7 @@ class Relaxation(Strict):
 
 
 class Memory(Strict):
-    """Hysteresis of the field: dB slowly grows while an indentation is held, and the added part decays after it.
+    """Hysteresis of the field: dB grows slowly during an indentation, and the growth decays after the indentation.
 
     The settings are chosen so that the same fraction of dB remains in the next no-load reading as on recorded boards
     (5 to 8 %). The division of this fraction among the time constants is assumed.
@@ -95,7 +95,7 @@ def field_memory(
 
 
 def relaxed_share(relaxation: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
-    """Return the force when the readings of an indentation are taken, relative to that of an elastic skin."""
+    """Return the force at the time of an indentation's readings, relative to the force of an elastic skin."""
     elastic = np.array([0.0, 1.0, 1.0])
     return float(relax(np.cumsum([0.0, relaxation.approach_s, relaxation.hold_s]), elastic, prony)[-1])
 
@@ -144,7 +144,7 @@ class Temperature(Strict):
     warming_s: Annotated[float, Field(gt=0, le=1e5)]  # time constant of the warming
     swing_K: Annotated[float, Field(ge=0, le=20)]  # amplitude of the variation of room temperature
     swing_s: Annotated[float, Field(gt=0, le=1e6)]  # period of the variation of room temperature
-    # standard deviation over chips of the relative change of sensitivity
+    # standard deviation over chips of the relative change of sensitivity per kelvin
     chip_sensitivity_per_K: Annotated[float, Field(ge=0, le=0.01)]
 
 
@@ -177,7 +177,7 @@ class Ageing(Strict):
 
 
 def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: float) -> Float[np.ndarray, " n"]:
-    """Return the force after N contacts, relative to a new skin.
+    """Return the force after N contacts, relative to the force of a new skin at the same depth.
 
     1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000)
     """

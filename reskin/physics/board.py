@@ -76,7 +76,7 @@ class Spreads(Strict):
     """
 
     board_gap: Share  # of the gap between skin and chips
-    board_uneven: Share  # of the gap at the outermost chips, because the base is tilted about x and y and bowed
+    board_uneven: Share  # of the gap at the outermost chips, due to tilt (about x and y) and bow of the base
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
@@ -129,8 +129,8 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
 
 
 def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # Relative height error of each chip due to tilt and bow of the board. The value of each of the three terms at the
-    # outermost chips is about a standard normal number. The skin is assumed to be flat.
+    # Return the relative height error of each chip due to tilt and bow of the board, to be scaled by `board_uneven`. At
+    # the outermost chips, each of the three terms is about a standard normal number. The skin is assumed to be flat.
     places_mm = np.array(design.chips_xy_mm)
     away_mm = np.hypot(*places_mm.T)
     share = places_mm / max(away_mm.max(), 1e-12)
