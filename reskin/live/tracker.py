@@ -396,7 +396,7 @@ class LiveSkin:
         return self._estimate(frames, t_s, sound)
 
     def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Collect chunks until they suffice to detect the wire format, then return all of them; return [] until then."""
+        """Collect chunks until they suffice to detect the wire format, then return all of them; before, return []."""
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:

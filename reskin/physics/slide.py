@@ -121,7 +121,7 @@ def compliance_m_per_N(
 def rigid_motion(
     places_m: Float[np.ndarray, "n 2"], displacement_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]
 ) -> RigidMotion:
-    """Return the rigid motion of the skin that displaces each place as given, with the least elastic energy of the base.
+    """Return for each place the rigid motion that displaces it as given, with the least elastic energy of the base.
 
     A rigid motion is u(X) = f + theta z x X, and the condition is u(p) = D at the place p. The solution is
     f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is the mean of

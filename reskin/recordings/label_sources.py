@@ -340,7 +340,10 @@ class Prompts:
         return f"place {place_i} (x {x_mm:g}, y {y_mm:g} mm)"
 
     def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
-        """Return the label that a person typed for a press; None at the end, without contact for a skipped place."""
+        """Return the label that a person types for a press; None if the person ends the recording.
+
+        For a skipped place, the label is without contact.
+        """
         for line in typed:
             match = REPLY.fullmatch(line)
             if line in ENDS:

@@ -41,7 +41,7 @@ class CaptureResult(NamedTuple):
 
     stream: Recording
     labels: str  # a summary of the labels for the user
-    failed: Exception | None  # the error that ended the labels
+    failed: Exception | None  # the exception that ended the source of labels, if any
 
 
 NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")

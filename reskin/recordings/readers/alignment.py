@@ -125,8 +125,8 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
     return int(before_i), int(after_i), int(row)
 
 
-# A move is a change of place between two contacts. A period of the passes is accepted if this fraction of the moves
-# that can be compared with the move one period later have the same places.
+# A move is a change of place between two contacts. A move can be compared if the rows one period later are in contact
+# too. A period of the passes is accepted if at least this fraction of these moves has the same places one period later.
 AGREEMENT_MIN = 0.95
 # Minimum fraction of the moves that can be compared. If the period is half the recording, only half of the moves have
 # a move one period later, and in some of them the rows may be without contact.
@@ -159,7 +159,7 @@ def _likely_periods(
 ) -> Int64[np.ndarray, " p"]:
     """Return the periods in rows that fit a sample of the moves in the first half of the recording.
 
-    To test all moves for all periods would take quadratic time.
+    Testing all moves for all periods would take quadratic time.
     """
     half_n = len(contact) // 2
     early = moves[moves[:, 1] < half_n]
@@ -181,7 +181,8 @@ def _likely_periods(
 def _find_moves(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, "moves 2"]:
     """Return the moves: pairs of the last row in contact at a place and the first row in contact at the next place.
 
-    A period that is wrong by less than a dwell cannot match both places.
+    Both rows of a move are compared, because a period that is wrong by less than a dwell can match one of the places,
+    but not both.
     """
     rows = np.flatnonzero(contact)
     pairs = np.stack([rows[:-1], rows[1:]], axis=1)

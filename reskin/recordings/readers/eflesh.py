@@ -2,8 +2,8 @@
 
 Places are robot coordinates minus their minimum, so a scan begins at 0 mm. The depth is measured downwards from the
 highest z of the recording, which may be above the skin, so the depth has an unknown offset. The force is known along
-one axis. Along x and y, its sign is unknown, because the recorder does not state whether it is the force on the skin or
-on the gauge; the account counts these rows.
+one axis. If this is x or y, the sign of the force is unknown, because the recorder does not state whether it is the
+force on the skin or on the gauge; the account counts these rows.
 """
 
 from collections.abc import Mapping

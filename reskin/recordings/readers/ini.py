@@ -1,8 +1,8 @@
 """Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row per indentation.
 
-Rows with a force below 0.02 N count as no contact, whatever their place in the truths; the readings have no place and
-zero force. The first rows of a pass, with the indenter at a corner of the grid, give the no-load field of the pass.
-`t_s` and `depth_mm` are unknown (NaN).
+The truths are places and forces. Rows with a force below 0.02 N count as no contact, whatever their place in the
+truths; their place becomes NaN and their force 0. The first rows of a pass, with the indenter at a corner of the grid,
+give the no-load field of the pass. `t_s` and `depth_mm` are unknown (NaN).
 
 The fields may lag: row i of the truths belongs to a later row of the readings. The lag in rows is given in the header
 (`rows_late`); otherwise it is the lag at which |dB| correlates best with the force. If the lag changes within a

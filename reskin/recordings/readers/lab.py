@@ -75,7 +75,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if table.temperature_degC.shape[1] != header.chips_n:
         chips_n = table.temperature_degC.shape[1]
         raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header {header.chips_n}. Correct one of them."
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
+            "header."
         )
     rows = check_rows(table.b_uT, table.temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
     keep, noload = table.contact & rows.keep, ~table.contact & rows.keep
