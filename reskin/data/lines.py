@@ -1,8 +1,8 @@
 """Pokes along straight lines; the only label of a poke is its rank along the line.
 
-This is the method of section 5 of the paper: "indent in a straight line and incrementally index these points". Here, the
-index is derived from the places of a robot's grid. The places are then discarded: `Lines` contains only row numbers,
-line numbers and indices.
+This is the method of section 5 of the paper: "indent in a straight line and incrementally index these points". Here,
+the index is derived from the places of a robot's grid. The places are then discarded: `Lines` contains only row
+numbers, line numbers and indices.
 """
 
 from collections.abc import Sequence
