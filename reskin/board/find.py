@@ -82,7 +82,7 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     if not boards:
         problems = "; ".join(map(str, results)) or "no serial port found"
         raise CaptureError(
-            f"no board found ({problems}). Plug one in, or use --port. To try it without: reskin live --emulate nominal"
+            f"no board found ({problems}). Plug one in, or use --port. Without a board, try: reskin live --emulate nominal"
         )
     return boards
 
@@ -126,7 +126,7 @@ def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
 
 
 def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
-    """Return the frame rate after the first chunk, whose bytes may have been waiting in the port."""
+    """Return the frame rate without the first chunk, because its bytes may have been waiting in the port."""
     later_n = int((frames.end_byte > len(chunks[0][0])).sum())
     elapsed_s = chunks[-1][1] - chunks[0][1]
     return later_n / elapsed_s if elapsed_s > 0 else np.nan

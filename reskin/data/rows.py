@@ -15,7 +15,7 @@ from reskin.errors import ParamsError
 from reskin.schema import Readings
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
-UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` only concatenates these
+UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` does not change these
 SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # if a recording has shear forces (paper section 4)
 
 
@@ -27,7 +27,7 @@ class Selection(Strict):
 
 @dataclass(frozen=True)
 class Rows:
-    """The readings in contact from all captures of a scene, one reading per row; captures are in order of name.
+    """The readings in contact from all captures of a scene, one reading per row; captures are sorted by name.
 
     `db_uT` is the field change relative to the no-load reading of the same indentation. `target` has columns x_mm, y_mm
     and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` is the

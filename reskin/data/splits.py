@@ -129,12 +129,12 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on k skins of the other boards, test on the held-out board; one fold per board, k and draw (figure 6b).
+    """Train on k skins of the other boards, test on the held-out board; one fold per board, k and draw.
 
-    Every board is held out in turn and has separate random draws. Within a draw, the training skins for a smaller k are
-    a subset of those for a larger k. If k is the number of all skins of the other boards, there is a single fold for
-    the board. It equals the fold of experiment `lobo` and has the same name, so that training runs of `lobo` are
-    reused.
+    This is figure 6b of the paper. Every board is held out in turn and has separate random draws. Within a draw, the
+    training skins for a smaller k are a subset of those for a larger k. If k is the number of all skins of the other
+    boards, there is a single fold for the board. It equals the fold of experiment `lobo` and has the same name, so that
+    training runs of `lobo` are reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None

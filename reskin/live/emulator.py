@@ -122,7 +122,7 @@ def read_capture(folder: Path) -> Script:
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     frames, t_s = frames.where(timed), t_s[timed]
-    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames are sent with the second
+    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames are sent with the second frame
     pieces = [data[first:last] for first, last in pairwise(edges)]
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
 

@@ -182,7 +182,7 @@ ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # name of a button -> th
 
 
 class Session:
-    """One board on the page: a thread that polls it, the traces, the current recording, and the calibration."""
+    """One board on the page: a thread that polls the board, the traces, the current recording, and the calibration."""
 
     def __init__(
         self, port: str, models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True

@@ -120,7 +120,7 @@ class UniversalEstimator:
 
         Returns
         -------
-        A text for the user, with the standard deviation of places and the misfit before and after.
+        A text for the user: the standard deviation of places and the misfit, before and after the calibration.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class UniversalEstimator:
 
         Returns
         -------
-        A text for the user, with the median error of the place at held-out presses before and after.
+        A text for the user: the median error of the place at held-out presses, before and after the calibration.
 
         Raises
         ------
@@ -396,7 +396,7 @@ class LiveSkin:
         return self._estimate(frames, t_s, sound)
 
     def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Collect chunks until they suffice to detect the wire format, then return all of them; before, return []."""
+        """Collect chunks, and return []; once the wire format can be detected from them, return all of them."""
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:

@@ -60,8 +60,8 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     network from which they start.
     """
     recipe, target = job.recipe, data.target[job.train]
-    # The names of the random generator do not include the recipe, so that all recipes have the same initial weights and
-    # the same batches.
+    # The names that seed the random generator do not include the recipe, so that all recipes have the same initial
+    # weights and the same batches.
     retry = ("again", job.attempt_i) if job.attempt_i else ()
     rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
     if job.tuning is None:

@@ -285,8 +285,8 @@ def blocks(rows_n: int) -> list[slice]:
 class ClassicalJob:
     """Training and test of a method on one fold; `train` and `test` are row numbers.
 
-    At most `rows_max_n` training rows are used, drawn at random. `few_labels` are the numbers of additional training
-    rows, from a new skin. Their total weight equals that of all other training rows.
+    At most `rows_max_n` training rows are used, drawn at random. `few_labels` are the row numbers of additional
+    training rows, from a new skin. Their total weight equals that of all other training rows.
     """
 
     name: str

@@ -38,8 +38,8 @@ BETA2, EPS = 0.999, 1e-8
 class Outcome:
     """The weights of a trained network, and the mean squared error of each block of steps (scaled units).
 
-    If a loss or a weight was not finite, or if the loss exceeded `DIVERGED`, `stopped_step` is the last step of this
-    block, and the weights are those after the block before. Otherwise, `stopped_step` is None.
+    If a loss or a weight was not finite in some block, or if the loss exceeded `DIVERGED`, `stopped_step` is the last
+    step of that block, and the weights are those after the previous block. Otherwise, `stopped_step` is None.
     """
 
     weights: Weights

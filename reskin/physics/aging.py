@@ -36,13 +36,13 @@ SKIN_RELAXATION = Prony(  # assumed values
 
 
 class Relaxation(Strict):
-    """Timing of an indentation: the tip approaches at constant speed, then keeps its depth.
+    """Timing of an indentation: the tip approaches at constant speed, then stays at constant depth.
 
     The skin is assumed to be fully relaxed before the indentation.
     """
 
     approach_s: Annotated[float, Field(ge=0, le=100)]
-    hold_s: Annotated[float, Field(ge=0, le=100)]  # from the end of the approach to the middle of the readings
+    hold_s: Annotated[float, Field(ge=0, le=100)]  # time from the end of the approach to the middle of the readings
 
 
 class Memory(Strict):
@@ -55,8 +55,8 @@ class Memory(Strict):
     # per time constant: fraction of dB that a very long indentation adds
     share: tuple[Annotated[float, Field(ge=0, le=1)], ...]
     tau_s: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
-    contact_s: Annotated[float, Field(ge=0, le=1e4)]  # from the start of an indentation to the end of its readings
-    rest_s: Annotated[float, Field(ge=0, le=1e4)]  # from the end of the readings to the next no-load reading
+    contact_s: Annotated[float, Field(ge=0, le=1e4)]  # time from the start of an indentation to the end of its readings
+    rest_s: Annotated[float, Field(ge=0, le=1e4)]  # time from the end of the readings to the next no-load reading
 
     @model_validator(mode="after")
     def _check_lengths(self) -> "Memory":

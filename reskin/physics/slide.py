@@ -2,7 +2,7 @@
 
 The base is modelled as evenly distributed, isotropic springs that hold the whole skin. Therefore, the rigid motion of
 the skin follows from the displacement of the material under the tip (for a press) or from the tangential force (for a
-drag). Friction between tip and skin limits the motion (`limit_by_friction`), so that it vanishes with the normal force.
+drag). Friction between tip and skin limits the motion, which vanishes with the normal force (`limit_by_friction`).
 
 The normal force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2), because the layer stiffens as
 it thins: for a skin of 2 mm, by a factor of 1.2 at 0.2 mm and 4.0 at 1.2 mm. This factor and the displacement due to a
@@ -121,11 +121,11 @@ def compliance_m_per_N(
 def rigid_motion(
     places_m: Float[np.ndarray, "n 2"], displacement_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]
 ) -> RigidMotion:
-    """Return for each place the rigid motion that displaces it as given, with the least elastic energy of the base.
+    """Return for each place the rigid motion that displaces it by D with the least elastic energy of the base.
 
-    A rigid motion is u(X) = f + theta z x X, and the condition is u(p) = D at the place p. The solution is
-    f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is the mean of
-    r^2 over the skin.
+    D is `displacement_m`. A rigid motion is u(X) = f + theta z x X, and the condition is u(p) = D at the place p. The
+    solution is f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is
+    the mean of r^2 over the skin.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     spin_rad = (q_m * displacement_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))

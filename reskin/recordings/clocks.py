@@ -203,7 +203,7 @@ def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
 
 
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
-    """Return the offset, probe time minus stream time in s, that fits best; raise if another one fits about as well."""
+    """Return the offset (probe time minus stream time, in s) that fits best; raise if another fits about as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
     samples = signal / np.abs(signal).mean()  # scaled to a mean magnitude of 1, because most steps may have no frame
     weights, unsigned = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.unsigned))
@@ -326,7 +326,7 @@ def _line(
     stream_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
 ) -> ClockMap:
     """Fit the clock map to offsets (probe time minus stream time) by least squares; one offset gives a rate of 1."""
-    mid_s, mean_s = stream_s.mean(), offset_s.mean()  # centred for precision, as clocks may count from 1970
+    mid_s, mean_s = stream_s.mean(), offset_s.mean()  # centred for precision: clocks may count from 1970
     spread_s2 = ((stream_s - mid_s) ** 2).sum()
     slope = float(((stream_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(stream_s) > 1 else 0.0
     residual_s = float(np.abs(offset_s - mean_s - slope * (stream_s - mid_s)).max())

@@ -292,7 +292,7 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
 
 
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
-    """Return an iterator over the readings of a native capture, and the account, which is complete at the end.
+    """Return an iterator over the readings of a native capture, and the account (complete after the iteration).
 
     Without sync marks, the stream is read twice, the first time to align the clocks.
     """

@@ -24,7 +24,7 @@ TIME_STEP_s = 1e-6  # resolution of the written times
 TIME_MAX_s = 1e11  # unix time in seconds is below this for 3,000 years; in milliseconds, it is above
 CLOCKS = ("unix_s", "t_s")  # time on this machine's clock, or on the clock of the source
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
-CONTACT_N = 0.05  # assumed: above the noise of a gauge
+CONTACT_N = 0.05  # assumed: a force of this or more is a contact; it is above the noise of a gauge
 NOLOAD_N = 0.025  # below this, there is no contact; from this to CONTACT_N, a contact may be beginning or ending
 # Assumed limits of a dwell. A longer contact is split into several dwells, and each dwell has a separate mean force.
 DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5
@@ -277,7 +277,7 @@ class DwellBuilder:
             self.short_n += 1
 
     def summary(self) -> str:
-        """Describe how many contacts were too short for a dwell; empty if none.
+        """Describe how many contacts were too short for a dwell; return "" if there are none.
 
         In a table with rows only at the start and end of contacts, all contacts are too short.
         """

@@ -79,7 +79,7 @@ def record_capture(
 def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
     """Make the context of a source of labels.
 
-    Until the source calls `mark`, the clock mark says that labels and arrivals are on the same clock.
+    Until the source calls `mark`, the clock mark states that labels and arrivals are on the same clock.
     """
     # Determined once, because the system's clock may be adjusted during the recording.
     offset_s = time.time() - time.monotonic()

@@ -11,8 +11,8 @@ BLOCK_ROWS_N = 500  # length of the blocks over which the field's slow drift is 
 ROUNDS_N = 4  # how many times `find_change` fits the lines and splits the rows
 OUTLIER = 4.0  # distances are clipped to this multiple of the median distance
 # A change of the lag is reported if it reduces the sum of distances by at least the cost of this many misaligned rows.
-# In the two public recordings and in windows of them, the largest value without a change is 12; a row that is lost 100
-# rows before the end gives 40 or more.
+# In the two public recordings and in windows of them, this number is at most 12 if the lag does not change, and 40 or
+# more if a row is lost 100 rows before the end.
 EVIDENCE_ROWS_MIN_N = 30
 # Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. Noise alone reaches 0.17 in 300
 # rows.
@@ -68,7 +68,7 @@ def _best_lag(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], force_N: Float64[np.ndarray, " f"],
     place: Int64[np.ndarray, " f"],
 ) -> Int64[np.ndarray, " f"]:  # fmt: skip
-    """Return an array with the lag that fits best if all rows have the same lag, one element per row."""
+    """Find the single lag that fits all rows best; return it as an array with one element per row."""
     costs = []
     for lag_i, lag in enumerate(LAGS):
         lags = np.full(len(place), lag)
@@ -139,8 +139,8 @@ GOLDEN = (np.sqrt(5.0) - 1) / 2
 def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
     """Return the number of the pass of each row, from 0: a new pass begins when the sequence of places repeats.
 
-    If it does not repeat, all rows are in pass 0. Places of rows without contact are ignored. The last pass may be
-    incomplete.
+    If the sequence does not repeat, all rows are in pass 0. Places of rows without contact are ignored. The last pass
+    may be incomplete.
     """
     rows_n = len(place_mm)
     moves = _find_moves(place_mm, contact)

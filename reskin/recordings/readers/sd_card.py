@@ -1,6 +1,6 @@
-"""Read and write the log that a board writes to an SD card (paper, section 6): one CSV line per frame, without labels.
+"""Read and write the log that a board writes to an SD card (paper section 6): one CSV line per frame, without labels.
 
-A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware does.
+A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as in wire format `text-txyz`.
 """
 
 from codecs import BOM_UTF8
