@@ -82,7 +82,8 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     if not boards:
         problems = "; ".join(map(str, results)) or "no serial port found"
         raise CaptureError(
-            f"no board found ({problems}). Plug one in, or use --port. Without a board, try: reskin live --emulate nominal"
+            f"no board found ({problems}). Plug one in, or use --port. Without a board, try: "
+            "reskin live --emulate nominal"
         )
     return boards
 
