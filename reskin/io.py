@@ -154,7 +154,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SchemaError(f"{path}: the file is not JSON: {error}. Run its stage again.") from None
+        raise SchemaError(f"{path}: the file is not JSON: {error}. Run the stage that wrote it again.") from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:

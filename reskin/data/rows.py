@@ -146,7 +146,7 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
         where, skin = f"capture {readings.capture}", readings.skin
         if readings.chips_n != first.chips_n:
             what = f"{readings.chips_n} chips, but {first.capture} in the same scene has {first.chips_n}"
-            raise ParamsError(f"{where}: {what}. Add it to a scene of its own.")
+            raise ParamsError(f"{where}: {what}. Add it to a separate scene.")
         if readings.source != first.source:
             rule = f"{first.source}, as {first.capture} is"
             remedy = "Simulated and recorded captures belong to different scenes."

@@ -60,7 +60,7 @@ def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: 
     """
     windows_n = max(0, (min(units_n) - test_n) // every_n)
     if not windows_n:
-        rule = f"at least drift.every_n + test_n = {every_n + test_n} long"
+        rule = f"at least drift.every_n + drift.test_n = {every_n + test_n} units long"
         remedy = "Record more, or reduce the size of the windows."
         raise ParamsError("experiment drift", "the shortest capture", rule, min(units_n), remedy)
     tests = tuple((i * every_n, i * every_n + test_n) for i in range(1, windows_n + 1))

@@ -164,8 +164,8 @@ class UniversalEstimator:
         self._labelled_mm, self._labelled_uT = place_mm[~held_out], db_uT[~held_out].astype(np.float64)
         self._calibrate()
         return (
-            f"adapted to {(~held_out).sum()} known places: median error at {held_out.sum()} others {before_mm:.2f} mm "
-            f"before, {error_mm():.2f} mm after"
+            f"adapted to {(~held_out).sum()} known places: median error at {held_out.sum()} other places "
+            f"{before_mm:.2f} mm before, {error_mm():.2f} mm after"
         )
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:

@@ -52,7 +52,7 @@ def run_jobs(
         collapsed = [i for i, result in enumerate(results) if result.collapsed]
         if not collapsed:
             break
-        log(f"{len(collapsed)} of {len(jobs)} training runs collapsed: training again with other draws")
+        log(f"{len(collapsed)} of {len(jobs)} training runs collapsed: training again with other random numbers")
         retries = [replace(jobs[i], attempt_i=attempt_i) for i in collapsed]
         for i, result in zip(collapsed, _run_once(retries, data, executor, cache, log), strict=True):
             seconds = results[i].seconds + result.seconds

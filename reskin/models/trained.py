@@ -113,8 +113,8 @@ def read_network(model: Path) -> Network:
         raise SchemaError(f"{card_file}: the model predicts {outputs}, not {', '.join(TARGETS)}. Use another model.")
     if card.collapsed:
         raise SchemaError(
-            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use a model of another "
-            "seed."
+            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use a model that was "
+            "trained with another seed."
         )
     inputs_n = VIEW[card.recipe.inputs](np.zeros((1, card.input.channels_n), np.float32)).shape[1]
     weights_n = tensors["input_shift"].size if "input_shift" in tensors else 0

@@ -134,7 +134,7 @@ def displace(material: Material, change: Waves, depth_m: float, press: IndentedL
     hoop = material.hoop * (1 + second.hoop * (1 + first.hoop / 2))
     moved = Material(material.r_m + second.r_m, material.z_m + second.z_m, material.f + _gradient(second) @ half, hoop)
     if not moved.z_m.max() < RIM_MAX * press.thickness_m:
-        rule = f"such that the rim stays below {RIM_MAX} of the skin's thickness"
+        rule = f"such that the rim stays below {RIM_MAX} times the skin's thickness"
         got = f"{depth_m / press.thickness_m:.3g} of the thickness"
         raise ParamsError("poke", "depth", rule, got, "Poke less deep.")
     return moved

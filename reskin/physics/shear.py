@@ -352,7 +352,7 @@ def rotation_from_curl(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.nd
 
 def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[np.ndarray, "2"]:
     if not 0 < modulus_Pa < np.inf:
-        raise ParamsError("drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Drag a solid skin.")
+        raise ParamsError("drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Check the skin's modulus.")
     return force_N * (3 / modulus_Pa)  # incompressible: G = E / 3
 
 

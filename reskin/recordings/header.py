@@ -126,7 +126,7 @@ def check_same_capture(header: Header, folder: str) -> None:
     """Raise if the name of a capture folder differs from the name in its header, as after renaming the folder."""
     if header.capture != folder:
         rule = f"the folder's name {folder!r}"
-        raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename it back.")
+        raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename the folder.")
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:

@@ -240,7 +240,7 @@ class ForceGauge:
     def summary(self) -> str:
         """Describe how many lines could not be read, and how many contacts have no force; "" if there are none."""
         bad = _bad_lines(f"the gauge at {self.port}", self._gauge)
-        without = f"{self._without_force_n} touches without a force: the gauge at {self.port} sent none during them"
+        without = f"{self._without_force_n} touches during which the gauge at {self.port} sent no force"
         return "; ".join(filter(None, (bad, self._problem, without if self._without_force_n else "")))
 
     @contextmanager

@@ -124,7 +124,7 @@ def _read_fields(
     differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
     if len(differ):
         where = f"{header.capture}/{CHANGES} line {differ[0] + 1}"
-        raise CaptureError(f"{where}: time differs from that of {SENSOR}. Take both files of one recording.")
+        raise CaptureError(f"{where}: time differs from that of {SENSOR}. Use both files of the same recording.")
     check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
     return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
 

@@ -179,7 +179,7 @@ def _check_lateness(
     lost = f"{rows_n} row{'s' if rows_n > 1 else ''} of {'readings' if change.after < change.before else 'truths'}"
     lags = f"{change.before} rows before about row {change.row + 1}, by {change.after} from there on"
     remedy = (
-        f"{lost} seem to be missing there. Cut both files before that row, or put back what is missing, and add the "
+        f"{lost} seem to be missing there. Cut both files before that row, or restore the missing rows, and add the "
         "recording again."
     )
     raise CaptureError(f"{header.capture}/{READINGS}: the fields lag behind their truths by {lags}. {remedy}")
@@ -203,6 +203,6 @@ def _noload_field(
         where = f"{header.capture}/{TRUTHS} line {int(np.argmax(pass_i == without[0])) + 1}"
         raise CaptureError(
             f"{where}: this pass does not begin with a fault-free row without contact (F < {CONTACT_MIN_N} N). "
-            "Start each pass off the skin, or cut this pass out."
+            "Start each pass off the skin, or remove this pass."
         )
     return noload_uT[pass_i]
