@@ -230,7 +230,8 @@ class FaultLog:
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
                 f"{self._where}: {', '.join(channels)} never changed in the whole recording. Check the wiring, the "
-                "chip and the columns, and record again. To accept it, set faults.constant_channel: flag in params.yaml."
+                "chip and the columns, and record again. To accept such channels, set faults.constant_channel: flag in "
+                "params.yaml."
             )
         if channels:
             position = np.array(self._span) if position is None else position
