@@ -48,8 +48,8 @@ def load_rows(folder: Path | str, *, force_min_N: float = 0.0) -> Rows:
     Returns
     -------
     Rows
-        For f readings: `db_uT` [f ch] is the field change from the no-load reading; `target` [f 3] is x_mm, y_mm and
-        Fz_N; `board` and `skin` [f] are the names of each reading's board and skin.
+        For f readings with ch channels: `db_uT` [f ch] is the field change from the no-load reading; `target` [f 3] is
+        x_mm, y_mm and Fz_N; `board` and `skin` [f] are the names of each reading's board and skin.
 
     Raises
     ------
@@ -337,7 +337,7 @@ def load_model(file: Path | str) -> Model:
 
 
 def load_universal(calibration: Path | str | None = None) -> Universal:
-    """Load the universal model that comes with the library; it predicts for a new skin without training data from it.
+    """Load the universal model that comes with the library. It needs no training data from the skin it is used on.
 
     Its methods calibrate the model to a skin: `zero` accepts readings without contact, `see` accepts presses at unknown
     places, and `label` accepts presses at known places. `next_place` proposes where to press next, and `save` writes
@@ -442,7 +442,7 @@ def _load_all(model: AnyModel) -> Sequence[Network] | Universal:
 
 
 def lifted() -> Label:
-    """Return the label for `record` that nothing touches the skin. One such label must come before each touch."""
+    """Return a label that tells `record`: nothing touches the skin. One such label must come before each touch."""
     from reskin.recordings.labels import Label
 
     return Label(False)
@@ -458,7 +458,7 @@ def touch(
     Fz_N: float = math.nan,
     pass_i: int = 0,
 ) -> Label:
-    """Return the label for `record` that the robot touches the skin and does not move.
+    """Return a label that tells `record`: the robot touches the skin at this place and does not move.
 
     Parameters
     ----------
@@ -467,7 +467,7 @@ def touch(
     depth_mm, Fx_N, Fy_N, Fz_N : float, optional
         Indentation depth, and force on the skin (Fz positive in compression). Default: NaN, for unknown values.
     pass_i : int
-        If all places are touched repeatedly: number of the repetition, from 0.
+        If the program visits all places several times: index of the current repetition, from 0.
 
     Examples
     --------
@@ -492,7 +492,7 @@ def record(
 ) -> Path:
     """Record a board while a program moves a robot and labels the contacts.
 
-    Prints a summary to stderr: the amounts of data that were recorded, lost and left out.
+    Prints a summary to stderr: how much data was recorded, lost and left out.
 
     Parameters
     ----------
@@ -521,12 +521,12 @@ def record(
     ReskinError
         If no board is detected, or it sends no frames.
     Exception
-        Any exception from `labels`; the data that were recorded before it are kept.
+        Any exception that `labels` raises; the data recorded until then are kept.
 
     Examples
     --------
     >>> def presses():
-    ...     for x_mm, y_mm in places:  # in random order, because the last touch affects the next one
+    ...     for x_mm, y_mm in places:  # in random order, because each touch affects the next one
     ...         robot.lift_and_go_to(x_mm, y_mm)
     ...         yield reskin.lifted()
     ...         robot.press()

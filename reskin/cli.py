@@ -150,7 +150,7 @@ def record(
     labels: Annotated[str | None, Option(help=LABELS)] = None,
     gauge: Annotated[str | None, Option(help=GAUGE)] = None,
     dwell_s: Annotated[
-        float, Option("--dwell", help="Time in s after Enter for which a label is valid.", min=0.1)
+        float, Option("--dwell", help="Seconds for which a label is valid after you press Enter.", min=0.1)
     ] = 1.0,
 ) -> None:
     """Record a board, with labels if requested. `reskin add` can add labels from a robot's log later."""

@@ -1,4 +1,4 @@
-"""Digests of Python code, to detect changes: of single modules without comments and docstrings, and of packages."""
+"""Digests that detect changes of code: of single modules, without comments and docstrings, and of whole packages."""
 
 import ast
 import hashlib

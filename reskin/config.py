@@ -26,7 +26,7 @@ Model = TypeVar("Model", bound=Strict)
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML 1.2 file, the version that DVC uses (in YAML 1.1, `1e-3` would be text)."""
+    """Read a file as YAML 1.2, like DVC (in YAML 1.1, `1e-3` would be text)."""
     try:
         return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -39,8 +39,8 @@ def read_yaml(path: Path) -> Any:
 def parse(model: type[Model], value: Any, where: str) -> Model:
     """Create a settings model from plain values; raise a `ParamsError` that names the wrong key and its rule."""
     try:
-        # Strict validation of Python values rejects a list for a tuple. Strict validation of JSON accepts it, but still
-        # rejects the text "3" for a number.
+        # Strict validation of Python values rejects a list where a tuple is expected. Strict validation of JSON accepts
+        # a list there, but still rejects the text "3" where a number is expected.
         return model.model_validate_json(json.dumps(value, default=str))
     except ValidationError as error:
         # A misspelt key causes two errors, an unknown and a missing key: report the unknown key.

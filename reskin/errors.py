@@ -1,4 +1,4 @@
-"""Exceptions for errors that a user can fix, and their messages for machine failures and missing packages."""
+"""Exceptions for errors that a user can fix, and messages for machine failures and missing packages."""
 
 import errno
 from collections.abc import Iterable, Iterator
@@ -17,7 +17,7 @@ class ReskinError(ValueError):
         Without further arguments, the complete message. With further arguments, only the location of the error: a file
         with the line or byte, an option, or a setting.
     what, rule, got, remedy
-        The other parts of the message: the wrong thing, what it must be, what it is, and what to try.
+        The other parts of the message: the name of the wrong value, what it must be, what it is, and what to try.
 
     Examples
     --------
@@ -82,7 +82,7 @@ RETRY = "Run it again: finished work is kept."
 def explaining(where: str) -> Iterator[None]:
     """Convert machine failures to `MachineError`, and a missing package to `ParamsError`; `where` starts the message.
 
-    All other exceptions are not changed.
+    Other exceptions pass through unchanged.
 
     >>> with explaining("split"):
     ...     raise OSError(errno.ENOSPC, "No space left on device", "data/folds/lab.json")

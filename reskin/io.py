@@ -154,7 +154,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SchemaError(f"{path}: the file is not JSON: {error}. Run its stage again.") from None
+        raise SchemaError(f"{path}: the file is not JSON: {error}. Run the stage that wrote it again.") from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
@@ -217,7 +217,7 @@ def read_table(path: Path) -> pa.Table:
 
 
 def write_readings(path: Path, blocks: Iterable[Readings], counts: Mapping[str, int]) -> None:
-    """Write the readings of one capture block by block, and then `counts`, which iterating over `blocks` may update."""
+    """Write the readings of one capture block by block, then `counts`. Iterating over `blocks` may update `counts`."""
     with replacing(path) as temporary:
         writer: pq.ParquetWriter | None = None
         for block in blocks:

@@ -1,6 +1,7 @@
-"""Estimate contacts, places and forces in a log (paper section 6: dog shoe, glove), and score them if labels exist.
+"""Estimate contacts, places and forces in a log, and score the estimates if the log has labels.
 
-A log must start without contact. The mean field of this quiet start is the no-load reading.
+Section 6 of the paper shows such logs of a dog's shoe and of a glove. A log must start without contact. The mean field
+of this quiet start is the no-load reading.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,14 +16,14 @@ from reskin.metrics import score
 
 WINDOW_S = 0.1  # assumed: length of the windows whose mean fields are compared with the mean field of the start
 QUIET_MIN_S = 0.5  # assumed: shortest quiet start; the mean of a shorter one is not a reliable no-load reading
-# A window is quiet if its mean differs from that of the start by at most this many standard errors in every channel.
+# A window is quiet if, in every channel, its mean differs from the start's mean by at most this many standard errors.
 # With 15 channels, noise alone exceeds this in 1 of 1,000 windows.
 WANDER_SDS = 4.0
 START_WINDOWS_N = 2  # number of windows at the start of the log from which mean and noise are estimated
 # A reading is in contact if |dB| exceeds its median over the quiet start by more than this multiple of the noise, which
 # is the rms of dB over all channels in the quiet start.
 CONTACT_SDS = 6.0
-POINTS_MAX_N = 1500  # largest number of points of a series in a figure
+POINTS_MAX_N = 1500  # largest number of points per series in a figure
 
 Estimator = Callable[[Float32[np.ndarray, "f ch"]], Float32[np.ndarray, "f 3"]]
 
@@ -159,14 +160,18 @@ def truth_at(
     end_s: Float64[np.ndarray, " d"],
     true: Float[np.ndarray, "d 3"],
 ) -> Float64[np.ndarray, "f 3"]:
-    """Return, for each reading, the true values of the dwell during which it was taken; NaN between dwells."""
+    """Return the true values [x_mm, y_mm, F_N] for each reading.
+
+    They are those of the dwell (a stop of the robot at one place) during which the reading was taken; NaN between
+    dwells.
+    """
     dwell_i = np.searchsorted(start_s, t_s, "right") - 1
     inside = (dwell_i >= 0) & (t_s <= end_s[dwell_i])
     return np.where(inside[:, None], true[dwell_i].astype(np.float64), np.nan)
 
 
 def thin(log: LogEstimates, true: Float64[np.ndarray, "f 3"] | None) -> dict[str, Any]:
-    """Return data of a figure: at most 1,500 evenly spaced readings, with None as the estimate without contact.
+    """Return the data of a figure: at most 1,500 evenly spaced readings; estimates without contact are None.
 
     `estimated` is the estimate of the first model. With several models, `low` and `high` are the smallest and the
     largest of their estimates.

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-ACCURACY_LIMIT_MM = 1.0  # paper section 4: both |dx| and |dy| within 1 mm
+ACCURACY_LIMIT_MM = 1.0  # section 4 of the paper: a place counts as accurate if |dx| and |dy| are at most 1 mm
 METRICS = ("accuracy_pct", "mse_xy_mm2", "mse_f_N2", "r2_f")
 # Mean and variance of the true forces of the scored rows, needed to combine the R^2 of several groups of rows.
 TRUTH = ("force_mean_N", "force_var_N2")
@@ -52,10 +52,10 @@ def register(true: Float[np.ndarray, "f 3"], predicted: Float[np.ndarray, "f 3"]
 def score_groups(
     true: Float[np.ndarray, "b 3"], predicted: Float[np.ndarray, "b 3"], board: np.ndarray, skin: np.ndarray
 ) -> dict[str, Any]:
-    """Score all test rows together, the rows of each test skin, and all rows after `register` per test board.
+    """Score all test rows together, the rows of each test skin, and all rows after `register` on each test board.
 
-    `board` and `skin` are the names of each row's board and skin. The result's key `registered`, for the last of these
-    scores, is a diagnostic.
+    `board` and `skin` are the names of each row's board and skin. The scores after `register` (key `registered`) are a
+    diagnostic.
     """
     registered = predicted.copy()
     for name in np.unique(board):

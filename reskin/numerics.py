@@ -68,7 +68,7 @@ def departures(environment: Mapping[str, str]) -> list[str]:
     ['ATEN_CPU_CAPABILITY=default']
     """
     pinned_to = {name: {value} for name, value in PINNED.items()}
-    features = " ".join(BEYOND_AVX2)  # `pinned` lists all of them, or only the first
+    features = " ".join(BEYOND_AVX2)  # `pinned` sets all of them, or the first few
     pinned_to["NPY_DISABLE_CPU_FEATURES"] = {features[:end].rstrip() for end in range(len(features) + 1)}
     values = {name: environment.get(name, "") for name in VARIABLES}
     changed = [f"{name}={value}" for name, value in values.items() if value and value not in pinned_to.get(name, set())]
@@ -76,7 +76,7 @@ def departures(environment: Mapping[str, str]) -> list[str]:
 
 
 def signature() -> tuple[str, ...]:
-    """Return the settings of this process that affect the last bits of a training run; cache keys contain them."""
+    """Return the settings of this process that affect the last bits of a trained network; cache keys contain them."""
     return ("pinned" if "avx2" in cpu_flags() else "not pinned", *departures(os.environ))
 
 

@@ -118,7 +118,7 @@ def read_any_log(log: Path, rate_hz: float) -> sd_card.Log:
 
 
 def _read_capture(folder: Path) -> sd_card.Log:
-    """Read the frames of a capture; drop frames without a time, which follow the last recorded arrival time."""
+    """Read the frames of a capture; drop frames after the last recorded arrival time, because they have no time."""
     header = read_header(folder)
     if header.layout == "sd-card":
         return sd_card.read_log(folder / LOG_FILE)

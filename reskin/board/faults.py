@@ -12,24 +12,24 @@ from jaxtyping import Bool, Float, Float64, Int
 from reskin.board.stream import TEMPERATURE_MAX_degC, TEMPERATURE_MIN_degC
 from reskin.board.wire import Frames
 
-# Values that the ReSkin firmware sends for a chip whose I2C read failed; seen in INI's recording AFG_flex_50.
+# Values that the ReSkin firmware sends for a chip whose I2C read failed; found in INI's public recording AFG_flex_50.
 FAILED_B_uT = (8028.16, 5194.00, 12943.36)
 FAILED_TEMPERATURE_degC = -880.49
-FAILED_TOLERANCE = 0.01  # text wires round to two decimals
+FAILED_TOLERANCE = 0.01  # text formats round to two decimals
 
-# The LSB of a chip with power-on settings; seen in INI's recordings AFG_test_new_board15 and piezo.
+# The LSB of a chip with power-on settings; found in INI's public recordings AFG_test_new_board15 and piezo.
 RESET_LSB_XY_uT = 0.98
 RESET_LSB_Z_uT = 1.58
 LSB_TOLERANCE = 0.1  # gains of the MLX90393 differ by 20 % or more (data sheet, table 17)
 
 # The values of a channel are multiples of the chip's LSB: they are on a grid. Gaps are the differences between
-# neighbouring distinct values. A grid is detected if a fraction STEP_SHARE_MIN of the gaps, and at least STEPS_MIN_N
-# gaps, are one step: in the first 200 frames of 14 real recordings, 5 % or more are. Without a grid, only one or two
-# gaps are close to the smallest gap, by chance.
+# neighbouring distinct values. A grid is detected if at least the fraction STEP_SHARE_MIN of the gaps, and at least
+# STEPS_MIN_N gaps, equal one step. In the first 200 frames of 14 real recordings, 5 % or more of the gaps equal one
+# step. Without a grid, only one or two gaps are close to the smallest gap, by chance.
 STEP_SHARE_MIN = 0.04
 STEPS_MIN_N = 4
-# Maximum relative standard deviation of the gaps that count as one step, those below 1.5 times the smallest gap. It is
-# 0.02 for an LSB of 0.242 uT written with two decimals, and 0.12 for random gaps.
+# Maximum relative standard deviation of the gaps that count as one step (gaps below 1.5 times the smallest gap). This
+# deviation is 0.02 for an LSB of 0.242 uT written with two decimals, and 0.12 for random gaps.
 STEP_SPREAD_MAX = 0.06
 SURE_STEPS_MIN_N = 20  # even with few values and no noise, this many equal gaps do not occur by chance
 STEP_MIN_uT = 0.1  # no setting of the MLX90393 has a finer LSB than 0.150 uT (data sheet, table 17)
@@ -38,8 +38,8 @@ SAME_VALUE_uT = 1e-3  # a smaller gap is a rounding error of float32 arithmetic
 # Because of noise, successive readings of a working chip differ. They are equal only if the chip is read again before
 # its next conversion (1.84 ms), or if its LSB is coarse. In 14 real recordings, at most 3 successive frames are equal.
 STUCK_FRAMES_MIN_N = 20
-# A chip is stuck only if another chip changes in at least this fraction of the frames in which the chip does not. The
-# value is below 1 because, in data without noise, readings change only while the board is pressed or released.
+# A chip whose reading stays the same is stuck only if another chip changes in at least this fraction of these frames.
+# The value is below 1 because, in data without noise, readings change only while the board is pressed or released.
 OTHERS_MOVE_MIN = 0.5
 
 B_MAX_uT = 49_000.0  # an MLX90393 measures up to 50 mT (data sheet)
@@ -49,12 +49,12 @@ CLOCK_STEP_MAX_S = 1.0  # a longer step of the board's clock is a jump
 REPEATED_LOOK_N, REPEATED_SHARE = 40, 0.4
 MISSING_STEPS = 1.6  # frames are missing if a step of the board's clock exceeds the median step by this factor
 SILENCE_S = 1.0
-# A silence must also exceed the median time between two frames by this factor, so that a slow log is not reported.
+# A silence must also exceed the median time between frames by this factor, so that a low frame rate is not a silence.
 SILENCE_STEPS = 50.0
-GARBAGE_FRAMES_N = 10  # more stray bytes than this many frames have suggest a wrong baud rate, not a torn frame
+GARBAGE_FRAMES_N = 10  # if the stray bytes are longer than this many frames, the baud rate is probably wrong
 LONG_LINE = 1.5  # a line of text that exceeds the median length by this factor contains stray bytes
 
-SCALE_FRAMES_N = 400  # enough to find the LSB of every good chip in real recordings; 200 may be too few
+SCALE_FRAMES_N = 400  # enough to find the LSB of every working chip in real recordings; 200 may be too few
 GRID_ROWS_N = 1000  # the LSB of a table is estimated from blocks of this many rows
 
 
@@ -70,7 +70,8 @@ def failed_reads(
 def zero_reads(b_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, "f k"]:
     """Mark the readings of a chip whose three field components are exactly 0, as in memory that was never filled.
 
-    Some rows of eFlashTeam7 have zeros on all chips. In the earth's field, a chip cannot read 0 on three axes at once.
+    Some rows of the public eFlashTeam7 recordings have zeros on all chips. In the earth's field, a chip cannot read 0
+    on three axes at once.
     """
     return np.asarray((_by_chip(b_uT) == 0).all(axis=2))
 
@@ -209,7 +210,7 @@ def repeated_frames(step_uT: Float[np.ndarray, "f ch"]) -> Bool[np.ndarray, " f"
         return np.zeros(len(same), bool)
     window = np.full(REPEATED_LOOK_N, 1 / REPEATED_LOOK_N)
     share, inside = (np.convolve(values, window, mode="same") for values in (same, np.ones(len(same))))
-    inside[inside > 1 - 0.5 / REPEATED_LOOK_N] = 1.0  # remove rounding errors; windows are cut only at the ends
+    inside[inside > 1 - 0.5 / REPEATED_LOOK_N] = 1.0  # remove rounding errors
     return np.asarray(same & (share / inside > REPEATED_SHARE))
 
 
@@ -281,17 +282,17 @@ class ReadingFaults(NamedTuple):
 
     @property
     def failed_rows(self) -> Bool[np.ndarray, " f"]:
-        """Frames in which the reading of at least one chip failed."""
+        """Mask of the frames in which the reading of at least one chip failed."""
         return np.asarray((self.failed_read | self.zeros).any(axis=1))
 
     @property
     def faulty_rows(self) -> Bool[np.ndarray, " f"]:
-        """Frames in which any chip has any of these faults."""
+        """Mask of the frames in which any chip has any of these faults."""
         return np.asarray((self.failed_read | self.zeros | self.too_hot | self.saturated).any(axis=1))
 
 
 def find_reading_faults(b_uT: Float[np.ndarray, "f ch"], temperature_degC: Float[np.ndarray, "f k"]) -> ReadingFaults:
-    """Mark the faults that can be detected in each reading by itself."""
+    """Mark the faults that can be detected from a single reading."""
     failed = failed_reads(b_uT, temperature_degC)
     return ReadingFaults(failed, zero_reads(b_uT), too_hot(temperature_degC) & ~failed, saturated(b_uT) & ~failed)
 
@@ -300,8 +301,8 @@ class ScaleWindow(NamedTuple):
     """The LSB of each chip, estimated from `SCALE_FRAMES_N` successive frames.
 
     `first_frame` is the number of the first of these frames, counted from 1; `t_s` are the times of all of them.
-    `unusual` marks chips whose LSB is not the expected one or differs from that of the other chips. `changed` marks
-    chips whose LSB differs from the first one that was found for this chip.
+    `unusual` marks chips whose LSB is not the expected one or differs from the LSB of the other chips. `changed` marks
+    chips whose LSB differs from the LSB that was first found for the same chip.
     """
 
     first_frame: int
@@ -321,9 +322,9 @@ class Faults(NamedTuple):
     repeated: Bool[np.ndarray, " f"]
     clock_jump: Bool[np.ndarray, " f"]
     unplug: Bool[np.ndarray, " f"]
-    missing_frames_n: Int[np.ndarray, " f"]  # before each frame, according to the board's clock
+    missing_frames_n: Int[np.ndarray, " f"]  # number of frames missing before each frame, by the board's clock
     torn_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame, or 0 if they are garbage
-    garbage_bytes_n: Int[np.ndarray, " f"]  # so many stray bytes that the baud rate may be wrong, or 0
+    garbage_bytes_n: Int[np.ndarray, " f"]  # stray bytes before each frame if very many (wrong baud rate?), or 0
     scale: tuple[ScaleWindow, ...]  # the windows that this portion completed
 
 
@@ -353,7 +354,7 @@ class FaultDetector:
         self._stuck, self._constant = StuckChips(chips_n), ConstantChannels(chips_n)
         self._window_uT, self._window_s = np.zeros((0, 3 * chips_n), np.float32), np.zeros(0)
         self._windowed_n = 0  # frames in complete windows
-        self._lsb_uT = np.full((chips_n, 2), np.nan)  # of each chip, once known
+        self._lsb_uT = np.full((chips_n, 2), np.nan)  # LSB of each chip; NaN until known
         self._last_b_uT: Float[np.ndarray, "1 ch"] | None = None  # field of the last frame without a faulty reading
         self._last: tuple[float, float, int] | None = None  # time, board's time and end byte of the last frame
 

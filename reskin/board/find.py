@@ -19,7 +19,7 @@ BAUD = 115200  # USB ports ignore the baud rate
 LISTENING_S = 1.5  # about 200 frames of the slowest board, enough to find the LSB of its chips
 REPLUG_TIMEOUT_S = 60.0
 POLL_S = 0.2
-BOARDS_MAX_N = 16  # opened at the same time
+BOARDS_MAX_N = 16  # largest number of boards that are opened at the same time
 LSB_TOLERANCE = 0.05  # relative; the LSBs of two gains differ by 20 % or more
 Chunk = tuple[bytes, float]  # bytes, and their time of arrival in s
 
@@ -82,7 +82,8 @@ def find_boards(names: Sequence[str] | None = None) -> list[DetectedBoard]:
     if not boards:
         problems = "; ".join(map(str, results)) or "no serial port found"
         raise CaptureError(
-            f"no board found ({problems}). Plug one in, or use --port. To try it without: reskin live --emulate nominal"
+            f"no board found ({problems}). Plug one in, or use --port. Without a board, try: "
+            "reskin live --emulate nominal"
         )
     return boards
 
@@ -126,7 +127,7 @@ def _median(steps_uT: Float64[np.ndarray, " k"]) -> float:
 
 
 def _rate_hz(frames: Frames, chunks: Sequence[Chunk]) -> float:
-    """Return the frame rate after the first chunk, whose bytes may have been waiting in the port."""
+    """Return the frame rate without the first chunk, because its bytes may have been waiting in the port."""
     later_n = int((frames.end_byte > len(chunks[0][0])).sum())
     elapsed_s = chunks[-1][1] - chunks[0][1]
     return later_n / elapsed_s if elapsed_s > 0 else np.nan
@@ -162,7 +163,7 @@ def _wait(find_ports: Callable[[], set[str]], pause: Callable[[float], None], ti
 
 
 def check_named_once(ports: Sequence[str], where: str) -> None:
-    """Raise `ParamsError` if a port is named twice, or unless there are 1 to `BOARDS_MAX_N` ports."""
+    """Raise `ParamsError` if a port is named twice, or if there are no ports or more than `BOARDS_MAX_N`."""
     if len(set(ports)) != len(ports) or not 0 < len(ports) <= BOARDS_MAX_N:
         rule = f"1 to {BOARDS_MAX_N}, each named once"
         raise ParamsError(where, "ports", rule, ", ".join(ports) or "none", "Name each port once.")

@@ -9,7 +9,8 @@ from reskin.board.find import BAUD, Chunk
 from reskin.board.port import Device, open_port, read_waiting
 from reskin.errors import CaptureError
 
-QUEUE_BYTES_MAX_N = 2**22  # two minutes of five chips at 400 Hz; from a longer queue, the oldest chunks are dropped
+# Two minutes of data from five chips at 400 Hz. If the queue is longer, its oldest chunks are dropped.
+QUEUE_BYTES_MAX_N = 2**22
 RETRY_S = 0.5
 PLUGGED_IN = b""  # a chunk that marks the beginning of a new stream
 
@@ -100,7 +101,7 @@ class Reader:
 
     def _queue_chunk(self, chunk: bytes) -> None:
         with self._arrived:
-            # The time is read within the lock, so that a chunk that `take` missed is never older than that call.
+            # The time is read within the lock, so that a chunk that `take` did not return has a time after `taken_s`.
             now_s = self.unix_s()
             self._chunks.append((chunk, now_s))
             self.waiting_bytes_n += len(chunk)

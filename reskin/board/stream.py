@@ -38,7 +38,7 @@ class _Scan:
 
     frames: Frames
     count: Counter[str]  # keys of `ACCOUNT`
-    settled_n: int  # number of first bytes that need not be scanned again
+    settled_n: int  # number of bytes at the start of the buffer that need not be scanned again
     at_boundary: bool  # whether a frame begins after the settled bytes
 
 
@@ -227,7 +227,7 @@ def _search(
     )
     best_i = int((here_n + next_n).argmax())
     start = int(starts[best_i])
-    # The bytes after a CR LF in a payload may look like a frame; then the frame that follows them is more plausible.
+    # The bytes after a CR LF in a payload may look like a frame. The real frame after them is then more plausible.
     is_tail = next_n[best_i] > here_n[best_i] and not (at_boundary and start == 0)
     return start + length_n * int(is_tail), True
 

@@ -149,8 +149,8 @@ def _numbers(
     line_end: Int64[np.ndarray, " f"],
 ) -> tuple[Float64[np.ndarray, "f c"], Bool[np.ndarray, " f"]]:
     """Read the number around each decimal point; the mask marks lines that consist of numbers and tabs only."""
-    # Unsigned bytes wrap around, so other characters than digits are above 9. Two zeros are appended, because a point
-    # may be the last byte.
+    # Unsigned bytes wrap around, so characters that are not digits give numbers above 9. Two zeros are appended,
+    # because a decimal point may be the last byte.
     digit = np.append(octets, np.zeros(2, np.uint8)) - np.uint8(ZERO)
     stop = dot + 3
     previous_stop = np.column_stack([line_start, stop[:, :-1]])  # where the previous number ends

@@ -22,7 +22,7 @@ def subtract(b_uT: Float32[np.ndarray, "f ch"], noload_uT: Float32[np.ndarray, "
 
 
 def rank(label: Shaped[np.ndarray, " f"]) -> Int64[np.ndarray, " f"]:
-    """Return for each row the number of its run of equal labels, counted from 0.
+    """Number the runs of equal labels from 0, and return the run number of each row.
 
     `label` is, for example, the indentation or pass of each row of a capture, in order of time.
     """
@@ -62,7 +62,7 @@ def free(
     distance is below `within_uT`.
     """
     rank_i = rank(indentation)
-    is_first_row = np.concatenate([[True], rank_i[1:] != rank_i[:-1]])  # of an indentation
+    is_first_row = np.concatenate([[True], rank_i[1:] != rank_i[:-1]])  # whether a row is the first of its indentation
     readings_uT: list[np.ndarray] = []
     for row_i in range(len(b_uT)):
         readings_uT += [noload_uT[row_i], b_uT[row_i]] if is_first_row[row_i] else [b_uT[row_i]]
@@ -77,7 +77,7 @@ def follow_free(readings: Iterable[np.ndarray], within_uT: float) -> Iterator[Fl
     The first reading must be free of contact. Consecutive similar readings, such as those of a press that is held, form
     one state of any duration. Different presses give different readings, but readings without contact are similar.
     Therefore, a state is classified as free of contact if it is similar to at least `SIMILAR_MIN_N` of the latest
-    states. During a long contact, such as that of a sliding finger, the baseline does not change.
+    states. During a long contact, such as a sliding finger, the baseline does not change.
     """
     states: deque[np.ndarray] = deque(maxlen=STATES_N)
     baseline_uT: np.ndarray | None = None

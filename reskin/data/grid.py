@@ -1,4 +1,4 @@
-"""The paper's poking protocol: in each pass, all 65 points of a grid are poked at one depth after another.
+"""The paper's poking protocol: all 65 points of a grid are poked at one depth, then all at the next depth, and so on.
 
 Places are in the coordinates of the labels: x and y from 0 to 16 mm, with the centre of the skin at (8, 8) mm.
 """

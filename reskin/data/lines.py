@@ -1,8 +1,8 @@
 """Pokes along straight lines; the only label of a poke is its rank along the line.
 
-This is the paper's method (section 5): "indent in a straight line and incrementally index these points". Here, the
-index is derived from the places of a robot's grid. The places are then discarded: `Lines` contains only row numbers,
-line numbers and indices.
+This is the method of section 5 of the paper: "indent in a straight line and incrementally index these points". Here,
+the index is derived from the places of a robot's grid. The places are then discarded: `Lines` contains only row
+numbers, line numbers and indices.
 """
 
 from collections.abc import Sequence
@@ -40,9 +40,9 @@ class Lines:
 def grid_lines(rows: Rows, chosen: Int64[np.ndarray, " c"]) -> Lines:
     """Assign the chosen row numbers to the grid lines of each skin, along x and along y, with an index along the line.
 
-    Of the labels, only the skin and the commanded place are used. The index along a line in x is the rank of the row's
-    x among all distinct x of the skin's chosen rows (for lines in y, likewise). A line without a row at one of these
-    coordinates therefore has a gap in its indices. Lines with a single place have no order and are left out.
+    The only labels that are used are the skin and the commanded place. The index along a line in x is the rank of the
+    row's x among all distinct x of the skin's chosen rows (for lines in y, likewise). A line without a row at one of
+    these coordinates therefore has a gap in its indices. Lines with a single place have no order and are left out.
     """
     row, line, order_i = [chosen[:0]], [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)]
     for skin_i, skin in enumerate(np.unique(rows.skin[chosen])):
@@ -99,7 +99,7 @@ def hand_rows(captures: Sequence[Readings]) -> tuple[Rows, dict[str, Lines]]:
 
 
 def shift_rows(lines: Lines, rows_n: int) -> Lines:
-    """Increase the row numbers of lines by `rows_n`, because their rows are stacked below `rows_n` other rows."""
+    """Increase the row numbers in `lines` by `rows_n`, for rows that are stacked below `rows_n` other rows."""
     return replace(lines, row=lines.row + rows_n)
 
 
@@ -108,10 +108,10 @@ def take_pokes(
 ) -> Int64[np.ndarray, " d"]:
     """Draw `indentations_n` indentations of one skin, evenly over the places; return their row numbers, sorted.
 
-    `pool` are the row numbers to draw from. Of the labels, only the place of an indentation's first row is used. In the
-    first round, one indentation is drawn for each place; in the second round, another one, and so on. The last round
-    may cover only some places, chosen at random. If a call with the same state of `rng` draws fewer indentations, these
-    are a subset.
+    `pool` contains the row numbers to draw from. The only label that is used is the place of an indentation's first
+    row. In the first round, one indentation is drawn for each place; in the second round, another one, and so on. The
+    last round may cover only some places, chosen at random. With the same state of `rng`, a call that draws fewer
+    indentations returns a subset.
     """
     _check_pool(rows, pool, indentations_n)
     indentations, first = np.unique(rows.indentation[pool], return_index=True)
@@ -141,7 +141,7 @@ def _steps(target: Float32[np.ndarray, "f 3"]) -> Int64[np.ndarray, "f 2"]:
 
 
 def _number(row: Int64[np.ndarray, " p"], line: Int64[np.ndarray, "p key"], order_i: Int64[np.ndarray, " p"]) -> Lines:
-    """Make `Lines` from the key of each row's line: drop lines with a single place, number the others, and sort."""
+    """Create `Lines` from the key of each row's line: drop lines with a single place, number the others, and sort."""
     line_i = np.unique(line, axis=0, return_inverse=True)[1].ravel()
     places = np.unique(np.stack([line_i, order_i], axis=1), axis=0)
     has_order = np.bincount(places[:, 0]) >= PLACES_MIN_N  # one element per line

@@ -15,19 +15,19 @@ from reskin.errors import ParamsError
 from reskin.schema import Readings
 
 TARGETS = ("x_mm", "y_mm", "Fz_N")
-UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # concatenated by `stack` as they are
-SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # if the indenter is dragged along lines (paper section 4)
+UNCHANGED_COLUMNS = ("capture", "board", "skin", "db_uT", "target", "pass_i")  # `stack` does not change these
+SHEAR_TARGETS = ("x_mm", "y_mm", "Fx_N", "Fy_N", "Fz_N")  # if a recording has shear forces (paper section 4)
 
 
 class Selection(Strict):
-    """Definition of contact: the place of the reading is known, and the force is unknown or at least `force_min_N`."""
+    """Criteria for a reading in contact: its place is known, and its force is unknown or at least `force_min_N`."""
 
     force_min_N: float
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The readings in contact from all captures of a scene, one reading per row; captures are in order of name.
+    """The readings in contact from all captures of a scene, one reading per row; captures are sorted by name.
 
     `db_uT` is the field change relative to the no-load reading of the same indentation. `target` has columns x_mm, y_mm
     and Fz_N (NaN if a recording has no force), or the other targets that were passed to `gather`. `pass_i` is the
@@ -52,7 +52,7 @@ class Rows:
 
     @classmethod
     def of_labels(cls, boards: Sequence[str], skins: Sequence[str], pass_i: Sequence[int] | None = None) -> "Rows":
-        """Create rows whose readings and targets are 0, one row per indentation, for examples of folds.
+        """Create rows whose readings and targets are 0, one row per indentation, for doctests of folds.
 
         Without `pass_i`, all rows are in pass 0.
         """
@@ -108,7 +108,7 @@ def stack(above: Rows, below: Rows) -> Rows:
     """Return the rows `above`, followed by the rows `below`.
 
     The row numbers of `above` do not change. The indentations of `below` are renumbered to follow those of `above`.
-    `dropped` is that of `above`.
+    `dropped` is copied from `above`.
     """
     if below.db_uT.shape[1:] != above.db_uT.shape[1:]:
         above_n, below_n = above.db_uT.shape[1], below.db_uT.shape[1]
@@ -146,7 +146,7 @@ def _check_one_kind(captures: Sequence[Readings]) -> None:
         where, skin = f"capture {readings.capture}", readings.skin
         if readings.chips_n != first.chips_n:
             what = f"{readings.chips_n} chips, but {first.capture} in the same scene has {first.chips_n}"
-            raise ParamsError(f"{where}: {what}. Add it to a scene of its own.")
+            raise ParamsError(f"{where}: {what}. Add it to a separate scene.")
         if readings.source != first.source:
             rule = f"{first.source}, as {first.capture} is"
             remedy = "Simulated and recorded captures belong to different scenes."

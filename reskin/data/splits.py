@@ -129,12 +129,12 @@ def leave_one_board_out(rows: Rows, split: Split, seed: int) -> list[Fold]:
 
 
 def fewer_sensors(rows: Rows, split: Split, seed: int) -> list[Fold]:
-    """Train on k skins of the other boards, test on the held-out board; one fold per board, k and draw (figure 6b).
+    """Train on k skins of the other boards, test on the held-out board; one fold per board, k and draw.
 
-    Every board is held out in turn and has separate random draws. Within a draw, the training skins for a smaller k are
-    a subset of those for a larger k. If k is the number of all skins of the other boards, there is a single fold for
-    the board. It equals the fold of experiment `lobo` and has the same name, so that training runs of `lobo` are
-    reused.
+    This is figure 6b of the paper. Every board is held out in turn and has separate random draws. Within a draw, the
+    training skins for a smaller k are a subset of those for a larger k. If k is the number of all skins of the other
+    boards, there is a single fold for the board. It equals the fold of experiment `lobo` and has the same name, so that
+    training runs of `lobo` are reused.
     """
     assert split.sensors_skins_n is not None
     assert split.sensors_draws_n is not None
@@ -191,7 +191,7 @@ def labelling_order(rows: Rows, fold: Fold, seed: int) -> Int64[np.ndarray, " m"
 def one_skin_to_others(rows: Rows, split: Split, seed: int) -> list[Fold]:
     """Train on one skin, test on all skins of other boards; one fold per training skin.
 
-    Boards with a training skin of any fold are not tested on, so that the test rows are the same for all folds. With
+    A board that has a training skin in any fold is not tested on, so that all folds have the same test rows. With
     `split.pool_passes_n`, the passes of the pool are excluded from the test rows here too, so that all experiments are
     tested on the same rows.
 
@@ -288,7 +288,7 @@ def draw_sides(
 
 
 def _test_n(all_n: int, fraction: float, what: str, where: str) -> int:
-    """Return how many of `all_n` groups to test on; raise `ParamsError` unless training and test have one or more."""
+    """Return how many of `all_n` groups to test on; raise `ParamsError` if none would be left to train or test on."""
     test_n = round(fraction * all_n)
     if not 0 < test_n < all_n:
         remedy = "Record more, change the fraction, or remove the experiment from the scene."

@@ -1,4 +1,4 @@
-"""Cut captures into windows of time, with several baseline policies (experiment `drift`, paper section 4).
+"""Cut captures into windows of time, and apply several baseline policies (experiment `drift`, paper section 4).
 
 A unit is an indentation or a pass. A window is a range of successive units. A part is the rows of one window of one
 capture, with the baselines of one policy.
@@ -48,7 +48,7 @@ class Part:
 
 
 def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: int) -> Windows:
-    """Return the training window, the first `train_n` units, and the test windows, each of `test_n` units.
+    """Return the training window (the first `train_n` units) and the test windows (`test_n` units each).
 
     Test windows begin at units `every_n`, 2 `every_n`, 3 `every_n`, ... `units_n` is the length of each capture in
     units; all windows are within the shortest capture.
@@ -60,7 +60,7 @@ def make_windows(units_n: Sequence[int], *, train_n: int, test_n: int, every_n: 
     """
     windows_n = max(0, (min(units_n) - test_n) // every_n)
     if not windows_n:
-        rule = f"at least drift.every_n + test_n = {every_n + test_n} long"
+        rule = f"at least drift.every_n + drift.test_n = {every_n + test_n} units long"
         remedy = "Record more, or reduce the size of the windows."
         raise ParamsError("experiment drift", "the shortest capture", rule, min(units_n), remedy)
     tests = tuple((i * every_n, i * every_n + test_n) for i in range(1, windows_n + 1))

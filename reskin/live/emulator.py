@@ -122,7 +122,7 @@ def read_capture(folder: Path) -> Script:
     t_s = timer(folder, header)(frames, 0)
     timed = np.isfinite(t_s)
     frames, t_s = frames.where(timed), t_s[timed]
-    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames are sent with the second
+    edges = np.append(0, frames.end_byte).tolist()  # bytes between two frames are sent with the second frame
     pieces = [data[first:last] for first, last in pairwise(edges)]
     return Script(header.source, header.wire, frames, pieces, t_s - t_s[0])
 
@@ -307,7 +307,8 @@ class Terminal(EmulatedPort):
 
     def unplug(self) -> None:
         if self._link is not None and self._open_ends:
-            self._link.unlink(missing_ok=True)  # first: another emulator may create this link after the close
+            # Remove the link first: after the close, another emulator may create the same link.
+            self._link.unlink(missing_ok=True)
         for descriptor in self._open_ends:
             os.close(descriptor)
         self._open_ends = ()
@@ -317,7 +318,7 @@ class Terminal(EmulatedPort):
         while sent_n < len(data) and not stop.is_set():
             readable, writable, _ = select.select([self._far], [self._far], [], TICK_S)
             with suppress(BlockingIOError):
-                if readable:  # data that the reader sends are ignored, except for the first byte, the packet status
+                if readable:  # use only the first byte, the packet status; ignore the data that the reader sends
                     self._opened |= bool(os.read(self._far, 4096)[0] & self._flushed)
                 if writable:
                     sent_n += os.write(self._far, data[sent_n:])

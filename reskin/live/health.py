@@ -13,7 +13,7 @@ from reskin.recordings.fault_policy import Action, FaultPolicy
 BATCH_FRAMES_N = 40  # frames per check for faults that span several frames; 0.1 s for a board with five chips
 RATE_WINDOW_S = 1.0
 SLOW_FRACTION = 0.7  # assumed: frames are missing if the frame rate is below this fraction of the usual rate
-USUAL_GAIN = 1e-4  # weight of a new rate in the running mean that is the usual rate: time constant 25 s at 400 Hz
+USUAL_GAIN = 1e-4  # weight of a new rate in the running mean, the usual rate; time constant 25 s at 400 Hz
 ACTIVE_S = 2.0  # an alarm remains active for this long after its last occurrence
 # A field change is external if the fraction of |dB|^2 that is not common to all chips is below this limit. For all
 # presses of scenes `quick` and `lab`, the fraction is 0.45 or more.
@@ -47,7 +47,8 @@ class Health:
         self.alarms: dict[str, Alarm] = {}
         self.rate_hz = self._usual_hz = np.nan
         self._chips_n = chips_n
-        # Fewer steps are required than for the rejection of a recorded capture, because an alarm has no lasting effect.
+        # A chip's LSB is accepted from fewer equal steps than in ingestion: ingestion rejects a whole capture if the
+        # LSB is wrong, but an alarm has no lasting effect.
         self._detector = FaultDetector(chips_n, steps_min_n=STEPS_MIN_N)
         self._batch: list[Frames] = []
         self._stuck = False  # whether frames are dropped because a chip was stuck at the end of the last batch
@@ -103,11 +104,11 @@ class Health:
         stuck = self._note_chips("stuck", faults.stuck, now_s, "stuck")
         self._stuck = bool(stuck[-1])
         self.note("frames repeat", int(faults.repeated.sum()), now_s, "repeated")
-        self._note_chips("past int16", faults.int16_wrap, now_s, "int16_wrap")
+        self._note_chips("int16 overflow", faults.int16_wrap, now_s, "int16_wrap")
         self.note("the board's clock jumps", int(faults.clock_jump.sum()), now_s, "clock_jump")
         for window in faults.scale:
             reset = np.repeat(window.unusual[None], len(window.t_s), axis=0)
-            self._note_chips("step differs from the other chips: reset", reset, now_s, "chip_reset")
+            self._note_chips("resolution differs from the other chips: reset", reset, now_s, "chip_reset")
 
     def _note_chips(self, name: str, mask: Bool[np.ndarray, "f k"], now_s: float, fault: str) -> Bool[np.ndarray, " f"]:
         """Add a fault to the alarm of each affected chip; return the mask of the frames that the policy drops."""

@@ -83,7 +83,7 @@ class Traces:
         self._unconfirmed.append((self._message_i, float(last.t_s[-1])))
         newest = self.newest_bin
         numbers = np.arange(max(after_bin, newest - BINS_N + 1, 0), newest + 1)
-        numbers = numbers[self._bin[numbers % BINS_N] == numbers]  # without bins that have no readings
+        numbers = numbers[self._bin[numbers % BINS_N] == numbers]  # drop bins without readings
         i = numbers % BINS_N
         latencies_ms = [
             1e3 * np.percentile(times_s, [50, 99]) if times_s else np.full(2, np.nan)
@@ -111,7 +111,7 @@ class Traces:
 
 
 class Presses:
-    """Collects presses for calibration: of each contact, the field change with the largest magnitude."""
+    """Collects presses for calibration: stores the largest field change of each contact."""
 
     def __init__(self, presses_n: int = PRESSES_N) -> None:
         self.presses_n = presses_n
@@ -157,7 +157,7 @@ class Presses:
 class GuidedPresses(Presses):
     """Presses at grid places, which the page shows in random order.
 
-    Every second press is held out from the calibration, to measure the error after it.
+    Every second press is held out from the calibration, to measure the error of the calibrated model.
     """
 
     def __init__(self) -> None:
@@ -182,7 +182,7 @@ ADAPTING = {"adapt": Presses, "places": GuidedPresses}  # name of a button -> th
 
 
 class Session:
-    """One board on the page: a thread that polls it, the traces, the current recording, and the calibration."""
+    """One board on the page: a thread that polls the board, the traces, the current recording, and the calibration."""
 
     def __init__(
         self, port: str, models: Models, source: str, fault_policy: FaultPolicy = LIVE_POLICY, *, alone: bool = True

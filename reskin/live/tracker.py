@@ -51,7 +51,7 @@ ENDS_KEPT_N = 256  # number of latest chunks whose end and arrival time are stor
 FRAME_BYTES_MIN_N = 16  # bytes per chip of a frame in the wire format with the shortest frames
 SPACING_MM = 5.0  # spacing of chips on the page if their positions are unknown
 # Assumed limit of a network's inputs, in standard deviations of its training data. The largest observed input is 6 in
-# scene `quick` and 7 in scene `lab`, each with models of the same scene.
+# scene `quick` and 7 in scene `lab`, each for models that were trained in the same scene.
 UNKNOWN_SDS = 10.0
 
 WAITING = "waiting for data"
@@ -95,8 +95,8 @@ class NetworkEstimator:
 class UniversalEstimator:
     """Predicts with a copy of a universal model, which is further calibrated to no-load readings and to presses.
 
-    The model that was passed is not changed. The presses of a call replace those of an earlier call, so that the user
-    can repeat bad presses.
+    The model that was passed is not changed. A call of `adapt` or `label` replaces the presses of an earlier call of
+    the same method, so that the user can repeat bad presses.
     """
 
     channels_n = CHANNELS_N
@@ -120,7 +120,7 @@ class UniversalEstimator:
 
         Returns
         -------
-        A text for the user, with the standard deviation of places and the misfit before and after.
+        A text for the user: the standard deviation of places and the misfit, before and after the calibration.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class UniversalEstimator:
 
         Returns
         -------
-        A text for the user, with the median error of the place at held-out presses before and after.
+        A text for the user: the median error of the place at held-out presses, before and after the calibration.
 
         Raises
         ------
@@ -164,8 +164,8 @@ class UniversalEstimator:
         self._labelled_mm, self._labelled_uT = place_mm[~held_out], db_uT[~held_out].astype(np.float64)
         self._calibrate()
         return (
-            f"adapted to {(~held_out).sum()} known places: median error at {held_out.sum()} others {before_mm:.2f} mm "
-            f"before, {error_mm():.2f} mm after"
+            f"adapted to {(~held_out).sum()} known places: median error at {held_out.sum()} other places "
+            f"{before_mm:.2f} mm before, {error_mm():.2f} mm after"
         )
 
     def __call__(self, db_uT: Float32[np.ndarray, "f ch"]) -> Prediction:
@@ -211,7 +211,7 @@ class Layout:
 
 
 def layout_of(chips_n: int) -> Layout:
-    """Return the layout of the nominal board with this number of chips; without such a board, a layout with one row.
+    """Return the layout of the nominal board with this number of chips; if there is none, put all chips in one row.
 
     The byte stream does not identify the board. A board with five chips is assumed to be the paper's board, and a board
     with forty chips the paper's sleeve.
@@ -396,7 +396,7 @@ class LiveSkin:
         return self._estimate(frames, t_s, sound)
 
     def _detect(self, chunks: list[Chunk]) -> list[Chunk]:
-        """Collect chunks until they suffice to detect the wire format, and return all of them; return [] before."""
+        """Collect chunks, and return []; once the wire format can be detected from them, return all of them."""
         self._head += chunks
         bytes_n = sum(len(chunk) for chunk, _ in self._head)
         if self._head[-1][1] - self._head[0][1] < HEAD_S and bytes_n < HEAD_BYTES_MAX_N:
@@ -458,7 +458,7 @@ class LiveSkin:
         return frames, np.fromiter((self._ends[i][1] for i in chunk_i), np.float64, len(frames))
 
     def _count_bytes(self, now_s: float) -> None:
-        """Add the counts of the stream since the last call to `account`, and raise alarms for lost bytes."""
+        """Add to `account` what the stream has counted since the last call, and raise alarms for lost bytes."""
         frame_min_n = FRAME_BYTES_MIN_N * self.detected.chips_n
         counted = Counter(self._stream.account())
         new, at_start, self._counted = counted - self._counted, not self._counted["frames_n"], counted
@@ -494,7 +494,7 @@ class LiveSkin:
         if len(b_uT) < 2 or (duration_s < NOLOAD_S and len(b_uT) < NOLOAD_FRAMES_MAX_N):
             return
         self._quiet, self._quiet_from_s = [], np.inf
-        with suppress(CaptureError):  # from `quiet_start` if the field changed; then the next second is tried
+        with suppress(CaptureError):  # `quiet_start` raises it if the field changed; the next second is then tried
             # Evenly spaced times replace the arrival times, which are equal for all frames of a chunk.
             b_uT = b_uT[: quiet_start(np.linspace(0, duration_s, len(b_uT)), b_uT, where=self.port)]
             if self.estimator is not None:
@@ -561,7 +561,10 @@ class LiveSkins:
         self._open_ports.close()
 
     def __iter__(self) -> Iterator[tuple[Contact, ...]]:
-        """Yield the latest contacts of all boards whenever one board has a new contact; silent boards have NaN."""
+        """Yield the latest contacts of all boards whenever one board has a new contact.
+
+        The contacts of a silent board have the value NaN.
+        """
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._error or (self._new and None not in self._latest))

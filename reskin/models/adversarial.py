@@ -1,9 +1,9 @@
 """Domain-adversarial training (Ganin et al., JMLR 2016), a reference method for adaptation.
 
 A second network, the discriminator, predicts from the features of the first network whether a reading is from a known
-skin or from the new skin. The first network is trained so that the discriminator fails. With weight 0, the features are
-not affected by the discriminator, which is the control. This module has a separate training loop, because batches from
-two sets of skins and a second network are not possible in `reskin.models.train`.
+skin or from the new skin. The first network is trained so that the discriminator fails. In the control experiment, the
+weight of the discriminator is 0, so that it does not affect the features. This module has a separate training loop,
+because `reskin.models.train` supports neither batches from two sets of skins nor a second network.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from reskin.models.train import AdamW, clip_gradients, one_cycle
 
 DISCRIMINATOR_WIDTH = 64  # assumed
 MOMENTUM = 0.5  # with a larger value, the two opposing networks oscillate (Radford et al., ICLR 2016)
-RAMP_RATE = 10.0  # of `ramp`, from Ganin et al.
+RAMP_RATE = 10.0  # the factor 10 in the formula of `ramp` (Ganin et al.)
 # The third layer has `FEATURES_N` outputs, as required by `Stack`.
 DISCRIMINATOR_WIDTHS = (FEATURES_N, DISCRIMINATOR_WIDTH, DISCRIMINATOR_WIDTH, FEATURES_N, 1)
 DISCRIMINATOR = tuple(Layer(in_n, out_n, out_n > 1) for in_n, out_n in pairwise(DISCRIMINATOR_WIDTHS))
@@ -40,8 +40,8 @@ class Domains:
 def train_adversarial(domains: Domains, schedule: Schedule, weight: float, rng: np.random.Generator) -> Weights:
     """Train one network from random initial weights, and return its weights.
 
-    Each batch has equal numbers of readings from the known skins and from the new skin. `weight` is the final weight of
-    the discriminator's gradient, which is reversed for the features.
+    Each batch has equal numbers of readings from the known skins and from the new skin. The discriminator's gradient is
+    reversed before it reaches the features; `weight` is its weight at the end of training.
     """
     torch.set_num_threads(1)  # so that the order of summation does not depend on the number of other processes
     layers = paper_layers(domains.known.shape[1], domains.target.shape[1])

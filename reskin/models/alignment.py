@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 CORAL_RIDGE = 1.0  # added to each variance of standardised inputs (Sun, Feng & Saenko, AAAI 2016)
 SD_MIN = 1e-6  # lower limit of standard deviations, which avoids a division by zero for constant channels
-RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))  # candidates; unit: (mean square of a channel) * (number of pairs)
+# Candidates for the ridge of `direct`, in units of (mean square of a channel) * (number of pairs).
+RIDGES = tuple(10.0 ** np.arange(-4, 2.1, 0.5))
 Inputs = Float[np.ndarray, "n c"]
 
 
@@ -48,8 +49,9 @@ def coral(source: Float[np.ndarray, "n c"], target: Float[np.ndarray, "m c"], ri
 def direct(source: Float[np.ndarray, "p c"], target: Float[np.ndarray, "p c"], ridge: float) -> Map:
     """Fit a linear map to p pairs of inputs at the same places (direct standardisation, Wang & Kowalski 1991).
 
-    The map is the identity plus a ridge regression of the differences within pairs, so that it is the identity in
-    directions without data. There is no constant term, because the field change without contact is zero for any skin.
+    The map is the identity plus a ridge regression of the differences within pairs. It therefore leaves inputs
+    unchanged in directions without data. There is no constant term, because the field change without contact is zero
+    for any skin.
     """
     origin = np.zeros(source.shape[1])
     gain = np.linalg.solve(source.T @ source + _penalty(source, ridge), source.T @ (target - source))

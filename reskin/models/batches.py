@@ -19,7 +19,7 @@ AXES_N = 3
 
 @dataclass(frozen=True)
 class LabelledRows:
-    """Scaled inputs and targets; `points` are for sampling triplets (None if the recipe has no triplet loss)."""
+    """Scaled inputs and targets, and `points` to sample triplets from (None if the recipe has no triplet loss)."""
 
     inputs: Float32[np.ndarray, "n c"]
     targets: Float32[np.ndarray, "n t"]
@@ -60,8 +60,8 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     network from which they start.
     """
     recipe, target = job.recipe, data.target[job.train]
-    # The names of the random generator do not include the recipe, so that all recipes have the same initial weights and
-    # the same batches.
+    # The names that seed the random generator do not include the recipe, so that all recipes have the same initial
+    # weights and the same batches.
     retry = ("again", job.attempt_i) if job.attempt_i else ()
     rng = rng_for(job.seed, "train", job.fold, job.skin, job.seed_i, *retry)
     if job.tuning is None:
@@ -81,7 +81,8 @@ def prepare(job: TrainingJob, data: TrainingData) -> tuple[PreparedJob, Scaler]:
     unlabelled = few_labels = None
     if job.loss_weights.unlabelled:
         assert isinstance(job.tuning, Adaptation)
-        lines = job.tuning.lines  # the order of the pokes; besides the field changes, the only data of the new skin
+        # Of the new skin, only the field changes and the order of the pokes along lines are used.
+        lines = job.tuning.lines
         row, point_row = np.unique(lines.row, return_inverse=True)
         view = VIEW[recipe.inputs](data.db_uT[row])
         points = triplet_points(lines.order_i[:, None].astype(np.float64), lines.line_i)
@@ -112,7 +113,7 @@ def virtual_boards(
     settings: Augmentation,
     rng: np.random.Generator,
 ) -> tuple[Float32[np.ndarray, "v ch"], Shaped[np.ndarray, " v"]]:
-    """Copy all rows `copies_n` times, and change the field changes as if other boards had measured them.
+    """Copy all rows `copies_n` times, and modify the copied field changes as if other boards had measured them.
 
     For each copy of a skin, random gains of the channels and tilts of the chips are drawn. Noise is drawn for each
     reading.
@@ -187,7 +188,7 @@ class BatchSampler:
 
     def _gather(self, source: str, drawn: Sequence[Int64[np.ndarray, "s b"]]) -> torch.Tensor:
         pairs = zip(drawn, self.first_row[source], strict=True)
-        rows = np.stack([row + first for row, first in pairs], axis=1)  # [s m b]
+        rows = np.stack([row + first for row, first in pairs], axis=1)  # [steps networks batch]
         return self.rows[source][torch.from_numpy(rows).to(self.device)]
 
 

@@ -152,7 +152,8 @@ def fit(
 def _ignore_constant_inputs(scaler: Scaler) -> Scaler:
     """Set the scale of constant inputs to infinity, so that they are scaled to 0.
 
-    With the smallest scale, an input that is constant in training but not in the test would dominate all distances.
+    With the scale `SCALE_FLOOR`, an input that is constant in training but not in the test would dominate all
+    distances.
     """
     constant = scaler.input_scale <= SCALE_FLOOR
     return replace(scaler, input_scale=np.where(constant, np.float32(np.inf), scaler.input_scale))
@@ -172,9 +173,8 @@ def _thin(
 ) -> tuple[Int64[np.ndarray, " a"], Float[np.ndarray, " a"] | None]:
     """Draw `most_n` of `rows_n` rows without replacement; return the row numbers and the weights of the drawn rows.
 
-    All rows with more than the smallest weight are kept, because they are the few labelled rows of a new skin. Their
-    weight is multiplied by the kept fraction of the other rows, so that their fraction of the total weight is
-    unchanged.
+    All rows whose weight is above the minimum are kept, because they are the few labelled rows of a new skin. Their
+    weight is multiplied by the kept fraction of the other rows, so that their share of the total weight is unchanged.
     """
     if weight is None:
         return np.sort(rng.choice(rows_n, most_n, replace=False)), None
@@ -262,7 +262,7 @@ class _BlockwiseCubicRidge:
 class _WeightedNeighbours:
     """Nearest neighbours with row weights w, which scikit-learn does not support.
 
-    The prediction is scikit-learn's prediction for w y, divided by that for w.
+    The prediction is scikit-learn's prediction of the target w y, divided by its prediction of the target w.
     """
 
     neighbours: KNeighborsRegressor
@@ -285,8 +285,8 @@ def blocks(rows_n: int) -> list[slice]:
 class ClassicalJob:
     """Training and test of a method on one fold; `train` and `test` are row numbers.
 
-    At most `rows_max_n` training rows are used, drawn at random. `few_labels` are the numbers of additional training
-    rows, from a new skin. Their total weight equals that of all other training rows.
+    At most `rows_max_n` training rows are used, drawn at random. `few_labels` are the row numbers of additional
+    training rows, from a new skin. Their total weight equals that of all other training rows.
     """
 
     name: str

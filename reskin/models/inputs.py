@@ -10,12 +10,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float32
 
-# Assumed lower limit of |dB|, below the noise, which is 3 uT per channel, or about 15 uT in the norm of 15 channels.
-# The log of this limit is 0, so that all inputs are 0 if the field change is 0.
+# Assumed lower limit of |dB|. It is below the noise (3 uT per channel, about 15 uT in the norm of 15 channels). The log
+# of this limit is 0, so that all inputs are 0 if the field change is 0.
 DB_FLOOR_uT = 1.0
 # Lower limit of scales, which avoids a division by zero for channels that are constant in training.
 SCALE_FLOOR = np.float32(1e-6)
-RELEASED_INPUT_SDS = np.float32(5.0)  # the input scale of the released network is about 5 standard deviations
+RELEASED_INPUT_SDS = np.float32(5.0)  # about the input scale of the network that the authors released
 RELEASED_PLACE_MM, RELEASED_FORCE_N = 16.0, 3.0
 
 
@@ -79,7 +79,7 @@ def fit_standard(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray,
 
 
 def fit_released(db_uT: Float32[np.ndarray, "f ch"], target: Float32[np.ndarray, "f t"]) -> Scaler:
-    """Fit the scaling of the released network: channels / (5 standard deviations), x / 16 mm, y / 16 mm, F / 3 N.
+    """Fit the scaling of the authors' released network: channels / (5 sd), x / 16 mm, y / 16 mm, F / 3 N.
 
     Means are not subtracted.
     """

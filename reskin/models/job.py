@@ -64,11 +64,11 @@ class TrainingResult:
     """The result of a training run.
 
     key: name of the result in the cache. curve: mean squared error in each block of steps. predicted: x, y in mm and
-    F in N for the test rows. stopped_step: step at which training diverged; None if it did not. `weights` are then
-    those before the divergence. explained_min: explained variance (R2) of the worst target on training rows; None for a
-    short training run. seconds: training time of the stack, divided by its number of networks. one_reading_s: median
-    time of a prediction for one reading. reused: whether the result is from the cache. collapsed_before_n: number of
-    earlier training runs of this job, all of which collapsed.
+    F in N for the test rows. stopped_step: step at which training diverged; None if it did not. If training diverged,
+    `weights` are those before the divergence. explained_min: explained variance (R2) of the worst target on training
+    rows; None for a short training run. seconds: training time of the stack, divided by its number of networks.
+    one_reading_s: median time of a prediction for one reading. reused: whether the result is from the cache.
+    collapsed_before_n: number of earlier training runs of this job, all of which collapsed.
     """
 
     key: str

@@ -1,4 +1,4 @@
-"""Training losses: the squared error, and the paper's triplet loss (section 5) with the sampling of triplets.
+"""Training losses: the squared error, and the triplet loss of section 5 of the paper with the sampling of triplets.
 
 A triplet consists of three points of the same group (a skin, or a line of pokes): an anchor, a positive and a negative.
 The positive is strictly nearer to the anchor than the negative.
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int64, Shaped
 
 from reskin.errors import TrainingError
 
-MAX_DRAWS_N = 100  # if half of all draws are ties, a fraction of 1e-30 of the anchors has a tie in all these draws
+MAX_DRAWS_N = 100  # if half of all draws are ties, only a fraction of 1e-30 of the anchors has ties in all draws
 # Two squared distances are a tie if they differ by less than this fraction of their sum. Rounding to float32 causes
 # differences of 1e-6.
 TIE_RTOL = 1e-5
@@ -37,7 +37,7 @@ def squared_error(
 def triplet_loss(
     anchor: Float[torch.Tensor, "m b d"], positive: Float[torch.Tensor, "m b d"], negative: Float[torch.Tensor, "m b d"]
 ) -> Float[torch.Tensor, " m"]:
-    """Return the mean of max(0, |a - p|^2 - |a - n|^2) over a batch, for each of m networks (section 5).
+    """Return the mean of max(0, |a - p|^2 - |a - n|^2) over a batch, for each of m networks (section 5 of the paper).
 
     a, p and n are the features of anchor, positive and negative; the loss has no margin. Distances are squared, so that
     the gradient is 0 and not infinite where points coincide.
@@ -126,7 +126,7 @@ def _draw_from_group(points: TripletPoints, anchor: np.ndarray, rng: np.random.G
 def _find_anchors(place: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
     """Return the mask of points of one group that can be anchors.
 
-    To save time, distances are compared only for points at the first `COMPARED_PLACES_N` places.
+    To save time, only the distances of a point from the first `COMPARED_PLACES_N` places are compared.
     """
     places, index, points_n = _unique_places(place)
     others = places[:COMPARED_PLACES_N].astype(np.float64)
@@ -141,7 +141,7 @@ def _unique_places(
 ) -> tuple[Float[np.ndarray, "p d"], Int64[np.ndarray, " n"], Int64[np.ndarray, " p"]]:
     """Return the sorted unique places, the index of each point's place, and the number of points at each place.
 
-    Equals `np.unique(place, axis=0, ...)`, which compares rows as records and takes three times as long.
+    The result equals that of `np.unique(place, axis=0, ...)`, which compares rows as records and is three times slower.
 
     >>> _unique_places(np.array([[1.0, 2.0], [0.0, 3.0], [1.0, 2.0]]))[1:]
     (array([1, 0, 1]), array([1, 2]))

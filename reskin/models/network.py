@@ -41,7 +41,7 @@ def paper_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]
 
 
 def released_layers(inputs_n: int, outputs_n: int = OUTPUTS_N) -> tuple[Layer, ...]:
-    """Return the layers of the released network, which also has a ReLU after layer 2 and on the output."""
+    """Return the layers of the network that the authors released, with two more ReLUs: after layer 2 and at the end."""
     return _layers(inputs_n, outputs_n, relus=(True, True, False, True, True, True))
 
 

@@ -30,9 +30,10 @@ class Schedule(Strict):
 class Recipe(Schedule):
     """Settings of a training run, including those that the paper does not specify.
 
-    architecture: `paper` (as in the paper's text) or `released` (as in the released network, with a ReLU after layer 2
-    and on the output). inputs: `raw` (the field change) or `shape` (its direction and the logarithm of its magnitude).
-    scaling: `standard` (mean 0 and standard deviation 1) or `released` (see `reskin.models.inputs.fit_released`).
+    architecture: `paper` (as in the paper's text) or `released` (as in the network that the authors released, with a
+    ReLU after layer 2 and on the output). inputs: `raw` (the field change) or `shape` (the direction of the field
+    change and the logarithm of its magnitude). scaling: `standard` (mean 0 and standard deviation 1) or `released`
+    (see `reskin.models.inputs.fit_released`).
     triplet_weight: weight of the triplet loss; with 0, no triplets are drawn.
     """
 
@@ -61,9 +62,10 @@ class AugmentedRecipe(Recipe):
 
 
 class AdaptationRecipe(Schedule):
-    """Adaptation to a new skin: the recipe's loss plus a triplet loss on unlabelled pokes along lines (section 5).
+    """Adaptation to a new skin: the recipe's loss plus a triplet loss on unlabelled pokes along lines.
 
-    unlabelled_weight: weight of this triplet loss; 0 for the control.
+    This is the method in section 5 of the paper. unlabelled_weight: weight of this triplet loss; 0 in the control
+    experiment.
     """
 
     unlabelled_weight: Weight

@@ -27,7 +27,7 @@ from reskin.numerics import device
 # and `reskin predict` rejects the network.
 MAX_ATTEMPTS_N = 3
 STACK_N = {"cpu": 3, "cuda": 64}  # networks per stack; on a CPU, larger stacks are not faster
-NO_ROWS = np.zeros(0, np.int64)  # row numbers of a `RemoteJob`, which are in the shared file
+NO_ROWS = np.zeros(0, np.int64)  # replaces the row numbers of a `RemoteJob`, which are in the shared file
 
 RemoteJob = tuple[TrainingJob, str, str]  # a job without row numbers; names of `train` and `test` in the shared file
 FoldRows = Mapping[int, tuple[str, np.ndarray]]  # id of an array of row numbers -> name in the shared file, the array
@@ -52,7 +52,7 @@ def run_jobs(
         collapsed = [i for i, result in enumerate(results) if result.collapsed]
         if not collapsed:
             break
-        log(f"{len(collapsed)} of {len(jobs)} training runs collapsed: training again with other draws")
+        log(f"{len(collapsed)} of {len(jobs)} training runs collapsed: training again with other random numbers")
         retries = [replace(jobs[i], attempt_i=attempt_i) for i in collapsed]
         for i, result in zip(collapsed, _run_once(retries, data, executor, cache, log), strict=True):
             seconds = results[i].seconds + result.seconds
@@ -139,7 +139,7 @@ def _train_to_files(shared_file: Path, remote: Sequence[RemoteJob], files: Seque
     try:
         results = train_stack(jobs, _read_data(shared_file))
     except RuntimeError as error:
-        # on a CPU, torch raises RuntimeError for this
+        # torch reports exhausted CPU memory as a RuntimeError
         if "out of memory" in str(error) or "allocate memory" in str(error):
             raise MemoryError(str(error)) from None
         raise

@@ -25,7 +25,7 @@ BLOCK_STEPS_N = 50  # steps in a block; batches are drawn and the loss is checke
 # that predicts the mean has an error of 1.
 DIVERGED = 1e8
 CHECKED_STEPS_N = 200  # with fewer steps, a network may not have learned anything, so collapse is not checked
-CHECKED_ROWS_N = 2000  # approximate number of training rows for the check of collapse, evenly spaced
+CHECKED_ROWS_N = 2000  # collapse is checked on about this many evenly spaced training rows
 
 # Defaults of torch.optim.lr_scheduler.OneCycleLR and torch.optim.AdamW.
 WARM_UP = 0.3  # fraction of the steps in which the learning rate rises
@@ -38,8 +38,8 @@ BETA2, EPS = 0.999, 1e-8
 class Outcome:
     """The weights of a trained network, and the mean squared error of each block of steps (scaled units).
 
-    If a loss or a weight was not finite, or if the loss exceeded `DIVERGED`, `stopped_step` is the last step of this
-    block, and the weights are those after the block before. Otherwise, `stopped_step` is None.
+    If a loss or a weight was not finite in some block, or if the loss exceeded `DIVERGED`, `stopped_step` is the last
+    step of that block, and the weights are those after the previous block. Otherwise, `stopped_step` is None.
     """
 
     weights: Weights
@@ -74,7 +74,7 @@ def train_stack(jobs: Sequence[TrainingJob], data: TrainingData) -> list[Trainin
 def train(
     jobs: Sequence[PreparedJob], architecture: str, schedule: Schedule, loss_weights: LossWeights, device: str
 ) -> list[Outcome]:
-    """Train a stack: minimise the squared error plus the loss terms with their weights.
+    """Train a stack: minimise the squared error plus the weighted loss terms of `LossWeights`.
 
     The paper specifies neither the optimiser nor the schedule. The choice here is AdamW with PyTorch's one-cycle
     schedule of learning rate and momentum.

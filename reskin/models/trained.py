@@ -113,8 +113,8 @@ def read_network(model: Path) -> Network:
         raise SchemaError(f"{card_file}: the model predicts {outputs}, not {', '.join(TARGETS)}. Use another model.")
     if card.collapsed:
         raise SchemaError(
-            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use a model of another "
-            "seed."
+            f"{card_file}: the model has collapsed: it predicts nearly the same for any input. Use a model that was "
+            "trained with another seed."
         )
     inputs_n = VIEW[card.recipe.inputs](np.zeros((1, card.input.channels_n), np.float32)).shape[1]
     weights_n = tensors["input_shift"].size if "input_shift" in tensors else 0
@@ -129,8 +129,8 @@ def read_network(model: Path) -> Network:
 
 def _find_models(missing: Path) -> str:
     """Return advice for the user on a missing model file; stages write model files to data/models/SCENE/STAGE."""
-    if found := sorted(file.name for file in missing.parent.glob(f"*{SUFFIX}")):
-        return f"Models in this folder: {', '.join(found[:3])}{', ...' if found[3:] else ''}"
+    if names := sorted(file.name for file in missing.parent.glob(f"*{SUFFIX}")):
+        return f"Models in this folder: {', '.join(names[:3])}{', ...' if names[3:] else ''}"
     if missing.parts[-5:-3] != ("data", "models"):
         return "Use the path of a trained .safetensors file."
     scene = missing.parts[-3]
@@ -139,26 +139,26 @@ def _find_models(missing: Path) -> str:
 
 def networks_held_out(models: Path, board: str, *, recipe: str = HEADLINE) -> list[Network]:
     """Read the networks of stage `train_multi` for which the board was held out, one network per seed."""
-    found = []
+    networks = []
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
         if (card["question"], card["fold"], card["recipe_name"]) == ("lobo", board, recipe):
-            found.append(Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0]))
-    if not found:
+            networks.append(Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0]))
+    if not networks:
         what = f"no networks of recipe {recipe} with board {board} held out"
         raise SchemaError(f"{models}: {what}. Train them: add lobo to the scene's experiments.")
-    return found
+    return networks
 
 
 def networks_by_fold(models: Path, experiment: str, *, recipe: str = HEADLINE) -> dict[str, list[Network]]:
     """Read the networks of an experiment, by fold, one per seed; return {} if the scene does not run the experiment."""
-    found: dict[str, list[Network]] = {}
+    by_fold: dict[str, list[Network]] = {}
     for file in sorted(models.glob("*.json")):
         card = io.read_json(file)
         if (card["question"], card["recipe_name"]) == (experiment, recipe):
             network = Network(card, io.read_tensors(file.with_suffix(".safetensors"))[0])
-            found.setdefault(card["fold"], []).append(network)
-    return found
+            by_fold.setdefault(card["fold"], []).append(network)
+    return by_fold
 
 
 # --- ONNX ---
@@ -190,14 +190,14 @@ def build_onnx(network: Network) -> "ModelProto":
         *_layers([layer.relu for layer in layers]),
         *_scale_outputs(),
     ]
-    made = [
+    node_protos = [
         helper.make_node(operator, list(inputs), [output], **ATTRIBUTES.get(operator, {}))
         for operator, inputs, output in nodes
     ]
     constants = {name: np.asarray(value, np.float32) for name, value in scaler.items()}
     constants["floor_uT"] = np.array([DB_FLOOR_uT], np.float32)
     graph = helper.make_graph(
-        made, "reskin",
+        node_protos, "reskin",
         [helper.make_tensor_value_info(INPUT, TensorProto.FLOAT, ["f", channels_n])],
         [helper.make_tensor_value_info(OUTPUT, TensorProto.FLOAT, ["f", scaler["target_shift"].size])],
         [numpy_helper.from_array(value, name) for name, value in constants.items()],

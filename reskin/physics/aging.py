@@ -36,17 +36,17 @@ SKIN_RELAXATION = Prony(  # assumed values
 
 
 class Relaxation(Strict):
-    """Timing of an indentation: the tip approaches at constant speed, then keeps its depth.
+    """Timing of an indentation: the tip approaches at constant speed, then stays at constant depth.
 
     The skin is assumed to be fully relaxed before the indentation.
     """
 
     approach_s: Annotated[float, Field(ge=0, le=100)]
-    hold_s: Annotated[float, Field(ge=0, le=100)]  # from the end of the approach to the middle of the readings
+    hold_s: Annotated[float, Field(ge=0, le=100)]  # time from the end of the approach to the middle of the readings
 
 
 class Memory(Strict):
-    """Hysteresis of the field: dB slowly grows while an indentation is held, and the added part decays after it.
+    """Hysteresis of the field: dB grows slowly during an indentation, and the growth decays after the indentation.
 
     The settings are chosen so that the same fraction of dB remains in the next no-load reading as on recorded boards
     (5 to 8 %). The division of this fraction among the time constants is assumed.
@@ -55,8 +55,8 @@ class Memory(Strict):
     # per time constant: fraction of dB that a very long indentation adds
     share: tuple[Annotated[float, Field(ge=0, le=1)], ...]
     tau_s: tuple[Annotated[float, Field(gt=0, le=1e6)], ...]
-    contact_s: Annotated[float, Field(ge=0, le=1e4)]  # from the start of an indentation to the end of its readings
-    rest_s: Annotated[float, Field(ge=0, le=1e4)]  # from the end of the readings to the next no-load reading
+    contact_s: Annotated[float, Field(ge=0, le=1e4)]  # time from the start of an indentation to the end of its readings
+    rest_s: Annotated[float, Field(ge=0, le=1e4)]  # time from the end of the readings to the next no-load reading
 
     @model_validator(mode="after")
     def _check_lengths(self) -> "Memory":
@@ -95,7 +95,7 @@ def field_memory(
 
 
 def relaxed_share(relaxation: Relaxation, prony: Prony = SKIN_RELAXATION) -> float:
-    """Return the force when the readings of an indentation are taken, relative to that of an elastic skin."""
+    """Return the force at the time of an indentation's readings, relative to the force of an elastic skin."""
     elastic = np.array([0.0, 1.0, 1.0])
     return float(relax(np.cumsum([0.0, relaxation.approach_s, relaxation.hold_s]), elastic, prony)[-1])
 
@@ -144,7 +144,7 @@ class Temperature(Strict):
     warming_s: Annotated[float, Field(gt=0, le=1e5)]  # time constant of the warming
     swing_K: Annotated[float, Field(ge=0, le=20)]  # amplitude of the variation of room temperature
     swing_s: Annotated[float, Field(gt=0, le=1e6)]  # period of the variation of room temperature
-    # standard deviation over chips of the relative change of sensitivity
+    # standard deviation over chips of the relative change of sensitivity per kelvin
     chip_sensitivity_per_K: Annotated[float, Field(ge=0, le=0.01)]
 
 
@@ -177,7 +177,7 @@ class Ageing(Strict):
 
 
 def softening(contacts_n: Int[np.ndarray, " n"], *, settling: float, ageing: float) -> Float[np.ndarray, " n"]:
-    """Return the force after N contacts, relative to a new skin.
+    """Return the force after N contacts, relative to the force of a new skin at the same depth.
 
     1 - settling (1 - exp(-N/300)) - ageing log10(1 + N/1000)
     """

@@ -44,7 +44,7 @@ class BoardDesign(Strict):
 
     chips_xy_mm: Annotated[tuple[tuple[float, float], ...], Field(min_length=1, max_length=CHIPS_MAX_N)]
     chips_turn_deg: tuple[float, ...]
-    # distance from the chips' sensing plane to the skin: 1.1 for rigid boards, 0.6 for flexible boards
+    # distance from the chips' sensing plane to the skin, such as 1.1 mm for rigid boards and 0.6 mm for flexible boards
     gap_mm: Annotated[float, Field(gt=0, le=10)]
     tiles: Tiles | None = None
 
@@ -75,21 +75,21 @@ class Spreads(Strict):
     positive. All other quantities are normally distributed around the design value.
     """
 
-    board_gap: Share  # of the gap between skin and chips
-    board_uneven: Share  # of the gap at the outermost chips, because the base is tilted about x and y and bowed
+    board_gap: Share  # relative sd of the gap between skin and chips
+    board_uneven: Share  # relative sd of the gap at the outermost chips, due to tilt and bow of the base
     chip_gain: Share
     chip_cross_axis: Share
     chip_tilt_deg: Annotated[float, Field(ge=0, le=10)]
     chip_offset_uT: Annotated[float, Field(ge=0, le=5000)]
-    skin_amplitude: Share  # of the magnetisation
-    skin_filler: Share  # local variation of the magnetisation
-    # correlation of the local variation: exp(-r^2 / 2 length^2)
+    skin_amplitude: Share  # relative sd of the magnetisation of whole skins
+    skin_filler: Share  # relative sd of the local variation of the magnetisation
+    # correlation of the local variation over a distance r: exp(-r^2 / 2 length^2)
     skin_filler_length_mm: Annotated[float, Field(gt=0, le=50)]
     skin_thickness: Share
     skin_modulus: Share
-    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # lateral offset of the skin on the board, along each axis
-    skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # rotation of the skin about z
-    skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # true depth minus commanded depth
+    skin_seat_mm: Annotated[float, Field(ge=0, le=2)]  # sd of the skin's lateral offset along each axis
+    skin_rotation_deg: Annotated[float, Field(ge=0, le=10)]  # sd of the skin's rotation about z
+    skin_depth_zero_mm: Annotated[float, Field(ge=0, le=0.2)]  # sd of (true depth - commanded depth)
 
 
 @dataclass(frozen=True)
@@ -129,8 +129,8 @@ def draw_board(design: BoardDesign, spreads: Spreads, *, seed: int, name: str) -
 
 
 def _unevenness(design: BoardDesign, rng: np.random.Generator) -> Float[np.ndarray, " k"]:
-    # Relative height error of each chip due to tilt and bow of the board. The value of each of the three terms at the
-    # outermost chips is about a standard normal number. The skin is assumed to be flat.
+    # Return the relative height error of each chip due to tilt and bow of the board, to be scaled by `board_uneven`. At
+    # the outermost chips, each of the three terms is about a standard normal number. The skin is assumed to be flat.
     places_mm = np.array(design.chips_xy_mm)
     away_mm = np.hypot(*places_mm.T)
     share = places_mm / max(away_mm.max(), 1e-12)

@@ -90,7 +90,7 @@ def last_conversions(
 def sample_at_conversion(
     value: Float[np.ndarray, "f k a"], age_s: Float[np.ndarray, "f k"], rate_hz: float
 ) -> Float[np.ndarray, "f k a"]:
-    """Interpolate values linearly between frames, to the time `age_s` before each frame at which a chip converts."""
+    """Interpolate values linearly between frames, to each chip's last conversion, `age_s` before the frame."""
     frames_n, chips_n = age_s.shape
     place = np.maximum(np.arange(frames_n)[:, None] - age_s * rate_hz, 0.0)
     before = np.minimum(place.astype(np.intp), max(frames_n - 2, 0))

@@ -32,7 +32,8 @@ STEP = 0.025
 LADDER = np.array([0.0, STEP / 4, STEP / 2, *(STEP * np.arange(1, round(1 / STEP) + 1))])
 RIM_MAX = 1.2  # largest height of the bulging rim, in thicknesses; above 1, the waves of the solution grow as exp(kz)
 MARKERS_N = 48  # number of markers on the surface; they are denser towards the axis
-PRESSURES_N = 6  # number of basis pressures; 4 or 8 would move the markers by less than 0.03 mm at a depth of 1.2 mm
+# Number of basis pressures. With 4 or 8, the positions of the markers at a depth of 1.2 mm change by less than 0.03 mm.
+PRESSURES_N = 6
 DAMPING = 1e-3  # damping of the least squares for the pressure, relative to the largest singular value
 
 
@@ -52,11 +53,12 @@ class Material:
 def follow(
     r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], depths_m: Float[np.ndarray, " d"], press: IndentedLayer
 ) -> list[Material]:
-    """Move material points from rest through increasing depths; return one `Material` per depth.
+    """Compute how material points move while a tip indents the layer step by step; return one `Material` per depth.
 
-    `depths_m` starts with 0. Markers on the surface are moved too, and each step solves for the pressure that moves the
-    markers onto the tip. If the pressure were computed for the surface at rest, the deformed surface would be 0.3 mm
-    off the tip at a depth of 1.2 mm.
+    `depths_m` are the increasing depths of the tip and start with 0, where the points are at `r_m`, `z_m`. Markers on
+    the surface are moved too, and each step solves for the pressure that moves the markers onto the tip. If the
+    pressure were computed for the surface at rest, the deformed surface would be 0.3 mm off the tip at a depth of 1.2
+    mm.
     """
     path = [with_markers(r_m, z_m, press)]
     for depth_m in map(float, depths_m[1:]):
@@ -67,7 +69,8 @@ def follow(
 def depth_scale(size: float) -> float:
     """Return the greatest depth that can be computed, in thicknesses, for R/h = `size`.
 
-    The depth must be below the thickness and the tip radius. This is a smooth function of `size` below 1 and `size`.
+    The depth must be below the thickness and below the tip radius. The result, a smooth function of `size`, is
+    therefore below 1 and below `size`.
     """
     return size / (1 + size**4) ** 0.25
 
@@ -84,7 +87,10 @@ def undeformed(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"]) -> Ma
 
 
 def with_markers(r_m: Float[np.ndarray, " s"], z_m: Float[np.ndarray, " s"], press: IndentedLayer) -> Material:
-    """Return material points at rest, after `MARKERS_N` markers on the surface inside the widest possible contact."""
+    """Return material points at rest: first `MARKERS_N` markers on the surface, then the given points.
+
+    The markers are inside the widest possible contact.
+    """
     widest = press.contact(press.thickness_m * depth_scale(press.tip_radius_m / press.thickness_m))
     r_m = np.append(widest.radius_m * np.linspace(0, 1, MARKERS_N) ** 2, r_m)
     return undeformed(r_m, np.append(np.full(MARKERS_N, press.thickness_m), z_m))
@@ -128,7 +134,7 @@ def displace(material: Material, change: Waves, depth_m: float, press: IndentedL
     hoop = material.hoop * (1 + second.hoop * (1 + first.hoop / 2))
     moved = Material(material.r_m + second.r_m, material.z_m + second.z_m, material.f + _gradient(second) @ half, hoop)
     if not moved.z_m.max() < RIM_MAX * press.thickness_m:
-        rule = f"such that the rim stays below {RIM_MAX} of the skin's thickness"
+        rule = f"such that the rim stays below {RIM_MAX} times the skin's thickness"
         got = f"{depth_m / press.thickness_m:.3g} of the thickness"
         raise ParamsError("poke", "depth", rule, got, "Poke less deep.")
     return moved
@@ -148,7 +154,7 @@ def rotation_angle(f: Float[np.ndarray, "s 2 2"]) -> Float[np.ndarray, " s"]:
 # tables that end at 4 thicknesses from the axis, the error of dB is up to 17 %.
 REACH = 5.0
 SIZE_STEP = 0.2  # step of ln(R/h) between tables; the interpolation error of dB is below 0.3 % (test_skin)
-STENCIL_N = 4  # number of points of the cubic interpolation between tables, and of that between depths
+STENCIL_N = 4  # number of points for cubic interpolation, both between tables and between depths
 DET_F_ERROR_MAX = 0.1  # largest relative error of the volume of the material, which is incompressible
 COARSE_R = np.linspace(0, 1, 56) ** 1.5  # radii at which displacements are computed, relative to `reach`
 FINE_R = np.linspace(0, 1, 512)  # radii at which displacements are tabulated; fine enough for linear interpolation
@@ -254,9 +260,9 @@ def _tabulate(
 def at_depth(table: DeformationMap, depth_m: float) -> Float[np.ndarray, "l i 3"]:
     """Interpolate the table between depths, by cubic polynomials in the square root of the depth.
 
-    The variable is the square root of the depth, because the displacement of distant material is almost proportional
-    to its cube. Below the first tabulated depth (about 10 um for a skin of 2 mm), the displacement is taken to be
-    proportional to the cube, like the force of a light touch.
+    The square root is used because the displacement of distant material is almost proportional to depth^1.5, the cube
+    of the root. Below the first tabulated depth (about 10 um for a skin of 2 mm), all displacements are assumed to be
+    proportional to depth^1.5, like the force of a light touch.
     """
     if not -np.inf < depth_m <= table.depth_m[-1]:
         rule = f"finite and at most {1e3 * table.depth_m[-1]:.4g} mm, the greatest tabulated depth"

@@ -32,9 +32,9 @@ def _gauss(top: float, points_n: int) -> tuple[Float[np.ndarray, " q"], Float[np
     return top * (x + 1) / 2, top * w / 2
 
 
-# Nodes and weights of Gauss quadrature: over the contact, in units of its radius; over kh up to 24 for the kernel,
-# where 1 - compliance, which falls as exp(-2 kh), is negligible; and over kh up to 40 for displacements, which is a
-# wavelength of 0.3 mm in a skin of 2 mm.
+# Nodes and weights of three Gauss quadratures. CONTACT: over the contact, in units of its radius. KERNEL: over kh up to
+# 24; above that, 1 - compliance is negligible, because it falls as exp(-2 kh). WAVES: over kh up to 40, for
+# displacements; in a skin of 2 mm, kh = 40 is a wavelength of 0.3 mm.
 CONTACT_X, CONTACT_W = _gauss(1.0, 48)
 KERNEL_KH, KERNEL_W = _gauss(24.0, 160)
 WAVES_KH, WAVES_W = _gauss(40.0, 240)
@@ -86,7 +86,7 @@ def bonded_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     (sinh 2A - 2A) / (cosh 2A + 2 A^2 + 1), A = kh, with numerator and denominator divided by exp(2A) / 2 to avoid
     overflow.
     """
-    double = np.minimum(2 * kh, 1e3)  # the compliance is 1 at this limit, which keeps the squares below finite
+    double = np.minimum(2 * kh, 1e3)  # keeps `double**2` finite; at this limit, the compliance is 1
     fade = np.exp(-double)
     s = double**2
     series = 2 * fade * double * s / 6 * (1 + s / 20 * (1 + s / 42 * (1 + s / 72 * (1 + s / 110))))
@@ -98,7 +98,7 @@ def slipping_compliance(kh: Float[np.ndarray, " w"]) -> Float[np.ndarray, " w"]:
     """Return the surface compliance of a slipping layer to a pressure wave, relative to that of a half-space.
 
     (cosh 2A - 1) / (sinh 2A + 2A), A = kh (Johnson 1985, 5.8), with numerator and denominator divided by exp(2A) / 2 to
-    avoid overflow; for long waves, its limit A / 2.
+    avoid overflow. For long waves, the limit A / 2 is returned.
     """
     double = np.minimum(2 * kh, 1e3)
     fade = np.exp(-double)

@@ -20,8 +20,7 @@ ARRAY_BELOW_M = 0.50e-3  # gap between the skin's base and the lower cubes, from
 ARRAY_ABOVE_M = 0.25e-3  # gap between the skin's top and the upper cubes, from the authors' CAD
 ARRAY_REMANENCE_T = 1.32  # N42 cubes, assumed
 
-# Signs of adjacent cubes, which the paper does not specify. In both cases, each upper cube attracts the lower cube that
-# is opposite.
+# Signs of adjacent cubes, which the paper does not specify. In both cases, each upper cube attracts the cube below it.
 Polarity = Literal["checkerboard", "same"]
 
 

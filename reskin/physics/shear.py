@@ -128,9 +128,9 @@ class WaveResponse:
 class ShearMap:
     """Displacement, and half of its curl, due to a force Q along x, on a grid with equal steps in r and in z.
 
-    Both are divided by Q / G. At the angle f from x, the components along x, y and z are A + B cos 2f, B sin 2f and
-    C cos f for the displacement, and -E sin 2f, D + E cos 2f and S sin f for the half curl. The last axis of `parts` is
-    A, B, C in 1/m and D, E, S in 1/m^2.
+    Both are divided by Q / G, where G is the shear modulus. At the angle f from x, the components along x, y and z are
+    A + B cos 2f, B sin 2f and C cos f for the displacement, and -E sin 2f, D + E cos 2f and S sin f for the half curl.
+    The last axis of `parts` is A, B, C in 1/m and D, E, S in 1/m^2.
     """
 
     r_m: Float[np.ndarray, " i"]
@@ -161,8 +161,9 @@ def slip_traction(contact: layer.Contact) -> Traction:
 def stick_traction(radius_m: float, thickness_m: float) -> Traction:
     """Return the axisymmetric traction of a sticking tip, which displaces the whole contact by the same amount.
 
-    The term B of `ShearMap` is neglected in this condition. The traction is the solution of chi - K chi = 1 (see
-    `layer.contact_of_radius`). For a thick layer, chi is constant, which is Mindlin's traction (a^2 - r^2)^(-1/2).
+    The term B of `ShearMap`, which makes the displacement non-uniform, is neglected. The traction is the solution of
+    chi - K chi = 1 (see `layer.contact_of_radius`). For a thick layer, chi is constant, which is Mindlin's traction
+    (a^2 - r^2)^(-1/2).
     """
     x_m, weights_m = radius_m * layer.CONTACT_X, radius_m * layer.CONTACT_W
     kernel = _kernel(x_m, thickness_m) * weights_m
@@ -171,7 +172,7 @@ def stick_traction(radius_m: float, thickness_m: float) -> Traction:
 
 
 def tangential_stiffness_m(traction: Traction, thickness_m: float) -> float:
-    """Return the tangential stiffness k_t of the layer, divided by G.
+    """Return the tangential stiffness k_t of the layer, divided by the shear modulus G.
 
     k_t is the force divided by the mean displacement along the force, weighted with the traction. By Parseval's
     theorem, k_t / G is 8 pi / integral of q^2 (w' + 2v) dk at the surface. For a half-space, w' + 2v = 3, and the
@@ -290,7 +291,7 @@ def shear_displacement(
     force_N: Float[np.ndarray, "2"],
     modulus_Pa: float,
 ) -> ShearDisplacement:
-    """Interpolate the linear displacement and the half curl at places, for a tangential force at `centre_m`.
+    """Interpolate the linear displacement and the half curl at `places_m`, for a tangential force at `centre_m`.
 
     `modulus_Pa` is Young's modulus, 3 G.
     """
@@ -351,7 +352,7 @@ def rotation_from_curl(half_curl: Float[np.ndarray, "s 3"]) -> tuple[Float[np.nd
 
 def _over_modulus(force_N: Float[np.ndarray, "2"], modulus_Pa: float) -> Float[np.ndarray, "2"]:
     if not 0 < modulus_Pa < np.inf:
-        raise ParamsError("drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Drag a solid skin.")
+        raise ParamsError("drag", "modulus", "above 0 Pa and finite", f"{modulus_Pa}", "Check the skin's modulus.")
     return force_N * (3 / modulus_Pa)  # incompressible: G = E / 3
 
 

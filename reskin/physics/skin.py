@@ -30,7 +30,7 @@ class SkinDesign(Strict):
     polarity: magnet.Polarity
     flipped: bool  # whether the magnetisation is reversed, which equals a rotation of a checkerboard skin by 90 degrees
     base: layer.Base
-    # Settings of the rigid sliding of a finite skin. None: an infinite layer that does not slide, with `layer.force`.
+    # How a finite skin slides on its base. None: the skin is an infinite layer that does not slide (see `layer.force`).
     hold: slide.HoldDesign | None
     saturation_T: Annotated[float, Field(ge=0, le=1)]  # volume fraction times remanence of the powder
     half_field_T: Annotated[float, Field(gt=0, le=10)]  # field that magnetises the powder to half of saturation_T

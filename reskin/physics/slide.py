@@ -2,7 +2,7 @@
 
 The base is modelled as evenly distributed, isotropic springs that hold the whole skin. Therefore, the rigid motion of
 the skin follows from the displacement of the material under the tip (for a press) or from the tangential force (for a
-drag). Friction between tip and skin limits the motion (`limit_by_friction`), so that it vanishes with the normal force.
+drag). Friction between tip and skin limits the motion, which vanishes with the normal force (`limit_by_friction`).
 
 The normal force is that of the slipping elastic layer (`layer`) times (1 - d/h)^(-3/2), because the layer stiffens as
 it thins: for a skin of 2 mm, by a factor of 1.2 at 0.2 mm and 4.0 at 1.2 mm. This factor and the displacement due to a
@@ -34,9 +34,9 @@ CURVE_N = 2000  # number of points of the inverse force curve, in which d is int
 class HoldDesign(Strict):
     """Section `skin.hold`: how the base holds a skin that slides on it, and how a press displaces the skin."""
 
-    give_um: tuple[float, float]  # displacement of arm and skin along x and y due to a press (compliance of the rig)
+    give_um: tuple[float, float]  # displacement of robot arm and skin along x and y due to a press
     away_um_mm: Annotated[float, Field(ge=0, le=100)]  # displacement towards the centre, per distance from the centre
-    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # (force / Young's modulus) at which `away_um_mm` has no effect
+    lets_go_mm2: Annotated[float, Field(gt=0, le=1e6)]  # force / Young's modulus above which `away_um_mm` has no effect
     springs_N_mm: Annotated[float, Field(gt=0, le=1e6)]  # lateral stiffness of the base: screws, clips, friction
     friction: Annotated[float, Field(gt=0, le=10)]  # coefficient between tip and skin
 
@@ -85,8 +85,8 @@ def press_displacement_m(
     """Return the displacement of the material under a tip that does not slip: give - away (1 - load) p.
 
     p is the place relative to the skin's centre. The second term displaces the material towards the centre. `load` is
-    the force divided by the force at which this term vanishes. After a light press, only a fraction of this
-    displacement remains (see `limit_by_friction`).
+    the force divided by the force at which this term vanishes. A light press causes only a fraction of this
+    displacement (see `limit_by_friction`).
     """
     return np.array(give_m) - away * (1 - load)[:, None] * places_m
 
@@ -101,7 +101,7 @@ def limit_by_friction(motion: RigidMotion, force_N: Float[np.ndarray, " n"], gri
     with np.errstate(invalid="ignore"):  # inf * 0 is NaN, if both motion and friction are 0
         needed_N = grip_N_per_m * np.hypot(*motion.move_m.T)
     moves = needed_N > 0
-    with np.errstate(over="ignore"):  # if the motion is so small that any force suffices
+    with np.errstate(over="ignore"):  # the quotient is infinite if the motion is so small that any force suffices
         share = np.where(moves, -np.expm1(-force_N / np.where(moves, needed_N, 1.0)), 0.0)
     return motion.scaled(share)
 
@@ -121,11 +121,11 @@ def compliance_m_per_N(
 def rigid_motion(
     places_m: Float[np.ndarray, "n 2"], displacement_m: Float[np.ndarray, "n 2"], sides_m: tuple[float, float]
 ) -> RigidMotion:
-    """Return, for each place, the rigid motion that displaces it as given with the least elastic energy of the base.
+    """Return for each place the rigid motion that displaces it by D with the least elastic energy of the base.
 
-    A rigid motion is u(X) = f + theta z x X, and the condition is u(p) = D at the place p. The solution is
-    f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is the mean of
-    r^2 over the skin.
+    D is `displacement_m`. A rigid motion is u(X) = f + theta z x X, and the condition is u(p) = D at the place p. The
+    solution is f = (I + q q^T / rho^2)^-1 D and theta = q.f / rho^2, where q = z x p, and rho^2 = (a^2 + b^2) / 12 is
+    the mean of r^2 over the skin.
     """
     q_m = np.stack([-places_m[:, 1], places_m[:, 0]], axis=1)
     spin_rad = (q_m * displacement_m).sum(axis=1) / (_rho2_m2(sides_m) + (q_m * q_m).sum(axis=1))
@@ -181,7 +181,7 @@ def force_at(
 
 
 def stiffening(depth_m: Float[np.ndarray, " n"], thickness_m: float) -> Float[np.ndarray, " n"]:
-    """Return the factor (1 - d/h)^(-3/2) by which a layer is stiffer at a depth; the same is assumed for shear."""
+    """Return the factor (1 - d/h)^(-3/2) by which a layer stiffens at depth d, for normal forces and for shear."""
     return (1 - np.maximum(depth_m, 0.0) / thickness_m) ** -STIFFENING
 
 

@@ -77,7 +77,7 @@ def constant_rate(frame: Float64[np.ndarray, " f"], rate_hz: float) -> Float64[n
 
 
 # Maximum deviation of a clock's fitted rate from 1. Real deviations are some per cent, if the nominal frame rate is
-# inaccurate; a larger deviation means that a mark is in milliseconds or that its two times are of different events.
+# inaccurate. A larger deviation means that a mark is in milliseconds, or that its two times belong to different events.
 RATE_LIMIT = 0.1
 
 # To align the clocks without marks, the stream is divided into time steps. `_search` finds an offset for its first
@@ -86,7 +86,8 @@ STEPS_PER_DWELL_N = 16  # steps in the median contact dwell (a "dwell length")
 STEPS_MAX_N = 2**27  # 128 MB; 1e6 indentations of 8 dwell lengths each
 SEARCH_STEPS_N = 2**16  # 4,000 dwell lengths, in which a rate error of 50 ppm adds up to 0.2 dwell lengths
 WINDOW_STEPS_N = 2**14  # 1,000 dwell lengths
-# Minimum fraction of dwell time that agrees with the field. The fraction is 0 by chance, and 1 if every dwell agrees.
+# Minimum fraction of dwell time that agrees with the field. The fraction is 1 if every dwell agrees, and 0 on average
+# for a random offset.
 EXPLAINED_MIN = 0.5
 # The best offset must match this many more indentations than every other offset. An offset that is wrong by one period
 # of a periodic protocol matches one indentation less, and one contact may be too weak to detect.
@@ -96,10 +97,10 @@ MARGIN_MIN = 1.5
 OVERLAP_MIN = 0.5
 # The top of a peak can be flat, so the position of the peak is the middle between its flanks at 5 % below the top.
 PEAK_DROP = 0.05
-# Contact threshold, as a multiple of the median distance from the no-load field in frames without contact: 2.7 standard
-# deviations of this distance above its median, for the 15 channels of a board.
+# Contact threshold for the distance of a frame from the no-load field, as a multiple of the median distance of frames
+# without contact. For 15 channels, the threshold is 2.7 standard deviations of these distances above their median.
 AWAY_NOISES = 1.5
-STRETCH_PERIODS_N = 32  # the no-load field is updated after this many periods, of one indentation each
+STRETCH_PERIODS_N = 32  # the no-load field is updated once per stretch; a stretch has this many indentations
 START_FRAMES_N = 4  # the first no-load field is the median of this many first frames
 REFERENCE_FRAMES_N = 4096  # at most this many frames of a stretch are used to estimate the no-load field
 _REMEDY = "Add sync marks: reskin add ... --mark STREAM_S,PROBE_S, one event on both clocks."
@@ -113,7 +114,8 @@ class ClockMap:
     """Linear map from stream time to probe time: probe_s = offset_s + rate * stream_s.
 
     `residual_s` is the largest misfit of the sync marks (or of the windows) to which the line was fitted. `explained`
-    is the fraction of dwell time that agrees with the field: 0 by chance; it is set to 1 if marks were given.
+    is the fraction of dwell time that agrees with the field (0 on average for a random offset), or 1 if marks were
+    given.
     """
 
     offset_s: float
@@ -142,7 +144,8 @@ def from_marks(marks: Float64[np.ndarray, "m 2"], where: str) -> ClockMap:
 def from_contacts(blocks: Iterable[Block], log: ProbeLog, where: str) -> ClockMap:
     """Find the clock map that aligns the contacts visible in the field with the dwells of the probe log.
 
-    The stream must begin with the robot lifted. The function needs 1 byte of memory per sixteenth of a dwell.
+    The stream must begin with the robot lifted. The function needs 1 byte of memory per time step; a step is 1/16 of
+    the median contact dwell.
     """
     if not log.contact.any():
         raise CaptureError(f"{where}: the probe log has no contacts. Record the capture again.")
@@ -200,13 +203,13 @@ def _running(weight: Float64[np.ndarray, " d"]) -> Float64[np.ndarray, " e"]:
 
 
 def _search(signal: Int8[np.ndarray, " g"], pattern: _Pattern, start_s: float, step_s: float, where: str) -> float:
-    """Return the offset, probe time minus stream time in s, that fits best; raise if another one fits about as well."""
+    """Return the offset (probe time minus stream time, in s) that fits best; raise if another fits about as well."""
     steps_n = min(int((pattern.end_s - pattern.start_s) / step_s) + 1, SEARCH_STEPS_N)
     samples = signal / np.abs(signal).mean()  # scaled to a mean magnitude of 1, because most steps may have no frame
     weights, unsigned = (weigh(pattern.start_s, steps_n, step_s) for weigh in (pattern.signed, pattern.unsigned))
     overlap = _correlate(unsigned, np.abs(samples))
-    # The score is the match minus what a poor fit would match. Without the second term, an offset that mismatches a
-    # dwell could compensate for it by a larger overlap with the log.
+    # The score is the match minus the match of a barely acceptable fit. Without the second term, an offset could
+    # compensate for a mismatched dwell by a larger overlap with the log.
     score = _correlate(weights, samples) - EXPLAINED_MIN * overlap
     score[overlap < OVERLAP_MIN * overlap.max()] = 0.0
     top_i = int(score.argmax())
@@ -323,7 +326,7 @@ def _line(
     stream_s: Float64[np.ndarray, " m"], offset_s: Float64[np.ndarray, " m"], explained: float, where: str
 ) -> ClockMap:
     """Fit the clock map to offsets (probe time minus stream time) by least squares; one offset gives a rate of 1."""
-    mid_s, mean_s = stream_s.mean(), offset_s.mean()  # centred for precision, as clocks may count from 1970
+    mid_s, mean_s = stream_s.mean(), offset_s.mean()  # centred for precision: clocks may count from 1970
     spread_s2 = ((stream_s - mid_s) ** 2).sum()
     slope = float(((stream_s - mid_s) * (offset_s - mean_s)).sum() / spread_s2) if len(stream_s) > 1 else 0.0
     residual_s = float(np.abs(offset_s - mean_s - slope * (stream_s - mid_s)).max())

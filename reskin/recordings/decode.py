@@ -30,8 +30,8 @@ def read_frames(
 ) -> tuple[Float64[np.ndarray, " f"], Float32[np.ndarray, "f ch"], Float32[np.ndarray, "f k"]]:
     """Return time in s, field in uT and temperature in degC of the frames of a decoded dump.
 
-    The time is that of the board's clock if every frame has it. Otherwise, it is computed from the frame's position and
-    the constant rate `rate_hz`; in binary formats, lost bytes also take time.
+    The times are those of the board's clock if every frame has one. Otherwise, a time is computed from the frame's
+    position and the constant rate `rate_hz`; in binary formats, lost bytes also take time.
     """
     chips_n = sum(name.startswith("temperature") for name in table.column_names)
     if table.column_names != list(_columns(chips_n)):
@@ -51,6 +51,6 @@ def read_frames(
 
 
 def _columns(chips_n: int) -> dict[str, str]:
-    """Return the columns of a decoded dump in order: the unit of each by its name."""
+    """Return the columns of a decoded dump in order, as a mapping from the column's name to its unit."""
     names = {f"b{axis}{chip}_uT": "uT" for chip in range(chips_n) for axis in "xyz"}
     return names | {f"temperature{chip}_degC": "degC" for chip in range(chips_n)} | {"device_s": "s", "end_byte": "1"}

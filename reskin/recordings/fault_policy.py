@@ -39,15 +39,15 @@ class FaultPolicy(Strict):
     stuck: Action  # the readings of a chip stay the same while others change
     constant_channel: FlagOrRefuse  # Bx, By or Bz of a chip never changes while its other channels do
     chip_reset: FlagOrRefuse  # a chip's LSB differs from that of the other chips, or changes
-    too_hot: Action  # or too cold: temperature out of range
+    too_hot: Action  # a chip's temperature is out of range (too hot or too cold)
     saturated: Action  # field at the end of the chip's range
     int16_wrap: Action  # field jumps by more than the range of int16
-    repeated: Action  # identical frames follow each other far more often than in a fast loop
+    repeated: Action  # many frames equal the previous frame; a few are normal if the firmware reads fast
     dropped: FlagOrRefuse  # frames are missing, according to the board's clock
     clock_jump: FlagOrRefuse  # the board's clock goes backwards, or jumps
     unplug: FlagOrRefuse  # no data arrives for a second or more
-    torn: DropOrRefuse  # bytes between frames
-    wrong_baud: DropOrRefuse  # many bytes between frames, in a row
+    torn: DropOrRefuse  # stray bytes between two frames
+    wrong_baud: DropOrRefuse  # very many stray bytes between two frames
 
 
 REFUSE_ALL = FaultPolicy.model_validate(dict.fromkeys(FaultPolicy.model_fields, "refuse"))
@@ -96,7 +96,7 @@ class FaultRecord:
 
 
 class CheckedRows(NamedTuple):
-    """Masks of the frames or rows to keep, and of the dropped ones by the first reason that applies.
+    """Masks of the rows (or frames) to keep, and of the dropped rows, each under the first reason that applies.
 
     `counts` is the result of `FaultLog.account`.
     """
@@ -185,7 +185,7 @@ class FaultLog:
     def record_readings(
         self, readings: ReadingFaults, position: Float64[np.ndarray, " f"] | Int[np.ndarray, " f"]
     ) -> tuple[Bool[np.ndarray, " f"], Bool[np.ndarray, " f"]]:
-        """Record the faults that can be detected in each reading by itself.
+        """Record the faults that can be detected from a single reading.
 
         Returns two masks of rows to drop: rows with a failed read, and other rows with a reading that is out of range.
         """
@@ -230,7 +230,8 @@ class FaultLog:
         if channels and self._policy.constant_channel == "refuse":
             raise CaptureError(
                 f"{self._where}: {', '.join(channels)} never changed in the whole recording. Check the wiring, the "
-                "chip and the columns, and record again; or accept it: faults: constant_channel: flag in params.yaml."
+                "chip and the columns, and record again. To accept such channels, set faults.constant_channel: flag in "
+                "params.yaml."
             )
         if channels:
             position = np.array(self._span) if position is None else position

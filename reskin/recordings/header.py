@@ -107,7 +107,7 @@ def parse(text: str, where: str) -> Header:
 
 
 def make_header(where: str, **fields: Any) -> Header:
-    """Make and check a header; the defaults of fields are for a recording in a layout other than `native`."""
+    """Create and check a header; fields that are not given suit a recording in a layout other than `native`."""
     defaults: dict[str, Any] = {
         "format": "reskin-capture/1", "source": "recorded", "wire": None, "unit_b": "uT", "unit_force": "N",
         "unit_place": "mm", "firmware": None, "clock": Clock(kind="recording", rate_hz=None, marks=()),
@@ -126,7 +126,7 @@ def check_same_capture(header: Header, folder: str) -> None:
     """Raise if the name of a capture folder differs from the name in its header, as after renaming the folder."""
     if header.capture != folder:
         rule = f"the folder's name {folder!r}"
-        raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename it back.")
+        raise CaptureError(f"{folder}/{HEADER_FILE}", "capture", rule, repr(header.capture), "Rename the folder.")
 
 
 def write_capture(folder: Path, header: Header, contents: Mapping[str, bytes | Path]) -> Header:

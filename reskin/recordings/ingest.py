@@ -292,7 +292,7 @@ def check_losses(account: Mapping[str, int], limit: float, where: str) -> None:
 
 
 def read_native(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Iterator[Readings], dict[str, int]]:
-    """Return an iterator of the readings of a native capture, and the account, which is complete after the last ones.
+    """Return an iterator over the readings of a native capture, and the account (complete after the iteration).
 
     Without sync marks, the stream is read twice, the first time to align the clocks.
     """
@@ -390,7 +390,7 @@ def timer(folder: Path, header: Header) -> Timer:
 
 
 def _arrivals(folder: Path) -> Arrivals:
-    """Read the arrivals; raise if they list more bytes than the stream has, as when it was cut after recording."""
+    """Read the arrivals; raise if they list more bytes than the stream has, for example if the stream was truncated."""
     table = clocks.parse(folder / ARRIVALS_FILE, str(folder / ARRIVALS_FILE))
     bytes_n, arrived_n = (folder / STREAM_FILE).stat().st_size, int(table.byte_end[-1])
     if bytes_n < arrived_n:

@@ -52,7 +52,7 @@ class LabelContext:
 class LabelSource(NamedTuple):
     """A source of labels."""
 
-    name: str  # for the header
+    name: str  # name of the source, for the capture's header
     scan: str | None  # order of the places
     run: Callable[[LabelContext], str]  # writes labels until they end or the recording stops; returns a summary
 
@@ -231,16 +231,16 @@ class ForceGauge:
     def during(self, start_s: float, end_s: float) -> Label:
         """Return a label with the mean force between two times.
 
-        Without a sample in this time, the force is NaN, and the contact is counted as one without a force.
+        If the gauge sent no sample in this time, the force is NaN, and a contact without force is counted.
         """
         labels = [sample.label for sample in list(self._kept) if sample.label and start_s <= sample.t_s <= end_s]
         self._without_force_n += not labels
         return mean_label(labels) if labels else Label(True)
 
     def summary(self) -> str:
-        """Describe how many lines could not be read, and how many contacts have no force; empty if none."""
+        """Describe how many lines could not be read, and how many contacts have no force; "" if there are none."""
         bad = _bad_lines(f"the gauge at {self.port}", self._gauge)
-        without = f"{self._without_force_n} touches without a force: the gauge at {self.port} sent none during them"
+        without = f"{self._without_force_n} touches during which the gauge at {self.port} sent no force"
         return "; ".join(filter(None, (bad, self._problem, without if self._without_force_n else "")))
 
     @contextmanager
@@ -340,7 +340,10 @@ class Prompts:
         return f"place {place_i} (x {x_mm:g}, y {y_mm:g} mm)"
 
     def _read_label(self, typed: Iterator[str], place_i: int) -> Label | None:
-        """Return the label that a person typed for a press; None at the end, without contact for a skipped place."""
+        """Return the label that a person types for a press; None if the person ends the recording.
+
+        For a skipped place, the label is without contact.
+        """
         for line in typed:
             match = REPLY.fullmatch(line)
             if line in ENDS:

@@ -1,4 +1,4 @@
-"""Labels during a recording: join samples of a table or a force gauge to dwells, and write these to `probe.csv`.
+"""Labels during a recording: combine samples of a table or a force gauge into dwells, and write them to `probe.csv`.
 
 The sources of labels are in `label_sources`.
 """
@@ -24,9 +24,10 @@ TIME_STEP_s = 1e-6  # resolution of the written times
 TIME_MAX_s = 1e11  # unix time in seconds is below this for 3,000 years; in milliseconds, it is above
 CLOCKS = ("unix_s", "t_s")  # time on this machine's clock, or on the clock of the source
 COLUMNS = (*CLOCKS, "phase", "pass_i", *LABELS)
-CONTACT_N = 0.05  # assumed: above the noise of a gauge
+CONTACT_N = 0.05  # assumed: a force of this or more is a contact; it is above the noise of a gauge
 NOLOAD_N = 0.025  # below this, there is no contact; from this to CONTACT_N, a contact may be beginning or ending
-DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5  # assumed: a longer contact is split into several dwells, each with its own force
+# Assumed limits of a dwell. A longer contact is split into several dwells, and each dwell has a separate mean force.
+DWELL_MIN_s, DWELL_MAX_s = 0.05, 0.5
 DWELL_SAMPLES_MAX_N = 10_000  # limits the memory if the clock of the source has stopped
 LINE_BYTES_MAX_N = 4096
 GAUGE_NUMBERS = {1: ("Fz_N",), 3: ("Fx_N", "Fy_N", "Fz_N")}  # number of values in a gauge's line -> their names
@@ -49,7 +50,7 @@ class Label(NamedTuple):
 
 
 class Dwell(NamedTuple):
-    """A label with the start and end of the time for which it holds, on the clock of its source."""
+    """A label with the start and end of the time for which it is valid, on the clock of the label's source."""
 
     label: Label
     t_start_s: float
@@ -239,10 +240,11 @@ class GaugeLines:
 
 
 class DwellBuilder:
-    """Join the samples of a contact at one place, or of a period without contact, to a dwell with mean force and depth.
+    """Combine samples into dwells with mean force and depth.
 
-    A contact longer than `DWELL_MAX_s` is cut into several dwells, so that some of its labels are already written if
-    the recorder is killed. `short_n` counts contacts that are too short for a dwell.
+    A dwell is made of the samples of a contact at one place, or of a period without contact. A contact longer than
+    `DWELL_MAX_s` is cut into several dwells, so that some of its labels are already written if the recorder is killed.
+    `short_n` counts contacts that are too short for a dwell.
     """
 
     def __init__(self) -> None:
@@ -275,7 +277,7 @@ class DwellBuilder:
             self.short_n += 1
 
     def summary(self) -> str:
-        """Describe how many contacts were too short for a dwell; empty if none.
+        """Describe how many contacts were too short for a dwell; return "" if there are none.
 
         In a table with rows only at the start and end of contacts, all contacts are too short.
         """
@@ -289,7 +291,7 @@ class DwellBuilder:
 
 
 def mean_label(labels: list[Label]) -> Label:
-    """Return the first label, with each number replaced by its mean over all labels; NaN if it is unknown in one."""
+    """Return the first label, with each number replaced by the mean over all labels (NaN if unknown in any label)."""
     means: dict[str, Any] = {name: math.fsum(getattr(label, name) for label in labels) / len(labels) for name in LABELS}
     return labels[0]._replace(**means)
 

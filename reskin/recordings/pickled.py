@@ -85,7 +85,7 @@ def decode(pickled: bytes, where: str) -> Any:
         return plain(stack.values.pop())
     except CaptureError:
         raise
-    except Exception as error:  # other bytes may fail anywhere: in pickletools, on an empty stack, in NumPy
+    except Exception as error:  # arbitrary bytes may fail anywhere: in pickletools, on an empty stack, in NumPy
         raise CaptureError(f"{where}: the pickle cannot be read: {_describe(error)}. {REMEDY}") from None
 
 

@@ -136,13 +136,14 @@ def dump(recording: Path, names: CaptureNames, what: Dump) -> Prepared:
 
 
 def native(recording: Path, names: CaptureNames, probe: Path | None, marks: Marks) -> Prepared:
-    """Prepare a capture folder that `reskin record` wrote; `probe` is a probe log that is added or replaces its log."""
+    """Prepare a capture folder that `reskin record` wrote; `probe`, if given, becomes the capture's probe log."""
     _check_exists(recording, folder=True)
     header = read_header(recording)
     for option, given, in_header in (("--board", names.board, header.board), ("--skin", names.skin, header.skin)):
         if in_header not in (given, UNNAMED):
             raise CaptureError(
-                f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct one of them."
+                f"{recording}: {option} is {given!r}, but the header says {in_header!r}. Correct the option or the "
+                "header."
             )
     # If the recorder was killed, the header does not list the files.
     files = {name: recording / name for name in NATIVE_FILES if (recording / name).exists() or name in header.files}

@@ -30,9 +30,10 @@ TYPES = {
 
 @dataclass(frozen=True)
 class ProbeLog:
-    """The dwells of one capture, axis d; NaN where a label is unknown.
+    """The dwells of one capture, one array element per dwell; NaN where a label is unknown.
 
-    `phase` is stored as `contact`: False while the robot is lifted. Forces have the signs of `reskin.schema`.
+    `contact` is True for phase `contact`, and False for phase `noload`, when the robot is lifted. Forces have the signs
+    of `reskin.schema`.
     """
 
     indentation: Int32[np.ndarray, " d"]

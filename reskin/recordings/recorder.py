@@ -41,7 +41,7 @@ class CaptureResult(NamedTuple):
 
     stream: Recording
     labels: str  # a summary of the labels for the user
-    failed: Exception | None  # the error that ended the labels
+    failed: Exception | None  # the exception that ended the source of labels, if any
 
 
 NO_INFO = CaptureInfo(UNNAMED, UNNAMED, "not stated")
@@ -79,7 +79,7 @@ def record_capture(
 def _label_context(part: Path, headers: list[Header], stop: threading.Event) -> LabelContext:
     """Make the context of a source of labels.
 
-    Until the source calls `mark`, the clock mark says that labels and arrivals are on the same clock.
+    Until the source calls `mark`, the clock mark states that labels and arrivals are on the same clock.
     """
     # Determined once, because the system's clock may be adjusted during the recording.
     offset_s = time.time() - time.monotonic()

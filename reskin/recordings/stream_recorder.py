@@ -19,7 +19,7 @@ from reskin.board.wire import TEXT_WIRES, Frames, Wire
 from reskin.errors import CaptureError
 from reskin.recordings.header import ARRIVALS_FILE, STREAM_FILE
 
-HEAD_BYTES_N = 16384  # this many first bytes are stored, to suggest a wire format if no frame arrives
+HEAD_BYTES_N = 16384  # number of first bytes that are stored, to suggest a wire format if no frame arrives
 
 Report = Callable[[Mapping[str, int]], None]  # called many times a second with the counts of `FrameStream.account`
 Watch = Callable[[Frames], object]  # called with frames as they arrive

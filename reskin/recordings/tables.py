@@ -226,7 +226,7 @@ def contact_rows(phases: list[str], where: str, first_line_n: int) -> Bool[np.nd
     for row_i, phase in enumerate(phases):
         if phase not in PHASES:
             place = f"phase in line {first_line_n + row_i}"
-            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Correct the word.")
+            raise CaptureError(where, place, "noload or contact", repr(phase[:20]), "Correct this cell.")
     if "contact" not in phases:
         raise CaptureError(f"{where}: no rows of phase contact. Was the recording cut?")
     return np.array([phase == "contact" for phase in phases])

@@ -129,9 +129,9 @@ def drag_tip(
 
     The tangential force shears the layer under the tip. If the base is held by springs (`Skin.hold`), the force also
     moves the whole skin; otherwise the base is assumed to be fixed sideways. The friction limit applies to the sum of
-    the forces due to pressing and dragging. It is assumed that the drag takes its full force, and that the displacement
-    due to the press is scaled by the remaining fraction of the limit. If the tip slips, this fraction is zero, and so
-    is the displacement due to the press.
+    the forces due to pressing and dragging. The drag is assumed to exert its full force, and the displacement due to
+    the press is multiplied by the remaining fraction of the limit. If the tip slips, this fraction is zero, and so is
+    the displacement due to the press.
     """
     if skin.hold is not None:
         skin = replace(skin, hold=replace(skin.hold, friction=friction.coefficient))
@@ -195,7 +195,7 @@ def _shear_map(skin: Skin, depth_m: float) -> shear.ShearMap:
 
 def _clip(force_N: Float[np.ndarray, "p 2"], limit_N: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p 2"]:
     size_N = np.hypot(*force_N.T)
-    with np.errstate(over="ignore"):  # if the force is far below the limit
+    with np.errstate(over="ignore"):  # the quotient is infinite if the force is far below the limit
         return force_N * np.minimum(1.0, limit_N / np.where(size_N > 0, size_N, 1.0))[:, None]
 
 

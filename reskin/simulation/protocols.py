@@ -93,7 +93,7 @@ class _OnlyTemperature(ProtocolSettings):
 
 
 class Grid(ProtocolSettings):
-    """The paper's grid of 65 places, pressed at several depths in several passes (section 3)."""
+    """The paper's grid of 65 places, pressed at several depths in several passes (paper section 3)."""
 
     kind: Literal["grid"]
     passes_n: Count
@@ -109,7 +109,7 @@ class Grid(ProtocolSettings):
 
 
 class Drag(ProtocolSettings):
-    """A tip that is dragged along lines in x and in y, 2 mm apart, over the whole grid (section 4, shear)."""
+    """A tip that is dragged along lines in x and in y, 2 mm apart, over the whole grid (paper section 4, shear)."""
 
     kind: Literal["drag"]
     passes_n: Count
@@ -141,7 +141,7 @@ class Drag(ProtocolSettings):
 
 
 class Hand(_RandomDepth):
-    """Manual indentations along lines, without labels: only their order along the lines is known (section 5.2)."""
+    """Manual indentations without labels: only their order along lines is known (paper section 5.2)."""
 
     kind: Literal["hand"]
     lines_n: Count
@@ -168,7 +168,7 @@ class Hand(_RandomDepth):
 
 
 class Scatter(_RandomDepth):
-    """Indentations at random places, uniformly distributed over a skin (section 6, arm sleeve).
+    """Indentations at random places, uniformly distributed over a skin (paper section 6, arm sleeve).
 
     The origin of the labels is a corner of the skin.
     """
@@ -192,7 +192,7 @@ class Scatter(_RandomDepth):
 
 
 class Load(_OnlyTemperature):
-    """A glass on the skin's centre that is filled in steps (section 6), modelled as a load on the rig's tip."""
+    """A glass on the skin's centre that is filled in steps (paper section 6), modelled as a load on the rig's tip."""
 
     kind: Literal["load"]
     # Number of fillings; at least 2, because an experiment fits to half of the fillings and tests on the other half.
@@ -217,7 +217,10 @@ class Load(_OnlyTemperature):
 
 
 class Press(_OnlyTemperature):
-    """Presses whose depth is half a sine over time, at grid places; each frame is a stop (section 7, dynamic data)."""
+    """Presses at grid places, whose depth is half a sine over time; each frame is a stop.
+
+    They represent the dynamic data of section 7 of the paper.
+    """
 
     kind: Literal["press"]
     presses_n: Count
@@ -240,7 +243,7 @@ class Press(_OnlyTemperature):
 
 
 class Walk(_OnlyTemperature):
-    """Footfalls of a shoe, or touches of a glove, in one continuous recording (section 6: dog shoe, glove)."""
+    """Footfalls of a shoe, or touches of a glove, in one continuous recording (paper section 6: dog shoe, glove)."""
 
     kind: Literal["walk"]
     steps_n: Count

@@ -40,7 +40,7 @@ class Rig(Strict):
 
 @dataclass(frozen=True)
 class Timeline:
-    """The t frames of one indentation.
+    """The frames of one indentation (t frames).
 
     `stop_i` is the stop to which a frame belongs, and `share` is the fraction of the stop's field change at the frame.
     """
@@ -57,8 +57,8 @@ class Timeline:
 def rig_for(rig: Rig, protocol: Protocol) -> Rig:
     """Return the rig's settings for a protocol.
 
-    The frame rate is that of the protocol, if it has one. Protocols `press` and `walk` have one frame per stop.
-    Protocol `walk` has no robot, no force noise, and a single clock.
+    The frame rate is that of the protocol, if the protocol sets one. Protocols `press` and `walk` have one frame per
+    stop. Protocol `walk` has no robot, no force noise, and a single clock.
     """
     changes: dict[str, float] = {} if protocol.rate_hz is None else {"rate_hz": protocol.rate_hz}
     if isinstance(protocol, Press | Walk):
@@ -234,7 +234,7 @@ def _field_at(
     response: Response, timeline: Timeline, readout: Readout, age_s: Float[np.ndarray, "f k"], first_i: int
 ) -> tuple[Float[np.ndarray, "b k 3"], Float[np.ndarray, "b k"]]:
     # Return the field in T and the temperature in degC at the conversion of each chip, for one block of indentations.
-    # Frames at the start of the block may contain conversions during the previous indentation, so it is included first.
+    # The first frames of the block may contain conversions from the previous indentation, so its field is computed too.
     lead_n = len(timeline) if first_i else 0
     block = slice(first_i - (1 if first_i else 0), first_i + BLOCK_INDENTATIONS_N)
     b_T = response.rest_T[block, None] + timeline.share[:, None, None] * response.change_T[block, timeline.stop_i]

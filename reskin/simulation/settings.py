@@ -22,7 +22,7 @@ Side_mm = Annotated[float, Field(gt=0, le=500)]
 
 
 class BoardKind(Strict):
-    """A kind of board, and the numbers of boards and skins; names of boards and skins start with the letter."""
+    """A kind of board, and the numbers of boards and skins; names of boards and skins start with `letter`."""
 
     letter: Annotated[str, Field(pattern="^[a-z]$")]
     boards_n: Count

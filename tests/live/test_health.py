@@ -15,10 +15,10 @@ from tests.live.boards import make_script
 SCRIPT = make_script(pokes_n=2)
 ALARMS = {
     "failed-read": "chip 1: failed I2C reads",
-    "chip-reset": "chip 1: step differs from the other chips: reset",
+    "chip-reset": "chip 1: resolution differs from the other chips: reset",
     "stuck": "chip 1: stuck",
     "saturated": "chip 1: field at the end of the range",
-    "int16-wrap": "chip 1: past int16",
+    "int16-wrap": "chip 1: int16 overflow",
     "too-hot": "chip 1: temperature out of range",
 }
 
@@ -170,7 +170,7 @@ def test_stuck_chip_is_invalid_unless_flagged():
         assert lost_n == pytest.approx(unused_n, abs=100)
 
 
-RESET, FAILED = "step differs from the other chips: reset", "failed I2C reads"
+RESET, FAILED = "resolution differs from the other chips: reset", "failed I2C reads"
 
 
 @pytest.mark.parametrize(

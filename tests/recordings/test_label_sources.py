@@ -203,7 +203,7 @@ def test_gauge_force_is_averaged_over_each_touch(context, tmp_path, fake_gauge):
 def test_touches_without_gauge_data_are_counted(context, fake_gauge):
     fake_gauge(repeat(b""))
     prompter, _ = prompts(["", "", "", "0.8N", "", "", "q"], forces=ForceGauge("gauge", 9600))
-    assert prompter.run(context) == "2 touches without a force: the gauge at gauge sent none during them"
+    assert prompter.run(context) == "2 touches during which the gauge at gauge sent no force"
 
 
 def test_labels_continue_after_the_gauge_is_unplugged(context, fake_gauge):

@@ -57,7 +57,7 @@ def test_header_is_that_of_the_text_firmware(log):
         (lambda rows: [rows[0].replace("T0,", "").replace("T1,", ""), *rows[1:]], "column 2 is 'Bx0'; it must be T0"),
         (lambda rows: [line.replace(",", ";") for line in rows], "semicolons in line 1"),
         (lambda rows: ["phase,x_mm,y_mm,Bx0\n", *rows[1:]], "labels or estimates.* reskin add"),
-        (lambda rows: [*rows[:-1], rows[-1].rstrip()], "the last line is cut"),
+        (lambda rows: [*rows[:-1], rows[-1].rstrip()], "the last line is incomplete"),
         (lambda rows: [*rows[:-1], rows[-1][:20] + "\n"], r"row 61: \d columns, but row 1 has 9"),
         (lambda rows: [*rows[:9], rows[9].replace("0.0360", "0.0300"), *rows[10:]], "row 10: t_s must be later"),
         (lambda rows: [*rows[:9], rows[8], *rows[9:]], "row 10: t_s must be later"),

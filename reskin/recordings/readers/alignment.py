@@ -11,8 +11,8 @@ BLOCK_ROWS_N = 500  # length of the blocks over which the field's slow drift is 
 ROUNDS_N = 4  # how many times `find_change` fits the lines and splits the rows
 OUTLIER = 4.0  # distances are clipped to this multiple of the median distance
 # A change of the lag is reported if it reduces the sum of distances by at least the cost of this many misaligned rows.
-# In the two public recordings and in windows of them, the largest value without a change is 12; a row that is lost 100
-# rows before the end gives 40 or more.
+# In the two public recordings and in windows of them, this number is at most 12 if the lag does not change, and 40 or
+# more if a row is lost 100 rows before the end.
 EVIDENCE_ROWS_MIN_N = 30
 # Minimum mean cost of a misaligned row, divided by the standard deviation of this cost. Noise alone reaches 0.17 in 300
 # rows.
@@ -68,7 +68,7 @@ def _best_lag(
     field_uT: Float64[np.ndarray, "f ch"], sound: Bool[np.ndarray, " f"], force_N: Float64[np.ndarray, " f"],
     place: Int64[np.ndarray, " f"],
 ) -> Int64[np.ndarray, " f"]:  # fmt: skip
-    """Return an array with the lag that fits best if all rows have the same lag, one element per row."""
+    """Find the single lag that fits all rows best; return it as an array with one element per row."""
     costs = []
     for lag_i, lag in enumerate(LAGS):
         lags = np.full(len(place), lag)
@@ -125,8 +125,8 @@ def _split(distance: Float[np.ndarray, "l f"]) -> tuple[int, int, int]:
     return int(before_i), int(after_i), int(row)
 
 
-# A move is a change of place between two contacts. A period of the passes is accepted if this fraction of the moves
-# that can be compared with the move one period later have the same places.
+# A move is a change of place between two contacts. A move can be compared if the rows one period later are in contact
+# too. A period of the passes is accepted if at least this fraction of these moves has the same places one period later.
 AGREEMENT_MIN = 0.95
 # Minimum fraction of the moves that can be compared. If the period is half the recording, only half of the moves have
 # a move one period later, and in some of them the rows may be without contact.
@@ -139,8 +139,8 @@ GOLDEN = (np.sqrt(5.0) - 1) / 2
 def find_passes(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int32[np.ndarray, " f"]:
     """Return the number of the pass of each row, from 0: a new pass begins when the sequence of places repeats.
 
-    If it does not repeat, all rows are in pass 0. Places of rows without contact are ignored. The last pass may be
-    incomplete.
+    If the sequence does not repeat, all rows are in pass 0. Places of rows without contact are ignored. The last pass
+    may be incomplete.
     """
     rows_n = len(place_mm)
     moves = _find_moves(place_mm, contact)
@@ -159,7 +159,7 @@ def _likely_periods(
 ) -> Int64[np.ndarray, " p"]:
     """Return the periods in rows that fit a sample of the moves in the first half of the recording.
 
-    To test all moves for all periods would take quadratic time.
+    Testing all moves for all periods would take quadratic time.
     """
     half_n = len(contact) // 2
     early = moves[moves[:, 1] < half_n]
@@ -181,7 +181,8 @@ def _likely_periods(
 def _find_moves(place_mm: Float[np.ndarray, "f 2"], contact: Bool[np.ndarray, " f"]) -> Int64[np.ndarray, "moves 2"]:
     """Return the moves: pairs of the last row in contact at a place and the first row in contact at the next place.
 
-    A period that is wrong by less than a dwell cannot match both places.
+    Both rows of a move are compared, because a period that is wrong by less than a dwell can match one of the places,
+    but not both.
     """
     rows = np.flatnonzero(contact)
     pairs = np.stack([rows[:-1], rows[1:]], axis=1)

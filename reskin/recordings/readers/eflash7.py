@@ -3,8 +3,8 @@
 One or two places of a 3 x 3 grid of unknown pitch are touched, so `x_mm` and `y_mm` are NaN. The account counts the
 rows of each place by its number n, as `place_<n>_rows_n`: n is 1 + column + 3 row, with columns and rows counted from
 0. The recorder subtracted a baseline that the file does not contain, so `b_uT` lacks a constant in each channel. The
-no-load field is the mean over the untouched rows at the start of a recording, and forces are relative to their mean
-force.
+no-load field is the mean field of the untouched rows at the start of a recording, and forces are relative to the mean
+force of these rows.
 """
 
 import re
@@ -81,7 +81,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if table.b_uT.shape[1] != 3 * header.chips_n:
         chips_n = table.b_uT.shape[1] // 3
         raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header {header.chips_n}. Correct one of them."
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
+            "header."
         )
     log = FaultLog(policy, where, "row")
     row = FIRST_LINE_N - 1 + np.arange(len(table.b_uT))

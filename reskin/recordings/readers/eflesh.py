@@ -2,8 +2,8 @@
 
 Places are robot coordinates minus their minimum, so a scan begins at 0 mm. The depth is measured downwards from the
 highest z of the recording, which may be above the skin, so the depth has an unknown offset. The force is known along
-one axis. Along x and y, its sign is unknown, because the recorder does not state whether it is the force on the skin or
-on the gauge; the account counts these rows.
+one axis. If this is x or y, the sign of the force is unknown, because the recorder does not state whether it is the
+force on the skin or on the gauge; the account counts these rows.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ FILES = (SENSOR, STATES, CHANGES)
 
 FORCE_AXES = ("x", "y", "z")
 NEWTON_PER_GRAM = 9.80665e-3  # standard gravity
-WEIGHT_COLUMN = 4  # of states.csv, after time, x, y and z; missing if only places were recorded
+WEIGHT_COLUMN = 4  # column of states.csv after time, x, y and z; missing if only places were recorded
 NO_NEW_WEIGHT = -1.0
 CLOCKS_APART_MAX_s = 0.05  # the recorder writes a row to both files in one step of its loop, milliseconds apart
 PLACE_DECIMALS = 3  # the robot reports -84.999992 mm for -85
@@ -56,7 +56,7 @@ def collect(recording: Path) -> dict[str, Path]:
     if missing:
         raise CaptureError(
             f"{recording}: no {', '.join(missing)} in it. A recording of layout eflesh is a folder with "
-            f"{', '.join(FILES)}: fetch it whole."
+            f"{', '.join(FILES)}. Copy the whole folder."
         )
     return {name: recording / name for name in FILES}
 
@@ -124,7 +124,7 @@ def _read_fields(
     differ = np.flatnonzero(sensor[:, 0] != changes[:, 0])
     if len(differ):
         where = f"{header.capture}/{CHANGES} line {differ[0] + 1}"
-        raise CaptureError(f"{where}: time differs from that of {SENSOR}. Take both files of one recording.")
+        raise CaptureError(f"{where}: time differs from that of {SENSOR}. Use both files of the same recording.")
     check_fields(sensor[:, 1:], f"{header.capture}/{SENSOR}", first_line_n=1)
     return sensor[:, 0], sensor[:, 1:], sensor[:, 1:] - changes[:, 1:]
 
@@ -166,7 +166,7 @@ def _check_clocks(sensor_s: Float64[np.ndarray, " f"], states_s: Float64[np.ndar
 def _number_passes(
     place_mm: Float64[np.ndarray, "f 2"], noload_uT: Float64[np.ndarray, "f ch"]
 ) -> tuple[Int32[np.ndarray, " f"], Int32[np.ndarray, " f"]]:
-    """Return the pass number of each row, and the number of touches before it.
+    """Return for each row its pass number and the number of earlier touches.
 
     With many places, each row is a touch, and a new pass begins when the places repeat. With a single place, the robot
     strokes up and down, and the recorder takes a new baseline before each stroke. Each new no-load field therefore

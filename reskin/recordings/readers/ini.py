@@ -1,8 +1,8 @@
 """Read layout `ini`: a 3-D printer and a force gauge, two text files (readings and truths), one row per indentation.
 
-Rows with a force below 0.02 N count as no contact, whatever their place in the truths; the readings have no place and
-zero force. The first rows of a pass, with the indenter at a corner of the grid, give the no-load field of the pass.
-`t_s` and `depth_mm` are unknown (NaN).
+The truths are places and forces. Rows with a force below 0.02 N count as no contact, whatever their place in the
+truths; their place becomes NaN and their force 0. The first rows of a pass, with the indenter at a corner of the grid,
+give the no-load field of the pass. `t_s` and `depth_mm` are unknown (NaN).
 
 The fields may lag: row i of the truths belongs to a later row of the readings. The lag in rows is given in the header
 (`rows_late`); otherwise it is the lag at which |dB| correlates best with the force. If the lag changes within a
@@ -179,7 +179,7 @@ def _check_lateness(
     lost = f"{rows_n} row{'s' if rows_n > 1 else ''} of {'readings' if change.after < change.before else 'truths'}"
     lags = f"{change.before} rows before about row {change.row + 1}, by {change.after} from there on"
     remedy = (
-        f"{lost} seem to be missing there. Cut both files before that row, or put back what is missing, and add the "
+        f"{lost} seem to be missing there. Cut both files before that row, or restore the missing rows, and add the "
         "recording again."
     )
     raise CaptureError(f"{header.capture}/{READINGS}: the fields lag behind their truths by {lags}. {remedy}")
@@ -203,6 +203,6 @@ def _noload_field(
         where = f"{header.capture}/{TRUTHS} line {int(np.argmax(pass_i == without[0])) + 1}"
         raise CaptureError(
             f"{where}: this pass does not begin with a fault-free row without contact (F < {CONTACT_MIN_N} N). "
-            "Start each pass off the skin, or cut this pass out."
+            "Start each pass off the skin, or remove this pass."
         )
     return noload_uT[pass_i]

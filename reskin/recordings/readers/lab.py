@@ -33,9 +33,9 @@ FILES = (READINGS,)
 FIRST_LINE_N = 2  # line number of the first row of numbers in the file
 # Factor from the force in the file (on the gauge) to the force on the skin. For x, the evidence is that pokes shift the
 # skin by 48 um along +x on both public boards (experiment `compare` fits this shift to the fields alone), while the
-# mean Fx is negative in all six files. For y, the shift and the mean force are too small for a decision. But the sign
-# of Fz requires a z axis that points into the skin. If the axes are right-handed, the y axis of the force then has the
-# direction of the y axis of the places.
+# mean Fx is negative in all six files. For y, the shift and the mean force are too small for a decision. However, the
+# sign of Fz implies that the gauge's z axis points into the skin. If the gauge's axes are right-handed, its y axis then
+# has the direction of the y axis of the places.
 ON_SKIN = -1.0
 
 Account = dict[str, int]
@@ -75,7 +75,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     if table.temperature_degC.shape[1] != header.chips_n:
         chips_n = table.temperature_degC.shape[1]
         raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header {header.chips_n}. Correct one of them."
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
+            "header."
         )
     rows = check_rows(table.b_uT, table.temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
     keep, noload = table.contact & rows.keep, ~table.contact & rows.keep

@@ -1,6 +1,6 @@
-"""Read and write the log that a board writes to an SD card (paper, section 6): one CSV line per frame, without labels.
+"""Read and write the log that a board writes to an SD card (paper section 6): one CSV line per frame, without labels.
 
-A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as the text firmware does.
+A line has the board's clock in seconds, then T, Bx, By, Bz of each chip in degC and uT, as in wire format `text-txyz`.
 """
 
 from codecs import BOM_UTF8
@@ -116,7 +116,8 @@ def _chips_n(path: Path, where: str) -> int:
         raise CaptureError(f"{where}: {_header_fault(names)}")
     if last != b"\n":
         raise CaptureError(
-            f"{where}: the last line is cut: no line feed ends it. Remove it if the board was switched off just then."
+            f"{where}: the last line is incomplete: it does not end with a line feed. If the board was switched off "
+            "while it wrote this line, remove the line."
         )
     return chips_n
 
@@ -155,7 +156,7 @@ def _check_time(t_s: Float64[np.ndarray, " f"], where: str, first_row: int) -> N
     if back.any():
         row_i = int(back.argmax()) + 1
         got = f"{t_s[row_i]:.4f} after {t_s[row_i - 1]:.4f}"
-        remedy = "Was the board reset? Cut the log there."
+        remedy = "Was the board reset? Split the log there."
         raise CaptureError(f"{where} row {row_i + first_row}", TIME, "later than the line above", got, remedy)
     rate_hz = 1 / float(np.median(np.diff(t_s)))
     if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:

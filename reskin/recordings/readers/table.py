@@ -74,7 +74,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     names, cells = _read_cells(folder / name, where)
     if (chips_n := count_chips_of(names)) != header.chips_n:
         raise CaptureError(
-            f"{where}: the file has {chips_n} chips, but the header {header.chips_n}. Correct one of them."
+            f"{where}: the file has {chips_n} chips, but the header says {header.chips_n}. Correct the file or the "
+            "header."
         )
     columns = columns_of(header.chips_n)
     check_columns(names, columns[: -len(OPTIONAL) - header.chips_n], where, layout="table")
@@ -88,7 +89,8 @@ def read(folder: Path, header: Header, policy: FaultPolicy) -> tuple[Readings, A
     temperature_degC = np.stack([numbers.get(f"T{chip}", unknown) for chip in range(header.chips_n)], axis=1)
     rows = check_rows(b_uT, temperature_degC, header.expected_lsb_uT, where=where, policy=policy)
     press = _number_presses(numbers, contact, where)
-    block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)  # a run of no-load rows and the contacts after it
+    # Number the blocks; a block is a run of no-load rows and the contacts after it.
+    block = np.cumsum(np.diff(contact.astype(int), prepend=1) < 0)
     rest = ~contact & rows.keep
     noload_uT = mean_by_group(b_uT[rest], block[rest], int(block[-1]) + 1)[block]
     keep = contact & rows.keep

@@ -122,7 +122,7 @@ def test_recorded_scenes_have_no_added_walk(scene, tmp_path):
         ([capture("c0"), capture("c1")], "the order in time of the 2 captures of skin s0 is unknown"),
         (
             [capture("c0", pokes_n=129)],
-            "the shortest capture must be at least drift.every_n . test_n = 130 long; got 129",
+            "the shortest capture must be at least drift.every_n . drift.test_n = 130 units long; got 129",
         ),
     ],
 )

@@ -220,7 +220,7 @@ def test_real_file_in_gauss_is_refused(tmp_path: Path, shared_data: Path) -> Non
 
 def test_other_chip_count_is_refused(tmp_path: Path) -> None:
     message = error_of(write(tmp_path, *PRESSES), HEADER.model_copy(update={"chips_n": 5}))
-    assert "2 chips, but the header 5" in message
+    assert "2 chips, but the header says 5" in message
 
 
 def test_recording_without_contact_is_refused(tmp_path: Path) -> None:
