@@ -76,7 +76,7 @@ def run(folder: Path, python: Path, setting: Mapping[str, str]) -> dict[str, Any
 
 
 def differences(first: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the counts of equal and differing values, and the largest relative difference with its name."""
+    """Return the counts of equal and differing values, the largest relative difference, and the name of its value."""
     done = compare(first, other)
     found = {
         "equal_n": done.equal.total(),

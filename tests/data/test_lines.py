@@ -184,9 +184,9 @@ def test_simulated_hand_pokes_are_indexed_from_0():
 def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
     table = grid(depths_n=3, passes_n=2)
     chosen = take_pokes(table, all_rows(table), indentations_n, rng_for(seed, "pokes"))
-    taken = set(table.indentation[chosen].tolist())
-    assert len(taken) == indentations_n
-    assert chosen.tolist() == [row for row in range(len(table)) if table.indentation[row] in taken]
+    indentations = set(table.indentation[chosen].tolist())
+    assert len(indentations) == indentations_n
+    assert chosen.tolist() == [row for row in range(len(table)) if table.indentation[row] in indentations]
     counts = Counter(map(tuple, table.target[chosen, :2].tolist()))
     visits_n = [counts[tuple(place_mm)] // READINGS_N for place_mm in points_mm().tolist()]
     assert max(visits_n) - min(visits_n) <= 1
@@ -195,10 +195,10 @@ def test_chosen_pokes_are_spread_evenly_over_places(indentations_n, seed):
 @given(st.integers(0, 390), st.integers(0, 390), st.integers(0, 2**32))
 def test_smaller_choice_is_a_subset_of_a_larger_one(one_n, other_n, seed):
     table = grid(depths_n=3, passes_n=2)
-    few, many = (
+    smaller, larger = (
         set(take_pokes(table, all_rows(table), n, rng_for(seed, "pokes")).tolist()) for n in sorted((one_n, other_n))
     )
-    assert few <= many
+    assert smaller <= larger
 
 
 @given(st.integers(0, 2**32))
@@ -221,10 +221,10 @@ def test_places_and_visits_are_equally_likely():
     # Place 0 has 8 visits, place 1 has one. A poke is at either place with equal probability; at place 0, all visits
     # are equally likely.
     table = rows_at([(0, 0)] * 8 + [(2, 0)])
-    taken = Counter(int(take_pokes(table, all_rows(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
+    draws_n = Counter(int(take_pokes(table, all_rows(table), 1, rng_for(0, "fair", i))[0]) for i in range(1600))
     # four standard deviations of a binomial distribution with p = 1/2
-    assert abs(taken[8] - 800) < 4 * np.sqrt(1600 / 4)
-    assert all(abs(taken[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
+    assert abs(draws_n[8] - 800) < 4 * np.sqrt(1600 / 4)
+    assert all(abs(draws_n[row] - 100) < 4 * np.sqrt(100 * 15 / 16) for row in range(8))
 
 
 def test_too_many_pokes_are_refused():

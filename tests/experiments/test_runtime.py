@@ -132,8 +132,8 @@ def test_boxes_fill_the_volume_of_the_lattice():
 
 
 def test_lifted_box_equals_charged_faces(monkeypatch):
-    # A single box fills the skin; the dipole approximation would be wrong. Between equal poles, it is magnetised along
-    # z.
+    # The skin is a single box, for which the dipole approximation would be wrong. The box is magnetised along
+    # z, because it is between equal poles.
     whole_skin, lift_m = Quadrature(SKIN_SIDE_M, 1), np.array([0.0, 0.0, 1e-3])
     like = design(polarity="same")
     one = draw_trial(

@@ -51,7 +51,7 @@ def write_model(folder: Path, name: str = "model", *, off_mm: float = 0.0, chips
     # weights of the linear model [3 ch]
     linear = np.linalg.lstsq(changes_uT(chips_n) / INPUT_SCALE_uT, PLACES - (off_mm, 0, 0), rcond=None)[0].T
     weights = {key: 0 * value for key, value in draw_weights(paper_layers(3 * chips_n), rng_for(0, "net")).items()}
-    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # of a value and its negative, a ReLU passes one
+    weights["layer1.weight"][:6] = np.concatenate([linear, -linear])  # ReLUs pass either a value or its negative
     for layer_i in range(2, 6):
         weights[f"layer{layer_i}.weight"][:6, :6] = np.eye(6)
     weights["layer6.weight"][:, :6] = np.hstack([np.eye(3), -np.eye(3)])

@@ -40,7 +40,7 @@ class SimulatedClock:
 
 
 class FakeReader:
-    """A reader that records the arrival time of each frame; once, at frame `late_i`, it is late by `late_s`."""
+    """A reader that records the arrival time of each frame, and once pauses for `late_s`, after frame `late_i`."""
 
     def __init__(self, times, late_i=-1, late_s=0.0):
         self.times, self.late_i, self.late_s, self.arrival_s = times, late_i, late_s, []

@@ -84,27 +84,27 @@ def expected_inputs(inputs: str, db_uT: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", SETTINGS)
 def test_job_equals_direct_call(name, inputs):
     one = method(name, inputs)
-    (got,) = results_of(task(one))
+    (found,) = results_of(task(one))
     train, test = (expected_inputs(inputs, ROWS.db_uT[rows]) for rows in (TRAIN, TEST))
     by_hand = fit(one, train, ROWS.target[TRAIN], rng_for(3, "baseline", "one"), weight=None)
     # Inputs of 1 uT to 200 uT may differ in the last bit of float32; predictions then differ by at most 1e-5.
-    np.testing.assert_allclose(got.predicted, by_hand.predict(test), atol=1e-5)
-    assert got.rows_n == 30
-    assert got.seconds > 0
-    assert got.one_reading_s > 0
+    np.testing.assert_allclose(found.predicted, by_hand.predict(test), atol=1e-5)
+    assert found.rows_n == 30
+    assert found.seconds > 0
+    assert found.one_reading_s > 0
 
 
 def test_labels_of_a_new_skin_weigh_as_much_as_all_others():
-    (got,) = results_of(task(few_labels=OWN))
+    (found,) = results_of(task(few_labels=OWN))
     train = np.concatenate([TRAIN, OWN])
     mean, sd = ROWS.db_uT[train].mean(axis=0, dtype=float), ROWS.db_uT[train].std(axis=0, dtype=float)
     middle, spread = ROWS.target[train].mean(axis=0, dtype=float), ROWS.target[train].std(axis=0, dtype=float)
     weight = [1.0] * 30 + [5.0] * 6  # 6 rows of weight 5 weigh as much as 30 rows
     plane = Ridge(1.0).fit((ROWS.db_uT[train] - mean) / sd, (ROWS.target[train] - middle) / spread, weight)
-    wanted = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
-    np.testing.assert_allclose(got.predicted, wanted, atol=1e-5)  # rounding to float32
-    assert got.rows_n == 36
-    assert np.abs(got.predicted - results_of(task())[0].predicted).max() > 1e-3
+    expected = plane.predict((ROWS.db_uT[TEST] - mean) / sd) * spread + middle
+    np.testing.assert_allclose(found.predicted, expected, atol=1e-5)  # rounding to float32
+    assert found.rows_n == 36
+    assert np.abs(found.predicted - results_of(task())[0].predicted).max() > 1e-3
 
 
 @settings(max_examples=20, deadline=None)
@@ -171,8 +171,8 @@ def test_targets_of_test_rows_do_not_matter(name):
     used = np.concatenate([TRAIN, OWN])
     others = ROWS.target.copy()
     others[np.setdiff1d(np.arange(ROWS_N), used)] = 1e6
-    (got,), (other,) = (
+    (found,), (other,) = (
         results_of(task(method(name), few_labels=OWN), rows=rows)
         for rows in (ROWS, TrainingData(ROWS.db_uT, others, ROWS.skin))
     )
-    assert (got.predicted == other.predicted).all()
+    assert (found.predicted == other.predicted).all()

@@ -16,8 +16,8 @@ TODAY = fingerprint(PARAMS)
 
 
 def test_order_of_settings_does_not_matter():
-    turned = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
-    assert fingerprint(turned) == TODAY
+    reordered = {name: dict(reversed(PARAMS[name].items())) for name in reversed(("skin", "rig", "chip", "spreads"))}
+    assert fingerprint(reordered) == TODAY
     assert len(TODAY) == 16
 
 

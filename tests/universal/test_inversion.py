@@ -47,12 +47,12 @@ def test_residuals_are_zero_on_the_lattice_only():
 
 def test_slopes_equal_finite_differences():
     two = _JointFit(TRUE, CHEAP, fields_uT()[:2], at_rest_uT(TRUE, CHEAP).ravel())
-    at = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
-    values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], at.ravel()])
+    presses = np.column_stack([PLACE_MM[:2], np.log(FORCE_N[:2])]) + 0.2
+    values = np.concatenate([[asdict(TRUE)[name] for name in PARAMETERS], presses.ravel()])
     columns = two.slopes(values)
     for i in (0, len(PARAMETERS), len(PARAMETERS) + 4):  # a parameter of the law, x of the first press, y of the second
-        by = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
-        expected = (two.residuals(values + by) - two.residuals(values)) / by.max()
+        change = (np.arange(len(values)) == i) * (STEP_MM if i else 0.1 * inversion.STEP.seat_x_mm)
+        expected = (two.residuals(values + change) - two.residuals(values)) / change.max()
         np.testing.assert_allclose(columns[:, i], expected, rtol=1e-6, atol=1e-9)
 
 

@@ -146,7 +146,7 @@ def test_law_without_slide_and_offsets_equals_the_nominal_skin():
     place_mm = np.array([[3.0, -2.0], [0.0, 6.0]])
     nominal_uT = law.nominal_uT(setup, place_mm, np.array([0.5, 0.5]))
     lengths = [np.linalg.norm(nominal_uT - law.simulate_uT(plain, setup, place_mm, np.full(2, force_N))) for force_N in
-               np.geomspace(0.2, 8, 30)]  # one of these forces gives the same depth  # fmt: skip
+               np.geomspace(0.2, 8, 30)]  # one of these forces gives nearly the depth of `nominal_uT`  # fmt: skip
     assert min(lengths) < 0.05 * np.linalg.norm(nominal_uT)
 
 
@@ -156,7 +156,8 @@ def test_pokes_beyond_the_greatest_depth_are_counted_and_clamped():
     (deepest_N,) = layer.force(deepest_m, **layer_settings, base="slipping") * 0.28**-1.5
     force_N = deepest_N * np.array([0.5, 0.999, 1.001, 3.0])
     assert law.beyond_n(TRUE, SETUP, force_N) == 2
-    without_slide = replace(TRUE, away_um_mm=0.0)  # no slide, because it would grow with the force
+    # With a slide, the field would change with the force even at a constant depth.
+    without_slide = replace(TRUE, away_um_mm=0.0)
     held_uT = law.simulate_uT(without_slide, SETUP, np.zeros((4, 2)), force_N)
     # a skin with half the modulus is indented as deeply by half the force
     soft = replace(TRUE, modulus_MPa=TRUE.modulus_MPa / 2)
