@@ -10,7 +10,7 @@ from tests.elements import Layer, along_x_strains, plate
 H_M, WIDTH_M, TIP_M, DEPTH_M = 2e-3, 0.8e-3, 2e-3, 1.2e-3
 DRAG_M = 0.9e-3  # greatest depth of a drag in the scenes
 DEEPEST_RADIUS_H = 0.75  # at least the contact radius of the deepest drag, divided by the thickness of the layer
-TAKEN_M = np.array([4e-5, 7e-5])
+DISPLACEMENT_M = np.array([4e-5, 7e-5])
 HELD = {
     # at the outer edge, u_r falls as 1 / r, which springs of stiffness 2 / r imitate
     "slipping": {"held": {"axis": [0], "base": [1]}, "drag": {"far": lambda r: 2 / r}},
@@ -112,12 +112,12 @@ def test_dragged_layer_equals_finite_elements(radius_h, tolerance):
 def test_stiff_plate_under_uniform_drag_moves_rigidly(sides_m):
     misses_m = []
     for stiffness in (1e3, 1e4):
-        middle_m, move_m, spin_rad = plate(sides_m, (6e-3, -3e-3), TAKEN_M, stiffness)
-        rigid = slide.rigid_motion(middle_m[None], TAKEN_M[None], sides_m)
+        middle_m, move_m, spin_rad = plate(sides_m, (6e-3, -3e-3), DISPLACEMENT_M, stiffness)
+        rigid = slide.rigid_motion(middle_m[None], DISPLACEMENT_M[None], sides_m)
         misses_m.append(np.append(move_m - rigid.move_m[0], (spin_rad - rigid.spin_rad[0]) * sides_m[0] / 2))
-    assert np.abs(misses_m[1]).max() < 1e-4 * TAKEN_M.max()
+    assert np.abs(misses_m[1]).max() < 1e-4 * DISPLACEMENT_M.max()
     # the deviation from a rigid motion is inversely proportional to the stiffness
-    np.testing.assert_allclose(misses_m[0], 10 * misses_m[1], atol=1e-5 * TAKEN_M.max())
+    np.testing.assert_allclose(misses_m[0], 10 * misses_m[1], atol=1e-5 * DISPLACEMENT_M.max())
 
 
 def test_base_friction_interpolates_between_slipping_and_bonded():

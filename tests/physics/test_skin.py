@@ -270,7 +270,8 @@ def test_filler_and_amplitude_scale_the_moments():
 
 
 def test_field_at_rest_has_the_magnitude_of_recordings():
-    # Recorded in-plane fields at rest are up to 3.6 mT. Factor of two, because all skins have the same amplitude.
+    # Recorded in-plane fields at rest are up to 3.6 mT. The tolerance is a factor of two, because the simulated skin
+    # has the nominal amplitude.
     rest_T, _ = changes_of_field(BOARD, skin(rule=DEFAULT_QUADRATURE), np.zeros((0, 3)))
     assert np.abs(rest_T[:, :2]).max() > 10 * np.abs(rest_T[:, 2]).max()
     assert 1.8e-3 < np.abs(rest_T).max() < 7.2e-3

@@ -37,8 +37,8 @@ DESIGN = parse(SkinDesign, nominal("skin") | {"tip_radius_mm": 2.0}, "params.yam
 SETUP = law.Setup(DESIGN, np.array(SECTION.design.places_mm), 1.1, SECTION.skin_mm, True, SECTION.tip_radius_mm)
 TRUE = law.Law(0.4, -0.3, 0.0, 1.6, 1.8, 0.5, -0.6, 0.22, 6.0, 40.0, 10.0)
 # Tolerances: errors of a fit to 50 pokes with 3 uT of noise; errors of gap and amplitude are correlated.
-NEAR = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
-TURN = chip_rotations(SECTION)
+TOLERANCES = law.Law(0.05, 0.05, 0.0, 0.15, 0.3, 0.1, 0.1, 0.03, 0.6, 3.0, 3.0)
+ROTATIONS = chip_rotations(SECTION)
 
 
 def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> RecordedPresses:
@@ -46,8 +46,8 @@ def simulated_presses(parameters: law.Law = TRUE, noise_uT: float = 3.0) -> Reco
     rng = rng_for(0, "compare")
     grid_mm = np.stack(np.meshgrid(*[np.linspace(-7, 7, 5)] * 2), axis=-1).reshape(-1, 2)
     place_mm, force_N = np.tile(grid_mm, (2, 1)), np.repeat([1.0, 4.0], 25)
-    db_uT = np.einsum("kij,nki->nkj", TURN, law.simulate_uT(parameters, SETUP, place_mm, force_N))
-    rest_uT = np.einsum("kij,ki->kj", TURN, law.at_rest_uT(parameters, SETUP))
+    db_uT = np.einsum("kij,nki->nkj", ROTATIONS, law.simulate_uT(parameters, SETUP, place_mm, force_N))
+    rest_uT = np.einsum("kij,ki->kj", ROTATIONS, law.at_rest_uT(parameters, SETUP))
     return RecordedPresses(
         board="b", groups=("soft", "hard"), group_i=np.repeat([0, 1], 25), capture_i=np.repeat([0, 1], 25),
         place_mm=place_mm * (1, -1) + SECTION.labels_middle_mm, force_N=force_N,
@@ -66,7 +66,7 @@ def sentence(pokes: RecordedPresses) -> str:
 
 
 def test_fit_recovers_the_true_parameters(recorded):
-    fitted, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(NEAR)
+    fitted, near = asdict(fit.fit(to_board_axes(recorded, SECTION), SETUP, fit.TEN)), asdict(TOLERANCES)
     assert {
         name: (fitted[name], true) for name, true in asdict(TRUE).items() if abs(fitted[name] - true) > near[name]
     } == {}
